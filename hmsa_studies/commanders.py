@@ -1,7 +1,6 @@
 """Who commands an actuator in the study of feedback: the controller itself, or linear control."""
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
 
 from hmsa_ros.control.loop import Loop
 from hmsa_ros.control.records import Settings, Target
@@ -14,9 +13,7 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Options, Planner
 from hmsa_studies.linear import Controller, Predictive, Quadratic
-
-if TYPE_CHECKING:
-    from hmsa_studies.feedback import Scenario, Strategy
+from hmsa_studies.scenario import Scenario, Strategy
 
 #: Largest load, and time in ns from a sample's arrival to the first level that depends on it.
 LARGEST, REACTION = 2.0, 300_000
@@ -35,7 +32,7 @@ class Commander(ABC):
     steadily = False
 
     def __init__(
-            self, scenario: 'Scenario', strategy: 'Strategy', error: float, seed: int) -> None:
+            self, scenario: Scenario, strategy: Strategy, error: float, seed: int) -> None:
         self.scenario = scenario
         self.target = scenario.block.rest
         self.device = SimulatedDevice(
@@ -79,7 +76,7 @@ class Commander(ABC):
         return plant
 
 
-def planner_of(scenario: 'Scenario', strategy: 'Strategy', lead: int = 0) -> Planner:
+def planner_of(scenario: Scenario, strategy: Strategy, lead: int = 0) -> Planner:
     """Return a planner with the nominal parameters, whose commands are sent ns ahead."""
     block = scenario.block
     unit = block.flux_density_unit
@@ -92,7 +89,7 @@ class _Running(Commander):
     """The controller as it is shipped, in open loop or with feedback."""
 
     def __init__(
-            self, scenario: 'Scenario', strategy: 'Strategy', error: float, seed: int) -> None:
+            self, scenario: Scenario, strategy: Strategy, error: float, seed: int) -> None:
         super().__init__(scenario, strategy, error, seed)
         self._loop = Loop(PlannerGroup({_JOINT: self.planner}), Settings(
             takeover_timeout=0, feedback='adapt' if strategy.kind == 'adapt' else 'off',
@@ -122,7 +119,7 @@ class _Steady(Commander):
     steadily = True
 
     def __init__(
-            self, scenario: 'Scenario', strategy: 'Strategy', error: float, seed: int) -> None:
+            self, scenario: Scenario, strategy: Strategy, error: float, seed: int) -> None:
         super().__init__(scenario, strategy, error, seed)
         self._controller = _LINEAR[strategy.kind](
             scenario.block, LARGEST, self.device.period,
@@ -163,7 +160,7 @@ class _Steady(Commander):
 
 
 def commander(
-        scenario: 'Scenario', strategy: 'Strategy', error: float, seed: int) -> Commander:
+        scenario: Scenario, strategy: Strategy, error: float, seed: int) -> Commander:
     """Return who carries out a strategy."""
     kind = _Steady if strategy.kind in _LINEAR else _Running
     return kind(scenario, strategy, error, seed)

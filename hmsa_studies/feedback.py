@@ -6,109 +6,23 @@ an unknown bias. Whoever commands it has the nominal ones. Open loop and feedbac
 controller that nodes run, driven in simulated time.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hmsa_ros.estimation.prior import TRACKED
-from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.model.simulation import ActuatorSimulation
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_studies.commanders import Commander, commander, LARGEST, planner_of
 from hmsa_studies.learning import carried_out, Learner
-from hmsa_studies.linear import Weights
+from hmsa_studies.scenario import Scenario, Strategy
 
-#: How far from rest a first move, and after it another one, go.
-TARGETS = (0.4, 0.1)
-# Between two samples of a camera, in units of time.
-_INTERVAL = 0.114
 # Samples before the first move, and points of a motion that is looked at.
 _BEFORE, _LOOK, _WATCHED = 50, 120, 40
 # A cycle, and after what time nothing moves, in nominal units of time.
 CYCLE, _SETTLED = 1.45, 150.0
 # Cycles between the first move and the next one, and trials of a move that is learnt.
 CYCLES, _TRIALS = 3, 4
-
-
-# Of some 100 tried, those with the least vibration and offset over G as known and 20 % off; others
-# where the coil lags, since the loop rings with these.
-_WEIGHTS = {'lqr': Weights(0.05, 0.01, 3.0), 'mpc': Weights(0.3, 0.03)}
-_CAREFUL = {'lqr': Weights(0.3, 0.3, 1.0), 'mpc': Weights(1.0, 0.03, wander=0.03)}
-
-
-@dataclass(frozen=True)
-class Scenario:
-    """Actuator and sensor; times in s."""
-
-    name: str
-    period: float  #: between two samples
-    delay: float  #: until a sample is there
-    noise: float  #: standard deviation of a sample of stretch
-    half_length: float = 0.01  #: m; sets the unit of time, 4.4 ms for 0.01 m
-    truth: Mapping[str, float] = field(default_factory=dict)  #: factors beside that of G
-    coil_time_constant: float = 0.0  #: unknown to the model
-    free: tuple[str, ...] = TRACKED
-    weights: Mapping[str, Weights] = field(default_factory=lambda: _WEIGHTS)
-    nominal: ActuatorParameters | None = None  #: in place of the example block
-
-    @property
-    def targets(self) -> tuple[float, ...]:
-        """Where moves go."""
-        return tuple(self.block.rest + x for x in TARGETS)
-
-    @property
-    def block(self) -> ActuatorParameters:
-        """Nominal."""
-        return self.nominal or ActuatorParameters.from_nondimensional(
-            NondimensionalParameters(), shear_modulus=1e4, density=1900.0,
-            half_length=self.half_length, remanence=0.1)
-
-    def actuator(self, error: float) -> ActuatorParameters:
-        """Return the true one, for an error of the shear modulus as a share."""
-        block = self.block
-        return replace(
-            block, shear_modulus=block.shear_modulus * (1.0 + error),
-            **{name: x * getattr(block, name) for name, x in self.truth.items()})
-
-
-def scenario_of(actuator: ActuatorParameters) -> Scenario:
-    """Return the scenario of an actuator that a camera sees: some thirty samples a period."""
-    period = _INTERVAL * actuator.time_unit
-    return Scenario(
-        f'{1.0 / period:.3g} Hz, {2e3 * period:.3g} ms late, noise 1e-3, T '
-        f'{1e3 * actuator.time_unit:.3g} ms', period, 2.0 * period, 1e-3, nominal=actuator)
-
-
-#: The matrix: samples at 1 kHz that are 2 ms late, and a camera on a slower actuator.
-SCENARIOS = (
-    Scenario('1 kHz, 2 ms late, noise 1e-3', 1e-3, 2e-3, 1e-3),
-    Scenario('1 kHz, 2 ms late, noise 1e-4', 1e-3, 2e-3, 1e-4),
-    Scenario('200 Hz, 10 ms late, noise 1e-3, T 44 ms', 5e-3, 1e-2, 1e-3, 0.1),
-    Scenario(
-        '1 kHz, 2 ms late, noise 1e-3; Br +5 %, lag 0.5 ms', 1e-3, 2e-3, 1e-3,
-        truth={'remanence': 1.05}, coil_time_constant=5e-4,
-        free=('shear_modulus', 'damping_coefficient', 'chain_limit', 'remanence',
-              'coil_time_constant', 'stretch_bias'), weights=_CAREFUL))
-
-
-@dataclass(frozen=True)
-class Strategy:
-    """How moves are planned."""
-
-    name: str
-    shaper: str
-    order: int = 1
-    #: What samples do: nothing; 'adapt' corrects moves that take longer where much is expected to
-    #: be left; 'lqr' and 'mpc' set a level after each; 'learning' tries the first move again.
-    kind: str = 'open'
-
-
-CHAINED = Strategy('chained', 'robust', 2)
-STRATEGIES = (
-    Strategy('two-step', 'two_step'), CHAINED, Strategy('ZVD', 'zvd'),
-    Strategy('learning', 'two_step', kind='learning'), Strategy('LQR', 'two_step', kind='lqr'),
-    Strategy('MPC', 'two_step', kind='mpc'), Strategy('adapt', 'two_step', kind='adapt'))
 
 
 @dataclass(frozen=True)

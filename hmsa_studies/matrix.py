@@ -8,18 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr
 
-from hmsa_studies.feedback import (
-    CHAINED,
-    CYCLE,
-    CYCLES,
-    Left,
-    Scenario,
-    SCENARIOS,
-    STRATEGIES,
-    Strategy,
-    TARGETS,
-    trial,
-)
+from hmsa_studies.feedback import CYCLE, CYCLES, Left, trial
+from hmsa_studies.scenario import CHAINED, Scenario, SCENARIOS, STRATEGIES, Strategy, TARGETS
 from hmsa_studies.tasks import Tasks
 
 #: Errors of the shear modulus that make a row together.

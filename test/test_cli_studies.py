@@ -18,7 +18,8 @@ from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError
 from hmsa_studies import matrix, paper_data, robustness
 from hmsa_studies.executors import given, here, in_order
-from hmsa_studies.feedback import SCENARIOS, STRATEGIES, trial
+from hmsa_studies.feedback import trial
+from hmsa_studies.scenario import SCENARIOS, STRATEGIES
 
 ROOT = Path(__file__).resolve().parent.parent
 PNG = b'\x89PNG\r\n\x1a\n'

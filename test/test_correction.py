@@ -18,14 +18,9 @@ from hmsa_ros.identification.known import Known
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Options as PlannerOptions
 from hmsa_ros.planning.planner import Planner
-from hmsa_studies.feedback import (
-    scenario_of,
-    SCENARIOS,
-    STRATEGIES,
-    Strategy,
-    trial,
-)
+from hmsa_studies.feedback import trial
 from hmsa_studies.linear import Linearised
+from hmsa_studies.scenario import scenario_of, SCENARIOS, STRATEGIES, Strategy
 
 TARGET, BEGIN, MS = 1.4, 50_000_000, 1_000_000
 

@@ -24,7 +24,7 @@ from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.planning.planner import Options
 from hmsa_ros.planning.timeline import Model
-from hmsa_studies.feedback import SCENARIOS
+from hmsa_studies.scenario import SCENARIOS
 
 
 def estimates(loop):

@@ -257,8 +257,9 @@ def _feedback(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) ->
     """Compare open loop with corrections."""
     from hmsa_ros.identification.files import read_belief
     from hmsa_studies.executors import in_order
-    from hmsa_studies.feedback import scenario_of, trial
+    from hmsa_studies.feedback import trial
     from hmsa_studies.matrix import left_of, Matrix
+    from hmsa_studies.scenario import scenario_of
 
     if arguments.seeds < 1:
         raise BadInputError(f'--seeds is {arguments.seeds}: expected at least 1')
