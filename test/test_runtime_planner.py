@@ -631,6 +631,22 @@ def test_clock_that_is_set_back_drops_the_plan_and_tells_so_once():
     assert rig.planner.plan.levels[0].stretch == 1.0
 
 
+def test_a_device_without_receipts_that_takes_over_from_another_is_noticed():
+    rig = Rig(settings=replace(QUIET, heartbeat_period=10 * MS))
+    reporters = {b'old'}
+    rig.runtime.hearing.reporters = lambda joint: frozenset(reporters)
+    rig.runtime.request(trajectory(*SEQUENCE))
+    rig.run(START + LEAD + 20 * MS)
+    assert rig.status.progress.state != 'idle'
+    # Both for a moment, as at no time there is none.
+    reporters.add(b'new')
+    rig.run(rig.now + 20 * MS)
+    reporters.remove(b'old')
+    rig.run(rig.now + 20 * MS)
+    assert sum('plant or driver of joint a came after the commands were sent' in x
+               for x in rig.notes()) == 1
+
+
 @pytest.mark.parametrize('by', [240_000 * MS, -5_000 * MS])
 def test_the_plan_goes_on_when_the_clock_is_set(by):
     rig = Rig(settings=replace(QUIET, heartbeat_period=10 * MS))

@@ -58,7 +58,8 @@ for _fault, _name, _how, _expected, _word, _counter in (
          'rejected and named', 'open loop until samples fit again', 'rejected'),
         ('swap', 'samples in the wrong order', 'each two swapped',
          'put in order by their stamps', '', ''),
-        ('twice', 'samples that come twice', 'each sample sent twice', 'passed over', '', ''),
+        ('twice', 'samples that come twice', 'each sample sent twice',
+         'passed over unread, as all that are denser than the estimate needs', '', ''),
         ('silence', 'a sensor that falls silent', 'no samples any more', 'open loop', '', '')):
     FAULTS.fault(
         f'sensor_{_fault}', f'{_name}, feedback adapt',

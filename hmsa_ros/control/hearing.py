@@ -35,6 +35,9 @@ class Hearing:
         self._clock, self._steady, self._found = clock, steady, found
         self.receipts = Receipts(steady)
         self._absent: set[str] = set()
+        #: Returns identifiers of who reports applied levels of a joint.
+        self.reporters: Callable[[str], frozenset[bytes]] = lambda joint: frozenset()
+        self._reporters: dict[str, frozenset[bytes]] = {}
         self.fresh: set[str] = set()
         self.cut: set[str] = set()
         self.until: int | None = None
@@ -67,8 +70,19 @@ class Hearing:
         """Find devices that were not found at the last look; return the verdict on a plan."""
         absent = {x for x in self._group.planners if not self._found(x)}
         come, self._absent = self._absent - absent, absent
+        come |= {x for x in self._group.planners if self._relieved(x)}
         verdicts = [self._appeared(x) for x in sorted(come)]
         return next((x for x in verdicts if x is not None), None)
+
+    def _relieved(self, joint: str) -> bool:
+        """Return whether another device took over from one that gives no receipts."""
+        if joint in self.receipts:
+            # They show it.
+            return False
+        before, now = self._reporters.get(joint, frozenset()), self.reporters(joint)
+        self._reporters[joint] = now or before
+        # Where there was none before, it is only found one topic after the other.
+        return bool(before and now - before)
 
     def received(
             self, joint: str, time: int, command: int, *, comparable: bool) -> Verdict | None:

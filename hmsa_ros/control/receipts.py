@@ -72,6 +72,9 @@ class Receipts:
     def __bool__(self) -> bool:
         return bool(self._joints)
 
+    def __contains__(self, joint: str) -> bool:
+        return joint in self._joints
+
     def sent(self, joint: str, stamp: int, now: int) -> None:
         """Take in that a command of a stamp in ns was sent at a time in ns of our clock."""
         known = self._joints.get(joint)

@@ -49,6 +49,14 @@ class JointChannel:
                 self._node.count_publishers(self._applied)
                 or self._node.count_publishers(topics.JOINT_STATES.name)))
 
+    @property
+    def reporters(self) -> frozenset[bytes]:
+        """Identifiers of who reports what takes effect."""
+        return frozenset(
+            bytes(x.endpoint_gid)
+            for x in self._node.get_publishers_info_by_topic(self._applied)) if (
+                self._applied) else frozenset()
+
     def unheard(self) -> str:
         """Return why nobody carries out the commands; empty where somebody does."""
         if not self._applied:

@@ -89,6 +89,7 @@ class PlannerNode(ManagedNode):
             observable=self._observable, unheard=self._unheard, glance=self._glance,
             found=lambda joint: self._channels[joint].found)
         runtime.one_clock = self._one_clock
+        runtime.hearing.reporters = lambda joint: self._channels[joint].reporters
         return runtime
 
     # -- states --------------------------------------------------------------------------------
