@@ -25,9 +25,10 @@ from hmsa_ros.planning.timeline import Draft, Plan, PlannedLevel
 LEAST_STEP = 0.1
 #: Residual vibration from peak to peak, as a share of the step, from which on it counts.
 SHARE = 5e-3
-# How much less a new plan is to leave, beyond so many deviations over the ways, and how much it may
-# leave itself: one that misses by a whole step is left to chance. After an exception: which share
-# of the gain it may leave more, and which share of what is there, once no more will be known.
+# How much less a new plan is to leave, beyond so many deviations over the ways, and how much it
+# may leave itself: one that misses by a whole step is left to chance. After an exception: which
+# share of the gain it may leave more, and which share of what is there, once no more will be
+# known.
 _GAIN, _SURE, _MOST, _RISK, _CLEARLY = 5e-3, 3.0, 1.0, 0.2, 0.5
 # What stands for a motion that cannot be predicted.
 _LOST = 1e3
