@@ -27,9 +27,9 @@ LEAST_STEP = 0.1
 SHARE = 5e-3
 # How much less a new plan is to leave, beyond so many deviations over the ways, and how much it
 # may leave itself: one that misses by a whole step is left to chance. After an exception: which
-# share of the gain it may leave more, and which share of what is there, once no more will be
-# known.
-_GAIN, _SURE, _MOST, _RISK, _CLEARLY = 5e-3, 3.0, 1.0, 0.2, 0.5
+# share of what is there it may leave then, which share of the gain it may leave more in one way,
+# and which share of what is there, once no more will be known.
+_GAIN, _SURE, _MOST, _LITTLE, _RISK, _CLEARLY = 5e-3, 3.0, 1.0, 0.35, 0.2, 0.5
 # What stands for a motion that cannot be predicted.
 _LOST = 1e3
 # Setpoints that are looked at, how far ahead the next one may begin, units of time that may be
@@ -164,7 +164,7 @@ def worthwhile(
     """
     gain = before - after
     mean, harm = float(gain.mean()), float(-gain.min())
-    if after.mean() > _MOST:
+    if after.mean() > (max(_LITTLE * before.mean(), _MOST) if unsure else _MOST):
         return False
     if unsure and not news:
         return mean >= max(_GAIN, (1.0 - _CLEARLY) * float(before.mean()))
