@@ -64,6 +64,11 @@ class Ending:
             for number, handler in before:
                 signal.signal(number, handler)
 
+    def go_on(self) -> None:
+        """Pass over Ctrl-Z from now on: nobody would watch what the process has switched on."""
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTSTP, signal.SIG_IGN)
+
     def ignore(self) -> None:
         """Pass over signals from now on: the process is about to end anyway."""
         if self._taken:

@@ -85,6 +85,14 @@ def test_a_node_that_is_told_to_end_while_it_is_imported_ends_without_a_word(
     assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
 
 
+def test_a_process_that_goes_on_is_not_stopped_from_the_keyboard():
+    code = ('import os, signal; from hmsa_ros.ending import ENDING; ENDING.go_on(); '
+            'os.kill(os.getpid(), signal.SIGTSTP); print("goes on")')
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == 'goes on\n'
+
+
 def test_an_interrupt_that_python_drops_still_ends_a_command(ros_env):
     done = subprocess.run(
         [sys.executable, '-c', IN_A_DESTRUCTOR], capture_output=True, text=True, check=False,

@@ -118,6 +118,7 @@ class DriverNode(DeviceNode):
                 'use_sim_time is true: expected false, hardware follows the clock of the machine')
         name = self.values[HARDWARE.name]
         self.trouble = ''
+        ENDING.go_on()
         with ENDING.by_default():
             self.device = HardwareWorker(
                 partial(_make_device, name, self.values, self._settings), time_ns)
