@@ -100,8 +100,8 @@ tools: $(VENV)/.tools env ## make the environment, with what tests and documenta
 # The stamps come last in their recipes: an environment left half made has none and is made anew.
 $(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(0 if (3, 10) <= sys.version_info[:2] <= (3, 13) else 1)' \
-	2>/dev/null || { echo "hmsa_ros: $(PYTHON) is $$($(PYTHON) --version 2>&1 | tail -n 1): expected" \
-	"Python 3.10 to 3.13; name one, as in: make PYTHON=python3.12" >&2; exit 1; }
+	2>/dev/null || { echo "hmsa_ros: $(PYTHON) is $$($(PYTHON) --version 2>/dev/null || echo not a Python that" \
+	"runs): expected Python 3.10 to 3.13; name one, as in: make PYTHON=python3.13" >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null \
 	|| { echo "hmsa_ros: $(PYTHON) cannot make environments: expected its modules venv and" \
 	"ensurepip; install them (on Debian and Ubuntu: python3-venv)" >&2; exit 1; }

@@ -284,6 +284,13 @@ def simulated(
             f'levels have the time {times[place]:g} s and the flux density {levels[place]:g} T in '
             f'row {place + 1}: expected finite numbers, and increasing times from 0 s on')
     model = truth.model
+    low, high = truth.flux_density_limits
+    beyond = np.flatnonzero((levels < low) | (levels > high))
+    if plan is None and len(beyond):
+        raise BadInputError(
+            f'level {levels[beyond[0]]:g} T in row {int(beyond[0]) + 1} is beyond the limits of '
+            f'the coil, {low:g} to {high:g} T: expected flux densities in T, or '
+            'flux_density_limits (in a parameter file flux_density_max) that allow it')
     begin = number(model.material.rest if start is None else start, 'start')
     check_stretch(begin, model.material, 'start stretch')
     end = _end(truth, times, levels, until, plan)

@@ -65,7 +65,9 @@ class Folder:
                 raise BadInputError(
                     f'{path} holds an SQLite bag ({others[0]}): expected MCAP; convert it with '
                     '"ros2 bag convert"')
-            raise BadInputError(f'{path} holds no .mcap file: expected a bag')
+            inside = sorted(x.parent.name for x in path.glob('*/*.mcap'))
+            raise BadInputError(f'{path} holds no .mcap file: expected a bag' + (
+                f', such as {path / inside[0]}' if inside else ''))
         stems = sorted({_stem(entry) for entry in present})
         if len(stems) > 1:
             raise BadInputError(

@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     if len(arguments.runs) < 2:
         raise BadInputError(
             f'only {arguments.runs[0]} is given: expected two runs or more, such as hmsa compare '
-            'first second')
+            'first/run second/run')
     from hmsa_ros.api.motion import compare, draw_all, read
 
     with progress('reading'):

@@ -158,7 +158,8 @@ class Lateness:
             return 'commands are lost, or overridden by another publisher'
         if self.cost < _NOTHING:
             return f'{said}, all alike, which leaves no vibration'
-        return f'{said}: some {100.0 * self.cost:.2g} % of the step of residual vibration'
+        cost = float(f'{100.0 * self.cost:.2g}')
+        return f'{said}: about {cost:g} % of the step of residual vibration'
 
     def advice(self, lead_time: int) -> str:
         """Return what helps, the rest of a sentence; commands are sent `lead_time` ns ahead."""
