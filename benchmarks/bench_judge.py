@@ -29,7 +29,8 @@ KINDS = {
     'undamped': 'no damping', 'rare': '4 to 8 samples a period',
     'short': '1.5 to 3 periods', 'frozen': 'sensor frozen on the way',
     'nan': 'sensor not a number', 'out': 'sensor out of range',
-    'unordered': 'in no order, repeated', 'edge': 'within 20 % of the tolerance'}
+    'unordered': 'in no order, repeated', 'edge': 'within 20 % of the tolerance',
+    'transient': 'pushed once during the hold'}
 #: Kinds in which part of the samples, or all, show something else than the stretch.
 BROKEN = ('frozen', 'nan', 'out')
 TOLERANCES = Tolerances(arrival=0.02, vibration=0.02, stretch=1e-3)
@@ -40,6 +41,10 @@ _CLEAR = 15.0
 # Periods at the begin and at the end of a creeping setpoint over which its rest is averaged.
 _SLICE = 6
 _FINE = 400
+# How many times the tolerance a push counts as beyond it.
+_BEYOND = 1.2
+# Noise from peak to peak in a period, in standard deviations, that is hardly ever exceeded.
+_PEAKS = 7.0
 _ARRIVAL = 10**18
 
 
@@ -130,7 +135,15 @@ def draw(seed: int, kind: str) -> Trial:
         white[1:] *= math.sqrt(1.0 - correlation ** 2)
         white = lfilter([1.0], [1.0, -correlation], white)
     target = start + step
+    push = 0.0
+    if kind == 'transient':
+        # A push and no vibration, at times as fast as a tenth of a period.
+        push = size * random.uniform(-0.15, 0.15)
+        width, middle = period * spread(0.05, 1.5), random.uniform(0.0, hold)
+        truth = replace(truth, amplitude=0.0, offset=0.1 * truth.offset)
     stretch = target + truth.stretch(time, step, move) + noise * white
+    if push:
+        stretch += _bump(time, push, width, middle)
     if kind == 'quantised':
         quantum = size * spread(1e-3, 0.03)
         stretch = quantum * np.round(stretch / quantum)
@@ -149,18 +162,27 @@ def draw(seed: int, kind: str) -> Trial:
     means = [float(np.mean(truth.rests(x))) for x in (
         fine[fine <= _SLICE * period], fine[fine >= hold - _SLICE * period], fine)]
     vibration = float(np.ptp(truth.vibrates(fine)))
+    if push:
+        # As far as there are samples of it.
+        after = time[time >= 0.0]
+        vibration = float(np.ptp(_bump(after, push, width, middle))) if len(after) else 0.0
     error = math.sqrt(
         noise ** 2 * (1.0 + correlation) / (1.0 - correlation) + quantum ** 2 / 12.0)
     within: bool | None = vibration <= limit and max(map(abs, means)) <= limit
     if not within and vibration <= limit and min(map(abs, means)) <= limit:
         # It creeps across the tolerance.
         within = None
+    if push and limit < vibration < _BEYOND * limit + _PEAKS * noise:
+        # It is too near to the tolerance to be told from noise.
+        within = None
     setpoint = Setpoint(
         target, start, _ARRIVAL - round(1e9 * move), _ARRIVAL, _ARRIVAL + round(1e9 * hold),
         model, decay, possible=(0.1, 3.0))
     return Trial(
         seed, kind, setpoint, _ARRIVAL + np.rint(1e9 * stamps).astype(np.int64), stretch, within,
-        _clarity(np.unique(time[time >= 0.0]), truth, error, means, vibration, limit),
+        # One push is not the vibration that is estimated.
+        0.0 if push else _clarity(
+            np.unique(time[time >= 0.0]), truth, error, means, vibration, limit),
         f'step {step:.3g}, offset {100 * truth.offset / size:.3g} %, vibration '
         f'{100 * vibration / size:.3g} %, frequency {truth.omega / model:.3g} and decay '
         f'{truth.decay / decay:.3g} of the model (decay/frequency {decay / model:.3g}), noise '
@@ -170,6 +192,11 @@ def draw(seed: int, kind: str) -> Trial:
         + (f', correlation {correlation:.3g}' if correlation else '')
         + (f', creep {100 * truth.creep / size:.3g} % in {truth.slow / period:.3g} periods'
            if creeps else ''))
+
+
+def _bump(time: np.ndarray, size: float, width: float, middle: float) -> np.ndarray:
+    """Return a push that begins and ends at rest."""
+    return np.asarray(size * np.exp(-0.5 * np.square((time - middle) / (0.25 * width))))
 
 
 def _clarity(

@@ -139,3 +139,11 @@ def test_a_sensor_that_rounds_at_rest_is_not_frozen():
 def test_the_quantile_of_students_t_is_that_of_scipy(freedom):
     assert student_quantile(freedom, 0.995) == pytest.approx(
         stdtrit(freedom, 0.995), rel=0.01)
+
+
+def test_a_push_that_does_not_ring_is_neither_arrived_nor_a_vibration():
+    time, stretch = held(noise=0.1, seconds=0.5)
+    pushed = stretch + 0.05 * STEP * np.exp(-0.5 * ((time / 1e9 - 0.25) / 0.001)**2)
+    found = judge(time, pushed, setpoint())
+    assert found.verdict == 'undecided'
+    assert 'moves by' in found.message

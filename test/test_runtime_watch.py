@@ -310,3 +310,19 @@ def test_a_bias_that_feedback_has_found_is_no_offset():
     assert found.arrived
     assert found.offset_std < 1e-3
     assert (offset.verdict, offset.offset) == ('off_target', pytest.approx(0.01, rel=0.05))
+
+
+@pytest.mark.parametrize('measured', [True, False])
+def test_a_stalled_planner_judges_what_came_meanwhile_and_misses_what_it_did_not_send(measured):
+    loop = Loop(rate=1000 if measured else 1)
+    tick = loop.runtime.tick
+    # The commands of the second setpoint are due in this time.
+    loop.runtime.tick = lambda now: [] if START + 90 * MS < now < START + 290 * MS else tick(now)
+    loop.run((1.2, 120 * MS), (1.3, 80 * MS), (1.25, 200 * MS))
+    found = {x.setpoint.number: x for status in loop.outputs if isinstance(status, StatusChanged)
+             for x in status.findings.values()}
+    first = 'arrived' if measured else 'unobserved'
+    assert [str(found[i].verdict) for i in (1, 2, 3)] == [first, 'missed', first]
+    assert 'commands were not sent in time' in found[2].message
+    assert loop.status.worst is found[2]
+    assert loop.status.verdict.code == 'missed'

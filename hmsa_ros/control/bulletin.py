@@ -1,6 +1,6 @@
 """What a runtime tells: verdicts, progress and previews, in the order in which they happen."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 
 from hmsa_ros.control.following import Following
 from hmsa_ros.control.records import (
@@ -101,7 +101,7 @@ class Bulletin:
         self.preview_again = stamps[_PREVIEW // 2] if len(stamps) == _PREVIEW else None
         self.outputs.append(PlanChanged(tuple(stamps), samples))
 
-    def found(self, findings: Sequence[Finding]) -> None:
+    def found(self, finding: Finding | None) -> None:
         """Tell what was measured; the verdict is the worst of the request."""
         worst = self._watch.worst
         if worst is None or self.verdict.severity is Severity.ERROR or not worst.failed and (
@@ -112,7 +112,7 @@ class Bulletin:
         self.give(
             Verdict(
                 Severity.OK if fine else Severity.WARN, worst.verdict, worst.message,
-                self.verdict.request), log=worst.failed and worst in findings)
+                self.verdict.request), log=worst.failed and worst is finding)
 
     def corrected(self, names: Iterable[str]) -> None:
         """Take in that the plans of joints have been corrected."""

@@ -225,7 +225,9 @@ class Following:
             planner = self._group.planners[name]
             self._found.pop(name, None)
             plan, (start, levels) = planner.plan, planner.unknown(now)
-            wanted = aims(plan, planner.soonest(now))
+            soonest = planner.soonest(now)
+            # What was to be reached before now is looked at now: it may not have been held.
+            wanted = [replace(x, arrival=max(x.arrival, soonest)) for x in aims(plan, soonest)]
             left = expected(start, levels, wanted, self.lateness) if wanted else np.zeros(1)
             if left.mean() <= SHARE:
                 return {}

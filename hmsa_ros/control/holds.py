@@ -26,8 +26,8 @@ _MOVING = 32
 # How long samples may stay away, by the steady clock, before it is judged without them.
 _PATIENCE = NANOSECONDS // 2
 _TOLERANCES = Tolerances()
-# How far in ns ahead of the clock a stamp may be: news of the time may be late.
-_AHEAD = NANOSECONDS // 20
+#: How far in ns ahead of the clock a timestamp may be: news of the time may be late.
+AHEAD = NANOSECONDS // 20
 
 
 class Hold:
@@ -38,11 +38,12 @@ class Hold:
     """
 
     def __init__(self, setpoint: Setpoint, *, last: bool) -> None:
-        self.setpoint = setpoint
+        self.setpoint = replace(setpoint, held=last)
         self.found: Finding | None = None
         self.over = False
+        self.untold = False  # whether it is missed, which nobody has been told
         self.news = False  # whether samples have been judged that nobody has looked at
-        self._last = last
+        self._last, self._end = last, setpoint.end
         self._samples: dict[int, float] = {}
         self._moving: set[int] = set()  # parts of the move of which there is one
         # Newest sample by its stamp; newest of all that were looked at, and when that was.
@@ -60,31 +61,29 @@ class Hold:
         least = begin + 2 * self._length if self._last else begin
         self._enough = least if setpoint.end is None else max(setpoint.end, least)
         self._closes = max(self._enough, begin + _RARE) if self._last else self._enough
-        if self._last and setpoint.end is not None and setpoint.moved is None:
-            self.setpoint = replace(setpoint, end=self._closes)
         self.due = min(begin + self._length, self._closes)
         self._few: bool | None = None
+        self._waits = False  # whether the last sample to come is waited for
 
     def move(self, arrival: int, *, corrected: bool) -> None:
         """Take in that another plan arrives at a time in ns, perhaps one corrected on the way."""
+        # What is held on is corrected as long as it is.
+        end = None if corrected and self._last else self._end
         if arrival == self._begin:
+            self.setpoint = replace(self.setpoint, end=end)
             return
-        end = self.setpoint.end
-        if corrected and self._last:
-            # What is held on is corrected as long as it is.
-            end = None
         self.setpoint = replace(
             self.setpoint, end=end, moved=None if arrival == self.setpoint.arrival else arrival)
         if not self._last and end is not None and arrival >= end:
             self.miss('a plan that was made anew reaches it only after its time')
             return
-        self.over = False
+        self.found, self.over, self.untold = None, False, False
         self._begin_at(arrival)
 
     def miss(self, reason: str) -> None:
-        """Take in that the setpoint is not carried out."""
-        if not self.over:
-            self.found, self.over = missed(self.setpoint, reason), True
+        """Take in that the setpoint is not carried out, whatever samples have shown by now."""
+        if self.found is None or self.found.verdict is not Code.MISSED:
+            self.found, self.over, self.untold = missed(self.setpoint, reason), True, True
 
     # -- samples -------------------------------------------------------------------------------
 
@@ -99,7 +98,7 @@ class Hold:
 
     def add(self, stamp: int, stretch: float, now: int) -> None:
         """Take a sample that arrives at a time in ns; none that is from the future."""
-        if stamp > now + _AHEAD:
+        if stamp > now + AHEAD:
             self._ahead = max(self._ahead, stamp - now)
             return
         self._newest = max(self._newest, stamp)
@@ -143,10 +142,14 @@ class Hold:
             self, now: int, steady: int, tolerances: Tolerances, sensor: Sensor, *,
             observable: bool) -> Finding | None:
         """Judge if that is due at a time in ns; None if not, or if that changes nothing."""
+        if self.untold:
+            self.untold = False
+            return self.found
         if self.over or not self._ready(now, steady, observable=observable):
             return None
+        # By samples up to now that was due, whenever it is looked at.
         found, self.news = self.judged(
-            self.setpoint, tolerances, sensor=sensor), bool(self._samples)
+            self.setpoint, tolerances, sensor=sensor, until=self.due), bool(self._samples)
         self.over = self.due >= self._closes or (
             self.due >= self._enough and not found.open)
         after = self.due - self._begin
@@ -163,6 +166,8 @@ class Hold:
 
     def wake(self, now: int) -> int:
         """Return when to judge next, a time in ns; 0 for now."""
+        if self.untold:
+            return 0
         return self._begin if now < self._begin else self.due if now < self.due else 0
 
     def _ready(self, now: int, steady: int, *, observable: bool) -> bool:
@@ -171,25 +176,31 @@ class Hold:
             return True
         if now < self.due:
             return False
-        rare = min(self._begin + _RARE, self._closes)
-        if self._newest >= self.due and (
-                self._newest >= rare or self._first() >= ENOUGH):
+        if self._newest >= self.due and self._first() < ENOUGH:
+            self.due = max(self.due, min(self._begin + _RARE, self._closes))
+        if self._newest >= self.due:
             return True
-        self._heard = self._heard or steady
-        if steady - self._heard <= _PATIENCE or now < self._closes:
+        if now < self._closes:
+            return False
+        if not self._waits:
+            # Samples may wait to be read until then.
+            self._waits, self._heard = True, steady
+        if steady - self._heard <= _PATIENCE:
             return False
         self.due = self._closes
         return True
 
     def judged(
             self, setpoint: Setpoint, tolerances: Tolerances = _TOLERANCES, *,
-            sensor: Sensor) -> Finding:
-        """Judge the samples that have come by now as those of a setpoint."""
-        if not self._samples:
+            sensor: Sensor, until: int | None = None) -> Finding:
+        """Judge the samples that have come, up to a time in ns, as those of a setpoint."""
+        samples = self._samples if until is None else {
+            x: y for x, y in self._samples.items() if x <= until}
+        if not samples:
             return unobserved(
                 setpoint, self._ahead and (
                     f'samples are stamped up to {self._ahead / NANOSECONDS:.3g} s ahead of the '
                     'clock') or '')
-        stamps = np.fromiter(self._samples, dtype=np.int64, count=len(self._samples))
-        values = np.fromiter(self._samples.values(), dtype=np.float64, count=len(stamps))
+        stamps = np.fromiter(samples, dtype=np.int64, count=len(samples))
+        values = np.fromiter(samples.values(), dtype=np.float64, count=len(stamps))
         return judge(stamps, values, setpoint, tolerances, sensor=sensor)

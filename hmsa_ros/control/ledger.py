@@ -54,7 +54,8 @@ class Ledger:
         later = [x for x in corrected if x >= asked]
         learnt = moves.learnt or len(later) < len(corrected)
         early = hold.judged(
-            replace(setpoint, moved=None, end=later[0] if later else setpoint.end), sensor=sensor)
+            replace(setpoint, moved=None, end=later[0], held=False) if later
+            else replace(setpoint, moved=None), sensor=sensor)
         if not learnt and math.isfinite(early.vibration):
             self._without = max(early.vibration / setpoint.step, _or(self._without, 0.0))
         arrival = setpoint.moved or asked

@@ -442,15 +442,13 @@ class PlannerRuntime:
         """Judge arrivals by what was measured."""
         if not self._watch.open:
             return
-        found, end = [], self._steady() + SLICE
-        observable = self._observable()
+        end, observable = self._steady() + SLICE, self._observable()
         while self._steady() < end:
             finding = self._watch.judge(now, self.settings.tolerances, observable=observable)
+            if finding is not None or not self._watch.open:
+                self._bulletin.found(finding)
             if finding is None:
                 break
-            found.append(finding)
-        if found or not self._watch.open:
-            self._bulletin.found(found)
 
     def _audit(self, name: str, hold: Hold) -> None:
         """Hold what a setpoint has left against feedback."""

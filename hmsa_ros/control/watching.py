@@ -4,7 +4,7 @@ from bisect import bisect_left, insort
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from hmsa_ros.control.holds import Hold
+from hmsa_ros.control.holds import AHEAD, Hold
 from hmsa_ros.control.slices import Clock
 from hmsa_ros.judge import Finding, missed, Sensor, Setpoint, Tolerances, worst
 from hmsa_ros.model.equations import stretch_limits
@@ -15,6 +15,7 @@ from hmsa_ros.planning.timeline import Plan, PlannedSegment
 # How long ago a sample may have come for samples to be expected, by the steady clock.
 _RECENT = 10_000_000_000
 _LEFT_OUT = 'commands came late, and there was no time left for it'
+_UNDONE = 'its commands were not sent in time, or took no effect'
 _STOPPED = 'the joint came to rest instead'
 
 
@@ -30,6 +31,7 @@ class _Joint:
     holds: list[Hold] = field(default_factory=list)  # the last one stays when it is over
     news: list[Finding] = field(default_factory=list)  # of setpoints that need no samples
     corrected: bool = False  # whether the plan that is to come corrects the one in force
+    needed: bool = False  # whether the plan was made anew in need
     newest: Finding | None = None
     closed: Finding | None = None  # the worst of the setpoints that are over
 
@@ -39,9 +41,16 @@ class _Joint:
         return len(self.asked.segments) - self.asked.kept
 
     @property
+    def begins(self) -> int | None:
+        """Time in ns at which the next setpoint to watch begins; None for none."""
+        if self.following >= self.count:
+            return None
+        return self.asked.segments[self.asked.kept + self.following].since
+
+    @property
     def open(self) -> bool:
         """Whether setpoints that have begun are still to be judged."""
-        return bool(self.news) or any(not x.over for x in self.holds)
+        return bool(self.news) or any(not x.over or x.untold for x in self.holds)
 
     @property
     def worst(self) -> Finding | None:
@@ -79,6 +88,11 @@ class _Joint:
             number += 1
         return gone
 
+    def undone(self) -> set[int]:
+        """Return the numbers of the setpoints that have begun and were not carried out."""
+        return {x for x in range(self.following)
+                if (one := self.segment(x)) is not None and not one.carried_out}
+
 
 class Watch:
     """Looks at samples of each setpoint as it was requested, and judges them."""
@@ -93,11 +107,13 @@ class Watch:
         # Reading a clock for each sample of each joint would take longer than all else.
         self._now = 0
         self._heard: int | None = None
+        # Time in ns at which the next setpoint begins: its samples may come before the next tick.
+        self._opens: int | None = None
         self.restart()
 
     def restart(self) -> None:
         """Forget everything; what is planned by now is not judged."""
-        self._joints = {}
+        self._joints, self._opens = {}, None
         for name, planner in self._group.planners.items():
             plan = planner.plan
             self._joints[name] = _Joint(
@@ -111,6 +127,8 @@ class Watch:
             # What samples have shown so far is of times that were others.
             joint.holds = [x if x.over else self._hold(name, joint, x.setpoint.number - 1)
                            for x in joint.holds]
+        if self._opens is not None:
+            self._opens += by
 
     def _asked(self) -> list[_Joint]:
         """Return the joints of the newest request."""
@@ -148,7 +166,7 @@ class Watch:
         times = [0 for x in self._joints.values() if x.news]
         times += [
             y.wake(now)
-            for x in self._joints.values() for y in x.holds if not y.over]
+            for x in self._joints.values() for y in x.holds if not y.over or y.untold]
         return min(times, default=None)
 
     # -- setpoints -----------------------------------------------------------------------------
@@ -165,10 +183,15 @@ class Watch:
                 joint = self._begin(name, joint, plan)
             elif plan.segments is not joint.plan.segments:
                 self._change(name, joint, plan, now)
-            segments, kept = joint.asked.segments, joint.asked.kept
-            while joint.following < joint.count and (
-                    segments[kept + joint.following].since <= now):
+        self._open_until(now)
+
+    def _open_until(self, time: int) -> None:
+        """Watch the setpoints that begin by a time in ns."""
+        for name, joint in self._joints.items():
+            while joint.begins is not None and joint.begins <= time:
                 self._open(name, joint)
+        self._opens = min(
+            (x.begins for x in self._joints.values() if x.begins is not None), default=None)
 
     def _begin(self, name: str, joint: _Joint, plan: Plan) -> _Joint:
         """Take in a request, or that a joint came to rest in place of the rest of one."""
@@ -186,7 +209,10 @@ class Watch:
 
     def _change(self, name: str, joint: _Joint, plan: Plan, now: int) -> None:
         """Go over to a plan that was made anew; what it leaves out is missed."""
+        joint.needed |= not joint.corrected
+        joint.corrected = False
         begun = {x.setpoint.number: x for x in joint.holds}
+        undone = joint.undone()
         for number in joint.leave_out(plan, now):
             if number + 1 in begun:
                 begun[number + 1].miss(_LEFT_OUT)
@@ -194,7 +220,9 @@ class Watch:
                 joint.news.append(missed(self._setpoint(name, joint, number), _LEFT_OUT))
         for hold in joint.holds:
             _keep_up(hold, joint)
-        joint.corrected = False
+        joint.news += [
+            missed(self._setpoint(name, joint, x), _UNDONE)
+            for x in sorted(joint.undone() - undone) if x + 1 not in begun]
 
     def _open(self, name: str, joint: _Joint) -> None:
         """Watch the next setpoint."""
@@ -204,7 +232,7 @@ class Watch:
         for hold in joint.holds:
             if hold.over:
                 joint.close(hold.found)
-        joint.holds = [x for x in joint.holds if not x.over]
+        joint.holds = [x for x in joint.holds if not x.over or x.untold]
         joint.holds.append(self._hold(name, joint, number))
 
     def _hold(self, name: str, joint: _Joint, number: int) -> Hold:
@@ -235,6 +263,8 @@ class Watch:
         """Return whether a sample of a time in ns is of use for one of the joints."""
         steady, wanted = self._steady(), False
         self._heard = steady
+        if self._opens is not None and stamp >= self._opens:
+            self._open_until(min(stamp, self._clock() + AHEAD))
         for joint in self._joints.values():
             for hold in joint.holds:
                 wanted |= hold.lacks(stamp, steady)
@@ -274,7 +304,9 @@ def _keep_up(hold: Hold, joint: _Joint) -> None:
     segment = joint.segment(hold.setpoint.number - 1)
     if segment is None:
         hold.miss(_LEFT_OUT)
+    elif not segment.carried_out:
+        hold.miss(_UNDONE)
     elif segment.arrival is not None:
-        hold.move(segment.arrival, corrected=joint.corrected)
+        hold.move(segment.arrival, corrected=not joint.needed)
     elif hold.setpoint.arrival is not None:
         hold.miss('its time ended before the move to it')

@@ -42,6 +42,8 @@ _FITTED = 6
 # Phases at which a vibration is looked at, and how many possible ones.
 _PHASES = np.linspace(0.0, 2.0 * math.pi, 32)
 _MOST_POSSIBLE = 200
+# Standard deviations of noise in its median from zero.
+_NORMAL = 1.4826
 # Largest correlation of neighbours that counts.
 _MOST_ALIKE = 0.98
 
@@ -63,7 +65,9 @@ class Fit:
     offset: Figure
     vibration: Figure  #: peak to peak in the period after time 0
     frequency: float  #: in rad/s
+    decay: float  #: in 1/s
     noise: float  #: standard deviation of a sample
+    usual: float  #: the same of most samples: what happens once does not count
     independent: float  #: share of the samples that noise which is not white leaves
 
 
@@ -262,7 +266,8 @@ def _bounds(problem: _Problem, tried: _Solved, searched: float) -> Fit:
             float(swing[mine]), unit * float(deviation[mine]),
             float(max(np.min(swing - reach * deviation), 0.0)),
             float(np.max((swing + near * deviation)[usual]))),
-        float(within.omega[mine]), math.sqrt(variance), 1.0 / together)
+        float(within.omega[mine]), float(within.decay[mine]), math.sqrt(variance),
+        _NORMAL * float(np.median(np.abs(left))) * math.sqrt(count / freedom), 1.0 / together)
 
 
 def student_quantile(freedom: float, probability: float) -> float:

@@ -37,6 +37,10 @@ _KEPT = 32
 _QUIET = 0.3
 # Noise of a period from peak to peak, in standard deviations, that is hardly ever exceeded.
 _PEAKS = 7.0
+# Samples in a period from which on they show how far it moves.
+_SEEN = 12
+# Of how many samples the mean is looked at where a motion does not ring.
+_TOGETHER = (1, 3, 9)
 # How much wider than for an arrival the bounds are for a miss.
 _SURER = 1.5
 # Changes from sample to sample of so small a share of the step are those of a motion that fades.
@@ -93,16 +97,17 @@ def _judged(
         sensor: Sensor, begin: int) -> Finding:
     """Judge usable samples of a setpoint from a time in ns on."""
     held = stamps >= begin
-    if setpoint.end is not None and begin < setpoint.end:
+    if setpoint.end is not None and not setpoint.held and begin < setpoint.end:
         held &= stamps <= setpoint.end
     count = int(np.count_nonzero(held))
     if not count:
         return unobserved(setpoint)
-    stamps, values = _thinned(stamps[held], values[held], begin, setpoint)
+    every = stamps[held], values[held]
+    stamps, values = _thinned(*every, begin, setpoint)
     allowed, swing = tolerances.of(setpoint)
     quiet = _QUIET * min(allowed, swing)
     findings: list[Finding] = []
-    noise = math.inf
+    noise, alike = math.inf, 1.0
     for number, part in enumerate(_looks(stamps, begin, setpoint)):
         rest = values[part] - setpoint.target
         moves = number > 0 and (
@@ -118,17 +123,40 @@ def _judged(
                 shown, len(rest), setpoint, tolerances, sensor,
                 # What has come to rest is taken to do so until it is seen to move.
                 rests=not moves if number else shown.vibration.high <= swing))
-            noise = min(noise, shown.noise)
+            noise = min(noise, shown.usual)
+            alike = min(alike, shown.independent)
         elif not number:
             findings.append(_too_few(setpoint, stamps[part]))
     # Of equal ones the first look, which shows the vibration; else the one that is farthest off.
-    return max(
+    found = max(
         findings, key=lambda x: (VERDICTS.index(x.verdict), x is findings[0], x.rank[1]))
+    most = _largest(*every, setpoint)
+    if found.verdict is Code.VIBRATING and most <= swing and (
+            len(every[0]) > _SEEN * (every[0][-1] - every[0][0]) / _period_ns(setpoint)):
+        # Nothing moved as far as what was fitted to it.
+        return replace(found, verdict=Code.UNDECIDED, message=(
+            f'{found.message}, but nothing moves by more than {setpoint.words(most)}: it does not '
+            'ring like an actuator'))
+    if not found.arrived:
+        return found
+    moves = most - _PEAKS * noise * math.sqrt(len(every[0]) / len(stamps)) > swing
+    for together in _TOGETHER:
+        if moves or len(values) < 2 * together:
+            break
+        after = (together - 1) // 2
+        most = _largest(
+            stamps[after:len(stamps) - after],
+            np.convolve(values, np.full(together, 1.0 / together), mode='valid'), setpoint)
+        moves = most - _PEAKS * noise * min(1.0 / math.sqrt(alike * together), 1.0) > swing
+    return found if not moves else replace(
+        found, verdict=Code.UNDECIDED, message=f'{found.message}, but moves by '
+        f'{setpoint.words(most)} without ringing: a disturbance of the actuator and one of its '
+        'sensor look the same')
 
 
 def _largest(stamps: Stamps, rest: Array, setpoint: Setpoint) -> float:
     """Return the largest motion from peak to peak in a period of a look."""
-    period = round(period_of(setpoint) * NANOSECONDS)
+    period = _period_ns(setpoint)
     most = 0.0
     # What half a period shows is in one period or in one that begins half of it later.
     for begin in (stamps[0], stamps[0] - period // 2):
@@ -156,6 +184,10 @@ def look_length(setpoint: Setpoint) -> int:
 def period_of(setpoint: Setpoint) -> float:
     """Return the period in s of vibration about a setpoint by the model."""
     return 2.0 * math.pi / setpoint.frequency
+
+
+def _period_ns(setpoint: Setpoint) -> int:
+    return round(period_of(setpoint) * NANOSECONDS)
 
 
 # -- samples ------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ class Setpoint:
     start: float  #: stretch of the setpoint before
     begins: int  #: from which it holds
     arrival: int | None  #: planned rest at the target; None where it is only approached
-    end: int | None = None  #: until which it holds; None for the last one, held on
+    end: int | None = None  #: until which it was requested; None for no end
     frequency: float = math.nan  #: in rad/s
     decay: float = 0.0  #: in 1/s
     joint: str = ''  #: empty where there is one
@@ -39,6 +39,7 @@ class Setpoint:
     moved: int | None = None
     #: What a position of the actuator can be.
     possible: tuple[float, float] = (-math.inf, math.inf)
+    held: bool = False  #: whether it is held on after its end, as the last one is
 
     @property
     def step(self) -> float:

@@ -177,14 +177,32 @@ class RunningPlan:
             max(now + self.model.options.lead_time, self.last_sent.stamp), self.model)
 
     def drop_missed(self, now: int, tolerance: int) -> int:
-        """Drop levels never sent and late by more than a tolerance (ns); return how many."""
+        """
+        Drop levels never sent, where one is late by more than a tolerance (ns); return how many.
+
+        Those that are less than lead_time ahead belong to a motion that will not happen.
+        """
         history = self._history
-        end = bisect_left(
-            history.levels, now - tolerance, history.sent, key=lambda x: x.stamp)
-        if end > history.sent:
-            self._remember(history.without(history.sent, end))
-            self.revision += 1
-        return end - history.sent
+        first = history.sent
+        if not self.pending or history.levels[first].stamp >= now - tolerance:
+            return 0
+        soonest = now + self.model.options.lead_time
+        end = bisect_left(history.levels, soonest, first, key=lambda x: x.stamp)
+        self._leave_out(first, end, soonest)
+        return end - first
+
+    def _leave_out(self, first: int, end: int, now: int) -> None:
+        """Take levels out of the plan: what is over by a time in ns and needs them is not done."""
+        plan, missing = self.plan, self._history.levels[first].stamp
+        over = max(plan.under_way(now), 0)
+        reached = bisect_left(plan.segments[:over], missing, key=lambda x: x.arrival or x.begin)
+        if reached < over:
+            self.plan = replace(plan, segments=(
+                *plan.segments[:reached],
+                *(replace(x, carried_out=False) for x in plan.segments[reached:over]),
+                *plan.segments[over:]))
+        self._remember(self._history.without(first, end))
+        self.revision += 1
 
     def unheard(self, now: int) -> int | None:
         """Return the stamp in ns of the last level that never took effect; None for none."""
@@ -195,8 +213,7 @@ class RunningPlan:
     def drop_unheard(self, stamp: int) -> None:
         """Take out of the plan what `unheard` has found."""
         first = self._history.known + 1
-        self._remember(self._history.without(first, first + self._history.unheard(stamp)))
-        self.revision += 1
+        self._leave_out(first, first + self._history.unheard(stamp), stamp)
 
     def applied(self, stamp: int, flux_density: float, tolerance: int) -> Deviation | None:
         """Take in a change of level as `History.with_news` does; None if it is no news."""

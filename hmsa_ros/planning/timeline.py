@@ -221,6 +221,7 @@ class PlannedSegment:
     #: Bound of what levels that follow creep leave of it in stretch, peak to peak.
     vibration: float = 0.0
     until: int | None = None  #: end as requested; None for one that is held on
+    carried_out: bool = True  #: whether its commands were sent and took effect, as far as known
 
     def shifted(self, span: int) -> 'PlannedSegment':
         """Return the segment with a span in ns added to all times."""

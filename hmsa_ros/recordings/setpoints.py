@@ -6,7 +6,7 @@ setpoint is reached. Where there is no plan, levels show it; where there is no r
 that lasts for a period of the actuator holds a setpoint.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 
@@ -24,6 +24,8 @@ SAME = 1e-6
 # Rest, to the precision of a planner, and of levels that follow creep: shares of the step, and of
 # the step in the time of a radian.
 _AT_REST = ((0.0, 1e-3), (2e-3, 1e-2))
+# Codes of plans that were made anew in need; feedback corrects others.
+_NEEDED = {'replanned', 'saturated'}
 # What holds a setpoint is known to the resolution of the hardware, as a share of its distance.
 _ROUNDED = 1e-3
 
@@ -141,14 +143,26 @@ def _uncommanded(run: Run, level: Level) -> bool:
     return bool(run.commands) and all(x.stamp != level.stamp for x in run.commands)
 
 
-def _fresh(plan: Sequence[Level], before: Sequence[Level]) -> float:
-    """Return from when on a plan is not as the one before; infinite if it goes on as that."""
+def _begun(plan: Sequence[Level], before: Sequence[Level]) -> bool:
+    """Return whether the first level was in force, perhaps from another time on than planned."""
+    return bool(before) and plan[0].stamp < plan[0].sent
+
+
+def _fresh(
+        plan: Sequence[Level], before: Sequence[Level],
+        sent: Container[int] | None = None) -> float:
+    """
+    Return from when on a plan is not as the one before; infinite if it goes on as that.
+
+    If it is known of which stamps commands were sent, those that never were are missing in it.
+    """
     if not plan:
         return math.inf
-    # The first level was in force, perhaps from another time on than planned.
-    begun = bool(before) and plan[0].stamp < plan[0].sent
+    begun = _begun(plan, before)
     new = {(x.stamp, x.flux_density) for x in plan[begun:]}
     old = {(x.stamp, x.flux_density) for x in before if plan[0].stamp < x.stamp}
+    if begun and sent is not None:
+        old |= {(x.stamp, x.flux_density) for x in before[1:] if x.stamp not in sent}
     return min((stamp for stamp, level in new ^ old if (stamp, level) in new
                 or stamp <= plan[-1].stamp), default=math.inf)
 
@@ -173,6 +187,7 @@ def _of(
     until = math.inf if after is None else after.sent
     plans = [x for x in run.plans if x and act.sent <= x[0].sent < until]
     codes = [x.code for x in run.verdicts if act.sent <= x.sent < until]
+    sent = {x.stamp for x in run.commands} or None
     earliest = begin = act.begin
     start = next((x.stretch for plan in plans for x in plan if x.stamp == begin), start)
     for number, (target, end) in enumerate(points, 1):
@@ -181,14 +196,14 @@ def _of(
         setpoint = replace(setpoint, number=number, count=len(points))
         here = replace(setpoint, end=None) if last else setpoint
         if plans:
-            moves = list(_arrivals(run, plans, here, earliest, last=last))
+            moves = list(_arrivals(run, plans, sent, here, earliest, last=last))
             arrival, left_out = moves.pop(0)[1] if moves else None, False
         else:
             arrival, moves = _by_levels(run, levels, here), []
             left_out = setpoint.step > SAME and not _within(levels, here)
         yield Requested(
             replace(setpoint, arrival=arrival), end, last, tuple(moves),
-            'corrected' in codes and 'replanned' not in codes, left_out)
+            bool(codes) and _NEEDED.isdisjoint(codes), left_out)
         earliest, begin, start = begin, end or begin, target
 
 
@@ -210,18 +225,18 @@ def _within(levels: Sequence[Level], setpoint: Setpoint) -> list[Level]:
 
 
 def _arrivals(
-        run: Run, plans: Sequence[Sequence[Level]], setpoint: Setpoint, earliest: int, *,
-        last: bool) -> Iterator[tuple[int, int | None]]:
+        run: Run, plans: Sequence[Sequence[Level]], sent: Container[int] | None,
+        setpoint: Setpoint, earliest: int, *, last: bool) -> Iterator[tuple[int, int | None]]:
     """Yield when plans were shown that change a setpoint, and when each arrives at it."""
     before: Sequence[Level] = ()
     arrival = None
     for plan in plans:
-        fresh = _fresh(plan, before)
+        fresh, begun = _fresh(plan, before, sent), _begun(plan, before)
         goes_on = before and fresh > before[-1].stamp and not last
         before = plan
         if setpoint.end is not None and fresh >= setpoint.end or arrival and goes_on:
             continue
-        new = [x for x in plan if x.stamp >= fresh]
+        new = [x for x in plan[begun:] if x.stamp >= fresh]
         found = _rest(run, new, setpoint)
         if found is None and arrival is not None:
             # One that is left out makes room for the next.
