@@ -374,6 +374,27 @@ def test_errors_that_no_residual_shows_widen_the_intervals_and_are_said():
         assert any(words in note for note in found.warnings)
 
 
+def test_latency_that_samples_do_not_show_is_named_with_what_it_moves_until_it_is_given():
+    period = 2.56 * T
+    times = np.linspace(0.0, 0.1, 60)
+    level_times, levels = steps((1.3,), SPAN, 1)
+    stretch = simulate(times, level_times, levels) + 2e-3 * np.random.default_rng(
+        3).standard_normal(60)
+    recording = Recording(times, stretch, level_times, levels)
+    free = tuple(x for x in DEFAULT_FREE if x != 'chain_limit')
+    note, = (x for x in identify(recording, free=free).warnings if 'sensor latency below' in x)
+    seconds = float(note.split('below ')[1].split(' s ')[0])
+    assert 0.003 * period < seconds < 0.3 * period
+    assert '--known sensor_latency=VALUE+-STD' in note
+    name, _, change = note.split('moves ')[1].split(': ')[0].split(' and ')[0].split(
+        ', ')[0].partition(' by ')
+    values = [identify(x, free=free).values[name] for x in (
+        recording, replace(recording, time=times + seconds))]
+    assert abs(values[1] - values[0]) == pytest.approx(float(change.split()[0]), rel=0.3)
+    given = identify(recording, free=free, known={'sensor_latency': 0.0})
+    assert not any('sensor latency below' in x for x in given.warnings)
+
+
 @pytest.mark.slow
 def test_small_stretches_do_not_hold_the_chain_limit():
     found = identify(recorded((1.02, 1.0)))

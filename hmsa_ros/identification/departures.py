@@ -96,6 +96,8 @@ class Departures:
     hint: Array  # variance of the coordinates by what the residuals hint at, shape (p,)
     # By name what a standard deviation of what they cannot show moves the coordinates by.
     considered: dict[str, Array]
+    # Latency of the sensor in s that would not be found, if nobody gave it, and what that moves.
+    late: tuple[float, Array] | None
 
 
 def departures(
@@ -118,30 +120,38 @@ def departures(
     total = float(residual @ residual)
     floor = dead_band(fit, deviation)
     single = np.sqrt(np.diag(inverse)) * deviation
+    named = list(_columns(fit))
+    columns = root[:, None] * np.stack([x.column for x in named], axis=1)
+    directions = columns
+    for _ in range(2):
+        directions = directions - base @ (solved @ (base.T @ directions))
+    norms, lengths = (np.linalg.norm(x, axis=0) for x in (directions, columns))
+    directions = directions / np.maximum(norms, 1e-300)
+    ways = (inverse @ (own.T @ columns)).T
+    signatures, considered = list[Signature](), dict[str, Array]()
     hint: Array = np.zeros(len(fit.free))
-    signatures, considered = [], dict[str, Array]()
-    for one in _columns(fit):
-        column = root * one.column
-        direction = column
-        for _ in range(2):
-            direction = direction - base @ (solved @ (base.T @ direction))
-        norm, length = float(np.linalg.norm(direction)), float(np.linalg.norm(column))
-        way = inverse @ (own.T @ column)
+    late = None
+    for one, direction, norm, length, way in zip(
+            named, directions.T, norms.tolist(), lengths.tolist(), ways, strict=True):
         if one.remedy == GAIN and GAIN not in given and (
                 deviation / max(norm, 1e-300) > _HIDDEN_GAIN):
             considered[GAIN] = USUAL_GAIN * way
         if total == 0.0 or norm <= 3e-5 * length:
             continue
-        direction = direction / norm
         size = float(direction @ residual)
-        rest = residual - size * direction
-        spread = float(np.linalg.norm(rest)) / math.sqrt(max(len(rest) - len(fit.free) - 1, 1))
-        spread *= 1.0 if found.white else inflation(direction, whiteness(rest))
+        spread = math.sqrt(max(total - size ** 2, 0.0) / max(
+            len(residual) - len(fit.free) - 1, 1))
+        if not found.white:
+            spread *= inflation(direction, whiteness(residual - size * direction))
         deviations, share = abs(size) / max(spread, 1e-300), size * size / total
         moves = abs(size) / norm * np.abs(way)
         signatures.append(Signature(one.name, share, deviations, bool(
             deviations > _DEVIATIONS and abs(size) / math.sqrt(len(residual)) > floor
             and (share > _SHARE or np.max(moves / single) > _MOVES)), one.remedy))
+        if one.remedy == 'sensor_latency' and one.remedy not in given and not (
+                signatures[-1].found):
+            seconds = _DEVIATIONS * spread / norm
+            late = seconds, seconds * way
         # An offset of the stamps is the commonest, and hides best.
         least = 0.0 if 'latency' in one.name and not _DELAYS.intersection(fit.free) else _HINT
         if deviations > least:
@@ -151,7 +161,7 @@ def departures(
         if std and name not in fit.free:
             considered[name] = std * (inverse @ (own.T @ (root * _change(fit, name))))
     return Departures(tuple(sorted(
-        signatures, key=lambda x: (-x.found, -x.share))), hint, considered)
+        signatures, key=lambda x: (-x.found, -x.share))), hint, considered, late)
 
 
 def dead_band(fit: Fit, deviation: float) -> float:

@@ -14,6 +14,7 @@ from hmsa_ros.identification.quantities import (
     BRANCHES,
     damping_unit,
     DEFAULT_FREE,
+    derivative,
     geometry_of,
     group_of,
     modulus_of,
@@ -242,7 +243,7 @@ def check_plausible(fit: Fit, unknown: Sequence[str] = ()) -> None:
         unit = QUANTITIES[name].unit
         raise BadInputError(
             f'{recording.label} moves as with a {label} of {value:.3g} {unit}, in samples '
-            f'{float(np.median(np.diff(recording.time))):.3g} s apart: expected {least:g} to '
+            f'{recording.gap:.3g} s apart: expected {least:g} to '
             f'{most:g} {unit}; check that times are in s, flux densities in T, and the size of '
             f'the actuator in --params-file{hint}')
 
@@ -330,15 +331,33 @@ def considered(
     return found
 
 
+def undetected(late: tuple[float, Array], std: Array, fit: Fit) -> list[str]:
+    """
+    Return what a latency that would not be found moves by more than a deviation, if anything.
+
+    Given are that latency in s, what it moves the coordinates by, and their deviations.
+    """
+    seconds, moves = late
+    words = [
+        f'{name} by {abs(move * derivative(name, fit.values[name])):.2g}'
+        f'{" " + unit if (unit := quantity_of(name).unit) else ""}'
+        for name, move, one in zip(fit.free, moves.tolist(), std.tolist(), strict=True)
+        if abs(move) > one]
+    return [
+        f'a sensor latency below {seconds:.2g} s would not be detected, and moves '
+        f'{_listed(words)}: if it is not zero, give --known sensor_latency=VALUE+-STD '
+        'or --free +sensor_latency'
+    ] if words else []
+
+
 def resting(fit: Fit, names: Collection[str]) -> str:
     """Return that samples show rest alone, which does not determine the parameters named."""
-    gap = float(np.median(np.diff(fit.recording.time)))
     return (
         f'{_listed([x for x in fit.free if x in names])} cannot be identified from this '
-        f'recording: rest at each level explains the samples, {gap:.3g} s apart, as well as any '
-        'motion does; record the motion after each change of level, with ten samples a period or '
-        'more, or free only what rest determines, as with --free remanence,chain_limit,'
-        'stretch_bias')
+        f'recording: rest at each level explains the samples, {fit.recording.gap:.3g} s apart, as '
+        'well as any motion does; record the motion after each change of level, with ten '
+        'samples a period or more, or free only what rest determines, as with --free '
+        'remanence,chain_limit,stretch_bias')
 
 
 def alike(best: Fit, others: Sequence[Fit]) -> str:

@@ -9,6 +9,7 @@ from the residuals themselves. Under normal noise that costs 0.1 % of the accura
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 import math
 from typing import Any
 
@@ -57,13 +58,13 @@ class Fit:
     # Information on each uncertain switch besides the samples, for a noise of 1.
     prior: float = 0.0
 
-    @property
+    @cached_property
     def root(self) -> Array:
         """By which residuals and derivatives are multiplied to count as they should."""
         found: Array = np.sqrt(self.weights) / self.spread
         return found
 
-    @property
+    @cached_property
     def jacobian(self) -> Array:
         """Derivatives by the coordinates, less what uncertain switches could do; (n, p)."""
         jacobian, extra = self.response.jacobian, self.response.by_switch
@@ -74,7 +75,7 @@ class Fit:
         found: Array = jacobian - extra @ np.linalg.solve(matrix, weighted.T @ jacobian)
         return found
 
-    @property
+    @cached_property
     def information(self) -> Array:
         """Information matrix by the coordinates, for a noise of 1; shape (p, p)."""
         matrix: Array = self.response.jacobian.T @ (self.root[:, None] ** 2 * self.jacobian)

@@ -242,8 +242,10 @@ def _warnings(
             f'{float(np.max(known.correlated)):.3g} times')
     if recording.quantum:
         found.append(f'the {recording.coordinate.name} comes in steps of {recording.quantum:.3g}')
-    found += diagnosis.considered(
-        known.missing.considered, np.sqrt(np.diag(known.covariance)), best.free, given)
+    std = np.sqrt(np.diag(known.covariance))
+    found += diagnosis.considered(known.missing.considered, std, best.free, given)
+    if known.missing.late is not None:
+        found += diagnosis.undetected(known.missing.late, std, best)
     if _shaped(best):
         found.append(
             'all moves are shaped so that nothing rings: they carry about a sixth of the '

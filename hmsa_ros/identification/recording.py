@@ -215,6 +215,11 @@ class Recording:
         return np.flatnonzero(inside)
 
     @cached_property
+    def gap(self) -> float:
+        """Median time between samples in s."""
+        return float(np.median(np.diff(self.time)))
+
+    @cached_property
     def quantum(self) -> float:
         """Step in which the values come; 0 where they are not quantised."""
         values = np.unique(self.stretch)

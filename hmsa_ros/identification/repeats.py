@@ -51,7 +51,7 @@ def repeated(fit: Fit, period: float, floor: float = 0.0) -> Repeated | None:
     if not whole:
         return None
     residual, shown = fit.root * fit.residual, fit.response.stretch
-    width = min(float(np.median(np.diff(fit.recording.time))), period / _FINEST)
+    width = min(fit.recording.gap, period / _FINEST)
     grams: list[list[Array]] = []
     squares, count, cost = 0.0, 0.0, 0.0
     for group in whole:
@@ -108,6 +108,7 @@ def _folded(
     for i, ((begin, end, _), place) in enumerate(zip(group, places, strict=True)):
         inside = (place >= 0) & (place < size)
         row = i * rows // len(group)
-        np.add.at(table[row], place[inside], residual[begin:end][inside])
-        np.add.at(seen[row], place[inside], 1.0)
+        at = place[inside]
+        table[row] += np.bincount(at, residual[begin:end][inside], size)
+        seen[row] += np.bincount(at, minlength=size)
     return table, seen

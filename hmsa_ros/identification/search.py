@@ -141,7 +141,7 @@ def rivals(best: Fit) -> tuple[Fit, list[Fit]]:
     range that they could have come from.
     """
     recording = best.recording
-    gap = float(np.median(np.diff(recording.time)))
+    gap = recording.gap
     many = diagnosis.frequency_of(best) * gap * _FEW_A_PERIOD < 1.0
     longest = max((float(recording.time[end - 1] - recording.time[begin])
                    for begin, end, _, _ in segments(recording)), default=0.0)

@@ -147,7 +147,7 @@ def _parameters(found: Identification) -> str:
                 'not identifiable' if lost else cell(100.0 * x.std / abs(x.value), '.3g')
                 if abs(x.value) > x.std else ''])
         else:
-            rows.append([name, x.unit or '1', cell(x.value), '', '', '', 'known'])
+            rows.append([name, x.unit or '1', cell(x.value), '', '', '', 'fixed'])
     return table(
         'parameter-table', 'Low and high bound the 95 % interval.',
         ['parameter', 'unit', 'value', 'deviation', 'low', 'high', 'deviation [%]'], rows)
