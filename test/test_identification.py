@@ -305,7 +305,7 @@ def test_what_the_sensor_does_rejects_the_model_by_name(change, word):
 def test_even_stamps_that_jitter_are_weighed_and_said():
     found = identify(_jittering(recorded()))
     assert found.verdict == 'identified', found.reason
-    assert any('stamps that are off by' in x for x in found.warnings)
+    assert any('timestamp errors of' in x for x in found.warnings)
     assert max(map(abs, relative(found).values())) < 4.0
 
 
@@ -468,7 +468,7 @@ def test_intervals_of_one_step_of_sixty_points_with_wrong_stamps_cover_the_truth
         order = np.argsort(stamps)
         found = identify(
             Recording(stamps[order], stretch[order], level_times, levels), actuator=start)
-        warned += any('as with stamps that are off by' in x for x in found.warnings)
+        warned += any('timestamp errors of' in x for x in found.warnings)
         if found.verdict == 'identified':
             inside += [x.low <= getattr(BLOCK, name) <= x.high
                        for name, x in found.parameters.items() if x.free and hasattr(BLOCK, name)]

@@ -266,25 +266,26 @@ def misfit(
         return ''
     if seen:
         words = '; '.join(
-            f'{x.name} ({x.share:.0%} of them, {x.deviations:.0f} deviations)' for x in seen[:3])
+            f'{x.name} ({x.share:.0%} of them, {x.deviations:.0f} standard deviations)'
+            for x in seen[:3])
         return f'the model leaves {figures}, which look like {words}{_remedy(seen)}'
     lost = int(np.count_nonzero(fit.weights < _OUT))
     if lost > 1 and mistaken(fit):
         return (
             f'{lost} samples right after changes of level are not those of the model, which '
-            f'leaves {figures} elsewhere: the motion itself is not described; are the levels '
-            'at their true times, and are enough samples in motion?')
+            f'leaves {figures} elsewhere: the model does not describe the motion; check the '
+            'times of the levels, and record more samples in motion')
     if alike is not None:
         return '' if alike.p_value > _CHANCE else (
             f'the model leaves {figures}, and {alike.size:.2g} of them rms, after equal changes '
-            f'of level the same (by chance with a probability of {alike.p_value:.2g}): something '
-            'acts that the model does not have; compare --report')
+            f'of level the same (by chance with a probability of {alike.p_value:.2g}): an effect '
+            'is missing from the model; see the figures of --report')
     ratio = in_motion(fit)
     if not found.white and ratio > _IN_MOTION and fit.recording.quantum == 0.0 and (
             abs(float(found.autocorrelation[1])) > 0.3):
         return (
             f'the model leaves {figures}, {ratio:.1f} times as large in fast motion as in '
-            'slow: something moves that the model does not know; compare --report')
+            'slow: a motion is missing from the model; see the figures of --report')
     return ''
 
 
@@ -325,7 +326,7 @@ def considered(
             found.append(
                 f'an error of {name} does not show in this recording: the intervals allow for '
                 f'one standard deviation of it, which moves {free[place]} by '
-                f'{ratio[place]:.3g} of its own' + (
+                f'{ratio[place]:.3g} of its standard deviations' + (
                     f'; {100.0 * USUAL_GAIN:g} % is assumed: calibrate the sensor, and give '
                     f'--known {name}=1+-0.1%' if name == GAIN and name not in given else ''))
     return found

@@ -204,8 +204,9 @@ def _conclude(
         reason = diagnosis.resting(best, still) if still else diagnosis.alike(best, others)
     elif not reason and not best.converged:
         reason = (
-            f'the search did not come to an end from {tried} starts: the best leaves residuals '
-            f'of {best.scale:.3g}; give a --params-file that is nearer, or free less')
+            f'the search did not converge from {tried} starts: the best fit leaves residuals '
+            f'of {best.scale:.3g}; give a --params-file with closer values, or free fewer '
+            'parameters')
     elif not reason:
         verdict = 'identified'
         reason = (
@@ -230,12 +231,13 @@ def _warnings(
     found, recording = [], best.recording
     if outliers:
         found.append(
-            f'{outliers} of {len(recording.time)} samples are more than six deviations off and '
-            'did not count')
+            f'{outliers} of {len(recording.time)} samples are more than six standard deviations '
+            'from the fit and did not count')
     if np.max(best.spread) > 1.0:
         found.append(
-            'the residuals grow with the rate, as with stamps that are off by '
-            f'{stamp_error(best, known.deviation):.2g} s rms: samples in motion count less')
+            'the residuals grow with the rate, as timestamp errors of '
+            f'{stamp_error(best, known.deviation):.2g} s rms would cause: samples in '
+            'motion count less')
     if not known.whiteness.white:
         found.append(
             'the residuals are not white: correlation widened the intervals by up to '

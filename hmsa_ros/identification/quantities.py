@@ -49,7 +49,8 @@ QUANTITIES: dict[str, Quantity] = {
         '', 1.0, advice='calibrate the sensor with a known length and leave stretch_gain out of '
         '--free: its gain looks like remanence and chain_limit'),
     'sensor_latency': Quantity(
-        's', 0.0, 'linear', -math.inf, advice='record unshaped steps with stamps of one clock'),
+        's', 0.0, 'linear', -math.inf,
+        advice='record unshaped steps with timestamps of one clock'),
     'coil_time_constant': Quantity(
         's', 0.0, 'linear', advice='record steps at more than two samples per time constant'),
     'constant_force': Quantity(

@@ -81,8 +81,7 @@ def search(
     if not found:
         raise BadInputError(
             f'no start value leads to a motion that {recording.label} could be compared with: '
-            'expected levels in T and an actuator as --params-file describes it; a level may be '
-            'more than it can hold')
+            'expected levels in T that the actuator of --params-file can hold')
     best, agreed = _best(found)
     if not best.converged:
         best = fit(recording, best.values, free) or best
