@@ -339,11 +339,13 @@ def undetected(late: tuple[float, Array], std: Array, fit: Fit) -> list[str]:
     Given are that latency in s, what it moves the coordinates by, and their deviations.
     """
     seconds, moves = late
-    words = [
-        f'{name} by {abs(move * derivative(name, fit.values[name])):.2g}'
-        f'{" " + unit if (unit := quantity_of(name).unit) else ""}'
-        for name, move, one in zip(fit.free, moves.tolist(), std.tolist(), strict=True)
-        if abs(move) > one]
+    modulus, ratio = modulus_of(fit.values.get('law'))
+    words = []
+    for name, move, one in zip(fit.free, moves.tolist(), std.tolist(), strict=True):
+        if abs(move) > one:
+            size = abs(move * derivative(name, fit.values[name]))
+            label, size = (modulus, ratio * size) if name == 'shear_modulus' else (name, size)
+            words.append(f'{label} by {size:.2g} {quantity_of(name).unit}'.rstrip())
     return [
         f'a sensor latency below {seconds:.2g} s would not be detected, and moves '
         f'{_listed(words)}: if it is not zero, give --known sensor_latency=VALUE+-STD '

@@ -88,7 +88,7 @@ def errors_of_stamps(jacobian: Array, residual: Array, rate: Array) -> tuple[Arr
     largest = np.append(0.0, _LARGEST_SPREADS if fastest > 0.0 else [])
     spreads = np.sqrt(1.0 + np.square(np.outer(largest, rate / max(fastest, 1e-300))))
     # Outliers are those of the likeliest, or the ratios could not be compared.
-    scaled = residual / min(spreads[::2], key=lambda x: _surprise(residual, x))
+    scaled = residual / min(spreads, key=lambda x: _surprise(residual, x))
     weights = weights_of(scaled, robust_scale(scaled))
     size = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-100)
     count = jacobian.shape[1]

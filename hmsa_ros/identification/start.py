@@ -183,18 +183,16 @@ def _oscillations(t: Array, y: Array) -> list[tuple[float, float, float]]:
     if not 0.0 < lowest < highest:
         return []
     frequencies = np.geomspace(lowest, highest, _FREQUENCIES)
-    # Of a coarse grid single precision is enough, and faster.
-    angle = np.outer(frequencies, t).astype(np.float32)
-    y = y.astype(np.float32)
+    angle = np.outer(frequencies, t)
     cosine, sine = np.cos(angle), np.sin(angle)
     power = np.zeros((len(_DECAYS), _FREQUENCIES))
     for i, ratio in enumerate(_DECAYS):
-        fading = np.exp(np.float32(-ratio) * angle)
+        fading = np.exp(-ratio * angle)
         c, s = fading * cosine, fading * sine
         cc, ss, cs = (np.einsum('ij,ij->i', a, b) for a, b in ((c, c), (s, s), (c, s)))
         yc, ys = c @ y, s @ y
         determinant = cc * ss - cs * cs
-        good = determinant > 1e-5 * cc * ss
+        good = determinant > 1e-9 * cc * ss
         power[i] = np.where(good, (
             ss * yc ** 2 - 2.0 * cs * yc * ys + cc * ys ** 2) / np.where(
                 good, determinant, 1.0), 0.0)
@@ -248,7 +246,7 @@ def scan(
         first = max(first, min(begin + _SCAN_SAMPLES, len(recording.time)))
     part = replace(recording, time=recording.time[:first], stretch=recording.stretch[:first]) \
         if first < len(recording.time) else recording
-    shortest = _SHORTEST * recording.gap
+    shortest = _SHORTEST * float(np.median(np.diff(recording.time)))
     tried: list[tuple[float, float, dict[str, float]]] = []
     timed = seeks_time(values, free)
     factors = np.geomspace(1.0 / _SCAN_RANGE, _SCAN_RANGE, _SCAN_POINTS) if timed else np.ones(1)
