@@ -174,7 +174,7 @@ def compare(*, quick: bool = False) -> Report:
     reference = Reference()
     rows: list[Row] = []
     # Short batches find both cores free now and then, even on a busy machine.
-    entries = _ours(reference) + _batches(reference, 20)
+    entries = _ours(reference) + _batches(reference, 2000)
     ours = entries[0].error
     branch = Creep((0.1,), (2.0,))
     entries += [_shaped(reference, *x) for x in (
@@ -309,9 +309,12 @@ def _installed() -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         venv.create(folder, with_pip=True)
         python = str(Path(folder) / 'bin' / 'python')
+        # A clone has nothing of an earlier build, which would be taken up.
+        clone = str(Path(folder) / 'clone')
+        subprocess.run(['git', 'clone', '--quiet', str(ROOT), clone], check=True)
         install = _process([
             python, '-m', 'pip', 'install', '--no-deps', '--quiet',
-            '--disable-pip-version-check', '.'])
+            '--disable-pip-version-check', clone])
         # The requirements, which take as long as the network does, are those of this Python.
         for site in Path(folder).glob('lib/python*/site-packages'):
             (site / 'requirements.pth').write_text(f'{sysconfig.get_path("purelib")}\n')
