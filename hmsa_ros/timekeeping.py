@@ -25,7 +25,8 @@ class StepWatch:
         return offset - last
 
 
-def clock_set_words(by: int) -> str:
-    """Return that a clock was set ahead by some ns."""
+def clock_set_words(by: int, what: str) -> str:
+    """Return that a clock was set ahead by some ns, and what happens as if it was not."""
     return (f'the clock of this host was set {"ahead" if by > 0 else "back"} by '
-            f'{abs(by) / NANOSECONDS:.3f} s')
+            f'{abs(by) / NANOSECONDS:.3f} s: {what} as long from now as before; have it slewed, '
+            'not set, while an experiment runs')

@@ -259,8 +259,7 @@ class PlannerRuntime:
             f'the clock jumped back by {back / NANOSECONDS:.3f} s: the plan is dropped, and the '
             'actuator is assumed where it began, at initial_stretch, unless joint_states shows '
             'otherwise' if back else
-            f'{clock_set_words(by)}: what is planned goes on, as long from now as before; have it '
-            'slewed, not set, while an experiment runs', self._bulletin.verdict.request),
+            clock_set_words(by, 'what is planned goes on,'), self._bulletin.verdict.request),
             log=True)
 
     def _go_on(self, by: int, requests: Iterable[Request]) -> None:

@@ -189,9 +189,7 @@ class HardwareDevice(Device):
             watchdog.pass_over(by)
             cut_off.clock_set(by)
             coil.clock_set(by)
-        self._notices.append(Notice(Kind.CLOCK, 0, (
-            f'{clock_set_words(by)}: levels ahead apply as long from now as before; have it '
-            'slewed, not set, while an experiment runs')))
+        self._notices.append(Notice(Kind.CLOCK, 0, clock_set_words(by, 'levels ahead apply')))
 
     def advance(self, time: int) -> None:
         """

@@ -65,7 +65,6 @@ class Fit:
     offset: Figure
     vibration: Figure  #: peak to peak in the period after time 0
     frequency: float  #: in rad/s
-    decay: float  #: in 1/s
     noise: float  #: standard deviation of a sample
     usual: float  #: the same of most samples: what happens once does not count
     independent: float  #: share of the samples that noise which is not white leaves
@@ -266,7 +265,7 @@ def _bounds(problem: _Problem, tried: _Solved, searched: float) -> Fit:
             float(swing[mine]), unit * float(deviation[mine]),
             float(max(np.min(swing - reach * deviation), 0.0)),
             float(np.max((swing + near * deviation)[usual]))),
-        float(within.omega[mine]), float(within.decay[mine]), math.sqrt(variance),
+        float(within.omega[mine]), math.sqrt(variance),
         _NORMAL * float(np.median(np.abs(left))) * math.sqrt(count / freedom), 1.0 / together)
 
 
