@@ -553,6 +553,9 @@ def test_the_plan_goes_on_when_the_wall_clock_is_set_back(ros, serve):
     setpoints.publish(Float64(data=1.1))
     ros.spin_until(
         lambda: statuses and statuses[-1].values[0].value == 'accepted', 'the plan')
+    # The clock is not really set: levels still to be sent would be late by as much.
+    ros.spin_until(
+        lambda: not planner._runtime.group.planners['actuator'].pending, 'the last level')
     # As if the last reading had been ten seconds ahead of this one.
     planner._steps._offset += 10**10
     ros.spin_until(
