@@ -93,6 +93,8 @@ MOTION = Extension(
         '-std=c++17', '-O2', '-ftree-vectorize', '-ffp-contract=off', '-fno-math-errno',
         '-fno-trapping-math', '-fvisibility=hidden', '-fno-exceptions', '-fno-rtti', '-Wno-psabi',
         '-g0'])
+DEADLINE = Extension(
+    PACKAGE + '._deadline', [PACKAGE + '/_deadline.c'], extra_compile_args=['-g0'])
 
 
 class BuildMotion(build_ext):
@@ -117,12 +119,12 @@ setup(
     version=VERSION,
     packages=find_packages(include=[PACKAGE, PACKAGE + '.*', 'hmsa_studies', 'hmsa_studies.*']),
     package_data={PACKAGE: [
-        'fastdds.xml', 'fastdds_localhost.xml', 'motion/_motion.pyi', 'py.typed',
+        'fastdds.xml', 'fastdds_localhost.xml', 'motion/_motion.pyi', '_deadline.pyi', 'py.typed',
         'report/page.css', 'report/page.js', 'report/style.mplstyle',
         *(f'cli/completion.{x}' for x in ('bash', 'zsh', 'fish')),
         *(os.path.relpath(x, os.path.join(HERE, PACKAGE)) for x in sorted(glob(
             os.path.join(HERE, PACKAGE, 'motion', 'hmsa', '*.hpp'))))]},
-    ext_modules=[MOTION],
+    ext_modules=[MOTION, DEADLINE],
     cmdclass={'build_ext': BuildMotion},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + PACKAGE]),

@@ -10,20 +10,21 @@ has something to put in order only notes them, and looks where it is safe to end
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-import ctypes
 import os
 import signal
 import sys
 import threading
 from typing import Any
 
+from hmsa_ros import _deadline
+
 _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # How long a process may take to end when all is done, in s.
 _LAST_SECONDS = 3
-# How long writing a sentence may take, in s.
-_WRITTEN = 0.05
 # Sentence of a process that is ended, in bytes.
 _LONGEST = 500
+# Deadlines of a process: of a call, and of its own end.
+_CALL, _END = 0, 1
 
 
 class Ending:
@@ -35,9 +36,14 @@ class Ending:
         self.status = 128 + signal.SIGINT
         self._respond: Callable[[], object] | None = None
 
-    def leave(self, status: int | None = None) -> None:
-        """End the process at once from now on: nothing has been done yet."""
-        self._take_over(lambda: os._exit(self.status if status is None else status))
+    def leave(self, status: int | None = None, text: str = '') -> None:
+        """End the process at once from now on, with a sentence: nothing has been done yet."""
+        def respond() -> None:
+            if text:
+                with suppress(OSError):
+                    os.write(sys.stderr.fileno(), encoded(text))
+            os._exit(self.status if status is None else status)
+        self._take_over(respond)
 
     def interrupt(self) -> None:
         """Raise KeyboardInterrupt from now on, if the signals have been taken over."""
@@ -76,8 +82,13 @@ class Ending:
                 signal.signal(number, signal.SIG_IGN)
 
     def finish(self, status: int) -> None:
-        """Have the process end with a status, soon, even if a library hangs in its clean-up."""
-        _exit_after(_LAST_SECONDS, status)
+        """
+        Have the process end with a status, soon, even if a library hangs in its clean-up.
+
+        Fast DDS 2.14 may never come back from the end of a participant: it waits, without
+        letting go, for a thread that has just received the end of another one.
+        """
+        _deadline.set(_END, _LAST_SECONDS, status)
 
     def check(self) -> None:
         """Raise KeyboardInterrupt if the end has been asked for."""
@@ -116,78 +127,25 @@ def _raise_again(dropped: Any) -> None:
         sys.__unraisablehook__(dropped)
 
 
-class _Event(ctypes.Structure):
-    """``struct sigevent`` of Linux that has a function called in a thread (man 7 sigevent)."""
-
-    _fields_ = (
-        ('value', ctypes.c_void_p), ('number', ctypes.c_int), ('notify', ctypes.c_int),
-        ('function', ctypes.c_void_p), ('rest', ctypes.c_byte * 40))
-
-
-class _Timer:
-    """Calls a function of the C library with one argument in a thread that needs no Python."""
-
-    def __init__(self, function: str, argument: int | None) -> None:
-        # With Python's lock kept: giving it away and getting it back takes much longer.
-        libc = ctypes.PyDLL(None)
-        self._timer: ctypes.c_void_p | None = None
-        if not hasattr(libc, 'timer_create'):
-            return
-        in_thread, monotonic = 2, 1
-        event = _Event(
-            value=argument, notify=in_thread,
-            function=ctypes.cast(getattr(libc, function), ctypes.c_void_p).value)
-        timer = ctypes.c_void_p()
-        if libc.timer_create(monotonic, ctypes.byref(event), ctypes.byref(timer)) == 0:
-            # struct itimerspec: interval and time to go, each in seconds and nanoseconds.
-            self._span = (ctypes.c_long * 4)()
-            self._timer, self._set = timer, libc.timer_settime
-            self._at = ctypes.byref(self._span)
-
-    def set(self, seconds: float) -> None:
-        """Call it after some seconds; 0 for not at all."""
-        if self._timer is not None:
-            whole = int(seconds)
-            self._span[2], self._span[3] = whole, int((seconds - whole) * 1e9)
-            self._set(self._timer, 0, self._at, None)
-
-
 def encoded(text: str) -> bytes:
     """Return a sentence as `Deadline` takes it."""
-    return f'error: {text}'.replace('%', '%%').encode()[:_LONGEST - 1]
+    return f'hmsa: error: {text}'.encode()[:_LONGEST - 1] + b'\n'
 
 
 class Deadline:
-    """Ends the process with a sentence, even where no Python runs: something took too long."""
+    """
+    Ends the process with a sentence, even where no Python runs: something took too long.
 
-    def __init__(self) -> None:
-        """Wait for `set`."""
-        self._text = ctypes.create_string_buffer(_LONGEST)
-        with suppress(ValueError):  # another C library
-            # What warnx() writes before a text; that of the interpreter otherwise.
-            ctypes.c_char_p.in_dll(
-                ctypes.PyDLL(None), 'program_invocation_short_name').value = b'hmsa'
-        self._say = _Timer('warnx', ctypes.addressof(self._text))
-        self._exit = _Timer('_exit', 1)
+    There is one in a process. Time in which the process is stopped does not count.
+    """
 
     def say(self, text: bytes) -> None:
         """Say this, as `encoded` makes it, when the time is over."""
-        self._text.value = text
+        _deadline.say(_CALL, text)
 
     def set(self, seconds: float) -> None:
         """Say it, and end the process with status 1, after some seconds; 0 for not at all."""
-        self._say.set(seconds)
-        self._exit.set(seconds + _WRITTEN if seconds else 0.0)
-
-
-def _exit_after(seconds: int, status: int) -> None:
-    """
-    Call ``_exit`` with a status after some seconds, from a thread that needs no Python.
-
-    Fast DDS 2.14 may never come back from the end of a participant: it waits, without letting
-    go, for a thread that has just received the end of another one.
-    """
-    _Timer('_exit', status).set(seconds)
+        _deadline.set(_CALL, seconds, 1)
 
 
 #: Of this process.

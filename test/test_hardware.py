@@ -819,3 +819,21 @@ def test_the_verdict_on_hardware_names_what_is_wrong():
     assert judge_hardware('', saturated=3, state_lost=1) == (
         1, '3 levels not reached: the amplifier is saturated; its state was lost, times: 1')
     assert judge_hardware('the cable', saturated=3, state_lost=1) == (2, 'the cable')
+
+
+def test_time_in_which_the_process_is_stopped_does_not_count_for_a_call(monkeypatch):
+    clock = iter([0.0, 0.0, 0.05, 60.0, *(60.0 + 0.1 * x for x in range(1, 20))])
+    now = [0.0]
+
+    def monotonic():
+        now[0] = next(clock, now[0])
+        return now[0]
+
+    monkeypatch.setattr('hmsa_ros.device.hardware.monotonic', monotonic)
+    calls = Calls(1.0)
+
+    def hang():
+        assert [calls.overdue() for _ in range(10)] == [''] * 10
+        return [calls.overdue() for _ in range(5)]
+
+    assert calls('Coil.write', hang)[-1] == 'Coil.write'

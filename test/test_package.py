@@ -158,7 +158,7 @@ def test_every_module_of_the_package_is_installed(setup):
 
 def test_every_other_file_of_the_package_is_installed(setup):
     found = [str(path.relative_to(ROOT / 'hmsa_ros')) for path in (ROOT / 'hmsa_ros').rglob('*')
-             if path.is_file() and path.suffix not in ('.py', '.pyc', '.so', '.cpp')
+             if path.is_file() and path.suffix not in ('.py', '.pyc', '.so', '.c', '.cpp')
              and '__pycache__' not in path.parts]
     assert sorted(setup['package_data']['hmsa_ros']) == sorted(found)
 

@@ -39,7 +39,10 @@ def add_parser(subparsers: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the node until it is asked to end."""
     # Asked to end while ROS is imported, it has nothing to put in order.
-    ENDING.leave(0)
+    if arguments.node == 'recorder':
+        ENDING.leave(1, 'the recorder was told to end before its bag was open: no bag is written')
+    else:
+        ENDING.leave(0)
     module = import_module(f'hmsa_ros.nodes.{arguments.node}')
     status: int = module.main(arguments.ros_args)
     return status

@@ -28,6 +28,8 @@ OPTIONAL = tuple(_TAKES)[2:]
 _ABSURD = 10 * NANOSECONDS
 # Of one call that yields its answer piece by piece, which may never end.
 _MOST_PIECES = 100_000
+# In s, the most that counts of the time between two looks at a call.
+_UNSEEN = 0.1
 # A call that blocks lets Python run, or the process ends so many s after its time.
 _GRACE = 1.5
 # Of the limit: less than this is rounding where the hardware names no resolution, and no field
@@ -145,6 +147,10 @@ class Calls:
         self._texts: dict[str, bytes] = {}
         self._armed = False
         self._begun: tuple[str, float] | None = None
+        # The call that was under way when `overdue` was last asked, when that was, and for how
+        # long it has been since.
+        self._seen: tuple[str, float] | None = None
+        self._looked = self._waited = 0.0
 
     def make_ready(self) -> None:
         """Do what takes some microseconds before a call."""
@@ -189,11 +195,17 @@ class Calls:
         begun = self._begun
         return '' if begun is None else begun[0]
 
-    @property
     def overdue(self) -> str:
-        """Name of the call that takes too long; empty if none does."""
-        begun = self._begun
-        return begun[0] if begun is not None and monotonic() - begun[1] > self.limit else ''
+        """
+        Return the name of the call that takes too long; empty if none does.
+
+        To be asked often: time in which nobody asks counts little, as that of a stopped process.
+        """
+        begun, now = self._begun, monotonic()
+        passed, self._looked = min(now - self._looked, _UNSEEN), now
+        self._waited = self._waited + passed if begun is self._seen else 0.0
+        self._seen = begun
+        return begun[0] if begun is not None and self._waited > self.limit else ''
 
 
 class Instrument:

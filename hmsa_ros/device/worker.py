@@ -151,7 +151,7 @@ class HardwareWorker:
             return
         if not self._thread.is_alive():
             self._save('the thread that serves the hardware has ended')
-        elif overdue := self.device.calls.overdue:
+        elif overdue := self.device.calls.overdue():
             self._save(f'{overdue} has not returned for {self.device.calls.limit:g} s '
                        '(hardware.timeout)')
 
