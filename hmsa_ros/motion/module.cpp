@@ -25,19 +25,6 @@ template <class F> auto with_system(const double *m, const F &f)
     return f(system);
 }
 template <int n> constexpr std::integral_constant<int, n> fixed{};
-// What is used most has code of its own; the rest of it is compiled once.
-template <class System, int NB> constexpr bool usual = std::is_same_v<System, GentBlock> && NB <= 1;
-// Calls f with as many branches as there are, or with some that hold nothing. More than one, and
-// those that do not flow in proportion, have one code.
-template <class System, class F> auto with_branches(int count, bool proportional, const F &f)
-{
-    if (count == 0)
-        return f(fixed<0>);
-    if constexpr (usual<System, 1>)
-        if (count == 1 && proportional)
-            return f(fixed<1>);
-    return f(fixed<most_branches>);
-}
 
 // -- arguments and results -----------------------------------------------------------------------
 
@@ -107,13 +94,6 @@ template <> struct Argument<Followed> {
         return !PyErr_Occurred();
     }
 };
-bool proportional(const double *rows, int count, int columns = branch_columns, int at = flow_at)
-{
-    bool is = true;
-    for (int b = 0; b < count; b++)
-        is = is && rows[columns * b + at] == maxwell;
-    return is;
-}
 bool fit(bool is)
 {
     if (!is)
@@ -230,9 +210,8 @@ auto two_step_late(double start, double rate, double target, double least, doubl
     if (fit(creeping <= most_branches))
         found = with_system(material.data, [&](const auto &system) {
             using System = std::decay_t<decltype(system)>;
-            return with_branches<System>(creeping, proportional(branches.data, creeping), [&](auto n) {
-                constexpr int unknowns = usual<System, n()> ? 3 : most_unknowns;
-                return late<n(), unknowns>(system, material.data, {start, rate, target},
+            return with_branches<double, System>(branches.data, creeping, [&](const auto &all) {
+                return late(system, all, material.data, {start, rate, target},
                     {least, most, rtol, hold}, {field, load, lag, branches.data, creeping, known});
             });
         });
@@ -292,8 +271,9 @@ int follow(int first, int last, Array<const bool> wanted, Results state, Results
                 creeping++;
         const bool done = with_system(plant.material + int64_t(plant.stride) * i,
             [&](const auto &system) {
-                return with_branches<std::decay_t<decltype(system)>>(creeping, proportional(own, creeping), [&](auto n) {
-                    return advance_row<n()>(plant, i, system);
+                using System = std::decay_t<decltype(system)>;
+                return with_branches<double, System>(own, creeping, [&](const auto &all) {
+                    return advance_row(plant, i, system, all);
                 });
             });
         status[i] = done ? turned : stuck;
@@ -313,8 +293,9 @@ bool sample_of(double stretch, double rate, double field, Numbers switches, Numb
         stretch, rate, field, lag, material[zeta_at], rtol, branches.data, creeping, out.data};
     return apart([&] {
         return with_system(material.data, [&](const auto &system) {
-            return with_branches<std::decay_t<decltype(system)>>(creeping, proportional(branches.data, creeping), [&](auto n) {
-                return sample<n()>(system, course);
+            using System = std::decay_t<decltype(system)>;
+            return with_branches<double, System>(branches.data, creeping, [&](const auto &all) {
+                return sample(system, all, course);
             });
         });
     });
@@ -359,21 +340,18 @@ std::tuple<bool, double, int> solve(Results times, Results loads, Numbers d_time
     int work = 0;
     const bool solved = with_system(material.data, [&](const auto &system) {
         using System = std::decay_t<decltype(system)>;
-        return with_branches<System>(creeping, proportional(branches.data, creeping), [&](auto n) {
-            const auto with = [&](auto p) {
-                Shooting<System, n(), p()> shooting{system, shot};
-                const bool found = shooting.solve(material.data, lasts);
-                work = shooting.work;
-                return found;
-            };
-            if constexpr (n() == 0 || usual<System, n()>)
-                if (unknowns <= 2)
-                    return with(fixed<2>);
-            if constexpr (usual<System, n()>)
-                if (unknowns == 3)
-                    return with(fixed<3>);
-            return with(fixed<most_unknowns>);
-        });
+        const auto with = [&](auto p) {
+            Shooting<System, p()> shooting{system, shot};
+            const bool found = shooting.solve(material.data, lasts);
+            work = shooting.work;
+            return found;
+        };
+        if (unknowns <= 2)
+            return with(fixed<2>);
+        if constexpr (has_own_code<System>)
+            if (unknowns == 3)
+                return with(fixed<3>);
+        return with(fixed<most_unknowns>);
     });
     return {solved, lasts, work};
 }
@@ -400,7 +378,7 @@ std::tuple<int, double> staircase(Numbers behind, Numbers branches, double stret
 
 using Four = Dual<double, 4>;
 using Eight = Dual<double, 8>;
-template <class S, class System, int NB> bool respond_as(const Recorded &of, int from)
+template <class S, class System, int NB = most_branches> bool respond_as(const Recorded &of, int from)
 {
     Response<S, System, NB> response{of, from};
     return response();
@@ -411,25 +389,32 @@ template <class S, int NB> __attribute__((target("avx2"), flatten)) bool respond
 {
     return respond_as<S, Block<S, Gent>, NB>(of, from);
 }
-template <class S, int NB> bool respond_part(const Recorded &of, int from)
+template <class S> bool respond_gent(const Recorded &of, int from)
 {
-    if (int(of.material[kind_at]) > neo_hookean)
-        return of.by_constants() ? respond_as<Eight, AnyOf<Eight>, NB>(of, from)
-                                 : respond_as<S, Any, NB>(of, from);
-    if constexpr (count_of<S> > 0)
-        if (__builtin_cpu_supports("avx2"))
-            return respond_wide<S, NB>(of, from);
-    return respond_as<S, Block<S, Gent>, NB>(of, from);
+    if (!__builtin_cpu_supports("avx2"))
+        return respond_as<S, Block<S, Gent>>(of, from);
+    // What identification does most has code of its own.
+    if constexpr (count_of<S> == 8)
+        if (of.branches == 1 && of.theta[first_branch + 2] == maxwell)
+            return respond_wide<S, 1>(of, from);
+    return respond_wide<S, most_branches>(of, from);
 }
-template <int NB> bool respond_all(const Recorded &of)
+bool respond_part(const Recorded &of, int from)
 {
-    if (of.wanted_count == 0)
-        return respond_part<double, NB>(of, 0);
-    const bool any = int(of.material[kind_at]) > neo_hookean && of.by_constants();
-    for (int from = 0; from < of.wanted_count; from += 8)
-        if (!(of.wanted_count - from > 4 || any ? respond_part<Eight, NB>(of, from)
-                                                : respond_part<Four, NB>(of, from)))
+    const int left = of.wanted_count - from;
+    if (int(of.material[kind_at]) > neo_hookean)
+        return of.by_constants() ? respond_as<Eight, AnyOf<Eight>>(of, from)
+            : left > 0 ? respond_as<Eight, Any>(of, from) : respond_as<double, Any>(of, from);
+    return left > 4 ? respond_gent<Eight>(of, from) : left > 0 ? respond_gent<Four>(of, from)
+        : respond_as<double, Block<double, Gent>>(of, from);
+}
+bool respond_all(const Recorded &of)
+{
+    int from = 0;
+    do
+        if (!respond_part(of, from))
             return false;
+    while ((from += 8) < of.wanted_count);
     return true;
 }
 // Whether the motion was followed to its end.
@@ -454,10 +439,7 @@ bool respond(Numbers theta, Numbers material, int branches, Places wanted, Numbe
     of.jacobian = jacobian.data, of.by_rate = by_rate.count ? by_rate.data : nullptr;
     of.behind = behind.count ? behind.data : nullptr;
     of.behind_last = behind_last.count ? behind_last.data : nullptr;
-    return apart([&] {
-        const bool in_proportion = proportional(theta.data + first_branch, branches, branch_places, 2);
-        return with_branches<GentBlock>(branches, in_proportion, [&](auto n) { return respond_all<n()>(of); });
-    });
+    return apart([&] { return respond_all(of); });
 }
 // The stretch at which a level holds the actuator, no number if there is none; its derivatives by
 // what is wanted are written.
@@ -472,9 +454,9 @@ double rest(Numbers theta, Numbers material, double level, Places wanted, Result
     const double l = quantity(equilibrium_q, pull / theta[stiffness_of], of.material);
     for (int from = 0; from < of.wanted_count; from += 8)
         if (int(material[kind_at]) > neo_hookean)
-            Response<Eight, AnyOf<Eight>, 0>(of, from).hold(l, level, slopes.data);
+            Response<Eight, AnyOf<Eight>>(of, from).hold(l, level, slopes.data);
         else
-            Response<Eight, Block<Eight, Gent>, 0>(of, from).hold(l, level, slopes.data);
+            Response<Eight, Block<Eight, Gent>>(of, from).hold(l, level, slopes.data);
     return hmsa::finite(quantity(stiffness_q, l, of.material)) ? l : __builtin_nan("");
 }
 

@@ -56,6 +56,18 @@ template <class S> constexpr int size_of = sizeof(S) / sizeof(real<S>);
 // f(i, y, k): derivative k of state y at node i of the step. Returns the error in units of rtol.
 template <class S, int W> struct Step {
     using R = real<S>;
+    // Where a state is more than three numbers and their derivatives by one, a loop over the stages,
+    // and over as many numbers as are in use: one code for all of them.
+    static constexpr bool unrolled = W <= 3 && count_of<S> <= 1;
+    static_assert(unrolled || W * size_of<S> % 2 == 0, "no room for the last pair");
+    int in_use = W;
+    HMSA_INLINE int width() const { return unrolled ? W : in_use; }
+    void use(int numbers)
+    {
+        in_use = numbers;
+        if constexpr (!unrolled)
+            std::memset(static_cast<void *>(k), 0, sizeof k);
+    }
     S k[12][W];
     // A row of the tableau for numbers m and on of a state: one at a time, or a pair.
     template <class V> HMSA_INLINE static V load(const S *x, int m)
@@ -82,11 +94,13 @@ template <class S, int W> struct Step {
     }
     template <int I> HMSA_INLINE void stage(const S *y, const R &h, S *x) const
     {
-        constexpr int numbers = W * size_of<S>, paired = sizeof(Pair<R>) > sizeof(R) ? numbers / 2 * 2 : 0;
+        constexpr bool pairs = sizeof(Pair<R>) > sizeof(R);
+        const int numbers = width() * size_of<S>, paired = pairs ? (numbers + !unrolled) / 2 * 2 : 0;
         for (int m = 0; m < paired; m += 2)
             put<Pair<R>, I>(y, h, x, m);
-        for (int m = paired; m < numbers; m++)
-            put<R, I>(y, h, x, m);
+        if constexpr (unrolled || !pairs)
+            for (int m = paired; m < numbers; m++)
+                put<R, I>(y, h, x, m);
     }
     template <int I, class F> HMSA_INLINE void one(const F &f, const S *y, const R &h)
     {
@@ -104,18 +118,15 @@ template <class S, int W> struct Step {
     {
         ((i == I + 1 ? stage<I + 1>(y, h, x) : void()), ...);
     }
-    // Where a state is more than three numbers and their derivatives by one, a loop over the stages:
-    // the equation is then compiled once, and not twelve times.
-    static constexpr bool unrolled = W <= 3 && count_of<S> <= 1;
     template <class F> HMSA_INLINE void move(const F &f, const S *y, const R &h, S *end)
     {
-        f(0, y, k[0]);
-        if constexpr (unrolled)
+        if constexpr (unrolled) {
+            f(0, y, k[0]);
             all(f, y, h, std::make_integer_sequence<int, 11>());
-        else
-            for (int i = 1; i < 12; i++) {
+        } else
+            for (int i = 0; i < 12; i++) {
                 pick(i, y, h, end, std::make_integer_sequence<int, 11>());
-                f(i, end, k[i]);
+                f(i, i ? end : y, k[i]);
             }
         stage<12>(y, h, end);
     }
@@ -141,7 +152,7 @@ template <class S, int W> struct Step {
     {
         move(f, y, h, end);
         R n5{}, n3{};
-        for (int w = 0; w < W; w++) {
+        for (int w = 0; w < width(); w++) {
             R d5 = dop853::e5[0] * value(k[0][w]), d3 = dop853::e3[0] * value(k[0][w]);
             for (int j = 5; j < 12; j++) {
                 d5 = d5 + dop853::e5[j] * value(k[j][w]);
@@ -153,7 +164,7 @@ template <class S, int W> struct Step {
             n5 = n5 + d5 * d5;
             n3 = n3 + d3 * d3;
         }
-        return h * n5 / sqrt(R(double(W) * (n5 + 0.01 * n3) + 1e-300));
+        return h * n5 / sqrt(R(double(width()) * (n5 + 0.01 * n3) + 1e-300));
     }
 };
 // Factor of the next step's length; 0.2 for an error that is no number.

@@ -74,7 +74,7 @@ template <class C> struct AnyFlow {
         power_law_flow.read(from + 1);
     }
     void seed(int constant, int j) { power_law_flow.seed(constant, j); }
-    template <class S> HMSA_INLINE S operator()(const S &x) const { return kind == maxwell ? x : other(x); }
+    // Of one that does not flow in proportion.
     template <class S> HMSA_APART S other(const S &x) const { return power_law_flow(x); }
     Fading fading(double x, double speed, double until) const
     {

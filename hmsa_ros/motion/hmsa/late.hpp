@@ -17,19 +17,17 @@ struct Before {
     const double *followed;  // null where they have relaxed
 };
 
-// P unknowns of the shooting, at least three.
-template <int NB, int P, class System> Late late(const System &system, const double *m, const Move &move,
-    const Wanted &wanted, const Before &before)
+template <int NB, class System> Late late(const System &system, const Branches<NB> &branches, const double *m,
+    const Move &move, const Wanted &wanted, const Before &before)
 {
     // Of the push, in time constants: it passes the holding level by as much as the level before
     // falls short of it.
     constexpr double length = 0.6931471805599453;
     Planner<System, NB> planner;
     auto &search = planner.search;
-    search.branches.read(before.branches, before.branch_count);
-    for (int b = 0; b < NB; b++)
-        search.followed[b] = before.followed && b < before.branch_count
-            ? before.followed[b] : system.elastic(move.start).v;
+    search.branches = branches;
+    for (int b = 0; b < branches.count(); b++)
+        search.followed[b] = before.followed ? before.followed[b] : system.elastic(move.start).v;
     const bool lags = before.lag > 0;
     Late found{planner(system, m, move, {wanted.least, wanted.most, wanted.rtol, wanted.hold, lags}), 0, 0};
     Plan &plan = found.plan;
@@ -37,7 +35,7 @@ template <int NB, int P, class System> Late late(const System &system, const dou
     if (plan.status != two_step || !lags)
         return found;
     double field = plan.beta_1;
-    for (int b = 0; b < NB; b++)
+    for (int b = 0; b < branches.count(); b++)
         field += search.branches.ratio[b] * (plan.beta_1 - planner.swing.end[2 + b].v);
     const double span = length * before.lag, turn = plan.tau_p + span;
     double times[3] = {0, turn, turn + span}, loads[3] = {plan.beta_p, 2 * field - plan.beta_p, plan.beta_1};
@@ -45,7 +43,8 @@ template <int NB, int P, class System> Late late(const System &system, const dou
     const Shot shot{3, 3, times, loads, d_times, d_loads, move.start, move.rate, before.field,
         before.load, move.target, infinity(), before.lag, before.branches, before.branch_count,
         search.followed, most_attempts};
-    Shooting<System, NB, P> shooting{system, shot};
+    // Unknowns of laws that have no code of their own: as many as there may be.
+    Shooting<System, has_own_code<System> ? 3 : most_unknowns> shooting{system, shot};
     double lasts;
     if (!shooting.solve(m, lasts))
         plan.status = not_converged;

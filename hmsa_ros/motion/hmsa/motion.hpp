@@ -15,13 +15,13 @@ template <class S> struct Drive {
 };
 
 template <class S, class System, int NB> struct Motion {
-    static constexpr int width = 2 + NB;
     const System &system;
     const Branches<NB> &branches;
-    S y[width] = {};  // stretch, rate, what the branches follow
-    Step<S, width> step;
+    const int width = 2 + branches.count();
+    S y[room_of<S, NB>] = {};  // stretch, rate, what the branches follow
+    Step<S, room_of<S, NB>> step;
     int room = most_attempts, made = 0;  // steps that it may try to the end of a piece; and has
-    Motion(const System &a, const Branches<NB> &b) : system(a), branches(b) {}
+    Motion(const System &a, const Branches<NB> &b) : system(a), branches(b) { step.use(width); }
 
     // Integrates over a duration; h is the step to begin with, 0 for none known, and to go on with.
     // Motion that meets a limiting stretch too hard to be resolved turns there, in no time and
@@ -35,7 +35,7 @@ template <class S, class System, int NB> struct Motion {
             const double fastest = max(branches.fastest, value(drive.rest) != 0 ? drive.decay : 0);
             h = 1 / (stiff / first + 0.25 / root * fastest);
         }
-        S end[width];
+        S end[room_of<S, NB>];
         double done = 0;
         for (int i = 0; i < room; i++, made++) {
             const double left = duration - done;
@@ -94,16 +94,14 @@ struct Plant {
     const double *durations;
     double rtol;
 };
-template <int NB, class System> bool advance_row(const Plant &plant, int i, const System &system)
+template <int NB, class System> bool advance_row(
+    const Plant &plant, int i, const System &system, const Branches<NB> &branches)
 {
     double *state = plant.state + 3 * i, *drive = plant.drive + 4 * i;
     double *rows = plant.branches ? plant.branches + branch_columns * most_branches * i : nullptr;
-    Branches<NB> branches;
-    if (NB > 0)
-        branches.read(rows, NB);
     Motion<double, System, NB> motion{system, branches};
     motion.y[0] = state[0], motion.y[1] = state[1];
-    for (int b = 0; b < NB; b++)
+    for (int b = 0; b < branches.count(); b++)
         motion.y[2 + b] = rows[branch_columns * b + follower_at];
     const double duration = plant.durations[i];
     const double zeta = plant.material[int64_t(plant.stride) * i + zeta_at];
@@ -111,7 +109,7 @@ template <int NB, class System> bool advance_row(const Plant &plant, int i, cons
     if (!motion.advance({drive[0], drive[1], drive[2], drive[3]}, duration, zeta, plant.rtol, h))
         return false;
     state[0] = motion.y[0], state[1] = motion.y[1], state[2] = h;
-    for (int b = 0; b < NB; b++)
+    for (int b = 0; b < branches.count(); b++)
         rows[branch_columns * b + follower_at] = motion.y[2 + b];
     const double line = drive[0];
     drive[0] += drive[1] * duration;
@@ -122,7 +120,7 @@ template <int NB, class System> bool advance_row(const Plant &plant, int i, cons
 
 // Samples at increasing times of the response to an amplifier whose output is loads[m] +
 // slopes[m] (t - switches[m]) from switches[m] on; the motion begins at the first, which is not later
-// than the first time. Rows of out (3 + NB, count) are stretch, rate, field and followers.
+// than the first time. Rows of out (3 + branch_count, count) are stretch, rate, field and followers.
 struct Course {
     int pieces, count;
     const double *switches, *loads, *slopes, *times;
@@ -131,13 +129,12 @@ struct Course {
     int branch_count;
     double *out;
 };
-template <int NB, class System> bool sample(const System &system, const Course &course)
+template <int NB, class System> bool sample(
+    const System &system, const Branches<NB> &branches, const Course &course)
 {
-    Branches<NB> branches;
-    branches.read(course.branches, course.branch_count);
     Motion<double, System, NB> motion{system, branches};
     motion.y[0] = course.stretch, motion.y[1] = course.rate;
-    for (int b = 0; b < NB && b < course.branch_count; b++)
+    for (int b = 0; b < branches.count(); b++)
         motion.y[2 + b] = course.branches[branch_columns * b + follower_at];
     const double lag = course.lag, decay = lag > 0 ? 1 / lag : 0;
     double t = course.switches[0], field = course.field, h = 0;
@@ -166,7 +163,7 @@ template <int NB, class System> bool sample(const System &system, const Course &
         column[0] = motion.y[0];
         column[course.count] = motion.y[1];
         column[2 * course.count] = field;
-        for (int b = 0; b < NB && b < course.branch_count; b++)
+        for (int b = 0; b < branches.count(); b++)
             column[(3 + b) * course.count] = motion.y[2 + b];
     }
     return true;

@@ -53,12 +53,12 @@ struct Recorded {
 };
 
 // N of the wanted parameters at a time, from one of them on; the motion is the same to the bit.
-template <class C, class System, int NB> struct Response {
+template <class C, class System, int NB = most_branches> struct Response {
     using S = C;
-    static constexpr int width = 2 + NB, N = count_of<S>;
+    static constexpr int most = room_of<S, NB>, N = count_of<S>;
     const Recorded &of;
-    int from;
-    Response(const Recorded &recorded, int first) : of(recorded), from(first) {}
+    const int from, width = 2 + of.branches;
+    Response(const Recorded &recorded, int first) : of(recorded), from(first) { step.use(width); }
     System system;
     typename System::Bare bare;  // the same without derivatives
     S a, damping, drive, force, lag;
@@ -68,7 +68,7 @@ template <class C, class System, int NB> struct Response {
     S excess;  // of the field over the line, where the piece began
     double piece_begin, fastest;
     int rubs, squares;  // places among the derivatives, -1 for none
-    Step<S, width> step;
+    Step<S, most> step;
 
     static S plain(double x)
     {
@@ -106,20 +106,21 @@ template <class C, class System, int NB> struct Response {
             rubs = wanted == friction_of ? j : rubs;
             squares = wanted == square_of ? j : squares;
         });
-        for (int b = 0; b < NB && b < of.branches; b++) {
+        branches.in_use = of.branches;
+        for (int b = 0; b < of.branches; b++) {
             const int first = first_branch + branch_places * b;
             branches.ratio[b] = seeded_at(first);
             branches.speed[b] = inverse(seeded_at(first + 1));
             bare_branches.speed[b] = value(branches.speed[b]);
-            if constexpr (Branches<NB, S>::flows) {
+            if constexpr (NB == most_branches) {
                 branches.flow[b].read(of.theta + first + 2);
                 bare_branches.flow[b].read(of.theta + first + 2);
-                if constexpr (N > 0)
-                    each([&](int j, int wanted) {
-                        if (first + 3 <= wanted && wanted < first + branch_places)
-                            branches.flow[b].seed(wanted - first - 3, j);
-                    });
             }
+            if constexpr (NB == most_branches && N > 0)
+                each([&](int j, int wanted) {
+                    if (first + 3 <= wanted && wanted < first + branch_places)
+                        branches.flow[b].seed(wanted - first - 3, j);
+                });
         }
     }
     S field(double dt) const
@@ -180,12 +181,13 @@ template <class C, class System, int NB> struct Response {
     bool operator()()
     {
         set_up();
-        S y[width], end[width], first[width], final[width];
+        S y[most] = {}, end[most], final[most];
+        const auto &first = step.k[0];
         y[0] = plain(of.theta[stretch_of]), y[1] = seeded_at(rate_of);
         if constexpr (N > 0)
             each([&](int j, int) { y[0].d[j] = of.start[from + j]; });
-        for (int b = 0; b < NB; b++)
-            y[2 + b] = system.force(y[0]) + (of.behind && b < of.branches ? of.behind[b] : 0);
+        for (int b = 0; b < of.branches; b++)
+            y[2 + b] = system.force(y[0]) + (of.behind ? of.behind[b] : 0);
         level = of.levels[0], ramp = of.ramps[0], piece_begin = of.begins[0];
         excess = plain(of.field - level) + lag * ramp;
         if constexpr (N > 0)
@@ -198,15 +200,12 @@ template <class C, class System, int NB> struct Response {
         double h = 0.2 / fastest, t = of.begins[0];
         bool fresh = true;
         int piece = 0, i = 0;
-        const int64_t most = most_response_steps + int64_t(most_steps_a_sample) * of.count;
-        for (int64_t attempt = 0; attempt < most; attempt++) {
-            if (fresh)
-                change(y, t - piece_begin, first);
-            fresh = false;
+        const int64_t attempts = most_response_steps + int64_t(most_steps_a_sample) * of.count;
+        for (int64_t attempt = 0; attempt < attempts; attempt++) {
             for (; i < of.count && of.times[i] <= t; i++)  // before the begin it is uniform
                 put(i, y[0] + y[1] * (of.times[i] - t), y[1]);
             if (i == of.count) {
-                for (int b = 0; b < NB && of.behind_last && b < of.branches; b++)
+                for (int b = 0; of.behind_last && b < of.branches; b++)
                     of.behind_last[b] = value(y[2 + b]) - value(system.force(y[0]));
                 return true;
             }
@@ -219,11 +218,12 @@ template <class C, class System, int NB> struct Response {
                 target = min(target, of.times[of.count - 1]);
             if (of.wanted_count > 0) {
                 h = min(h, longest_phase * per_phase);
-                for (int b = 0; b < NB && b < of.branches; b++)
+                for (int b = 0; b < of.branches; b++)
                     h = min(h, relaxed_share / bare_branches.tangent(b, bare.elastic(l).v - value(y[2 + b])));
             }
             const double span = min(h, target - t), dt = t - piece_begin;
-            const double error = make(y, first, dt, span, end);
+            const double error = make(y, fresh, dt, span, end);
+            fresh = false;
             if (!(error <= 1)) {
                 h = span * resized(error);
                 if (!(h > 1e-12 / fastest))
@@ -239,7 +239,7 @@ template <class C, class System, int NB> struct Response {
                 put(i, stretch, rate);
             }
             for (int w = 0; w < width; w++)
-                y[w] = end[w], first[w] = final[w];
+                y[w] = end[w], step.k[0][w] = final[w];
             t = after;
             if (span == h || error > 0.5)
                 h = span * resized(error);
@@ -265,14 +265,11 @@ template <class C, class System, int NB> struct Response {
                 });
             }
     }
-    // One step, whose first slope is known; the rate counts in natural frequencies.
-    double make(const S *y, const S *known, double dt, double h, S *end)
+    // One step, whose first slope is known unless it is fresh; the rate counts in natural frequencies.
+    double make(const S *y, bool fresh, double dt, double h, S *end)
     {
         return step.scaled([&](int stage, const S *x, S *by) __attribute__((always_inline)) {
-            if (stage == 0)
-                for (int w = 0; w < width; w++)
-                    by[w] = known[w];
-            else
+            if (stage > 0 || fresh)
                 change(x, dt + h * dop853::node[stage], by);
         }, y, h, of.rtol, fastest, end);
     }

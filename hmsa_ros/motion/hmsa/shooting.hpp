@@ -19,7 +19,7 @@ struct Shot {
     int most_work;
 };
 
-template <class System, int NB, int P> struct Shooting {
+template <class System, int P> struct Shooting {
     // Tolerances of the first pass, far from the solution and at it, the largest and as shares of
     // the move; and the distance from rest, as a share, from which on it is measured with the last.
     static constexpr double first = 1e-6, rough = 1e-8, rough_share = 1e-7, fine_most = 1e-12,
@@ -34,16 +34,15 @@ template <class System, int NB, int P> struct Shooting {
     // the search. And the share of the distance that a fine pass has to leave less than.
     static constexpr double last = 1e-12, accepted = 1e-10, slowest = 0.1;
 
-    static constexpr int M = 3 + NB;
     const System &system;
     const Shot &shot;
     Shooting(const System &a, const Shot &b) : system(a), shot(b) {}
     double zeta;
-    Branches<NB> branches;
+    Branches<most_branches> branches;
     int count;  // of pieces
     double duration[2 * most_levels], begin[2 * most_levels], slope[2 * most_levels];
     double d_duration[2 * most_levels][P], d_begin[2 * most_levels][P];
-    double end[M], d_end[M][P];  // stretch, rate, field, followers
+    double end[3 + most_branches], d_end[3 + most_branches][P];  // stretch, rate, field, followers
     double miss[most_unknowns], trial[most_unknowns][P];  // as many rows as unknowns
     double frequency_at_target, stiffness, force;
     double first_times[most_levels], first_loads[most_levels];
@@ -113,10 +112,16 @@ template <class System, int NB, int P> struct Shooting {
     // Follows the pieces; with derivatives where S has them.
     template <class S> bool respond(double rtol)
     {
+        return with_branches<S, System>(shot.branches, shot.branch_count, [&](const auto &branches) {
+            return respond<S>(branches, rtol);
+        });
+    }
+    template <class S, int NB> bool respond(const Branches<NB> &branches, double rtol)
+    {
         Motion<S, System, NB> motion{system, branches};
         motion.y[0] = motion.y[0] + shot.stretch;
         motion.y[1] = motion.y[1] + shot.rate;
-        for (int b = 0; b < NB && b < shot.branch_count; b++)
+        for (int b = 0; b < branches.count(); b++)
             motion.y[2 + b] = motion.y[2 + b] + shot.followed[b];
         S field = 0.0 * motion.y[0] + shot.field;
         const double decay = shot.lag > 0 ? 1 / shot.lag : 0;
@@ -139,7 +144,7 @@ template <class System, int NB, int P> struct Shooting {
                 change(system, branches, motion.y, field, by);
                 const double change = slope[m] - value(rest) * decay * left;
                 for (int c = 0; c < shot.unknowns; c++) {
-                    for (int w = 0; w < 2 + NB; w++)
+                    for (int w = 0; w < motion.width; w++)
                         motion.y[w].d[c] += by[w].v * d_duration[m][c];
                     field.d[c] += change * d_duration[m][c];
                 }
@@ -152,7 +157,7 @@ template <class System, int NB, int P> struct Shooting {
                     d_end[row][c] = x.d[c];
         };
         put(0, motion.y[0]), put(1, motion.y[1]), put(2, field);
-        for (int b = 0; b < NB; b++)
+        for (int b = 0; b < branches.count(); b++)
             put(3 + b, motion.y[2 + b]);
         return true;
     }
@@ -179,7 +184,7 @@ template <class System, int NB, int P> struct Shooting {
                 trial[row][c] = shot.d_loads[(shot.levels - 1) * shot.unknowns + c] / stiffness;
             row++;
         }
-        for (int b = 0; b < NB && b < shot.branch_count; b++)
+        for (int b = 0; b < shot.branch_count; b++)
             // What a branch holds the field has to balance, and the amplifier to lead.
             for (int i = 2; i < row; i++) {
                 const double share = branches.ratio[b] / stiffness;

@@ -40,6 +40,7 @@ template <class R, class System, int NB = 0> struct Swing {
     } bracket[n];
     Step<S, W> step;
 
+    HMSA_INLINE int width() const { return 2 + branches.count(); }
     static bool has(const Mask &mask, int i)
     {
         if constexpr (n == 1)
@@ -70,7 +71,8 @@ template <class R, class System, int NB = 0> struct Swing {
     HMSA_APART void begin(int i, double l, double v, double load, double direction, double move,
         double frequency, double zeta, double tolerance, const double *followed = nullptr)
     {
-        for (int w = 0; w < W; w++) {
+        step.use(width());
+        for (int w = 0; w < width(); w++) {
             set(y[w].v, i, w == 0 ? l : w == 1 ? v : followed[w - 2]);
             set(y[w].d[0], i, 0);
         }
@@ -110,7 +112,7 @@ template <class R, class System, int NB = 0> struct Swing {
             | (y[0].v * y[0].v * abs(squared) > felt * felt)
             | ((speed < still) & (abs(slope) < calm)) | (steps > double(most));
         const auto moves = good & !special;
-        for (int w = 0; w < W; w++) {
+        for (int w = 0; w < width(); w++) {
             y[w].v = select(moves, end[w].v, y[w].v);
             y[w].d[0] = select(moves, end[w].d[0], y[w].d[0]);
         }
@@ -141,7 +143,7 @@ template <class R, class System, int NB = 0> struct Swing {
         const double counted = get(error, i) * (get(rtol, i) / max(get(rtol, i), kept));
         if (!(counted <= 1 && direction * v > 0 && direction * w <= 0)) {
             if (counted <= 1) {
-                for (int m = 0; m < W; m++) {
+                for (int m = 0; m < width(); m++) {
                     set(y[m].v, i, get(end[m].v, i));
                     set(y[m].d[0], i, get(end[m].d[0], i));
                 }
@@ -168,7 +170,7 @@ template <class R, class System, int NB = 0> struct Swing {
     {
         const double w = get(end[1].v, i), all = get(h, i), direction = get(sign, i);
         D at[W], by[W];
-        for (int m = 0; m < W; m++)
+        for (int m = 0; m < width(); m++)
             at[m] = {get(end[m].v, i), {get(end[m].d[0], i)}};
         change(one, branches, at, D{get(beta, i), {1}}, by);
         const D &x = at[0], &u = at[1], &a = by[1];
@@ -177,7 +179,7 @@ template <class R, class System, int NB = 0> struct Swing {
         if (direction * a.v < 0) {
             // The jerk is the derivative along the motion.
             D along[W], further[W];
-            for (int m = 0; m < W; m++)
+            for (int m = 0; m < width(); m++)
                 along[m] = {at[m].v, {by[m].v}};
             change(one, branches, along, get(beta, i), further);
             const double jerk = further[1].d[0];
@@ -194,6 +196,16 @@ template <class R, class System, int NB = 0> struct Swing {
         (direction * w > 0 ? bracket[i].before : bracket[i].after) = all;
         return again(i, all + left);
     }
+    // The first turning point of one motion, once it has begun.
+    HMSA_APART Event turn(const System &one)
+    {
+        for (;;)
+            if (advance()) {
+                const Event event = decide(0, one);
+                if (event.status != goes_on)
+                    return event;
+            }
+    }
     Event again(int i, double dt)
     {
         const Bracket &in = bracket[i];
@@ -209,11 +221,6 @@ template <class System> Event turning_point(const System &system, double l, doub
     Swing<double, System> swing{};
     swing.system = system;
     swing.begin(0, l, v, load, direction, move, frequency(system, l), zeta, tolerance);
-    for (;;)
-        if (swing.advance()) {
-            const Event event = swing.decide(0, system);
-            if (event.status != goes_on)
-                return event;
-        }
+    return swing.turn(system);
 }
 }  // namespace hmsa

@@ -229,10 +229,12 @@ template <int NB, class C = double> struct Branches {
     C ratio[NB + 1] = {}, speed[NB + 1] = {};
     AnyFlow<C> flow[flows ? NB : 1];
     double total = 1, fastest = 0;
-    // Fewer than NB are filled up by ones that hold nothing.
+    int in_use = NB;
+    HMSA_INLINE int count() const { return flows ? in_use : NB; }
     void read(const double *from, int count)
     {
-        for (int b = 0; b < count && b < NB; b++, from += branch_columns) {
+        in_use = count;
+        for (int b = 0; b < count; b++, from += branch_columns) {
             ratio[b] = from[ratio_at];
             speed[b] = from[speed_at];
             if constexpr (flows)
@@ -244,9 +246,9 @@ template <int NB, class C = double> struct Branches {
     template <class S> HMSA_INLINE auto rate(int b, const S &above) const
     {
         if constexpr (flows)
-            return flow[b](above) * speed[b];
-        else
-            return above * speed[b];
+            if (flow[b].kind != maxwell)
+                return flow[b].other(above) * speed[b];
+        return above * speed[b];
     }
     // How fast a branch relaxes that holds so much.
     double pace(int b, double above) const
@@ -259,13 +261,35 @@ template <int NB, class C = double> struct Branches {
     // What each holds under an elastic force, and the derivative of what it follows.
     template <class S, class F> HMSA_INLINE void hold(const S &force, const S *followed, S *by, const F &held) const
     {
-        for (int b = 0; b < NB; b++) {
+        for (int b = 0; b < count(); b++) {
             const S above = force - followed[b];
             held(above * ratio[b]);
             by[b] = rate(b, above);
         }
     }
 };
+// Scalars in a state with so many branches; in pairs where a step goes through them in a loop.
+template <class S, int NB> constexpr int room_of = count_of<S> <= 1 && NB <= 1 ? 2 + NB : (3 + NB) / 2 * 2;
+// Blocks have code of their own; other laws share as much as they can.
+template <class System> constexpr bool has_own_code = false;
+template <class C, template <class> class Law> constexpr bool has_own_code<Block<C, Law>> = true;
+// Calls f with the branches of rows. None, and one that flows in proportion, have code of their own,
+// unless it would be made once more for each of many derivatives.
+template <class S, class System, class F> auto with_branches(const double *rows, int count, const F &f)
+{
+    const auto call = [&](auto branches) {
+        branches.read(rows, count);
+        return f(branches);
+    };
+    if constexpr (count_of<S> <= 1) {
+        if (count == 0)
+            return call(Branches<0>{});
+        if constexpr (has_own_code<System>)
+            if (count == 1 && rows[flow_at] == maxwell)
+                return call(Branches<1>{});
+    }
+    return call(Branches<most_branches>{});
+}
 // The derivative by time of a state: stretch, rate, what the branches follow.
 template <int NB, class System, class S, class L> HMSA_INLINE void change(const System &system,
     const Branches<NB> &branches, const S *x, const L &load, S *by, real<S> *squared = nullptr)

@@ -53,7 +53,7 @@ template <class System, int NB = 0> struct Search {
     double balance(double force, const double *felt) const
     {
         double load = force;
-        for (int b = 0; b < NB; b++)
+        for (int b = 0; b < branches.count(); b++)
             load += felt[b] * (force - followed[b]);
         return load;
     }
@@ -67,7 +67,7 @@ template <class System, int NB = 0> struct Search {
             return infinity();
         const double half = 0.5 * (start + target);
         double felt[NB + 1], drag = system.drag * system.shape(half);
-        for (int b = 0; b < NB; b++) {
+        for (int b = 0; b < branches.count(); b++) {
             const double omega = frequency(system, target);
             const double phase = omega / max(branches.pace(b, beta_1 - followed[b]), 1e-9 * omega);
             const double part = branches.ratio[b] * phase / (1 + phase * phase);
@@ -76,7 +76,7 @@ template <class System, int NB = 0> struct Search {
         }
         const auto energy = [&](double l) {
             double sum = system.energy(l);
-            for (int b = 0; b < NB; b++)
+            for (int b = 0; b < branches.count(); b++)
                 sum += felt[b] * (system.energy(l) - followed[b] * l);
             return sum;
         };
@@ -239,25 +239,16 @@ template <class System, int NB = 0> struct Planner {
     Search<System, NB> search;
     Swing<double, System, NB> swing;
 
-    void begin_pass()
-    {
-        swing.begin(0, search.start, search.rate, search.load(), search.direction, search.move,
-            search.frequency_at_start, search.zeta, search.tolerance, search.followed);
-    }
     Plan shoot(const System &system, const double *m, const Move &move, double direction, const Wanted &wanted)
     {
         if (!search.begin(system, m, move, direction, wanted))
             return search.plan;
         swing.system = system, swing.branches = search.branches;
-        for (begin_pass();;)
-            if (swing.advance()) {
-                const Event event = swing.decide(0, system);
-                if (event.status == goes_on)
-                    continue;
-                if (search.found(event))
-                    return search.plan;
-                begin_pass();
-            }
+        do
+            swing.begin(0, search.start, search.rate, search.load(), search.direction, search.move,
+                search.frequency_at_start, search.zeta, search.tolerance, search.followed);
+        while (!search.found(swing.turn(system)));
+        return search.plan;
     }
     // Whether there is something to search; else the plan says why not.
     HMSA_APART bool begins(const System &system, const double *m, const Move &move, const Wanted &wanted, Plan &plan)
