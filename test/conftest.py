@@ -146,6 +146,8 @@ def own_domain_fixture() -> Callable[[], AbstractContextManager[int]]:
 def ros_domain_id() -> Iterator[int]:
     """Return a domain id that no other test on this machine uses at the same time."""
     with own_domain() as domain:
+        # What is there by now stays; only what the test makes is looked through at its end.
+        gc.freeze()
         yield domain
         # Nodes that were destroyed stay in the domain until Python has collected them, and who has
         # it next would meet them.
