@@ -32,6 +32,8 @@ class Column:
             return '–' if value is None else str(value)
         if math.isnan(value):
             return '–'
+        if math.isinf(value):
+            return '∞' if value > 0.0 else '-∞'
         if self.form.endswith('%'):
             from hmsa_ros.model.residual import percent  # imports NumPy
 

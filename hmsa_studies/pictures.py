@@ -47,7 +47,9 @@ def draw_robustness(
         rows = [['G', 'zeta'], ['J_lim' if 'J_lim' in names else 'box', 'box']]
     else:
         rows = [[x] for x in cells]
-    with style.picture(paths, 1.4 + 2.3 * len(rows) + 0.3 * (3 - columns), paper) as figure:
+    # In a column of a journal the panels are lower, so that all fit on its page.
+    height = 2.3 if columns > 1 else 1.6
+    with style.picture(paths, 1.4 + height * len(rows) + 0.3 * (3 - columns), paper) as figure:
         figure.suptitle(
             f'{case.material.coordinate.name} {case.start:g} to {case.target:g}; '
             f'{_nominal(case)}')

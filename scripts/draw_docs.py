@@ -71,7 +71,7 @@ def force(path: Path) -> None:
         axes.plot([1.0], [0.0], **style.EQUILIBRIUM)
         axes.set_ylim(-8.0, 8.0)
         axes.legend(loc=(0.22, 0.66))
-        style.finish(axes, STRETCH, r"load that holds it, $\beta_1 = \psi'$")
+        style.finish(axes, STRETCH, style.axis('load', r'\beta_1'))
 
 
 def two_steps(path: Path) -> None:
@@ -182,7 +182,9 @@ def laws(path: Path) -> None:
         'yeoh': {'law.c10': 5e3, 'law.c20': -200.0, 'law.c30': 40.0},
         'ogden': {'law.mu': [2e4], 'law.alpha': [1.0]},
         'arruda_boyce': {'law.mu': [8.354e3], 'law.lambda_m': 2.0}}
-    groups = {'gent, J 5': MATERIAL, 'neo_hookean': NondimensionalParameters(j_lim=np.inf)} | {
+    groups = {
+        r'gent, $J_\mathrm{lim} = 5$': MATERIAL,
+        'neo_hookean': NondimensionalParameters(j_lim=np.inf)} | {
         name: NondimensionalParameters(law=LAWS[name].scaled(values)[1])
         for name, values in cases.items()}
     with style.picture(path, 3.2, replace(SCREEN, width=120)) as figure:
@@ -194,7 +196,7 @@ def laws(path: Path) -> None:
         axes.plot([1.0], [0.0], **style.EQUILIBRIUM)
         axes.set_ylim(-4.0, 6.0)
         axes.legend(loc='upper left')
-        style.finish(axes, STRETCH, r"load that holds it, $\beta_1 = \psi'$")
+        style.finish(axes, STRETCH, style.axis('load', r'\beta_1'))
 
 
 def creep(path: Path) -> None:

@@ -241,8 +241,47 @@ def test_the_plan_names_units_currents_and_amplifiers(files, capsys):
                  'bandwidth (Hz)', 'voltage (V)'):
         assert name in said
     # 200 T/s at 0.02 T/A: 10 kA/s through 5 mH, and 6.48 A through 2 ohm.
-    row = next(x.split() for x in said.splitlines() if x.split()[:2] == ['200', 'inf'])
+    row = next(x.split() for x in said.splitlines() if x.split()[:2] == ['200', '∞'])
     assert [float(row[i]) for i in (2, 5, 7)] == pytest.approx([1.975, 6.48, 63.0], rel=1e-3)
+    # The coil itself: R/(2 pi L), on which a level takes no voltage but R I.
+    row = next(x.split() for x in said.splitlines() if x.split()[:2] == ['∞', '63.66'])
+    assert float(row[7]) == pytest.approx(2.0 * float(row[5]), rel=0.01)
+
+
+def test_a_plan_shows_the_levels_between_and_writes_all_for_other_commands(files, capsys):
+    words = ['plan', '1.1:0.5', '--shaper', 'robust', '--params-file', 'actuator.yaml']
+    assert main([*words, '--out', 'robust.csv']) == 0
+    said = capsys.readouterr().out
+    rows = np.loadtxt('robust.csv', delimiter=',', skiprows=1)
+    assert f'{rows[1, 1]:.6g} at {rows[1, 0]:.6g}' in said
+    assert 'between (T at s)' in said
+    assert main(['simulate', 'robust.csv', '--params-file', 'actuator.yaml', '--json']) == 0
+    (found,) = json.loads(capsys.readouterr().out)['rows']
+    assert found['verdict'] == 'arrived'
+    assert found['residual'] < 0.02
+    words = ['plan', '1.1:10', '--shaper', 'robust']
+    assert main(words) == 0
+    assert 'between (b at tau)' in capsys.readouterr().out
+    assert main([*words, '--out', 'robust.csv']) == 2
+
+
+def test_of_an_unshaped_step_the_residual_is_shown_beside_what_is_left_when_it_is_judged():
+    block = hmsa_ros.Actuator()
+    runs = [block.plan([(1.1, 0.5)], shaper=x).simulate() for x in ('two_step', 'step')]
+    table = hmsa_ros.compare(*runs)
+    assert table['verdict'] == ['arrived', 'arrived']
+    shaped, unshaped = table['residual']
+    assert shaped < 1e-4
+    # What its overshoot of 78 % and its swing back of 57 % are together, by the model.
+    assert unshaped == pytest.approx(135.0, abs=5.0)
+    assert table['vibration'][1] < 1.0
+    assert table['judged from'][0] == pytest.approx(table['move time'][0])
+    assert table['judged from'][1] > 10.0 * table['move time'][1]
+    # The same figures alone, and in the heading of the picture.
+    alone = runs[1].report()
+    assert alone['residual'] == [unshaped]
+    titles = [x.get_title(loc='right') for x in runs[1].plot().axes]
+    assert f'to 1.1: residual {unshaped:.1f} %' in titles
 
 
 def test_a_law_is_chosen_by_option(files, capsys):

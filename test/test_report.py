@@ -1102,7 +1102,8 @@ def test_noise_is_no_vibration_and_an_offset_is_named(tmp_path):
     assert row['verdict'][1] == 'off target'
     assert float(row['offset [%]'][0]) == found[0].setpoint.percent(found[0].offset)
     assert found[0].message in report.words
-    assert 'off target, residual' in ' '.join(report.words)
+    heading = ' '.join(report.words)
+    assert re.search(r'1\. to 1\.3: residual [\d.]+ %, off target', heading)
 
 
 def test_a_setpoint_that_a_new_plan_leaves_out_is_missed(tmp_path):

@@ -53,10 +53,16 @@ def amplifiers(
             'as two_step')
     if slew_limits is None:
         slew_limits = _series(swing / fastest)
-    if bandwidths is None:
-        bandwidths = _series(1.0 / fastest)
     rows = [_row(best, best, math.inf, math.inf, numbers)]
     notes = []
+    if bandwidths is None:
+        bandwidths = _series(1.0 / fastest)
+        if len(numbers) == len(coil):
+            own = numbers['resistance'] / (2.0 * math.pi * numbers['inductance'])
+            bandwidths = sorted({*bandwidths, own}, reverse=True)
+            notes.append(
+                f'{own:.4g} Hz is the bandwidth of the coil itself, R/(2 pi L), on an amplifier '
+                'that sets voltages and not currents')
     for slew, band in [*((x, math.inf) for x in slew_limits), *(
             (math.inf, x) for x in bandwidths)]:
         try:
@@ -77,8 +83,8 @@ def amplifiers(
     if len(numbers) == len(coil):
         columns += [Column('voltage', 'V', '.3g'), Column('power', 'W', '.3g')]
     return Table(tuple(columns), tuple(rows), (
-        'slew: of ramps; bandwidth: of a first-order lag; lost: against ideal steps, in the '
-        'longest move; field: largest magnitude of a level' + (
+        '∞: no limit; slew: of ramps; bandwidth: of a first-order lag; lost: against ideal steps, '
+        'in the longest move; field: largest magnitude of a level' + (
             '; voltage: L dI/dt + R I, its largest magnitude; power: that voltage times the '
             'largest current' if len(numbers) == len(coil) else '')), tuple(notes))
 

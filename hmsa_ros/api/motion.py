@@ -94,15 +94,19 @@ class Motion:
         A path writes the page of ``hmsa report`` as well; if it cannot be written, this is a
         `BadInputError`.
         """
+        from hmsa_ros.report.comparison import setpoints
+
+        part = self._part()
         if path is not None:
             from hmsa_ros.files import write_text
             from hmsa_ros.report.page import page
 
-            write_text(Path(path), page([self._part()]))
-        from hmsa_ros.report.outcome import findings_of, findings_table, level_results, level_table
+            write_text(Path(path), page([part]))
+        if part.evaluation.findings:
+            return setpoints([part])
+        from hmsa_ros.report.outcome import level_results, level_table
 
-        found = findings_of(self.run)
-        return findings_table(found) if found else level_table(level_results(self.run))
+        return level_table(level_results(self.run))
 
     def plot(self, path: str | Path | Sequence[str | Path] | None = None, **paper: Any) -> Any:
         """

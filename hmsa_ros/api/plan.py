@@ -1,6 +1,7 @@
 """A plan: what to send to the coil and when, and the motion that it predicts."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 import math
 from pathlib import Path
@@ -16,6 +17,28 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.planning.sequence import Segment
 from hmsa_ros.recordings.tables import write_table
 from hmsa_ros.table import Column, frame, Table
+
+#: Column of the levels after the first and before the last.
+BETWEEN = 'between'
+_MOST_BETWEEN = 4
+
+
+def between(segment: Segment, time: float, shown: Callable[[float], float]) -> str:
+    """Return the levels between the first and the last of a move, each at its time; or nothing."""
+    inside = segment.move.levels[1:-1]
+    return ', '.join(
+        f'{shown(x.load):.6g} at {x.time * time:.6g}' for x in inside
+    ) if len(inside) <= _MOST_BETWEEN else f'{len(inside)} levels'
+
+
+def with_between(table: Table) -> Table:
+    """Return a table of moves without its column of levels between where no move has any."""
+    if any(table[BETWEEN]):
+        return table
+    place = [x.name for x in table.columns].index(BETWEEN)
+    return replace(
+        table, columns=table.columns[:place] + table.columns[place + 1:],
+        rows=tuple(x[:place] + x[place + 1:] for x in table.rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +113,7 @@ class Plan:
             tesla_per_ampere, 'tesla_per_ampere', 'T/A', above=0.0)
 
     def report(self) -> Table:
-        """Return the first and last level of each setpoint, its move time and its status."""
+        """Return the levels of each setpoint, its move time and its status."""
         units, name = self.actuator.model.units, self.actuator.block.coordinate.name
         rows = []
         for x in self.segments:
@@ -99,11 +122,13 @@ class Plan:
                 x.setpoint.stretch, x.setpoint.span * units.time,
                 x.move.levels[0].load * units.load if shaped else None,
                 x.move.duration * units.time if shaped and math.isfinite(x.move.duration)
-                else None, x.held * units.load, str(x.move.code)))
-        return Table((
+                else None, x.held * units.load,
+                between(x, units.time, lambda load: load * units.load), str(x.move.code)))
+        return with_between(Table((
             Column(name), Column('duration', 's'), Column('first level', 'T'),
-            Column('move time', 's'), Column('last level', 'T'), Column('status')), tuple(rows),
-            notes=tuple(note for x in self.segments for note in x.notes()))
+            Column('move time', 's'), Column('last level', 'T'),
+            Column(BETWEEN, 'T at s'), Column('status')), tuple(rows),
+            notes=tuple(note for x in self.segments for note in x.notes())))
 
     def simulate(
             self, *, truth: Actuator | None = None, noise: float = 0.0,

@@ -69,17 +69,30 @@ def add_parser(subparsers: Any) -> None:
          'current and voltage'),
         of_unit('--inductance', 'H', 'inductance L of the coil'),
         of_unit('--resistance', 'ohm', 'resistance R of the coil'),
+        ('--out', 'FILE', Path,
+         'with --params-file: levels to write, ending in .csv (for hmsa simulate and hmsa run '
+         '--levels), .parquet or .mat; an existing file is replaced'),
         ('--json', 'print JSON in full precision'))
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Plan and print, in seconds and tesla for the actuator of a parameter file."""
+    """
+    Plan and print, in seconds and tesla for the actuator of a parameter file.
+
+    Without one, a file of levels to write is a `BadInputError`.
+    """
     si = arguments.params_file is not None
+    from hmsa_ros.api.plan import BETWEEN, between, with_between
+    from hmsa_ros.model.equations import signed_root
+
     facts, amplifiers = {}, None
     if si:
         actuator = _actuator(arguments)
-        segments = actuator.plan(
-            arguments.setpoints, arguments.shaper or 'two_step', **_more(arguments)).segments
+        plan = actuator.plan(
+            arguments.setpoints, arguments.shaper or 'two_step', **_more(arguments))
+        segments = plan.segments
+        if arguments.out is not None:
+            plan.save(arguments.out)
         group, units = actuator.model.material, actuator.model.units
         facts = {'c1': group.c1, 'zeta': group.zeta, 'j_lim': group.j_lim,
                  'time_unit': units.time, 'flux_density_unit': units.load}
@@ -94,23 +107,34 @@ def run(arguments: argparse.Namespace) -> int:
             Column('flux_density_1', 'T')]
         if arguments.tesla_per_ampere is not None:
             shown += [Column('current_p', 'A'), Column('current_1', 'A')]
+        inside = [between(x, units.time, lambda load: load * units.load) for x in segments]
+        middle = Column(BETWEEN, 'T at s')
         caption = (f'c1 {group.c1:.6g}, zeta {group.zeta:.6g}, time unit L sqrt(rho/G) '
                    f'{units.time:.6g} s')
     else:
+        if arguments.out is not None:
+            raise BadInputError(
+                '--out is given: expected --params-file with it, since the file has seconds and '
+                'tesla')
         group = _group(arguments)
         segments = _nondimensional(arguments, group)
         rows = [_row(x) for x in segments]
         shown = [Column('span', _TIME), Column('b_p'), Column('tau_p', _TIME), Column('b_1')]
+        inside = [between(x, 1.0, lambda load: float(signed_root(load))) for x in segments]
+        middle = Column(BETWEEN, 'b at tau')
         caption = 'nondimensional as in the paper, b = sqrt(Br B/(mu0 G)); in seconds and tesla ' \
                   'with --params-file'
     if arguments.json:
         print(json_text({**facts, 'segments': rows, **(
             {} if amplifiers is None else {'amplifiers': amplifiers.records()})}))
         return 0
-    print(Table(
-        (Column(group.coordinate.name), *shown, Column('status')),
-        tuple((x['stretch'], *(x[y.name] for y in shown), x['status']) for x in rows), caption,
-        tuple(note for x in segments for note in x.notes())))
+    print(with_between(Table(
+        (Column(group.coordinate.name), *shown, middle, Column('status')),
+        tuple((x['stretch'], *(x[y.name] for y in shown), z, x['status'])
+              for x, z in zip(rows, inside, strict=True)), caption,
+        tuple(note for x in segments for note in x.notes()))))
+    if arguments.out is not None:
+        print(f'{arguments.out} written')
     if amplifiers is not None:
         print(f'\n{amplifiers}')
     return 0

@@ -18,6 +18,7 @@ from hmsa_ros.files import json_text
 if TYPE_CHECKING:
     from hmsa_ros.judge import Finding, Tolerances
     from hmsa_ros.lab.experiment import Conducted, Experiment
+    from hmsa_ros.report.arrivals import Part
     from hmsa_ros.report.outcome import LevelResult
 
 NOT_MEASURED = 'predicted, not measured'
@@ -79,23 +80,23 @@ def run(arguments: argparse.Namespace) -> int:
             done = conduct(experiment, dict(os.environ), update)
             ENDING.check()
             update('evaluating the bag', None)
-            findings, levels = _measure(experiment, tolerances) if done.measured else ([], [])
-            report = _report(experiment.bag, folder / 'report.html') if (
-                arguments.report and done.measured) else None
+            parts = _measure(experiment, tolerances) if done.measured else []
+            report = _report(parts, folder / 'report.html') if arguments.report and parts else None
     except KeyboardInterrupt:
         console.print(
             f'interrupted; the bag so far: {experiment.bag}' if experiment.bag.exists()
             else 'interrupted', highlight=False, soft_wrap=True)
         return ENDING.status
+    findings = [] if experiment.levels else [y for x in parts for y in x.evaluation.findings]
     verdict, reason = _verdict(experiment, findings, done)
     if arguments.json:
         print(json_text({
             'verdict': verdict, 'reason': reason, 'setpoints': [x.to_dict() for x in findings],
-            **({'levels': [asdict(x) for x in levels]} if experiment.levels else {}),
+            **({'levels': [asdict(x) for x in _levels(parts)]} if experiment.levels else {}),
             'notes': done.notes, 'exits': done.exits, 'bag': str(experiment.bag),
             'report': None if report is None else str(report)}))
     else:
-        _print(findings, levels, reason, done, experiment.bag, report)
+        _print(experiment, parts, reason, done, report)
     return 0 if verdict in ('arrived', NOT_MEASURED) else 1
 
 
@@ -132,29 +133,29 @@ def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
         tuple(arguments.joint.split(',')), expected, levels_of(arguments))
 
 
-def _measure(
-        experiment: 'Experiment',
-        tolerances: 'Tolerances | None') -> 'tuple[list[Finding], list[LevelResult]]':
-    """Read the bag and judge the setpoints or measure the levels of each joint."""
-    from hmsa_ros.recordings.bags import read_runs
-    from hmsa_ros.report.outcome import findings_of, level_results
-
-    runs = read_runs(
-        experiment.bag, joints=experiment.joints if len(experiment.joints) > 1 else ())
-    if experiment.levels:
-        return [], [level for each in runs for level in level_results(each)]
-    return [x for each in runs for x in findings_of(each, tolerances)], []
-
-
-def _report(bag: Path, path: Path) -> Path:
-    from hmsa_ros.files import write_text
+def _measure(experiment: 'Experiment', tolerances: 'Tolerances | None') -> 'list[Part]':
+    """Read the bag and judge the setpoints of each joint."""
     from hmsa_ros.recordings.bags import read_runs
     from hmsa_ros.report.arrivals import Part
     from hmsa_ros.report.evaluation import evaluate
-    from hmsa_ros.report.page import page
     from hmsa_ros.report.timing import timing
 
-    write_text(path, page([Part(x, evaluate(x), timing(x)) for x in read_runs(bag)]))
+    return [Part(x, evaluate(x, tolerances), timing(x)) for x in read_runs(
+        experiment.bag, joints=experiment.joints if len(experiment.joints) > 1 else ())]
+
+
+def _levels(parts: 'list[Part]') -> 'list[LevelResult]':
+    """Return what was measured of the levels."""
+    from hmsa_ros.report.outcome import level_results
+
+    return [level for x in parts for level in level_results(x.run)]
+
+
+def _report(parts: 'list[Part]', path: Path) -> Path:
+    from hmsa_ros.files import write_text
+    from hmsa_ros.report.page import page
+
+    write_text(path, page(parts))
     return path
 
 
@@ -184,19 +185,21 @@ def _verdict(
 
 
 def _print(
-        findings: 'list[Finding]', levels: 'list[LevelResult]', reason: str, done: 'Conducted',
-        bag: Path, report: Path | None) -> None:
-    from hmsa_ros.report.outcome import findings_table, level_table
+        experiment: 'Experiment', parts: 'list[Part]', reason: str, done: 'Conducted',
+        report: Path | None) -> None:
+    from hmsa_ros.report.comparison import setpoints
+    from hmsa_ros.report.outcome import level_table
 
+    levels = _levels(parts) if experiment.levels else []
     if levels:
         print(level_table(levels))
-    if findings:
-        print(findings_table(findings))
-    parts = [f'{key} {x:.1f} s' for key, x in done.seconds.items()]
+    elif any(x.evaluation.findings for x in parts):
+        print(setpoints(parts))
+    seconds = [f'{key} {x:.1f} s' for key, x in done.seconds.items()]
     if done.pace < _SLOW:
-        parts[1] += f' (simulated time at {done.pace:.2g} of real time)'
+        seconds[1] += f' (simulated time at {done.pace:.2g} of real time)'
     for line in (
-            *(f'note     {x}' for x in done.notes), f'time     {", ".join(parts)}',
-            f'verdict  {reason}', f'bag      {bag}',
+            *(f'note     {x}' for x in done.notes), f'time     {", ".join(seconds)}',
+            f'verdict  {reason}', f'bag      {experiment.bag}',
             *([] if report is None else [f'report   {report}'])):
         print(line)

@@ -56,6 +56,12 @@ def residual_text(results: Sequence[MoveResult], *, least: bool = False) -> str:
         f'{percent(x)} %' for x in ([min(shares)] if least else []) + [max(shares)]))
 
 
+def left_text(results: Sequence[MoveResult], *, least: bool = False) -> str:
+    """Return what some moves left in words, as a heading has it."""
+    text = residual_text(results, least=least)
+    return text if text == NOT_MOVED else f'residual {text}'
+
+
 def reach(parts: Sequence[Part], number: int) -> float:
     """Return how far an arrival's panel reaches from 0, in percent of the step."""
     return min(150.0, max([_LEAST_PERCENT, *(
@@ -87,5 +93,5 @@ def title(parts: Sequence[Part], number: int) -> str:
     results = results_of(parts, number)
     targets = ', '.join(dict.fromkeys(f'{x.stretch:.6g}' for x in results))
     said = verdicts([x.evaluation for x in parts], number)
-    left = residual_text(results, least=True)
-    return f'{results[0].place + 1}. to {targets}: {said}residual {left}'
+    left = left_text(results, least=True)
+    return f'{results[0].place + 1}. to {targets}: {left}{said}'

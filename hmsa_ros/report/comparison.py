@@ -9,6 +9,7 @@ import numpy as np
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.recordings.record import Run
 from hmsa_ros.report.arrivals import around, Part, step_of
+from hmsa_ros.report.evaluation import judged_from
 from hmsa_ros.table import Column, Table
 
 
@@ -42,29 +43,56 @@ def comparison(parts: Sequence[Part]) -> Table:
         raise BadInputError(
             f'{", ".join(x.run.label for x in parts)} have no setpoint: expected runs with '
             'requests or levels that hold a stretch')
-    rows = []
     labels = [x.label for x in labelled([x.run for x in parts])]
-    for number in range(count):
-        for label, part in zip(labels, parts, strict=True):
-            findings = part.evaluation.findings
-            if number >= len(findings):
-                continue
-            found = findings[number]
-            place = _place(part, number)
-            arrival = math.nan if place is None else part.evaluation.results[place].arrival
-            rows.append((
-                number + 1, label, found.setpoint.target, 1e3 * arrival,
-                *(found.setpoint.percent(x) if math.isfinite(x) else math.nan for x in (
-                    found.offset, found.offset_std, found.vibration, found.vibration_std)),
-                _apart(parts[0], part, number), str(found.verdict).replace('_', ' ')))
-    return Table((
-        Column('setpoint'), Column('run'), Column('target'), Column('move time', 'ms', '.4g'),
-        Column('offset', '%', '+%'), Column('offset std', '%', '%', '±'),
-        Column('vibration', '%', '%'), Column('vibration std', '%', '%', '±'),
-        Column('apart', '%', '%'), Column('verdict')), tuple(rows),
-        'move time: from the first level to rest; offset: mean less the target; vibration: peak '
-        f'to peak; apart: largest distance from the curve of {labels[0]}, from the start of the '
-        'move on; all in % of the step; ±: standard deviations')
+    rows = [
+        (number + 1, label, *_measured(part, number), _apart(parts[0], part, number),
+         _verdict(part, number))
+        for number in range(count) for label, part in zip(labels, parts, strict=True)
+        if number < len(part.evaluation.findings)]
+    return Table(
+        (Column('setpoint'), Column('run'), *_MEASURED, Column('apart', '%', '%'),
+         Column('verdict')), tuple(rows),
+        f'{_CAPTION}; apart: largest distance from the curve of {labels[0]}, from the start of '
+        'the move on; in % of the step')
+
+
+def setpoints(parts: Sequence[Part]) -> Table:
+    """Return what was measured of each setpoint of a run; parts are its joints."""
+    return Table(
+        (Column('setpoint'), *_MEASURED, Column('frequency', 'Hz', '.3g', 'f'),
+         Column('verdict')),
+        tuple((
+            f'{x.setpoint.joint} {x.setpoint.number}' if x.setpoint.joint else x.setpoint.number,
+            *_measured(part, number), x.frequency, _verdict(part, number))
+            for part in parts for number, x in enumerate(part.evaluation.findings)),
+        f'{_CAPTION}; f: frequency of the vibration; in % of the step')
+
+
+_MEASURED = (
+    Column('target'), Column('move time', 'ms', '.4g'), Column('residual', '%', '%'),
+    Column('judged from', 'ms', '.4g'), Column('offset', '%', '+%'),
+    Column('offset std', '%', '%', '±'), Column('vibration', '%', '%'),
+    Column('vibration std', '%', '%', '±'))
+_CAPTION = (
+    'move time: from the first level to planned rest, half a period for an unshaped step; '
+    'residual: peak to peak from then on; judged from: start of the samples that decide the '
+    'verdict, for an unshaped step once its vibration should have faded; offset: their mean less '
+    'the target; vibration: peak to peak in their first period; ±: standard deviations')
+
+
+def _measured(part: Part, number: int) -> tuple[float, ...]:
+    """Return the values of `_MEASURED`; NaN for what was not measured."""
+    found, place = part.evaluation.findings[number], _place(part, number)
+    result = None if place is None else part.evaluation.results[place]
+    return (
+        found.setpoint.target, *((math.nan, math.nan) if result is None else (
+            1e3 * result.arrival, 100.0 * result.residual)), 1e3 * judged_from(found),
+        *(found.setpoint.percent(x) for x in (
+            found.offset, found.offset_std, found.vibration, found.vibration_std)))
+
+
+def _verdict(part: Part, number: int) -> str:
+    return str(part.evaluation.findings[number].verdict).replace('_', ' ')
 
 
 def _place(part: Part, number: int) -> int | None:

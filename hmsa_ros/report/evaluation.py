@@ -12,7 +12,7 @@ import numpy as np
 
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces.topics import PLANNER
-from hmsa_ros.judge import Finding
+from hmsa_ros.judge import Finding, rests_from, Tolerances
 from hmsa_ros.model.delivery import late, pieces
 from hmsa_ros.model.equations import (
     Array,
@@ -118,16 +118,28 @@ class Evaluation:
         return (stamp - self.zero) / NANOSECONDS
 
 
+def judged_from(finding: Finding) -> float:
+    """Return from when on samples were judged, in s from the start of the move."""
+    return (rests_from(finding.setpoint) - finding.setpoint.begins) / NANOSECONDS
+
+
 def verdicts(evaluations: Sequence[Evaluation], number: int) -> str:
-    """Return the verdicts on a move in all runs that have it, each with a comma; or nothing."""
+    """Return the verdicts on a move in all runs that have it, each after a comma; or nothing."""
     places = [(x.findings, x.results[number].place) for x in evaluations
               if number < len(x.results)]
-    return ''.join(f'{x}, ' for x in dict.fromkeys(
-        str(found[i].verdict).replace('_', ' ') for found, i in places if i < len(found)))
+    return ''.join(f', {x}' for x in dict.fromkeys(
+        _verdict(found[i]) for found, i in places if i < len(found)))
 
 
-def evaluate(run: Run) -> Evaluation:
-    """Measure a run."""
+def _verdict(finding: Finding) -> str:
+    """Return a verdict, and from when on it holds where that is after the move."""
+    words = str(finding.verdict).replace('_', ' ')
+    late = finding.setpoint.arrival is None and finding.arrived
+    return f'{words} after {1e3 * judged_from(finding):.3g} ms' if late else words
+
+
+def evaluate(run: Run, tolerances: Tolerances | None = None) -> Evaluation:
+    """Measure a run, and judge it by tolerances, by default those of its planner."""
     levels = in_force((x,) for x in without_repeats(run.commands)[0])
     plan = in_force(run.plans)
     asked = setpoints_of(run)
@@ -151,7 +163,7 @@ def evaluate(run: Run) -> Evaluation:
         first, time, start, levels, found, tuple(results),
         through(Curve(time, run.stretch, run.rate), period), plain, plan,
         Curve((stamps - first) / NANOSECONDS, *_predict(run, plan, stamps)),
-        tuple(findings_of(run, asked=asked)))
+        tuple(findings_of(run, tolerances, asked=asked)))
 
 
 def _first(run: Run, levels: Sequence[Level], asked: Sequence[Requested]) -> int:

@@ -45,6 +45,7 @@ PLAIN = Look(VERMILION, 1.0, (4.0, 1.5))
 PLAN = Look(BLACK, 1.1, (1.0, 2.0), order=4)
 FIELD = Look(ORANGE, 1.1, (6.0, 1.5, 1.0, 1.5))
 TARGET = Look(GREY, 0.9, (2.0, 2.0), order=1)
+ARRIVAL = Look(BLACK, 0.8, (1.0, 1.5), order=1)
 
 #: Of the shapers, by name; `ordered` has those of several orders.
 SHAPERS = {

@@ -119,23 +119,6 @@ def level_results(run: Run) -> list[LevelResult]:
     return results
 
 
-def findings_table(findings: Sequence[Finding]) -> Table:
-    """Return the table of what was found of setpoints."""
-    return Table((
-        Column('setpoint'), Column('target'), Column('offset', '%', '+%'),
-        Column('offset std', '%', '%', '±'), Column('vibration', '%', '%'),
-        Column('vibration std', '%', '%', '±'), Column('frequency', 'Hz', '.3g', 'f'),
-        Column('verdict')),
-        tuple((
-            f'{x.setpoint.joint} {x.setpoint.number}' if x.setpoint.joint else x.setpoint.number,
-            x.setpoint.target, *(
-                x.setpoint.percent(y) if math.isfinite(y) else math.nan for y in (
-                    x.offset, x.offset_std, x.vibration, x.vibration_std)),
-            x.frequency, str(x.verdict).replace('_', ' ')) for x in findings),
-        'offset: mean stretch less the target; vibration: peak to peak; both in % of the step; '
-        '±: their standard deviations; f: frequency of the vibration')
-
-
 def level_table(levels: Sequence[LevelResult]) -> Table:
     """Return the table of the levels that were in force for the longest."""
     longest = sorted(levels, key=lambda x: -x.duration)[:_MOST_LEVELS]

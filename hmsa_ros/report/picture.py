@@ -10,9 +10,9 @@ import numpy as np
 from hmsa_ros.report import looks, style
 from hmsa_ros.report.arrivals import (
     around,
+    left_text,
     Part,
     reach,
-    residual_text,
     results_of,
     span,
     step_of,
@@ -20,11 +20,13 @@ from hmsa_ros.report.arrivals import (
 )
 from hmsa_ros.report.charts import commanded, time_unit, TimeUnit
 from hmsa_ros.report.curves import Curve, decimate
-from hmsa_ros.report.evaluation import verdicts
+from hmsa_ros.report.evaluation import period_of
 from hmsa_ros.report.paper import Paper
 
 # Samples are drawn as points where there are so many in a panel at most.
 _MOST_SAMPLES = 200
+# Dashes of more periods than these in a panel would run into each other.
+_DASHED, _THIN = 25.0, 0.6
 # What follows the last arrival is shown for so many durations of its move where nothing but rest,
 # within a share of the step, follows.
 _REST, _STILL = 8.0, 0.02
@@ -79,7 +81,10 @@ def draw(
                 style.axis('off target', unit='% of step') if i == shown[0] else '', letter)
             panel.set_title(_title(parts, i), loc='right', fontsize='small')
         figure.align_ylabels([axes['command'], axes['response']])
-        style.legend_below(figure, *(x for key, x in axes.items() if key != 'command'))
+        # Where curves are dense they lose their dashes, so that the response comes last.
+        style.legend_below(
+            figure, *(x for key, x in axes.items() if key not in ('command', 'response')),
+            axes['response'])
     return figure
 
 
@@ -105,14 +110,15 @@ def _shown_times(parts: Sequence[Part]) -> tuple[float, float]:
 
 def _draw_recorded(
         panel: Axes, part: Part, curve: tuple[Any, Any], samples: tuple[Any, Any],
-        look: looks.Look, *, alone: bool) -> None:
+        look: looks.Look, *, alone: bool, **more: Any) -> None:
     """Draw the curve through the samples, and these where they are few."""
-    panel.plot(*curve, **look.line(), label=part.run.origin if alone else part.run.label)
+    label = part.run.origin if alone else part.run.label
+    panel.plot(*curve, **{**look.line(), **more}, label=label)
     exact = part.run.origin == 'simulated' and not part.run.number('plant.stretch_noise')
     if not exact and len(samples[0]) < len(curve[0]) and len(samples[0]) <= _MOST_SAMPLES:
         panel.plot(
             *samples, linestyle='none', marker='o', markersize=2.2, color=look.colour, zorder=4,
-            label='samples')
+            label='samples' if alone else f'{label}, samples')
 
 
 def _draw_run(
@@ -131,14 +137,19 @@ def _draw_run(
     plain, curve, samples = (
         x.between(*times) for x in (
             found.plain, found.recorded, Curve(found.time, run.stretch, run.rate)))
+    dense: dict[str, Any] = {} if times[1] - times[0] <= _DASHED * period_of(run) else {
+        'linestyle': '-', 'linewidth': _THIN}
     if alone:
         # Several runs are compared by what was recorded.
-        for panel, x, y in (('response', *decimate(unit.of(plain.time), plain.stretch)),
-                            ('phase', plain.stretch, plain.rate)):
-            axes[panel].plot(x, y, **style.UNSHAPED, label='unshaped steps (simulated)')
+        for panel, x, y, more in (
+                ('response', *decimate(unit.of(plain.time), plain.stretch), dense),
+                ('phase', plain.stretch, plain.rate, {})):
+            axes[panel].plot(
+                x, y, **{**style.UNSHAPED, **more}, label='unshaped steps (simulated)')
     _draw_recorded(
         axes['response'], part, decimate(unit.of(curve.time), curve.stretch),
-        (unit.of(samples.time), samples.stretch), look, alone=alone)
+        (unit.of(samples.time), samples.stretch), look, alone=alone,
+        **(dense if look.dash else {}))
     _draw_recorded(
         axes['phase'], part, (curve.stretch, curve.rate), (samples.stretch, samples.rate), look,
         alone=alone)
@@ -164,13 +175,11 @@ def _draw_arrival(
     _draw_recorded(
         panel, part, decimate(*shown(found.recorded)),
         shown(Curve(found.time, part.run.stretch, part.run.rate)), look, alone=alone)
-    panel.axvline(1e3 * found.results[number].arrival, **style.TARGET)
+    # Of an unshaped step it is when a shaped one would have arrived.
+    panel.axvline(1e3 * found.results[number].arrival, **style.ARRIVAL, label='end of the move')
 
 
 def _title(parts: Sequence[Part], number: int) -> str:
     results = results_of(parts, number)
     targets = '/'.join(dict.fromkeys(f'{x.stretch:.5g}' for x in results))
-    if len(parts) > 1:
-        return f'to {targets}'
-    said = verdicts([x.evaluation for x in parts], number)
-    return f'to {targets}: {said}{residual_text(results)}'
+    return f'to {targets}' if len(parts) > 1 else f'to {targets}: {left_text(results)}'

@@ -28,7 +28,8 @@ from hmsa_ros.report import looks
 from hmsa_ros.report.looks import BLACK
 from hmsa_ros.report.paper import kind_of, Paper
 
-SHAPED, UNSHAPED, TARGET = (x.line() for x in (looks.RECORDED, looks.PLAIN, looks.TARGET))
+SHAPED, UNSHAPED, TARGET, ARRIVAL = (
+    x.line() for x in (looks.RECORDED, looks.PLAIN, looks.TARGET, looks.ARRIVAL))
 EQUILIBRIUM: dict[str, Any] = {
     'color': BLACK, 'linestyle': 'none', 'marker': 'o', 'markersize': 4.5, 'zorder': 5}
 #: Of words beside curves.

@@ -94,7 +94,8 @@ def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> 
         study,
     )
 
-    material, limits, delivery, _ = nominal(arguments)
+    material, limits, delivery, units = nominal(arguments)
+    unit = None if arguments.params_file is None else units.time
     shapers = None
     if arguments.shapers is not None:
         shapers = tuple(name.strip() for name in arguments.shapers.split(','))
@@ -111,7 +112,7 @@ def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> 
         count = len(compared)
         studies = [(x, results[i * count:(i + 1) * count]) for i, x in enumerate(cases)]
         files = (*files, *_write(folder, studies, arguments))
-        return _show(studies, list(files), as_json=arguments.json)
+        return _show(studies, list(files), unit, as_json=arguments.json)
 
     if in_chunks:
         table = folder / 'table.parquet'
@@ -130,15 +131,16 @@ def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> 
 
 
 def _show(
-        studies: 'list[tuple[Case, list[Result]]]', files: list[Path], *, as_json: bool) -> int:
-    """Print the results and the names of the files."""
+        studies: 'list[tuple[Case, list[Result]]]', files: list[Path], unit: float | None, *,
+        as_json: bool) -> int:
+    """Print the results, in seconds too where the unit of time is known in s, and the files."""
     if as_json:
         print(json_text({
-            'moves': [_record(case, results) for case, results in studies],
+            'moves': [_record(case, results, unit) for case, results in studies],
             'files': [str(path) for path in files]}))
         return 0
     for case, results in studies:
-        _print_table(case, results)
+        _print_table(case, results, unit)
     print(*files, sep='\n')
     return 0
 
@@ -165,7 +167,8 @@ def _write(
     return files
 
 
-def _record(case: 'Case', results: 'list[Result]') -> dict[str, Any]:
+def _record(
+        case: 'Case', results: 'list[Result]', unit: float | None) -> dict[str, Any]:
     """Return a case as the JSON output shows it; null where there is no such number."""
     from hmsa_studies.robustness import ORDERED, PARAMETERS
 
@@ -183,6 +186,7 @@ def _record(case: 'Case', results: 'list[Result]') -> dict[str, Any]:
             record |= {
                 'levels': [[x.time, x.load] for x in result.move.levels],
                 'arrival': result.arrival,
+                **({} if unit is None else {'arrival_seconds': result.arrival * unit}),
                 'arrives': math.isfinite(result.move.duration),
                 'residual': result.nominal,
                 'worst': {
@@ -207,7 +211,7 @@ def _record(case: 'Case', results: 'list[Result]') -> dict[str, Any]:
         'shapers': records}
 
 
-def _print_table(case: 'Case', results: 'list[Result]') -> None:
+def _print_table(case: 'Case', results: 'list[Result]', unit: float | None) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
@@ -222,7 +226,8 @@ def _print_table(case: 'Case', results: 'list[Result]') -> None:
         caption=f'residual: peak-to-peak {case.material.coordinate.name} after arrival in % of '
                 f'the step, without the steady-state error; worst case within {error} % of error, '
                 'in the last column for all errors at once; arrival in '
-                + ('L sqrt(rho/G)' if case.material.law is None else 'units of time'))
+                + ('ms' if unit else 'L sqrt(rho/G)' if case.material.law is None
+                   else 'units of time'))
     table.add_column('shaper', no_wrap=True)
     for name in ('arrival', 'nominal', *case.parameters, 'all'):
         table.add_column(name, justify='right', no_wrap=True)
@@ -230,7 +235,7 @@ def _print_table(case: 'Case', results: 'list[Result]') -> None:
         if result.move is None:
             table.add_row(result.candidate.name, *'---', *'-' * len(case.parameters))
             continue
-        arrival = f'{result.arrival:.3f}'
+        arrival = f'{result.arrival * (1e3 * unit if unit else 1.0):.3f}'
         table.add_row(
             result.candidate.name,
             arrival if math.isfinite(result.move.duration) else f'({arrival})',
