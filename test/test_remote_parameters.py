@@ -8,6 +8,8 @@ from rcl_interfaces.srv import GetParameters, GetParameterTypes, ListParameters
 from rclpy.parameter import Parameter
 
 from hmsa_ros.bag.experiment import parameter_key
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.lab.remote import RemoteNode
 from hmsa_ros.nodes.remote_parameters import RemoteParameters
 
 pytestmark = pytest.mark.ros
@@ -59,3 +61,9 @@ def test_a_parameter_without_a_value_hides_no_other(ros):
     ros.spin_until(lambda: asking.poll(found.append) or found, 'the answer')
     assert found[0][parameter_key(name, 'density')] == '1900.0'
     assert parameter_key(name, 'left.density') not in found[0]
+
+
+@pytest.mark.parametrize('name', ['law.name', '', 'a b', '/'])
+def test_what_cannot_be_a_node_is_refused(name):
+    with pytest.raises(BadInputError, match='expected the name of a node before that of a param'):
+        RemoteNode(name)

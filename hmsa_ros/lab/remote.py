@@ -8,8 +8,10 @@ from typing import Any
 
 from rcl_interfaces.msg import Parameter, ParameterType
 from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.parameter import get_parameter_value, parameter_value_to_python
+from rclpy.validate_topic_name import validate_topic_name
 
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, HmsaError
@@ -32,9 +34,20 @@ class RemoteNode:
     timeout : float
         Patience in s.
 
+    Raises
+    ------
+    BadInputError
+        If no node can have that name.
+
     """
 
     def __init__(self, name: str, namespace: str = '', timeout: float = 10.0) -> None:
+        try:
+            validate_topic_name(name)
+        except InvalidTopicNameException as error:
+            raise BadInputError(
+                f'node is {name!r}: expected the name of a node before that of a parameter, as '
+                'in planner law.name') from error
         self._name, self._where, self._timeout = name, namespace, timeout
         self._node = visit('parameters', namespace)
         self._executor = EventsExecutor(context=self._node.context)
