@@ -410,6 +410,24 @@ def test_plant_on_the_wall_clock_samples_the_present(bench):
     plant.check([(stamps[applied - 1], 0.05)], start=stamps[0])
 
 
+def test_a_plant_that_falls_behind_the_clock_says_so_once_in_its_diagnostics(bench, monkeypatch):
+    plant = bench()
+    arrays = plant.collect(topics.DIAGNOSTICS)
+    plant.ros.spin_until(lambda: len(plant.samples) > 100, 'samples')
+    device = plant.served.nodes[0].device
+    follow, jumps = device.follow, [2 * 10**9]
+    monkeypatch.setattr(
+        device, 'follow', lambda *x, **y: follow(*x, **y) or (jumps.pop() if jumps else 0))
+    said = 'the plant fell 2.000 s behind the clock: lower publish_rate'
+
+    def words() -> list[str]:
+        return [y.message for x in arrays for y in x.status if y.name == 'plant: time']
+
+    plant.ros.spin_until(lambda: said in words() and words()[-1] != said, said)
+    (warning,) = (y for x in arrays for y in x.status if y.message == said)
+    assert warning.level == DiagnosticStatus.WARN
+
+
 def test_plant_keeps_to_its_namespace(ros, serve):
     serve(PlantNode, *LEADING, '-r', '__ns:=/left')
     expected = {

@@ -107,6 +107,8 @@ class PlantNode(DeviceNode):
         self._clock_published = 0
         self._measured = (start, monotonic_ns())
         self._clocks_warned = False
+        # Time in ns that it was behind the clock and left out, since the last report.
+        self._fell = 0
 
         self._clock_publisher = (
             endpoints.publisher(self, topics.CLOCK_TOPIC) if self._authority else None)
@@ -162,6 +164,7 @@ class PlantNode(DeviceNode):
         self._clock_seen = now
         jump = self.device.follow(now, standing=self._standing)
         if jump:
+            self._fell += max(jump, 0) if behind else 0
             self.get_logger().warning(
                 _jump_in_words(jump, behind=behind), throttle_duration_sec=1.0)
         if not self._standing:
@@ -252,6 +255,11 @@ class PlantNode(DeviceNode):
         achieved = (self.device.time - then) / max(steady - since, 1) if then else 0.0
         level = 0
         message = f'time is held, {self.state}' if self._standing else 'time runs'
+        if self._fell:
+            level = 1
+            message = (f'the plant fell {self._fell / NANOSECONDS:.3f} s behind the clock: lower '
+                       'publish_rate')
+        self._fell = 0
         clocks = self.count_publishers(topics.CLOCK_TOPIC.name)
         if clocks > 1 and (self._authority or self.get_parameter('use_sim_time').value):
             level = 1
