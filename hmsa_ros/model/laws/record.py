@@ -7,7 +7,6 @@ from typing import Any
 from hmsa_ros.errors import BadInputError, excerpt
 
 # Families of laws: the first number of a packed material.
-ANY = -1.0  # one of them
 GENT = 0.0  # 1/J_lim
 NEO_HOOKEAN = 1.0  # none
 POLYNOMIAL = 2.0  # b, a_1 to a_5 of b (I2 - 3) + sum a_k (I1 - 3)^k
