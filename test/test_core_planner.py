@@ -233,7 +233,7 @@ BAD_POINTS = {
                       [(1.1, 40), (1.2, 80), (1.3, 50)]),
     'negative time': (Code.NOT_INCREASING, r'point 0 is -0.001 s: expected at least 0 s',
                       [(1.1, -1)]),
-    'too short': (Code.SPELL_TOO_SHORT, r'takes 0.005\d+ s, its span is 0.003 s',
+    'too short': (Code.SPELL_TOO_SHORT, r'takes 0.005\d+ s, its setpoint lasts 0.003 s',
                   [(1.1, 40), (1.2, 43)]),
     'too strong': (Code.FLUX_LIMIT, r'stretch 2.2 needs a flux density of .* T: expected -0.4 T '
                    'to 0.4 T', [(1.1, 40), (2.2, 80)]),

@@ -120,8 +120,8 @@ def test_whatever_the_spans_the_last_setpoint_is_reached(points, zeta):
 
 def test_a_spell_too_short_is_refused_with_both_times():
     with pytest.raises(RefusedError, match=(
-            r'the move from stretch 1.1 to 1.2 takes 1.353, its span is 1: expected a span at '
-            'least as long as the move')) as caught:
+            r'the move from stretch 1.1 to 1.2 takes 1.353, its setpoint lasts 1: '
+            'expected a duration at least as long as the move')) as caught:
         plan_sequence(setpoints((1.1, 10), (1.2, 1.0)), PAPER)
     assert caught.value.code is Code.SPELL_TOO_SHORT
 
@@ -142,7 +142,7 @@ def test_continue_plans_on_from_where_the_actuator_really_is():
     assert first.move.code is Code.SPELL_TOO_SHORT
     assert first.move.duration == math.inf
     assert len(first.move.levels) == 1
-    assert 'the span 0.7 ends before stretch 1.2 is reached' in first.move.reason
+    assert 'the duration 0.7 ends before stretch 1.2 is reached' in first.move.reason
     expected = follow((1.0, 0.0), [(0.7, first.move.levels[0].load)], 0.2, 5.0, 2.0)
     assert (last.start.stretch, last.start.rate) == pytest.approx(expected, abs=1e-11)
     assert last.start.rate > 0.1
@@ -180,7 +180,7 @@ REFUSALS = {
         Code.FLUX_LIMIT, r'stretch 1.35 needs a flux density of 0.9\d*: expected -1 to 0.9',
         lambda: plan_sequence(
             setpoints((1.35, 10)), PAPER, start=State(1.45), limits=Limits(-1.0, 0.9))),
-    'spell': (Code.SPELL_TOO_SHORT, 'its span is 0.5',
+    'spell': (Code.SPELL_TOO_SHORT, 'its setpoint lasts 0.5',
               lambda: plan_sequence(setpoints((1.1, 0.5)), PAPER)),
 }
 
@@ -209,7 +209,7 @@ def test_reasons_are_worded_in_the_units_given():
     with pytest.raises(RefusedError, match=r'of 0.1213 T: expected -0.1257 T to 0.06285 T'):
         plan_sequence(
             setpoints((1.4, 10)), PAPER, limits=Limits(-1.0, 0.5), units=units)
-    with pytest.raises(RefusedError, match=r'takes 0.005737 s, its span is 0.00218 s'):
+    with pytest.raises(RefusedError, match=r'takes 0.005737 s, its setpoint lasts 0.00218 s'):
         plan_sequence(setpoints((1.1, 0.5)), PAPER, units=units)
 
 
@@ -224,8 +224,9 @@ def test_arguments_out_of_range_are_bad_input(arguments, reason):
 
 
 @pytest.mark.parametrize(('stretch', 'span', 'reason'), [
-    (math.nan, 10.0, 'stretch is'), (math.inf, 10.0, 'stretch is inf'), (1.1, 0.0, 'span is 0'),
-    (1.1, -1.0, 'span is -1'), (1.1, math.nan, 'span is nan')])
+    (math.nan, 10.0, 'stretch is'), (math.inf, 10.0, 'stretch is inf'),
+    (1.1, 0.0, 'duration is 0'), (1.1, -1.0, 'duration is -1'),
+    (1.1, math.nan, 'duration is nan')])
 def test_setpoints_out_of_range_are_refused(stretch, span, reason):
     with pytest.raises(BadInputError, match=reason):
         Setpoint(stretch, span)

@@ -330,7 +330,7 @@ def test_a_sequence_begins_each_move_where_the_last_one_really_ended():
     # The first spell is too short: the second move starts from a moving state.
     first = get_shaper('two_step')(Request(State(1.0), 1.3, PAPER))
     setpoints = [Setpoint(1.3, 0.5 * first.duration), Setpoint(1.1, 10.0)]
-    with pytest.raises(RefusedError, match='its span is'):
+    with pytest.raises(RefusedError, match='its setpoint lasts'):
         plan_sequence(setpoints, PAPER)
     segments = plan_sequence(setpoints, PAPER, short_spell='continue', limits=WIDE)
     assert segments[0].move.code is Code.SPELL_TOO_SHORT

@@ -408,7 +408,7 @@ BAD = {
         trajectory((0.0, SPELL)), 'bad_input', 'expected a finite number greater than 0'),
     'flux_limit': (
         trajectory((2.2, SPELL)), 'flux_limit', 'stretch 2.2 needs a flux density of'),
-    'spell_too_short': (trajectory((1.3, MS)), 'spell_too_short', 'its span is 0.001 s'),
+    'spell_too_short': (trajectory((1.3, MS)), 'spell_too_short', 'its setpoint lasts 0.001 s'),
     'no_time_at_all': (trajectory((1.3, 0)), 'spell_too_short', 'time_from_start 0'),
     'jump_at_the_start': (
         trajectory((1.3, 0), (1.4, SPELL)), 'spell_too_short', 'at time_from_start 0'),

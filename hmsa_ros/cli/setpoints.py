@@ -52,7 +52,7 @@ def setpoint_of_joints(text: str) -> tuple[tuple[float, ...], float]:
             raise ValueError(text)
         found = [Setpoint(float(stretch), float(span)) for stretch in stretches.split(',')]
         if math.isinf(found[0].span):
-            raise BadInputError('span is inf: expected a finite number')
+            raise BadInputError('duration is inf: expected a finite number')
     except BadInputError as error:
         raise argparse.ArgumentTypeError(f'{text!r}: {error}') from error
     except ValueError:

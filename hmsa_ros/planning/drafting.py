@@ -126,7 +126,7 @@ def draft_sequence(
                     Code.SPELL_TOO_SHORT,
                     f'{outset.model.units.coordinate} {stretch:g} begins and ends within one '
                     f'command period of {outset.model.options.period / NANOSECONDS:g} s: expected '
-                    'a longer span')
+                    'a longer duration')
             setpoints.append(Setpoint(stretch, outset.model.time(end - left)))
             left = end
         if number % _CHECKED == _CHECKED - 1:

@@ -155,9 +155,9 @@ def segments(
                 raise RefusedError(
                     Code.SPELL_TOO_SHORT,
                     f'the move from {units.coordinate} {state.stretch:.6g} to '
-                    f'{setpoint.stretch:g} takes {units.time_text(move.duration)}, its span is '
-                    f'{units.time_text(setpoint.span)}: expected a span at least as long as the '
-                    'move')
+                    f'{setpoint.stretch:g} takes {units.time_text(move.duration)}, its setpoint '
+                    f'lasts {units.time_text(setpoint.span)}: expected a duration at least as '
+                    'long as the move')
             move = _cut(move, setpoint, units, last=following is None)
         end = _follow(state, move, setpoint, material, delivery)
         if following is not None and move.tail:
@@ -176,7 +176,7 @@ def _cut(move: Move, setpoint: Setpoint, units: Units, *, last: bool) -> Move:
     return replace(
         move if last else move.until(setpoint.span), code=Code.SPELL_TOO_SHORT,
         duration=move.duration if last else math.inf,
-        reason=f'the span {units.time_text(setpoint.span)} ends before '
+        reason=f'the duration {units.time_text(setpoint.span)} ends before '
         f'{units.coordinate} {setpoint.stretch:g} is reached, which takes '
         f'{units.time_text(move.duration)}')
 

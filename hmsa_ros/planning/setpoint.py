@@ -29,4 +29,4 @@ class Setpoint:
         if not math.isfinite(self.stretch):
             raise BadInputError(f'stretch is {self.stretch:g}: expected a finite number')
         if not self.span > 0.0:
-            raise BadInputError(f'span is {self.span:g}: expected a number greater than 0')
+            raise BadInputError(f'duration is {self.span:g}: expected a number greater than 0')
