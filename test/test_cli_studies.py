@@ -6,6 +6,7 @@ import csv
 import errno
 import io
 import json
+import math
 import os
 from pathlib import Path
 import signal
@@ -24,6 +25,8 @@ from hmsa_studies.scenario import SCENARIOS, STRATEGIES
 ROOT = Path(__file__).resolve().parent.parent
 PNG = b'\x89PNG\r\n\x1a\n'
 HEADER = 'start,target,zeta,j_lim,c1,status,beta_p,b_p,tau_p,beta_1,b_1'
+# Pictures that are not looked at.
+QUICKLY = '--dpi', 50, '--format', 'png'
 
 
 @pytest.fixture
@@ -133,7 +136,7 @@ def test_robustness_in_chunks_is_the_same_whatever_computes_it(run, tmp_path):
 
 def test_robustness_says_what_could_not_be_had(run):
     status, out, _ = run(
-        'robustness', '--move', '1:1.1', '--shapers', 'two_step,zv', '--zeta', 3)
+        'robustness', '--move', '1:1.1', '--shapers', 'two_step,zv', '--zeta', 3, *QUICKLY)
     assert status == 0
     assert 'note: two-step: zeta 3 is too damped' in out
     assert 'arrival of the two-step command (in brackets)' in out
@@ -158,9 +161,13 @@ def test_robustness_takes_the_actuator_of_a_file_with_its_law_and_its_coil(
     file.write_text('/**:\n  ros__parameters:\n    law.name: yeoh\n    law.c10: 5000.0\n'
                     '    law.c20: 500.0\n    coil_time_constant: 0.0005\n')
     status, out, _ = run(
-        'robustness', '--params-file', file, '--move', '1:1.3', '--shapers', 'two_step', '--json')
+        'robustness', '--params-file', file, '--move', '1:1.3', '--shapers', 'two_step', '--json',
+        *QUICKLY)
     assert status == 0
     found, = json.loads(out)['moves'][0]['shapers']
+    # In seconds, too: G is 2 c10 = 10 kPa, and L sqrt(rho/G) 4.359 ms.
+    assert found['arrival_seconds'] == pytest.approx(
+        found['arrival'] * 0.01 * math.sqrt(1900.0 / 1e4), rel=1e-9)
     # Known, neither law nor lag leaves anything; and there is no chain limit to be in error.
     assert found['residual'] < 1e-8
     assert found['worst']['G']['residual'] > 0.05
