@@ -6,6 +6,7 @@ would be over.
 */
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
+#include <errno.h>
 #include <poll.h>
 #include <pthread.h>
 #include <signal.h>
@@ -83,7 +84,7 @@ static PyObject *set(PyObject *self, PyObject *arguments) {
         PyErr_SetString(PyExc_ValueError, "expected a deadline of 0 or 1, and 0 to 1e6 s");
         return NULL;
     }
-    if (!counting && start()) {
+    if (!counting && (errno = start()) != 0) {
         return PyErr_SetFromErrno(PyExc_OSError);
     }
     atomic_store(&deadlines[number].status, status);
@@ -118,6 +119,10 @@ static struct PyModuleDef module = {
     NULL, NULL, NULL, NULL};
 
 PyMODINIT_FUNC PyInit__deadline(void) {
+    PyObject *made = PyModule_Create(&module);
+    if (made && PyModule_AddIntConstant(made, "LONGEST", LONGEST)) {
+        Py_CLEAR(made);
+    }
     pthread_atfork(NULL, NULL, forget);
-    return PyModule_Create(&module);
+    return made;
 }

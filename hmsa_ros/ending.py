@@ -21,8 +21,6 @@ from hmsa_ros import _deadline
 _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # How long a process may take to end when all is done, in s.
 _LAST_SECONDS = 3
-# Sentence of a process that is ended, in bytes.
-_LONGEST = 500
 # Deadlines of a process: of a call, and of its own end.
 _CALL, _END = 0, 1
 
@@ -129,7 +127,7 @@ def _raise_again(dropped: Any) -> None:
 
 def encoded(text: str) -> bytes:
     """Return a sentence as `Deadline` takes it."""
-    return f'hmsa: error: {text}'.encode()[:_LONGEST - 1] + b'\n'
+    return f'hmsa: error: {text}'.encode()[:_deadline.LONGEST - 1] + b'\n'
 
 
 class Deadline:

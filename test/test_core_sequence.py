@@ -180,8 +180,8 @@ REFUSALS = {
         Code.FLUX_LIMIT, r'stretch 1.35 needs a flux density of 0.9\d*: expected -1 to 0.9',
         lambda: plan_sequence(
             setpoints((1.35, 10)), PAPER, start=State(1.45), limits=Limits(-1.0, 0.9))),
-    'spell': (Code.SPELL_TOO_SHORT, 'its setpoint lasts 0.5',
-              lambda: plan_sequence(setpoints((1.1, 0.5)), PAPER)),
+    'duration': (Code.SPELL_TOO_SHORT, 'its setpoint lasts 0.5',
+                 lambda: plan_sequence(setpoints((1.1, 0.5)), PAPER)),
 }
 
 

@@ -146,10 +146,11 @@ class Calls:
         self._deadline = deadline
         self._texts: dict[str, bytes] = {}
         self._armed = False
-        self._begun: tuple[str, float] | None = None
+        # Name of the call under way, in a tuple of its own for each.
+        self._begun: tuple[str] | None = None
         # The call that was under way when `overdue` was last asked, when that was, and for how
         # long it has been since.
-        self._seen: tuple[str, float] | None = None
+        self._seen: tuple[str] | None = None
         self._looked = self._waited = 0.0
 
     def make_ready(self) -> None:
@@ -169,7 +170,7 @@ class Calls:
                     'calls')
             self._deadline.say(self._texts[name])
         begun = monotonic()
-        self._begun = name, begun
+        self._begun = (name,)
         try:
             return act(*arguments)
         finally:
