@@ -20,6 +20,7 @@ _LARGEST_FILE = 512 * 1024 * 1024
 _UNITS = {
     'time': {'s': 1.0, 'sec': 1.0, 'seconds': 1.0, 'ms': 1e-3, 'us': 1e-6, 'µs': 1e-6,
              'ns': 1e-9},
+    'current': {'a': 1.0, 'amperes': 1.0, 'ma': 1e-3, 'v': 1.0},
     'stretch': {'1': 1.0, '-': 1.0, '': 1.0},
     'flux_density': {'t': 1.0, 'tesla': 1.0, 'mt': 1e-3, 'g': 1e-4, 'gauss': 1e-4},
 }
@@ -159,7 +160,7 @@ def _places(
         if name in places:
             continue
         known = _UNITS[name]
-        default = {'time': 's', 'stretch': '', 'flux_density': 't'}[name]
+        default = {'time': 's', 'current': 'a', 'stretch': '', 'flux_density': 't'}[name]
         if (unit or default) not in known:
             raise BadInputError(
                 f'{path} gives {name} in {unit}: expected '

@@ -76,7 +76,7 @@ def _setting(text: str) -> tuple[str, Any]:
     import yaml
 
     key, given, value = text.partition('=')
-    if not given or not key.isidentifier():
+    if not given or not all(x.isidentifier() for x in key.split('.')):
         raise BadInputError(f'--set {text}: expected KEY=VALUE, as in --set port=/dev/ttyACM0')
     try:
         return key, yaml.safe_load(value)

@@ -113,6 +113,9 @@ def load(text: str) -> Callable[[str, Mapping[str, Any]], Hardware]:
     def made(joint: str, settings: Mapping[str, Any]) -> Hardware:
         try:
             found = make(joint, **settings)
+        except BadInputError as error:
+            raise BadInputError(
+                f'hardware {text!r} of joint {joint} does not start: {error}') from error
         except BaseException as error:
             takes = ' and the settings ' + ', '.join(
                 f'hardware.{x}' for x in settings) if settings else ''
@@ -246,7 +249,7 @@ class Instrument:
             value = getattr(self._hardware, name, None)
         except BaseException as error:  # of a property
             raise BadInputError(f'{self.name}.{name} raised {told(error)}') from error
-        if value is not None and not (_is_number(value) and value > 0.0):
+        if value is not None and not (is_number(value) and value > 0.0):
             raise BadInputError(
                 f'{self.name}.{name} is {excerpt(value)}: expected a number above 0, or None')
         return None if value is None else float(value)
@@ -312,9 +315,9 @@ class Instrument:
         when, really = (answer[0], answer[1]) if pair else (answer, level)
         if when is None:
             when = now
-        elif _is_number(when):
+        elif is_number(when):
             when = self._ours(when)
-        if not (_is_number(when) and self._may_be(when, now) and _is_number(really)):
+        if not (is_number(when) and self._may_be(when, now) and is_number(really)):
             raise HardwareError(
                 f'{self.name}.write of joint {self._joint} returned {excerpt(answer)}: expected '
                 f'when the level took effect in ns, near now, {now}, that and the level really '
@@ -335,14 +338,7 @@ class Instrument:
         """
         answer = self._call('read', self._theirs(now))
         try:
-            if isinstance(answer, (str, bytes)):
-                raise TypeError
-            values = (answer,) if _is_number(answer, finite=False) else (*answer,)
-            if len(values) > _MOST_PIECES:
-                raise ValueError
-            if any(_is_number(x, finite=False) for x in values):
-                return [self._reading(values, now)]
-            return [self._reading(x, now) for x in values]
+            return [self._stamped(x, now) for x in readings(answer)]
         except (TypeError, ValueError) as error:
             raise HardwareError(
                 f'{self.name}.read of joint {self._joint} returned {excerpt(answer)}: expected '
@@ -350,8 +346,7 @@ class Instrument:
                 f'list of the latter, at most {_MOST_PIECES}, with NaN for what is not measured'
             ) from error
 
-    def _reading(self, values: Sequence[Any], now: int) -> Reading:
-        found = _reading(values)
+    def _stamped(self, found: Reading, now: int) -> Reading:
         if found.stamp is None:
             return found
         stamp = self._ours(found.stamp)
@@ -397,7 +392,7 @@ class Instrument:
         """
         answer = self._call('applied')
         try:
-            if not all(_is_number(x) and _is_number(y) for x, y in answer):
+            if not all(is_number(x) and is_number(y) for x, y in answer):
                 raise TypeError
             found = [(self._ours(x), float(y)) for x, y in answer]
             if not all(self._may_be(x, now) for x, _ in found):
@@ -425,7 +420,7 @@ class Instrument:
         before = clock()
         answer = self._call('clock')
         after = clock()
-        if not _is_number(answer):
+        if not is_number(answer):
             raise HardwareError(
                 f'{self._names["clock"]} returned {excerpt(answer)}: expected its time in ns')
         return self.clock_map.add(before, int(answer), after)
@@ -464,21 +459,42 @@ class Instrument:
             getattr(self._hardware, 'close', lambda: None)()
 
 
+def readings(answer: Any) -> list[Reading]:
+    """
+    Return the readings in the answer of a ``read``.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If there are none in it.
+
+    """
+    if isinstance(answer, (str, bytes)):
+        raise TypeError('read returned text')
+    values = (answer,) if is_number(answer, finite=False) else (*answer,)
+    if len(values) > _MOST_PIECES:
+        raise ValueError(f'read returned more than {_MOST_PIECES} readings')
+    if any(is_number(x, finite=False) for x in values):
+        return [_reading(values)]
+    return [_reading(x) for x in values]
+
+
 def _reading(values: Sequence[Any]) -> Reading:
     """Return stretch, rate and stamp; raise TypeError or ValueError if they are none."""
     if len(values) > 3:
         raise TypeError
     stretch, rate, stamp = [*values, None, None][:3]
-    if not _is_number(stretch, finite=False) or not (
-            rate is None or _is_number(rate, finite=False)) or not (
-            stamp is None or _is_number(stamp)):
+    if not is_number(stretch, finite=False) or not (
+            rate is None or is_number(rate, finite=False)) or not (
+            stamp is None or is_number(stamp)):
         raise TypeError
     return Reading(
         float(stretch), math.nan if rate is None else float(rate),
         None if stamp is None else int(stamp))
 
 
-def _is_number(value: Any, *, finite: bool = True) -> bool:
+def is_number(value: Any, *, finite: bool = True) -> bool:
+    """Return whether a value is a real number, and finite where it must be."""
     if type(value) is bool or not isinstance(value, Real):
         return False
     try:
