@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.rosbag2.enums import StoragePlugin
 from rosbags.typesys import get_typestore, Stores
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import MagneticField
+from sensor_msgs.msg import JointState, MagneticField
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
@@ -354,6 +354,31 @@ def test_a_replay_begins_when_the_recorder_has_found_what_the_plant_sends(start,
     assert samples.count > 1
 
 
+def test_it_ends_when_samples_have_come_up_to_the_end(ros, play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [('/a', i, i) for i in range(50)])
+    end, samples = START + 49 * MS, ros.node.create_publisher(JointState, '/joint_states', 100)
+    seen = []
+    ros.node.create_subscription(
+        Clock, '/clock', lambda x: seen.append(x.clock.sec * 10**9 + x.clock.nanosec),
+        QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT))
+    process = play(
+        bag, 'play.clock_publish_frequency:=1000.0', 'play.wait_for_samples:=[joint_states]')
+    ros.spin_until(samples.get_subscription_count, 'a player that listens')
+
+    def publish(*stamps):
+        for stamp in stamps:
+            sample = JointState()
+            sample.header.stamp.sec, sample.header.stamp.nanosec = divmod(stamp, 10**9)
+            samples.publish(sample)
+
+    publish(end - 30 * MS, end - 29 * MS)
+    # It repeats the time of the end while it waits.
+    ros.spin_until(lambda: seen.count(end) > 5, 'the end')
+    assert process.popen.poll() is None
+    publish(end - MS, end)
+    assert process.wait() == 0, process.output
+
+
 @pytest.mark.slow
 def test_topics_without_end_are_refused_and_those_named_are_played(ros, play, tmp_path):
     path = tmp_path / 'bag.mcap'
@@ -393,6 +418,7 @@ def test_an_empty_bag_ends_at_once(play, tmp_path):
 
 
 @pytest.mark.parametrize(('parameters', 'expected'), [
+    (('storage.uri:={bag}', 'play.wait_for_samples:=[joint_states]'), 'needs a /clock'),
     ((), 'parameter storage.uri is empty'),
     (('storage.uri:=/none',), 'does not exist: expected the folder of a bag'),
     (('storage.uri:={bag}', 'play.rate:=0.0'), 'play.rate'),

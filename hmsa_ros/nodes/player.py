@@ -34,6 +34,7 @@ from hmsa_ros.interfaces.parameters import duration_from, duration_specs, Parame
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.audience import Audience
 from hmsa_ros.nodes.conversions import to_clock, to_status
+from hmsa_ros.nodes.followers import Followers
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare
 from hmsa_ros.nodes.runner import run
@@ -97,6 +98,10 @@ PARAMETERS = (
         'play.wait_for_subscribers_timeout', 60.0, 'How long to wait for subscribers and nodes.',
         's', 0.0, 1e6),
     ParameterSpec(
+        'play.wait_for_samples', [],
+        'Topics of samples (sensor_msgs/msg/JointState) from nodes that follow /clock: at the end '
+        'the player waits until they have reached the time of the last message.'),
+    ParameterSpec(
         'play.discovery_time', 3.5,
         'How long to look for existing subscribers; ends early once every topic has one, or '
         'every topic in play.wait_for_subscribers.', 's', 0.0, 3600.0),
@@ -110,8 +115,8 @@ PARAMETERS = (
         'thread.', '', 0, 99),
     *duration_specs(
         'play.wait_acked_timeout', 20,
-        'Whole seconds to wait at the end for acknowledgements of reliable subscribers; '
-        'negative for no wait.', -1),
+        'Whole seconds to wait at the end for acknowledgements of reliable subscribers, and for '
+        'the next sample of play.wait_for_samples; negative for no wait.', -1),
 )
 
 
@@ -156,6 +161,12 @@ class Player(ManagedNode):
         self._audience = Audience(
             self, self._senders, self._names('play.wait_for_subscribers'),
             self._names('play.wait_for_nodes'), self._recorder())
+        followers = self._names('play.wait_for_samples')
+        if followers and self._clock_out is None:
+            raise BadInputError(
+                'parameter play.wait_for_samples needs a /clock from the player: set '
+                'play.clock_publish_frequency')
+        self._followers = Followers(self, followers)
         # While inactive it is paused.
         self._resumes = not values['play.start_paused']
         self._transport = Transport(
@@ -261,6 +272,7 @@ class Player(ManagedNode):
                 f'{max(0, self._excerpt.end - self._excerpt.start) * 1e-9:.3f} s at rate '
                 f'{transport.rate:g}')
             self._sender.run()
+            self._wait_for_followers(transport)
             self._finish(transport)
         except HmsaError as error:
             self.failure = error
@@ -291,6 +303,22 @@ class Player(ManagedNode):
                     f'no {", no ".join(missing)} within {timeout:g} s: expected one; start it, '
                     'or remove it from play.wait_for_subscribers, play.wait_for_nodes and '
                     'play.wait_for_recorder')
+
+    def _wait_for_followers(self, transport: Transport) -> None:
+        """Wait while nodes that follow the clock come nearer to the time it shows now."""
+        limit = duration_from(self._values, 'play.wait_acked_timeout') * 1e-9
+        behind, since = self._followers.behind(self._excerpt.end), time.monotonic()
+        while limit >= 0.0 and behind and not transport.rest(_POLL_SECONDS):
+            # It may be lost on its way.
+            self._send_clock(self._excerpt.end)
+            now = self._followers.behind(self._excerpt.end)
+            if now != behind:
+                behind, since = now, time.monotonic()
+            elif time.monotonic() >= since + limit:
+                self.get_logger().warning(
+                    f'no sample within {limit:g} s, and {self._followers.in_words(behind)}: '
+                    'expected samples until the end of the bag; look at their publisher')
+                break
 
     def _finish(self, transport: Transport) -> None:
         """Wait for reliable subscribers and say what was sent."""
