@@ -17,4 +17,6 @@ FAULTS = (
     *samples.FAULTS, *hardware.FAULTS, *bags.FAULTS, *apart.FAULTS)
 
 #: What the tests inject: one of each kind.
-QUICK = ('none', 'twice', 'planner_restarted', 'stranger_first', 'parameter_refused')
+QUICK = (
+    'none', 'twice', 'planner_restarted', 'planner_stopped', 'stranger_first',
+    'parameter_refused')
