@@ -18,6 +18,7 @@ import pkgutil
 import re
 from typing import Any
 
+from codes import EXPLANATIONS
 from docutils import nodes
 from docutils.parsers.rst import directives
 from numpydoc.docscrape import get_doc_object
@@ -29,7 +30,7 @@ from sphinx.util.docutils import SphinxDirective
 from hmsa_ros import errors
 from hmsa_ros.cli import build_parser
 from hmsa_ros.interfaces import topics
-from hmsa_ros.model.status import Code, EXPLANATIONS
+from hmsa_ros.model.status import Code
 
 LOGGER = logging.getLogger(__name__)
 PACKAGES = Path(errors.__file__).parent.parent
@@ -278,7 +279,7 @@ class Codes(Generated):
             if code not in EXPLANATIONS:
                 self.missing(
                     f'code {code} in hmsa_ros.model.status is not explained: expected an entry '
-                    'in EXPLANATIONS')
+                    'in docs/_ext/codes.py')
         return table(
             ('code', 'meaning', 'what to do'),
             ((f'`{code}`', *EXPLANATIONS[code]) for code in Code if code in EXPLANATIONS))
