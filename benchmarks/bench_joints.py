@@ -18,7 +18,8 @@ from hmsa_ros.interfaces import topics
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.capture import Capture, Taken
-from hmsa_ros.nodes.conversions import stamp_of, to_trajectory
+from hmsa_ros.nodes.cdr import stamp_of
+from hmsa_ros.nodes.conversions import to_trajectory
 
 #: Joints of one plant and planner, by the rate of samples in Hz.
 _JOINTS = ((1, 1000.0), (16, 1000.0), (64, 1000.0), (128, 1000.0), (64, 4000.0))

@@ -147,7 +147,7 @@ def check_bag(folder: Path, kind: str, killed: str, step: int = _STEP_NS) -> Cyc
     from hmsa_ros.bag.reader import BagReader
     from hmsa_ros.bag.recover import recover
     from hmsa_ros.errors import HmsaError
-    from hmsa_ros.nodes.conversions import stamp_of
+    from hmsa_ros.nodes.cdr import stamp_of
     from hmsa_ros.recordings.verify import verify
 
     found = Cycle(kind, killed)
@@ -437,7 +437,7 @@ class Soak:
         """Send garbage; in calm cycles only where it cannot reach the plant or what is checked."""
         from benchmarks.faults import garbage
         from hmsa_ros.interfaces import topics
-        from hmsa_ros.nodes.message_types import interface_class
+        from hmsa_ros.nodes.endpoints import interface_class
 
         inputs = [
             x for x in self._topics
@@ -464,7 +464,7 @@ class Soak:
         from std_srvs.srv import SetBool
 
         from benchmarks.faults.inputs import wild_request
-        from hmsa_ros.nodes.message_types import interface_class
+        from hmsa_ros.nodes.endpoints import interface_class
 
         choice = self._dice.random()
         if choice < 0.4:

@@ -83,7 +83,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def bound(kind: Any, qos: Any = 1000) -> tuple[Any, Any]:
     """Return message class and profile, of rclpy or as `hmsa_ros.interfaces` names them."""
     from hmsa_ros.nodes import endpoints
-    from hmsa_ros.nodes.message_types import interface_class
+    from hmsa_ros.nodes.endpoints import interface_class
     return (interface_class(kind) if isinstance(kind, str) else kind,
             endpoints.profile(qos) if isinstance(qos, endpoints.Quality) else qos)
 

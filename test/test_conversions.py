@@ -17,7 +17,7 @@ from hmsa_ros.judge import Finding, missed, Setpoint, unobserved
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.nodes import conversions
-from hmsa_ros.nodes.trajectories import read_trajectory
+from hmsa_ros.nodes.cdr import read_trajectory
 from hmsa_ros.planning.group import PlannerGroup, Progress
 from hmsa_ros.planning.planner import Options, Planner
 

@@ -8,7 +8,7 @@ from rclpy.parameter import Parameter
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.parameters import ACTUATOR, INITIAL_STRETCH, JOINT, ParameterSpec
-from hmsa_ros.nodes.joints import declare_joints, joint_names, JOINTS
+from hmsa_ros.nodes.parameters import declare_joints, joint_names, JOINTS
 
 OWN = (*ACTUATOR, INITIAL_STRETCH)
 SPECS = (*OWN, JOINT, JOINTS, ParameterSpec('other', 1, 'Not for one joint.', '', 0, 9))

@@ -21,9 +21,8 @@ from hmsa_ros.interfaces.parameters import ACTUATOR, BLOCK, ParameterSpec
 from hmsa_ros.interfaces.topics import NODES
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 import hmsa_ros.nodes
-from hmsa_ros.nodes import planning, plant_joint
-from hmsa_ros.nodes.joints import declare_joints
-from hmsa_ros.nodes.parameters import check_names, declare, type_of
+from hmsa_ros.nodes import planning, plant
+from hmsa_ros.nodes.parameters import check_names, declare, declare_joints, type_of
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 
@@ -45,7 +44,7 @@ DIMENSIONLESS = {
     'arrival_tolerance', 'feedback_tolerance', 'stretch_tolerance', 'vibration_tolerance',
     *(f'mismatch.{x.name.partition(".")[2]}' for x in ACTUATOR)}
 
-OWN = {'planner': planning.OWN, 'plant': plant_joint.OWN}
+OWN = {'planner': planning.OWN, 'plant': plant.OWN}
 
 every_node = pytest.mark.parametrize('node', DECLARED)
 

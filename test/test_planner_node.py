@@ -22,8 +22,9 @@ from hmsa_ros.interfaces import topics
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.nodes.conversions import from_command, from_time, to_time, to_trajectory
 from hmsa_ros.nodes.planner import PlannerNode
-from hmsa_ros.planning.planner import Options, PlannedLevel, Planner
+from hmsa_ros.planning.planner import Options, Planner
 from hmsa_ros.planning.shapers.pace import Pace
+from hmsa_ros.planning.timeline import PlannedLevel
 
 pytestmark = pytest.mark.ros
 

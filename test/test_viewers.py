@@ -24,8 +24,8 @@ from hmsa_ros import rerun_view
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.actuator import parameters_of
 from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.nodes.endpoints import interface_class
 from hmsa_ros.nodes.markers import Block, Scene, State
-from hmsa_ros.nodes.message_types import interface_class
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIG = ROOT / 'config'

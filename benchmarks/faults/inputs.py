@@ -13,7 +13,7 @@ from benchmarks.faults.rig import hushed, Rig
 from benchmarks.faults.table import Seen
 from hmsa_ros.interfaces import topics
 from hmsa_ros.nodes.conversions import to_command
-from hmsa_ros.nodes.message_types import interface_class
+from hmsa_ros.nodes.endpoints import interface_class
 
 FAULTS = Register()
 _COUNT = 300

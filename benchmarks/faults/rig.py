@@ -26,7 +26,7 @@ from hmsa_ros.interfaces import topics
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
-from hmsa_ros.nodes.message_types import interface_class
+from hmsa_ros.nodes.endpoints import interface_class
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 #: Patience with a process that starts, or with a condition, in s.

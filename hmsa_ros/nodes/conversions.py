@@ -15,7 +15,6 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.schedule import obeyed
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.nodes.cdr import Cursor
 
 if TYPE_CHECKING:
     # It comes along with the planner, which a recorder has no use for.
@@ -154,14 +153,6 @@ def to_status(
     return DiagnosticStatus(
         name=name, hardware_id=joint, level=bytes([level]), message=message,
         values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
-
-
-def stamp_of(data: bytes) -> int:
-    """Return the stamp in ns of a serialized message that begins with a header, else 0."""
-    try:
-        return Cursor(data).time()
-    except BadInputError:
-        return 0
 
 
 def to_diagnostics(stamp: int, *statuses: DiagnosticStatus) -> DiagnosticArray:

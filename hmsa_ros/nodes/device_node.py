@@ -17,9 +17,9 @@ from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.parameters import ParameterSpec
 from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.guard import COMMAND_SOURCES, CommandInput
-from hmsa_ros.nodes.joints import JointParameters
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.outlet import Outlet
+from hmsa_ros.nodes.parameters import JointParameters
 from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.samples import SamplePublisher
 

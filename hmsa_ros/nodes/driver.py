@@ -27,8 +27,8 @@ from hmsa_ros.nodes.device_node import (
     fallback_from,
     PUBLISH_SCALARS,
 )
-from hmsa_ros.nodes.joints import declare_joints, JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART
+from hmsa_ros.nodes.parameters import declare_joints, JointParameters, JOINTS
 from hmsa_ros.nodes.runner import run
 
 # How long hardware may take to start before that is said, in s.

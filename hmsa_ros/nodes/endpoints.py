@@ -1,6 +1,7 @@
 """Topics and services (`hmsa_ros.interfaces.topics`) on a node of rclpy."""
 
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
 from rclpy.node import Node
@@ -8,10 +9,35 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
+from hmsa_ros.bag.definitions import is_interface_package
+from hmsa_ros.errors import BagError
 from hmsa_ros.interfaces.topics import from_outside, Quality, Service, Topic
 from hmsa_ros.nodes.capture import RawSubscription
-from hmsa_ros.nodes.message_types import interface_class
 from hmsa_ros.nodes.service_call import ServiceCall
+
+
+def interface_class(type_name: str) -> type[Any]:
+    """
+    Return the class of a message, service or action type like ``'std_msgs/msg/Float64'``.
+
+    Raises
+    ------
+    BagError
+        If its package is not installed.
+
+    """
+    parts = type_name.split('/')
+    try:
+        package, folder, name = parts
+        # The name may come from anybody's bag: nothing but an interface is ever imported.
+        if folder not in ('msg', 'srv', 'action') or not is_interface_package(package):
+            raise ImportError(type_name)
+        found: type[Any] = getattr(import_module(f'{package}.{folder}'), name)
+    except (ValueError, ImportError, AttributeError) as error:
+        raise BagError(
+            f'message type {type_name} is not installed: expected its Python package; source '
+            'its workspace') from error
+    return found
 
 
 def profile(quality: Quality) -> QoSProfile:

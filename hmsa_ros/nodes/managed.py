@@ -30,7 +30,6 @@ from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.parameters import ParameterSpec
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import to_diagnostics
-from hmsa_ros.nodes.message_types import interface_class
 from hmsa_ros.nodes.outlet import Outlet
 from hmsa_ros.nodes.parameters import check_former_names, check_names, declare
 
@@ -117,7 +116,7 @@ class ManagedNode(LifecycleNode):
                 response.success, response.message = False, str(error)
             return response
 
-        self.create_service(interface_class(service.type), service.name, answer)
+        self.create_service(endpoints.interface_class(service.type), service.name, answer)
 
     def diagnose(
             self, report: Callable[[], Iterable[DiagnosticStatus]]) -> Callable[[], None]:

@@ -14,18 +14,8 @@ from rclpy.parameter import Parameter
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 
+from hmsa_ros.control import records
 from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.records import (
-    EstimateChanged,
-    Note,
-    Output,
-    PlanChanged,
-    Send,
-    Severity,
-    StatusChanged,
-    Stop,
-    Trajectory,
-)
 from hmsa_ros.control.takeover import Seen
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces import topics
@@ -35,16 +25,15 @@ from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.capture import decode, RawSubscription
+from hmsa_ros.nodes.cdr import read_trajectory, stamp_of
 from hmsa_ros.nodes.channel import JointChannel
-from hmsa_ros.nodes.joints import declare_joints
 from hmsa_ros.nodes.managed import AUTOSTART, ManagedNode
-from hmsa_ros.nodes.marker_publisher import TargetMarkers
+from hmsa_ros.nodes.markers import TargetMarkers
 from hmsa_ros.nodes.newest_clock import NewestClock
-from hmsa_ros.nodes.parameters import check_names
+from hmsa_ros.nodes.parameters import check_names, declare_joints
 from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from, SPECS
 from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.runner import run
-from hmsa_ros.nodes.trajectories import read_trajectory
 from hmsa_ros.timekeeping import StepWatch
 
 PARAMETERS = SPECS
@@ -109,9 +98,9 @@ class PlannerNode(ManagedNode):
             endpoints.publisher(self, x) for x in (topics.PLAN, topics.STATUS, topics.ESTIMATE))
         self._targets = TargetMarkers(self, self._settings)
         self._publish: dict[type, Callable[..., None]] = {
-            Send: self._publish_command, PlanChanged: self._publish_plan,
-            StatusChanged: self._publish_status, EstimateChanged: self._publish_estimate,
-            Note: self._log}
+            records.Send: self._publish_command, records.PlanChanged: self._publish_plan,
+            records.StatusChanged: self._publish_status,
+            records.EstimateChanged: self._publish_estimate, records.Note: self._log}
         endpoints.subscribe(self, topics.JOINT_TRAJECTORY, self._on_trajectory, raw=True)
         self.offer(topics.STOP, self._on_stop)
         self.offer(topics.RESET_ESTIMATE, lambda: (True, self._runtime.feedback.reset()))
@@ -157,20 +146,20 @@ class PlannerNode(ManagedNode):
         try:
             request = read_trajectory(data)
         except BadInputError as error:
-            self._runtime.planning.refuse(error, Trajectory((), (), 0))
+            self._runtime.planning.refuse(error, records.Trajectory((), (), 0))
         else:
             self._runtime.request(request)
         self._serve()
 
     def _on_stop(self) -> tuple[bool, str]:
-        verdict = self._runtime.request(Stop())
+        verdict = self._runtime.request(records.Stop())
         self._serve()
-        return verdict.severity < Severity.ERROR, verdict.message
+        return verdict.severity < records.Severity.ERROR, verdict.message
 
     def _on_sample(self, data: bytes) -> None:
         # Most of a thousand samples a second are of no use, and reading them takes time. Those of
         # two plants are not of one actuator.
-        if self._runtime.crowded or not self._runtime.looks_at(conversions.stamp_of(data)):
+        if self._runtime.crowded or not self._runtime.looks_at(stamp_of(data)):
             return
         try:
             message = decode(data, JointState)
@@ -261,29 +250,29 @@ class PlannerNode(ManagedNode):
 
     # -- out -----------------------------------------------------------------------------------
 
-    def _take(self, outputs: Iterable[Output]) -> None:
+    def _take(self, outputs: Iterable[records.Output]) -> None:
         for output in outputs:
             self._publish[type(output)](output)
 
-    def _publish_command(self, command: Send) -> None:
+    def _publish_command(self, command: records.Send) -> None:
         self._channels[command.joint].send(command, self._settings['frame_id'])
 
-    def _publish_plan(self, plan: PlanChanged) -> None:
+    def _publish_plan(self, plan: records.PlanChanged) -> None:
         self._plan.publish(conversions.to_plan(plan.stamps, plan.samples))
 
-    def _publish_status(self, status: StatusChanged) -> None:
+    def _publish_status(self, status: records.StatusChanged) -> None:
         self._status.publish(conversions.to_planner_status(status))
         self._targets.show(self.now(), {
             name: float(x.stretch) if x.stretch else None for name, x in status.each.items()})
 
-    def _publish_estimate(self, estimate: EstimateChanged) -> None:
+    def _publish_estimate(self, estimate: records.EstimateChanged) -> None:
         self._estimate.publish(conversions.to_diagnostics(
             estimate.time, conversions.to_status(
                 f'{self.get_name()}: estimate', estimate.joint, estimate.severity,
                 estimate.message, estimate.values)))
 
-    def _log(self, note: Note) -> None:
-        if note.severity is Severity.ERROR:
+    def _log(self, note: records.Note) -> None:
+        if note.severity is records.Severity.ERROR:
             self.get_logger().error(note.message)
         else:
             self.get_logger().warning(note.message)
@@ -292,7 +281,7 @@ class PlannerNode(ManagedNode):
         severity, message, values = self._runtime.report()
         self._serve()
         if crowded := self._crowd():
-            severity, message = Severity.ERROR, crowded
+            severity, message = records.Severity.ERROR, crowded
             if crowded != self._crowded:
                 self.get_logger().error(crowded)
         self._crowded = crowded

@@ -11,26 +11,14 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.files import errors_from
 from hmsa_ros.identification.known import Known
 from hmsa_ros.identification.quantities import check_free
+from hmsa_ros.interfaces import parameters as shared
 from hmsa_ros.interfaces.actuator import planned_from
-from hmsa_ros.interfaces.parameters import (
-    BLOCK,
-    COIL_TIME_CONSTANT,
-    CREEP_TOLERANCE,
-    FIXED,
-    FLUX_DENSITY_MAX,
-    FLUX_DENSITY_MIN,
-    INITIAL_STRETCH,
-    JOINT,
-    KNOWN,
-    ParameterSpec,
-    SLEW_LIMIT,
-    VISCOELASTIC,
-)
+from hmsa_ros.interfaces.parameters import ParameterSpec
 from hmsa_ros.judge import Tolerances
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.nodes.joints import JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART
-from hmsa_ros.nodes.marker_publisher import MARKER_SCALE
+from hmsa_ros.nodes.markers import MARKER_SCALE
+from hmsa_ros.nodes.parameters import JointParameters, JOINTS
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Options, Planner
 from hmsa_ros.planning.sequence import SHORT_SPELL
@@ -44,8 +32,8 @@ _SETTINGS = Settings()
 
 #: Parameters that a joint may have a value of its own for.
 OWN = (
-    *(replace(x, read_only=x.name in FIXED) for x in BLOCK),
-    INITIAL_STRETCH,
+    *(replace(x, read_only=x.name in shared.FIXED) for x in shared.BLOCK),
+    shared.INITIAL_STRETCH,
     ParameterSpec(
         'shaper', 'two_step', 'Shaper that plans each move.', choices=tuple(SHAPERS),
         read_only=False),
@@ -72,18 +60,18 @@ OWN = (
         'stretch_rate_max', 0.0,
         'Maximum stretch rate of the shaper smooth; 0 for any.', '1/s', 0.0, 1e12,
         read_only=False),
-    replace(SLEW_LIMIT, read_only=False),
-    replace(COIL_TIME_CONSTANT, read_only=False),
-    *VISCOELASTIC,
-    replace(CREEP_TOLERANCE, read_only=False),
-    replace(FLUX_DENSITY_MIN, read_only=False),
-    replace(FLUX_DENSITY_MAX, read_only=False),
-    *KNOWN,
+    replace(shared.SLEW_LIMIT, read_only=False),
+    replace(shared.COIL_TIME_CONSTANT, read_only=False),
+    *shared.VISCOELASTIC,
+    replace(shared.CREEP_TOLERANCE, read_only=False),
+    replace(shared.FLUX_DENSITY_MIN, read_only=False),
+    replace(shared.FLUX_DENSITY_MAX, read_only=False),
+    *shared.KNOWN,
 )
 
 SPECS = (
     *OWN,
-    JOINT,
+    shared.JOINT,
     JOINTS,
     ParameterSpec(
         'allow_partial_joints', _SETTINGS.allow_partial_joints,

@@ -1,35 +1,128 @@
 """Plant node: simulated actuators, driven by stamped flux density commands."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 import math
 from time import monotonic_ns, time_ns
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import WrenchStamped
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.parameter import Parameter
 
+from hmsa_ros.control.seldom import Seldom
 from hmsa_ros.device.health import too_few_samples
+from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces import parameters as shared
 from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.parameters import JOINT, ParameterSpec, PUBLISH_RATE
-from hmsa_ros.model.actuators import unheld
+from hmsa_ros.interfaces.actuator import actuator_from, creep_from
+from hmsa_ros.interfaces.parameters import ParameterSpec
+from hmsa_ros.model.actuators import check_stretch, Setup, unheld
 from hmsa_ros.model.pacer import Pacer
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
-from hmsa_ros.nodes.device_node import COMMAND_SOURCE, DeviceNode, PUBLISH_SCALARS
-from hmsa_ros.nodes.joints import declare_joints, JointParameters, JOINTS
+from hmsa_ros.nodes.device_node import (
+    COMMAND_SOURCE,
+    DeviceJoint,
+    DeviceNode,
+    FALLBACK,
+    fallback_from,
+    PUBLISH_SCALARS,
+)
 from hmsa_ros.nodes.managed import AUTOSTART
-from hmsa_ros.nodes.marker_publisher import MARKER_FRAME, MARKER_RATE, MARKER_SCALE, StateMarkers
-from hmsa_ros.nodes.markers import State
-from hmsa_ros.nodes.plant_joint import joint_from, OWN, PlantJoint
+from hmsa_ros.nodes.markers import MARKER_FRAME, MARKER_RATE, MARKER_SCALE, State, StateMarkers
+from hmsa_ros.nodes.parameters import declare_joints, JointParameters, JOINTS
 from hmsa_ros.nodes.runner import run
+
+#: Parameters that each joint may have values of its own for.
+OWN = (
+    *shared.BLOCK,
+    shared.INITIAL_STRETCH,
+    *shared.MISMATCH,
+    *shared.VISCOELASTIC,
+    shared.SLEW_LIMIT,
+    shared.COIL_TIME_CONSTANT,
+    ParameterSpec(
+        'stretch_noise', 0.0, 'Standard deviation of the noise on the published stretch.',
+        '', 0.0, 1e3),
+    ParameterSpec(
+        'rate_noise', 0.0, 'Standard deviation of the noise on the published stretch rate.', '1/s',
+        0.0, 1e9),
+    ParameterSpec(
+        'stretch_bias', 0.0, 'Sensor bias, added to the published stretch.', '', -1e3, 1e3),
+    ParameterSpec(
+        'stretch_gain', 1.0,
+        'Sensor gain, a factor on the published stretch and stretch rate.', '', 1e-3, 1e3),
+    *FALLBACK,
+    ParameterSpec(
+        'reset_stretch', 0.0,
+        'Stretch after ~/reset, held by its equilibrium flux density; 0 for initial_stretch.', '',
+        -1.0, 1e3, read_only=False),
+    ParameterSpec(
+        'reset_rate', 0.0, 'Stretch rate after ~/reset.', '1/s', -1e9, 1e9,
+        read_only=False),
+)
+
+
+class PlantJoint(DeviceJoint):
+    """A simulated actuator on the wire, which forces may disturb."""
+
+    _device: SimulatedDevice
+
+    def __init__(self, node: DeviceNode, number: int) -> None:
+        super().__init__(node, number)
+        self._tell_force = Seldom()
+        endpoints.subscribe(node, topics.of_joint(
+            topics.DISTURBANCE_FORCE, self.name, node.values.names), self._on_force)
+
+    def _on_force(self, message: WrenchStamped) -> None:
+        if not self._node.active:
+            return
+        try:
+            self._device.push(self._number, *_from_wrench(message))
+        except BadInputError as error:
+            if self._tell_force():
+                self._node.get_logger().error(f'{self._of_me}disturbance refused: {error}')
+
+
+def joint_from(values: Mapping[str, Any]) -> SimulatedJoint:
+    """Return the joint that the values of `OWN` describe: the block times the mismatch."""
+    actuator = actuator_from(values)
+    if values['reset_stretch']:
+        check_stretch(
+            values['reset_stretch'], actuator.nondimensional, 'reset_stretch')
+    return SimulatedJoint(
+        Setup(
+            actuator, values['initial_stretch'], values['slew_limit'] or math.inf,
+            values['coil_time_constant'], creep_from(values)),
+        fallback_from(values),
+        SensorErrors(
+            values['stretch_noise'], values['rate_noise'], values['stretch_bias'],
+            values['stretch_gain']))
+
+
+def _from_wrench(message: WrenchStamped) -> tuple[int, float]:
+    """Return stamp in ns and force along the field in N of a disturbance."""
+    force, torque = message.wrench.force, message.wrench.torque
+    if not math.isfinite(force.z):
+        raise BadInputError(f'force.z is {force.z:g} N: expected a finite number')
+    if any((force.x, force.y, torque.x, torque.y, torque.z)):
+        raise BadInputError(
+            'a force across the field or a torque: expected force.z alone, the block moves '
+            'along the field only')
+    stamp = conversions.from_time(message.header.stamp)
+    if stamp < 0:
+        raise BadInputError(f'disturbing force stamped {stamp} ns: expected at least 0')
+    return stamp, float(force.z)
+
 
 PARAMETERS = (
     AUTOSTART,
     *OWN,
-    JOINT,
+    shared.JOINT,
     JOINTS,
     COMMAND_SOURCE,
     ParameterSpec(
@@ -42,7 +135,7 @@ PARAMETERS = (
         's', 0.0, 1e3),
     ParameterSpec(
         'seed', 0, 'Seed of the noise; the same seed gives the same run.', '', 0, 2**31 - 1),
-    PUBLISH_RATE,
+    shared.PUBLISH_RATE,
     PUBLISH_SCALARS,
     ParameterSpec(
         'publish_clock', False,

@@ -8,7 +8,7 @@ from rclpy.node import Node
 from hmsa_ros.bag.reader import BagReader, Topic
 from hmsa_ros.errors import BadInputError, BagError, printable
 from hmsa_ros.interfaces import topics
-from hmsa_ros.nodes.message_types import interface_class
+from hmsa_ros.nodes.endpoints import interface_class
 from hmsa_ros.nodes.qos import publisher
 from hmsa_ros.nodes.selection import Filter, is_full_name
 

@@ -12,7 +12,7 @@ from hmsa_ros.bag.recording import Recording
 from hmsa_ros.bag.writer import Topic
 from hmsa_ros.errors import BagError
 from hmsa_ros.nodes.capture import Capture, RawSubscription
-from hmsa_ros.nodes.message_types import interface_class
+from hmsa_ros.nodes.endpoints import interface_class
 from hmsa_ros.nodes.qos import stored, subscription
 from hmsa_ros.nodes.selection import Selection
 

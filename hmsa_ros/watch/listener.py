@@ -24,7 +24,7 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
 from hmsa_ros.nodes.conversions import from_time
-from hmsa_ros.nodes.message_types import interface_class
+from hmsa_ros.nodes.endpoints import interface_class
 from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.visitor import leave, visit
 from hmsa_ros.watch.scene import History, Joint, Report, Scene
