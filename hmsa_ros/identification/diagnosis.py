@@ -7,20 +7,10 @@ import math
 import numpy as np
 
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification import quantities
 from hmsa_ros.identification.departures import GAIN, USUAL_GAIN
 from hmsa_ros.identification.fit import Fit
 from hmsa_ros.identification.noise import autocorrelation, Whiteness
-from hmsa_ros.identification.quantities import (
-    BRANCHES,
-    damping_unit,
-    DEFAULT_FREE,
-    derivative,
-    geometry_of,
-    group_of,
-    modulus_of,
-    QUANTITIES,
-    quantity_of,
-)
 from hmsa_ros.identification.repeats import Repeated
 from hmsa_ros.identification.response import complete
 from hmsa_ros.identification.result import Signature
@@ -55,21 +45,21 @@ def allowed(fit: Fit) -> Array:
     """Return the deviation of each free parameter's coordinate that still leaves a number."""
     values = fit.values
     unit = values['time_unit']
-    load = geometry_of(values).loaded * values['shear_modulus']
+    load = quantities.geometry_of(values).loaded * values['shear_modulus']
     limits = {
         'chain_limit': _RELATIVE / min(values['chain_limit'], 1e3),
         'damping_coefficient': _RELATIVE * max(
-            values['damping_coefficient'], 0.05 * damping_unit(values)),
+            values['damping_coefficient'], 0.05 * quantities.damping_unit(values)),
         'stretch_bias': 0.05, 'stretch_gain': 0.1, 'sensor_latency': 0.5 * unit,
         'coil_time_constant': max(_RELATIVE * values['coil_time_constant'], 0.1 * unit),
         'constant_force': 0.1 * load, 'initial_stretch': 0.05, 'initial_rate': 0.5 / unit,
-        **{x: y for pair in BRANCHES for x, y in zip(pair, (0.05, 0.5), strict=True)}}
+        **{x: y for pair in quantities.BRANCHES for x, y in zip(pair, (0.05, 0.5), strict=True)}}
     return np.array([limits.get(x, _of_law(fit, x)) for x in fit.free])
 
 
 def _of_law(fit: Fit, name: str) -> float:
     """Return what is allowed of a constant of the law, and of all that has a logarithm."""
-    quantity, value = quantity_of(name), float(fit.values[name])
+    quantity, value = quantities.quantity_of(name), float(fit.values[name])
     if quantity.scale == 'log':
         return _RELATIVE
     if quantity.scale == 'inverse':
@@ -119,29 +109,29 @@ def weakness(fit: Fit, deviation: float, factors: Array) -> Weakness | None:
                 f'{words} at the same time leaves the recorded motion unchanged within the '
                 'noise')
     advice = list(dict.fromkeys(
-        quantity_of(x).advice for x in names if quantity_of(x).advice))
+        quantities.quantity_of(x).advice for x in names if quantities.quantity_of(x).advice))
     if {'shear_modulus', 'density', 'remanence'} <= set(fit.free) or (
             {'shear_modulus', 'time_unit', 'remanence'} <= set(fit.free)):
-        advice = [QUANTITIES['density'].advice]
+        advice = [quantities.QUANTITIES['density'].advice]
     kept = next((x for x in _FIRST_KEPT if x in names), names[0])
     listed = '; '.join(sentences) or 'the recorded motion hardly depends on them'
     return Weakness(names, (
         f'{_listed(list(names))} cannot be identified from this recording: {listed}. Instead, '
         f'{"; or ".join(advice[:3])}; or ' + (
             f'keep what is known, as with --free=-{kept} or --known {kept}=VALUE+-STD'
-            if kept in DEFAULT_FREE else f'leave {kept} out of --free')))
+            if kept in quantities.DEFAULT_FREE else f'leave {kept} out of --free')))
 
 
 def _change(fit: Fit, place: int, change: float, first: float) -> str:
     """Word a change of one parameter along a direction in which the first one grows."""
     name = fit.free[place]
     change = math.copysign(1.0, first) * change
-    kind = quantity_of(name).scale
+    kind = quantities.quantity_of(name).scale
     if kind == 'linear':
         value = fit.values[name]
         if name == 'damping_coefficient' and value > 0.0:
             return f'{name} {100.0 * change / value:+.3g} %'
-        unit = quantity_of(name).unit
+        unit = quantities.quantity_of(name).unit
         return f'{name} {change:+.3g}{" " + unit if unit else ""}'
     if kind == 'inverse':
         change = -change * fit.values[name]
@@ -178,7 +168,7 @@ def second_mode(fit: Fit) -> list[Signature]:
 
 def frequency_of(fit: Fit) -> float:
     """Return the frequency in Hz at which it rings about rest."""
-    group = group_of(fit.values)
+    group = quantities.group_of(fit.values)
     return float(equations.natural_frequency(group.rest, group)) / complete(
         fit.values, fit.free)['time_unit'] / (2.0 * math.pi)
 
@@ -228,7 +218,7 @@ def distant(fit: Fit, found: Whiteness) -> bool:
 def check_plausible(fit: Fit, unknown: Sequence[str] = ()) -> None:
     """Raise `BadInputError` for what can only come from data in other units."""
     recording = fit.recording
-    modulus, ratio = modulus_of(fit.values.get('law'))
+    modulus, ratio = quantities.modulus_of(fit.values.get('law'))
     for name, (least, most, power) in _USUAL.items():
         value, label = fit.values[name], name
         if name == 'shear_modulus':
@@ -240,7 +230,7 @@ def check_plausible(fit: Fit, unknown: Sequence[str] = ()) -> None:
             for x, y in _FINER.items() if least <= value * y ** power <= most), '')
         if not hint and name == 'remanence' and least <= 1e3 * value <= most:
             hint = '; if flux densities are in mT, write "flux_density [mT]" in the header'
-        unit = QUANTITIES[name].unit
+        unit = quantities.QUANTITIES[name].unit
         raise BadInputError(
             f'{recording.label} moves as with a {label} of {value:.3g} {unit}, in samples '
             f'{recording.gap:.3g} s apart: expected {least:g} to '
@@ -339,13 +329,13 @@ def undetected(late: tuple[float, Array], std: Array, fit: Fit) -> list[str]:
     Given are that latency in s, what it moves the coordinates by, and their deviations.
     """
     seconds, moves = late
-    modulus, ratio = modulus_of(fit.values.get('law'))
+    modulus, ratio = quantities.modulus_of(fit.values.get('law'))
     words = []
     for name, move, one in zip(fit.free, moves.tolist(), std.tolist(), strict=True):
         if abs(move) > one:
-            size = abs(move * derivative(name, fit.values[name]))
+            size = abs(move * quantities.derivative(name, fit.values[name]))
             label, size = (modulus, ratio * size) if name == 'shear_modulus' else (name, size)
-            words.append(f'{label} by {size:.2g} {quantity_of(name).unit}'.rstrip())
+            words.append(f'{label} by {size:.2g} {quantities.quantity_of(name).unit}'.rstrip())
     return [
         f'a sensor latency below {seconds:.2g} s would not be detected, and moves '
         f'{_listed(words)}: if it is not zero, give --known sensor_latency=VALUE+-STD '

@@ -15,12 +15,7 @@ import math
 import numpy as np
 
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.quantities import (
-    check_free,
-    DEFAULT_FREE,
-    derivative,
-    values_of,
-)
+from hmsa_ros.identification import quantities
 from hmsa_ros.identification.recording import Course
 from hmsa_ros.identification.response import respond, Response
 from hmsa_ros.model import equations
@@ -139,11 +134,11 @@ class Designer:
     def __init__(
             self, actuator: ActuatorParameters, bounds: Bounds, duration: float, *,
             rate: float = 1000.0, noise: float = 1e-3,
-            free: Sequence[str] = DEFAULT_FREE) -> None:
+            free: Sequence[str] = quantities.DEFAULT_FREE) -> None:
         least, most = bounds.of_motion(actuator)
         self._actuator, self._bounds, self._noise = actuator, bounds, noise
-        self._free = check_free(free, actuator.law)
-        self._values = values_of(actuator)
+        self._free = quantities.check_free(free, actuator.law)
+        self._values = quantities.values_of(actuator)
         self._group = actuator.nondimensional
         self.period = 2.0 * math.pi * actuator.time_unit / float(
             equations.natural_frequency(self._group.rest, self._group))
@@ -208,7 +203,7 @@ class Designer:
         std = {}
         for name, deviation in zip(self._free, deviations.tolist(), strict=True):
             value = self._values[name]
-            absolute = abs(derivative(name, value)) * deviation
+            absolute = abs(quantities.derivative(name, value)) * deviation
             std[name] = absolute / abs(value) if value else absolute
         return Program(level_times, levels, std, float(size), reach, rest)
 
@@ -373,7 +368,7 @@ class Designer:
 def excite(
         actuator: ActuatorParameters, bounds: Bounds | None = None, *,
         duration: float | None = None, rate: float = 1000.0, noise: float = 1e-3,
-        free: Sequence[str] = DEFAULT_FREE) -> Excitation:
+        free: Sequence[str] = quantities.DEFAULT_FREE) -> Excitation:
     """
     Design the sequence to record for identification, beside unshaped steps and the paper's.
 

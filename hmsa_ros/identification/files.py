@@ -16,15 +16,8 @@ from typing import Any
 import numpy as np
 
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification import quantities
 from hmsa_ros.identification.known import Known, PREFIX
-from hmsa_ros.identification.quantities import (
-    actuator_of,
-    BRANCHES,
-    constants_of,
-    flow_of,
-    FLOWING,
-    quantity_of,
-)
 from hmsa_ros.identification.result import Identification
 from hmsa_ros.interfaces.actuator import actuator_from, parameters_of
 from hmsa_ros.interfaces.parameters import BLOCK
@@ -43,7 +36,7 @@ _OTHERS = {
     'initial_stretch': 'initial_stretch'}
 _LISTS = dict(zip(
     ('viscoelastic.ratio', 'viscoelastic.time', *(f'viscoelastic.{x}' for x in CONSTANTS)),
-    zip(*(x + y for x, y in zip(BRANCHES, FLOWING, strict=True)), strict=True), strict=True))
+    zip(*map(tuple.__add__, quantities.BRANCHES, quantities.FLOWING), strict=True), strict=True))
 # Half of a 95 % interval, or half an axis of the ellipsoid of so many, in standard deviations.
 _HALF_95 = (0.0, 1.96, 2.448, 2.795, 3.080)
 # What changes how a block moves, in the order of `hmsa_ros.model.mismatch.Errors`.
@@ -105,7 +98,7 @@ def read_belief(path: Path | None, entries: Entries | None = None) -> Belief:
                 'since as many branches of creep are identified')
         if isinstance(value, list):
             others |= {x: _number(path, key, y) for x, y in zip(names, value, strict=False)}
-    for ratio, time in BRANCHES:
+    for ratio, time in quantities.BRANCHES:
         if others.get(ratio) == 0.0:
             others.pop(time, None)
     try:
@@ -189,7 +182,7 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
         *(f'# Note: {x}.' for x in found.warnings),
         '/**:', '  ros__parameters:']
     written: dict[str, Any] = {}
-    actuator = actuator_of(found.values)
+    actuator = quantities.actuator_of(found.values)
     for name, value in actuator.numbers.items():
         source = 'time_unit' if name == 'density' and 'time_unit' in found.names else name
         lines.append(_line(f'actuator.{name}', value, found, source))
@@ -198,7 +191,7 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
         if key not in written:
             scale = key == f'law.{found.shown("shear_modulus")[0]}'
             sought = ['shear_modulus'] if scale else [
-                x for x, (constant, _) in constants_of(actuator.law).items()
+                x for x, (constant, _) in quantities.constants_of(actuator.law).items()
                 if constant.name == key and x in found.names]
             lines.append(_line(key, value, found, *sought))
             written[key] = value
@@ -206,9 +199,9 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
         if name in found.names or name in belief.others:
             written[key] = found.values[name]
             lines.append(_line(key, written[key], found, name))
-    held = [i for i, pair in enumerate(BRANCHES)
-            if found.values[pair[0]] > 0.0 or set(pair + FLOWING[i]) & set(found.names)]
-    flow = flow_of(found.values, found.names)
+    held = [i for i, pair in enumerate(quantities.BRANCHES)
+            if found.values[pair[0]] > 0.0 or set(pair + quantities.FLOWING[i]) & set(found.names)]
+    flow = quantities.flow_of(found.values, found.names)
     creeps = any(x in found.names for names in _LISTS.values() for x in names)
     if creeps and flow is not MAXWELL:
         written['viscoelastic.flow'] = flow.name
@@ -243,7 +236,7 @@ def _line(key: str, value: Any, found: Identification, *names: str) -> str:
             label, estimate = name, found.parameters[name]
         if not estimate.free:
             return f'{line}  # not identified'
-        unit = f' {quantity_of(name).unit}' if quantity_of(name).unit else ''
+        unit = f' {quantities.quantity_of(name).unit}' if quantities.quantity_of(name).unit else ''
         alone = len(names) == 1 and (key.endswith(label) or key in _LISTS)
         notes.append(
             f'{"" if alone else f"{name} "}standard deviation {estimate.std:.3g}{unit}, 95 % '

@@ -16,13 +16,7 @@ from typing import Any
 import numpy as np
 
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.quantities import (
-    from_coordinate,
-    QUANTITIES,
-    quantity_of,
-    to_coordinate,
-    with_constants,
-)
+from hmsa_ros.identification import quantities
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import clip, respond, Response
 from hmsa_ros.model.equations import Array
@@ -123,12 +117,13 @@ def moved(values: Mapping[str, float], free: Sequence[str], step: Array) -> dict
     """Return values after a step of the coordinates, kept in their ranges."""
     done: dict[str, Any] = dict(values)
     for name, change in zip(free, step.tolist(), strict=True):
-        done[name] = clip(name, from_coordinate(name, to_coordinate(name, values[name]) + change))
+        there = quantities.to_coordinate(name, values[name]) + change
+        done[name] = clip(name, quantities.from_coordinate(name, there))
         if name == 'chain_limit' and not math.isfinite(done[name]):
             done[name] = 1e9
     # Where constants make no law there is no motion either.
     with suppress(BadInputError):
-        done = with_constants(done)
+        done = quantities.with_constants(done)
     return done
 
 
@@ -269,14 +264,15 @@ def _stride(values: Mapping[str, float], free: Sequence[str], step: Array) -> fl
     """Return the share of a step that no logarithm, and no chain limit, leaps with."""
     share = 1.0
     for name, change in zip(free, step.tolist(), strict=True):
-        quantity, limit = quantity_of(name), _STRIDE
+        quantity, limit = quantities.quantity_of(name), _STRIDE
         if quantity.scale == 'inverse':
             limit = max(0.5 / values[name], 0.02)
         elif name == 'damping_coefficient':
             limit = max(2.0 * values[name], 1e-6)
         elif quantity.unit == 'Pa' and quantity.scale == 'linear':
             limit = 0.5 * _STRIDE * values['shear_modulus']
-        elif name in QUANTITIES and quantity.scale == 'linear' and name != 'initial_stretch':
+        elif quantity.scale == 'linear' and name != 'initial_stretch' and (
+                name in quantities.QUANTITIES):
             continue
         if abs(change) > limit:
             share = min(share, limit / abs(change))

@@ -8,22 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification import diagnosis
+from hmsa_ros.identification import diagnosis, quantities
 from hmsa_ros.identification.departures import dead_band
 from hmsa_ros.identification.fit import Fit, fit, robust_scale
 from hmsa_ros.identification.intervals import estimates_of, Precision, precision_of, stamp_error
 from hmsa_ros.identification.noise import errors_of_stamps, whiteness
-from hmsa_ros.identification.quantities import (
-    BRANCHES,
-    check_free,
-    constant_values,
-    constants_of,
-    DEFAULT_FREE,
-    GEOMETRY,
-    modulus_of,
-    STATIC,
-    values_of,
-)
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.repeats import repeated
 from hmsa_ros.identification.response import complete
@@ -44,7 +33,7 @@ _SHAPED = 0.15
 def identify(
         time: ArrayLike | Recording, stretch: ArrayLike | None = None,
         level_times: ArrayLike | None = None, levels: ArrayLike | None = None, *,
-        free: Sequence[str] = DEFAULT_FREE, actuator: ActuatorParameters | None = None,
+        free: Sequence[str] = quantities.DEFAULT_FREE, actuator: ActuatorParameters | None = None,
         known: Mapping[str, float] | None = None,
         uncertain: Mapping[str, float] | None = None, slew_limit: float = math.inf
 ) -> Identification:
@@ -98,12 +87,12 @@ def identify(
             np.atleast_1d(np.asarray(level_times, dtype=np.float64)),
             np.atleast_1d(np.asarray(levels, dtype=np.float64)), slew_limit,
             coordinate=actuator.coordinate)
-    free = check_free(free, actuator.law)
+    free = quantities.check_free(free, actuator.law)
     known, uncertain = known or {}, uncertain or {}
     values = _values(actuator, known, uncertain, free)
-    if actuator.law is not None and set(free) & set(constants_of(actuator.law)):
-        values |= constant_values(actuator.law, actuator.shear_modulus)
-    sought = [time for ratio, time in BRANCHES if ratio in free]
+    if actuator.law is not None and set(free) & set(quantities.constants_of(actuator.law)):
+        values |= quantities.constant_values(actuator.law, actuator.shear_modulus)
+    sought = [time for ratio, time in quantities.BRANCHES if ratio in free]
     if len(sought) > 1:
         # From the swing on to what is left at the end.
         span = 0.2 * float(recording.time[-1] - recording.time[0])
@@ -145,7 +134,8 @@ def _values(
             if both else
             f'the standard deviation of {bad[0]} is {uncertain[bad[0]]:g}: expected a finite '
             'number of at least 0')
-    values = values_of(actuator, {x: y for x, y in known.items() if x not in GEOMETRY})
+    values = quantities.values_of(
+        actuator, {x: y for x, y in known.items() if x not in quantities.GEOMETRY})
     return complete(values, ('time_unit',) if 'time_unit' in known else ())
 
 
@@ -200,7 +190,7 @@ def _conclude(
         verdict = 'not_identifiable'
         reason = f'{weak.words}; besides, {reason}' if reason else weak.words
     elif not reason and (still or others):
-        verdict, lost = 'not_identifiable', still or set(best.free) - STATIC
+        verdict, lost = 'not_identifiable', still or set(best.free) - quantities.STATIC
         reason = diagnosis.resting(best, still) if still else diagnosis.alike(best, others)
     elif not reason and not best.converged:
         reason = (
@@ -213,7 +203,7 @@ def _conclude(
             f'{len(best.free)} parameters from {len(best.recording.time)} samples with a noise of '
             f'{known.deviation:.3g}')
     # A beam's modulus is known as Young's.
-    reason = reason.replace('shear_modulus', modulus_of(best.values.get('law'))[0])
+    reason = reason.replace('shear_modulus', quantities.modulus_of(best.values.get('law'))[0])
     parameters, matrix = estimates_of(best, known, lost)
     outliers = int(np.count_nonzero(best.weights == 0.0))
     warnings = (*best.recording.notes, *_warnings(best, known, outliers, given))

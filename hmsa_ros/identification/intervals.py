@@ -7,19 +7,10 @@ import math
 import numpy as np
 
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification import diagnosis
+from hmsa_ros.identification import diagnosis, quantities
 from hmsa_ros.identification.departures import Departures, departures
 from hmsa_ros.identification.fit import Fit, fit, LEAST_SCALE, moved
 from hmsa_ros.identification.noise import Whiteness, whiteness, widening
-from hmsa_ros.identification.quantities import (
-    constants_of,
-    derivative,
-    from_coordinate,
-    GEOMETRY,
-    QUANTITIES,
-    quantity_of,
-    to_coordinate,
-)
 from hmsa_ros.identification.response import complete, respond
 from hmsa_ros.identification.result import Estimate, Identification
 from hmsa_ros.model.equations import Array
@@ -138,27 +129,27 @@ def estimates_of(
     whole = np.sqrt(np.diag(known.covariance) + sum(
         x ** 2 for x in known.missing.considered.values()))
     values = complete(best.values, best.free)
-    scales = np.array([derivative(x, values[x]) for x in best.free])
+    scales = np.array([quantities.derivative(x, values[x]) for x in best.free])
     matrix = known.covariance * np.outer(scales, scales)
     estimates: dict[str, Estimate] = {}
-    constants = [x for x in constants_of(values.get('law')) if x in values]
-    for name in (*QUANTITIES, *constants):
-        value, quantity = values[name], quantity_of(name)
+    constants = [x for x in quantities.constants_of(values.get('law')) if x in values]
+    for name in (*quantities.QUANTITIES, *constants):
+        value, quantity = values[name], quantities.quantity_of(name)
         if name in lost:
             estimates[name] = Estimate(
                 math.nan, math.nan, math.nan, math.nan, quantity.unit, True)
         elif name in best.free:
             place = best.free.index(name)
             half = quantile * float(whole[place])
-            x = to_coordinate(name, value)
-            ends = sorted(from_coordinate(name, y) for y in (x - half, x + half))
+            x = quantities.to_coordinate(name, value)
+            ends = sorted(quantities.from_coordinate(name, y) for y in (x - half, x + half))
             if quantity.scale == 'inverse' and x - half <= 1e-9:
                 ends[1] = math.inf
             estimates[name] = Estimate(
                 value, math.sqrt(matrix[place, place]), ends[0], ends[1], quantity.unit, True)
         else:
             estimates[name] = Estimate(value, 0.0, value, value, quantity.unit, False)
-    for name in GEOMETRY:
+    for name in quantities.GEOMETRY:
         value = values[name]
         estimates[name] = Estimate(value, 0.0, value, value, 'm', False)
     for place, name in enumerate(best.free):
@@ -199,16 +190,16 @@ def profile(
             f'{name} was not free: expected one of {", ".join(found.names)}')
     others = tuple(x for x in found.names if x != name)
     place = found.names.index(name)
-    centre = to_coordinate(name, found.values[name])
+    centre = quantities.to_coordinate(name, found.values[name])
     std = math.sqrt(float(found.covariance[place, place])) / abs(
-        derivative(name, found.values[name])) if math.isfinite(
+        quantities.derivative(name, found.values[name])) if math.isfinite(
             found.covariance[place, place]) else 0.2 * max(abs(centre), 0.1)
     weights = found.weights / found.spread ** 2
     base = float(np.sum(weights * found.residual ** 2))
     kept = replace(found.recording, notes=())
     rows = []
     for x in centre + 4.0 * std * np.linspace(-1.0, 1.0, points):
-        values = {**found.values, name: from_coordinate(name, float(x))}
+        values = {**found.values, name: quantities.from_coordinate(name, float(x))}
         one = fit(kept, values, others, spread=found.spread) if others else None
         if one is not None:
             loss = float(np.sum(weights * one.residual ** 2))

@@ -11,16 +11,7 @@ from numpy.typing import NDArray
 
 from hmsa_ros import motion
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.quantities import (
-    BRANCHES,
-    constants_of,
-    derivative,
-    flow_of,
-    FLOWING,
-    geometry_of,
-    quantity_of,
-    with_constants,
-)
+from hmsa_ros.identification import quantities
 from hmsa_ros.identification.recording import Course, pieces, Recording
 from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.equations import Array
@@ -39,9 +30,9 @@ _PLACES = {
     'coil_time_constant': places.LAG, 'initial_stretch': places.STRETCH,
     'initial_rate': places.RATE,
     **{x: places.FIRST_BRANCH + places.BRANCH * i + j
-       for i, z in enumerate(BRANCHES) for j, x in enumerate(z)},
+       for i, z in enumerate(quantities.BRANCHES) for j, x in enumerate(z)},
     **{x: places.FIRST_BRANCH + places.BRANCH * i + places.FLOW_CONSTANT + j
-       for i, z in enumerate(FLOWING) for j, x in enumerate(z)}}
+       for i, z in enumerate(quantities.FLOWING) for j, x in enumerate(z)}}
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +50,7 @@ def _chain(
         values: Mapping[str, Any], branches: int, free: Sequence[str]
 ) -> tuple[Array, dict[str, dict[int, float]]]:
     """Return theta of the motion and, by name, its derivatives by the free parameters."""
-    geometry, density = geometry_of(values), values['density']
+    geometry, density = quantities.geometry_of(values), values['density']
     inertia = density * geometry.half_length ** 2
     a = values['shear_modulus'] / inertia
     per_damping = 0.5 * geometry.c1 * geometry.half_length / geometry.damped / inertia
@@ -79,7 +70,8 @@ def _chain(
         for name, i in _PLACES.items():
             if places.FIRST_BRANCH <= i < len(theta):
                 theta[i] = values[name]
-        theta[places.FIRST_BRANCH + places.FLOW::places.BRANCH] = flow_of(values, free).kind
+        theta[places.FIRST_BRANCH + places.FLOW::places.BRANCH] = quantities.flow_of(
+            values, free).kind
     per_density = {
         places.STIFFNESS: -a / density, places.DAMPING: -d / density,
         places.DRIVE: -k / density, places.FORCE: -f / density}
@@ -106,7 +98,7 @@ def _chain(
         elif name == 'chain_limit':
             chain[name] = {places.CONSTANT: -1.0 / values[name] ** 2}
         elif name not in _SENSOR:
-            constant, i = constants_of(values['law'])[name]
+            constant, i = quantities.constants_of(values['law'])[name]
             # The scale of the law stays: constants in Pa change its force in proportion.
             chain[name] = {places.CONSTANT + constant.place + 2 * i: (
                 1.0 / values['shear_modulus'] if constant.unit == 'Pa' else 1.0)}
@@ -120,7 +112,7 @@ def complete(values: Mapping[str, float], free: Sequence[str]) -> dict[str, floa
     Where the time unit is free the density follows from it, else the other way round. Raises
     `BadInputError` if there is no law with such constants.
     """
-    done = with_constants(values)
+    done = quantities.with_constants(values)
     if 'time_unit' in free:
         done['density'] = (
             done['shear_modulus'] * (done['time_unit'] / done['half_length']) ** 2)
@@ -160,18 +152,19 @@ class Setup:
         """
         given: Creep | None = values.get('creep')
         branches = len(given.ratios) if given else max((
-            i for i, names in enumerate(BRANCHES, 1)
+            i for i, names in enumerate(quantities.BRANCHES, 1)
             if values[names[0]] > 0.0 or set(names) & set(free)), default=0)
         theta, chain = _chain(values, branches, free)
         inner = sorted({i for x in chain.values() for i in x})
         rows = {x: i for i, x in enumerate(inner)}
-        material = _packed(values['chain_limit'], geometry_of(values).c1, values['law']).copy()
+        material = _packed(
+            values['chain_limit'], quantities.geometry_of(values).c1, values['law']).copy()
         if 'chain_limit' in free:
             material[KIND] = GENT
         mixing = np.zeros((len(inner) + len(more), len(free) + len(more)))
         for j, name in enumerate(free):
             if name in chain:
-                scale = derivative(name, values[name])
+                scale = quantities.derivative(name, values[name])
                 for i, x in chain[name].items():
                     mixing[rows[i], j] = scale * x
         for j in range(1, len(more) + 1):
@@ -241,7 +234,7 @@ def sensed(
     """
     gain = values['stretch_gain']
     by_sensor: dict[str, float | Array] = {
-        'stretch_bias': 1.0, 'stretch_gain': derivative('stretch_gain', gain) * stretch,
+        'stretch_bias': 1.0, 'stretch_gain': quantities.derivative('stretch_gain', gain) * stretch,
         'sensor_latency': -gain * rate}
     for j, name in enumerate(free):
         if name in by_sensor:
@@ -251,5 +244,5 @@ def sensed(
 
 def clip(name: str, value: float) -> float:
     """Return a value within its range."""
-    quantity = quantity_of(name)
+    quantity = quantities.quantity_of(name)
     return min(max(value, quantity.least), quantity.most)

@@ -17,12 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.quantities import (
-    constants_of,
-    damping_unit,
-    group_of,
-    with_constants,
-)
+from hmsa_ros.identification import quantities
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import respond
 from hmsa_ros.model import equations
@@ -134,7 +129,7 @@ def static(
     stretch = np.array([_median(np.array([x[2] for x in rests if x[1] == y])) for y in fields])
     low, high = float(np.min(recording.stretch)), float(np.max(recording.stretch))
     best = (math.inf, math.nan, usual)
-    group = group_of(values)
+    group = quantities.group_of(values)
     # Motion may go further than what can be held, but not where there is no force.
     ends = group.rest + 1.002 * (np.array([low, high]) - group.rest)
     shape = np.full(len(limits), group.c1)
@@ -212,7 +207,7 @@ def starts(
     if 'stretch_gain' in free:
         given['stretch_gain'] = 1.0
     found = static(recording, given, free)
-    material = group_of(given, zeta=0.2, j_lim=found.chain_limit)
+    material = quantities.group_of(given, zeta=0.2, j_lim=found.chain_limit)
     lower, upper = equations.stretch_limits(material)
     candidates: list[dict[str, float]] = []
     for frequency, decay, mean in ringing(recording, found.rests):
@@ -222,8 +217,9 @@ def starts(
         unit = float(equations.natural_frequency(mean, material)) / natural
         candidate = _candidate(given, free, unit, found)
         if 'damping_coefficient' in free:
-            candidate['damping_coefficient'] = decay / natural * damping_unit(candidate) * float(
-                equations.critical_zeta(mean, material))
+            critical = float(equations.critical_zeta(mean, material))
+            candidate['damping_coefficient'] = (
+                decay / natural * critical * quantities.damping_unit(candidate))
         if all(abs(math.log(x['time_unit'] / candidate['time_unit'])) > 0.02
                for x in candidates):
             candidates.append(candidate)
@@ -270,12 +266,13 @@ def at_units(
         values: Mapping[str, float], free: Sequence[str], units: Array, decay: float,
         found: Static) -> list[dict[str, float]]:
     """Return start values of time units in s, and of a share of critical damping about rest."""
-    group = group_of(values)
+    group = quantities.group_of(values)
     critical = float(equations.critical_zeta(group.rest, group))
     candidates = [_candidate(values, free, x, found) for x in units.tolist()]
     if 'damping_coefficient' in free:
         for candidate in candidates:
-            candidate['damping_coefficient'] = decay * critical * damping_unit(candidate)
+            candidate['damping_coefficient'] = (
+                decay * critical * quantities.damping_unit(candidate))
     return candidates
 
 
@@ -286,7 +283,7 @@ def seeks_time(values: Mapping[str, Any], free: Sequence[str]) -> bool:
 
 def _stresses(values: Mapping[str, Any]) -> list[str]:
     """Return the constants of the law that make its modulus."""
-    return [x for x, (constant, _) in constants_of(values.get('law')).items()
+    return [x for x, (constant, _) in quantities.constants_of(values.get('law')).items()
             if constant.unit == 'Pa']
 
 
@@ -305,7 +302,7 @@ def _candidate(
         for name in stresses:
             values[name] *= values['shear_modulus'] / before
         with suppress(BadInputError):
-            values = with_constants(values)
+            values = quantities.with_constants(values)
     elif 'time_unit' in free or 'density' in free:
         values['density'] = values['shear_modulus'] * (unit / length) ** 2
     values['time_unit'] = unit
