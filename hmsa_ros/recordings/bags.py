@@ -18,22 +18,12 @@ from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.interfaces.status import whole
 from hmsa_ros.judge import Sensor
 from hmsa_ros.model.schedule import obeyed
+from hmsa_ros.recordings import topics as roles
 from hmsa_ros.recordings.levels import Level
 from hmsa_ros.recordings.parameters import actuators, named_joint, recorded
 from hmsa_ros.recordings.record import LearntSensor, RecordedRequest, Run, Verdict
 from hmsa_ros.recordings.samples import nanoseconds_of, SampleReader
-from hmsa_ros.recordings.topics import (
-    APPLIED,
-    COMMAND,
-    ESTIMATE,
-    FORCE,
-    JOINT_STATES,
-    PLAN,
-    SETPOINT,
-    topics_by_joint,
-    TRAJECTORY,
-    TYPES,
-)
+from hmsa_ros.recordings.topics import topics_by_joint
 
 # Between two calls of the progress.
 _PROGRESS_MESSAGES = 20_000
@@ -130,7 +120,8 @@ def _collect(
         except BagError as error:
             raise BadInputError(f'{reader.path} cannot be evaluated: {error}') from error
     collected = {
-        space: _Collected(SampleReader(decoders[next(iter(by_joint.values()))[JOINT_STATES]]))
+        space: _Collected(SampleReader(
+            decoders[next(iter(by_joint.values()))[roles.JOINT_STATES]]))
         for space, by_joint in spaces.items()}
     begin, end = reader.start_time or 0, reader.end_time or 0
     for i, message in enumerate(reader.messages(list(found))):
@@ -210,15 +201,15 @@ class _Collected:
             decode: Callable[[bytes], Any]) -> None:
         """Take in a message, or count and note it if it is not what its topic is for."""
         try:
-            if role == JOINT_STATES:
+            if role == roles.JOINT_STATES:
                 self.samples.take(message.log_time, message.data)
             else:
                 self._take(role, joint, message.log_time, decode(message.data))
         except (AttributeError, TypeError, ValueError, OverflowError) as error:
             # The bag brings the definition along, and may call anything by that name.
             self._leave_out(
-                f'a message of topic {message.topic} is not as {TYPES[role]} is defined in ROS '
-                f'2: {error}')
+                f'a message of topic {message.topic} is not as {roles.TYPES[role]} is defined in '
+                f'ROS 2: {error}')
         except BagError as error:
             self._leave_out(str(error))
 
@@ -228,27 +219,27 @@ class _Collected:
             self.notes.append(f'{reason}: left out')
 
     def _take(self, role: str, joint: str, sent: int, content: Any) -> None:
-        if role in (COMMAND, APPLIED):
+        if role in (roles.COMMAND, roles.APPLIED):
             vector = content.magnetic_field
-            kept = self.commands if role == COMMAND else self.applied
+            kept = self.commands if role == roles.COMMAND else self.applied
             if obeyed(vector.x, vector.y, vector.z):
                 stamp = nanoseconds_of(content.header.stamp)
                 kept.setdefault(joint, []).append(Level(
-                    stamp or (sent if role == COMMAND else 0), float(vector.z), sent))
+                    stamp or (sent if role == roles.COMMAND else 0), float(vector.z), sent))
             else:
                 self.refused[joint] = self.refused.get(joint, 0) + 1
-        elif role == FORCE:
+        elif role == roles.FORCE:
             self.forces.setdefault(joint, []).append((
                 sent, nanoseconds_of(content.header.stamp) or sent,
                 float(content.wrench.force.z)))
-        elif role == PLAN:
+        elif role == roles.PLAN:
             self.plans.append(_Trajectory.of(sent, content))
-        elif role == TRAJECTORY:
+        elif role == roles.TRAJECTORY:
             self.trajectories.append(_Trajectory.of(sent, content))
-        elif role == SETPOINT:
+        elif role == roles.SETPOINT:
             self.setpoints.setdefault(joint, []).append(
                 RecordedRequest(sent, 0, ((float(content.data), None),)))
-        elif role == ESTIMATE:
+        elif role == roles.ESTIMATE:
             self.sensors += (
                 (x.hardware_id, LearntSensor(sent, Sensor.of({y.key: y.value for y in x.values})))
                 for x in content.status)
@@ -296,10 +287,10 @@ class _Collected:
             self, label: str, reader: BagReader, summary: BagSummary, topics: Mapping[str, str],
             given: Mapping[str, object], key: str, joint: str) -> Run:
         """Return the run of one joint, whose topics have its name in them or not."""
-        states = topics[JOINT_STATES]
-        parameters = recorded(reader.custom_data, states[:-len(JOINT_STATES)])
+        states = topics[roles.JOINT_STATES]
+        parameters = recorded(reader.custom_data, states[:-len(roles.JOINT_STATES)])
         planned = [x for plan in self.plans for x in plan.joints]
-        beside = topics.get(COMMAND, '').split('/')[-2:-1]
+        beside = topics.get(roles.COMMAND, '').split('/')[-2:-1]
         named = joint or next(
             (x for x in (*planned, named_joint(parameters), *beside) if x in self.samples.names),
             '')
@@ -307,13 +298,13 @@ class _Collected:
         plant, planner, known, more = actuators(parameters, given, named)
         refused = self.refused.get(key, 0)
         notes = [*self.notes, *summary.problems]
-        if COMMAND not in topics:
+        if roles.COMMAND not in topics:
             notes.append(
-                f'The recording has no {COMMAND}: setpoints, unshaped steps and lateness are '
-                'unknown.')
+                f'The recording has no {roles.COMMAND}: setpoints, unshaped steps and lateness '
+                'are unknown.')
         elif not self.commands.get(key):
             notes.append(
-                f'{topics[COMMAND]} holds no command: there is no setpoint to evaluate.')
+                f'{topics[roles.COMMAND]} holds no command: there is no setpoint to evaluate.')
         if refused:
             notes.append(
                 f'{refused} commands are not finite or not along z: left out, as the plant '

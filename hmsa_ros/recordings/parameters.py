@@ -9,16 +9,9 @@ from typing import Any
 from hmsa_ros.bag.experiment import parameters_of
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.files import read_at_most
+from hmsa_ros.interfaces import parameters as shared
 from hmsa_ros.interfaces.actuator import actuator_from, creep_from
-from hmsa_ros.interfaces.parameters import (
-    ACTUATOR,
-    BLOCK,
-    JOINT,
-    LAW,
-    ParameterSpec,
-    present_name,
-    VISCOELASTIC,
-)
+from hmsa_ros.interfaces.parameters import ParameterSpec
 from hmsa_ros.interfaces.topics import PLANNER, PLANT
 from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
@@ -55,9 +48,9 @@ def recorded(custom_data: Mapping[str, str], space: str) -> dict[str, object]:
     for node in (PLANNER, PLANT):
         for name, text in parameters_of(custom_data, node, space).items():
             try:
-                parameters[f'{node}.{present_name(name)}'] = json.loads(text)
+                parameters[f'{node}.{shared.present_name(name)}'] = json.loads(text)
             except (ValueError, RecursionError):
-                parameters[f'{node}.{present_name(name)}'] = text
+                parameters[f'{node}.{shared.present_name(name)}'] = text
     return parameters
 
 
@@ -67,7 +60,7 @@ def named_joint(parameters: Mapping[str, object]) -> str:
         several = parameters.get(f'{node}.joints')
         if isinstance(several, list) and several:
             return str(several[0]) if len(several) == 1 else ''
-        if name := parameters.get(f'{node}.{JOINT.name}'):
+        if name := parameters.get(f'{node}.{shared.JOINT.name}'):
             return str(name)
     return ''
 
@@ -87,15 +80,16 @@ def actuators(
     notes = []
     for node in (PLANT, PLANNER):
         values = {x: number_of(of_joint(parameters, joint, f'{node}.{x}')) for x in _NAMES}
-        if all(values[x.name] is not None for x in ACTUATOR):
+        if all(values[x.name] is not None for x in shared.ACTUATOR):
             try:
                 found[node] = actuator_from(
                     {k: v for k, v in values.items() if v is not None}
-                    | _own(parameters, joint, node, LAW))
+                    | _own(parameters, joint, node, shared.LAW))
             except BadInputError as error:
                 notes.append(f'The parameters of the {node} in the bag cannot be used: {error}.')
     if given:
-        own = actuator_from(values_of({}, PLANT, ACTUATOR) | _own(given, joint, PLANT, BLOCK))
+        own = actuator_from(
+            values_of({}, PLANT, shared.ACTUATOR) | _own(given, joint, PLANT, shared.BLOCK))
         for node, other in found.items():
             if other.coordinate != own.coordinate:
                 raise BadInputError(
@@ -127,7 +121,7 @@ def actuators(
 
 def creep_of(parameters: Mapping[str, object], joint: str, node: str = PLANT) -> Creep:
     """Return the Maxwell branches of the plant of a run, or those that its planner knows."""
-    return creep_from(_own(parameters, joint, node, VISCOELASTIC))
+    return creep_from(_own(parameters, joint, node, shared.VISCOELASTIC))
 
 
 def _own(
@@ -141,7 +135,7 @@ def _own(
 
 
 _NAMES = tuple(
-    name for x in ACTUATOR for name in (x.name, f'mismatch.{x.name.partition(".")[2]}'))
+    name for x in shared.ACTUATOR for name in (x.name, f'mismatch.{x.name.partition(".")[2]}'))
 
 
 def read_parameter_file(
@@ -158,10 +152,10 @@ def read_parameter_file(
         for own in (False, True):
             found |= {f'{node}.{name}': value for key, name, value in entries
                       if key == (node if own else '')}
-    if not any(name.partition('.')[2].endswith(x.name) for name in found for x in BLOCK):
+    if not any(name.partition('.')[2].endswith(x.name) for name in found for x in shared.BLOCK):
         raise BadInputError(
             f'{path} sets no parameter of the actuator: expected some of '
-            + ', '.join(x.name for x in ACTUATOR))
+            + ', '.join(x.name for x in shared.ACTUATOR))
     return found
 
 
@@ -210,7 +204,7 @@ def entries_of(path: Path) -> Entries:
         whole, _, parameter = name.rpartition('ros__parameters.')
         node = whole.rstrip('.').rpartition('/')[2]
         entries.append((
-            '' if node in ('*', '**') else node, present_name(parameter), value))
+            '' if node in ('*', '**') else node, shared.present_name(parameter), value))
     return entries
 
 
