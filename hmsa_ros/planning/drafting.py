@@ -18,7 +18,8 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.history import agree
 from hmsa_ros.planning.sequence import Segment, segments
 from hmsa_ros.planning.setpoint import impossible, Setpoint
-from hmsa_ros.planning.shapers.request import Shaper
+from hmsa_ros.planning.shapers import get_shaper
+from hmsa_ros.planning.shapers.request import Request, Shaper
 from hmsa_ros.planning.shapers.through import through
 from hmsa_ros.planning.stopping import brake, holdable
 from hmsa_ros.planning.timeline import Draft, Model, Plan, PlannedLevel, PlannedSegment
@@ -73,9 +74,7 @@ def on_grid(time: int, model: Model) -> int:
 
 def check_points(points: Sequence[tuple[float, int]], rest: float) -> Steps[None]:
     """Refuse points (stretch, end in ns from the start) that are no sequence: `RefusedError`."""
-    if not points:
-        raise RefusedError(
-            Code.BAD_INPUT, 'the trajectory has no points: expected at least one')
+    check_any(points)
     previous = -1
     for number, (stretch, time) in enumerate(points):
         check_target(stretch, rest)
@@ -88,6 +87,13 @@ def check_points(points: Sequence[tuple[float, int]], rest: float) -> Steps[None
         previous = time
         if number % _CHECKED == _CHECKED - 1:
             yield
+
+
+def check_any(points: Sequence[tuple[float, int]]) -> None:
+    """Refuse a request without points with `RefusedError`."""
+    if not points:
+        raise RefusedError(
+            Code.BAD_INPUT, 'the trajectory has no points: expected at least one')
 
 
 def check_target(stretch: float, rest: float) -> None:
@@ -285,10 +291,11 @@ def _planned(
         model: Model, state: State, setpoints: Iterable[Setpoint], shaper: str = '',
         first: Shaper | None = None) -> Iterator[Segment]:
     options = model.options
+    frame = Request(
+        state, state.stretch, model.material, model.limits, model.delivery, options.order,
+        model.units, options.errors, model.pace)
     return segments(
-        setpoints, model.material, start=state, shaper=shaper or options.shaper, first=first,
-        limits=model.limits, delivery=model.delivery, order=options.order, units=model.units,
-        short_spell=options.short_spell, errors=options.errors, pace=model.pace)
+        frame, setpoints, get_shaper(shaper or options.shaper), options.short_spell, first=first)
 
 
 def _placed(

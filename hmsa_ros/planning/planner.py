@@ -15,33 +15,14 @@ from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.simulation import check_stretch
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.planning.drafting import (
-    check_points,
-    check_target,
-    draft_moves,
-    draft_resumption,
-    draft_sequence,
-    draft_setpoints,
-    draft_stop,
-    finish,
-    later_outsets,
-    on_grid,
-    Outset,
-    Steps,
-)
+from hmsa_ros.planning import drafting
+from hmsa_ros.planning.drafting import Outset, Steps
 from hmsa_ros.planning.raw import check_levels, draft_levels
 from hmsa_ros.planning.running import RunningPlan
 from hmsa_ros.planning.setpoint import Setpoint
-from hmsa_ros.planning.timeline import (
-    Draft,
-    Model,
-    Options,
-    Plan,
-    PlannedLevel,
-    PlannedSegment,
-)
+from hmsa_ros.planning.timeline import Draft, Model, Options, Plan
 
-__all__ = ['Options', 'Plan', 'PlannedLevel', 'PlannedSegment', 'Planner']
+__all__ = ['Options', 'Planner']
 
 
 class Planner(RunningPlan):
@@ -90,15 +71,15 @@ class Planner(RunningPlan):
     def request(
             self, points: Sequence[tuple[float, int]], stamp: int | None, now: int) -> Plan:
         """Take a setpoint sequence; `draft_request` says more."""
-        return self.take(finish(self.draft_request(points, stamp, now)), now)
+        return self.take(drafting.finish(self.draft_request(points, stamp, now)), now)
 
     def setpoint(self, stretch: float, now: int) -> Plan:
         """Go to one stretch as soon as possible and hold it."""
-        return self.take(finish(self.draft_setpoint(stretch, now)), now)
+        return self.take(drafting.finish(self.draft_setpoint(stretch, now)), now)
 
     def stop(self, now: int) -> Plan:
         """Drop what is ahead and come to rest as near as the flux density limits allow."""
-        return self.take(finish(self.draft_stop(now)), now)
+        return self.take(drafting.finish(self.draft_stop(now)), now)
 
     def draft_request(
             self, points: Sequence[tuple[float, int]], stamp: int | None,
@@ -110,11 +91,11 @@ class Planner(RunningPlan):
         then, a past one joins the sequence in the middle. The draft is None where the request
         changes nothing; what cannot be carried out is a `RefusedError`.
         """
-        yield from check_points(points, self.model.material.rest)
+        yield from drafting.check_points(points, self.model.material.rest)
         soonest = self.soonest(now)
         base = soonest if stamp is None else stamp
-        outset = self._outset(on_grid(max(base, soonest), self.model))
-        return (yield from draft_sequence(outset, points, base, now))
+        outset = self._outset(drafting.on_grid(max(base, soonest), self.model))
+        return (yield from drafting.draft_sequence(outset, points, base, now))
 
     def draft_levels(
             self, points: Sequence[tuple[float, int]], stamp: int | None,
@@ -126,7 +107,7 @@ class Planner(RunningPlan):
         """
         check_levels(points, self.model)
         soonest = self.soonest(now)
-        begin = on_grid((soonest if stamp is None else stamp) + points[0][1], self.model)
+        begin = drafting.on_grid((soonest if stamp is None else stamp) + points[0][1], self.model)
         if begin < soonest:
             raise RefusedError(
                 Code.IN_THE_PAST, f'the first level applies {(now - begin) / NANOSECONDS:.3f} s '
@@ -135,13 +116,13 @@ class Planner(RunningPlan):
 
     def draft_setpoint(self, stretch: float, now: int) -> Steps[Draft | None]:
         """Work out a move to one stretch; None where it changes nothing."""
-        check_target(stretch, self.model.material.rest)
+        drafting.check_target(stretch, self.model.material.rest)
         outset = self._outset(self.soonest(now))
-        return (yield from draft_setpoints(outset, [Setpoint(stretch, math.inf)]))
+        return (yield from drafting.draft_setpoints(outset, [Setpoint(stretch, math.inf)]))
 
     def draft_stop(self, now: int) -> Steps[Draft]:
         """Work out how to come to rest."""
-        return (yield from draft_stop(self._outset(self.soonest(now))))
+        return (yield from drafting.draft_stop(self._outset(self.soonest(now))))
 
     def draft_resumption(self, now: int, arrival: int | None = None) -> Steps[Draft | None]:
         """Plan what is left anew from where the actuator is, to arrive in time if one is given."""
@@ -152,14 +133,14 @@ class Planner(RunningPlan):
             begin = max(begin, self.plan.segments[0].since)
         outset = self._outset(begin)
         if arrival is not None:
-            return (yield from draft_resumption(outset, arrival))
-        for later in later_outsets(outset):
+            return (yield from drafting.draft_resumption(outset, arrival))
+        for later in drafting.later_outsets(outset):
             try:
-                return (yield from draft_resumption(self._outset(later)))
+                return (yield from drafting.draft_resumption(self._outset(later)))
             except RefusedError:
                 # From another phase of the motion it may be possible.
                 yield
-        return (yield from draft_resumption(outset))
+        return (yield from drafting.draft_resumption(outset))
 
     def draft_trim(self, now: int, flux_density: float) -> Steps[Draft]:
         """Work out how to hold the setpoint under way by another level in T, from rest."""
@@ -168,7 +149,7 @@ class Planner(RunningPlan):
         # Beside the target, by what the model does not know of: it goes by its own stretches.
         held, wanted = (float(equilibrium_stretch(x / model.units.load, model.material)) for x in (
             self.plan.level(begin).flux_density, flux_density))
-        draft = yield from draft_moves(
+        draft = yield from drafting.draft_moves(
             Outset(self.plan, model, begin, replace(state, stretch=held, rate=0.0)),
             [Setpoint(wanted, math.inf)])
         segment = self.plan.segments[place]
@@ -192,4 +173,4 @@ class Planner(RunningPlan):
 
     def soonest(self, now: int) -> int:
         """Return the first time that a command can still reach in time."""
-        return on_grid(now + self.model.options.lead_time, self.model)
+        return drafting.on_grid(now + self.model.options.lead_time, self.model)

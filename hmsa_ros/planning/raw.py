@@ -13,7 +13,7 @@ from hmsa_ros.model.equations import equilibrium_stretch, stretch_limits
 from hmsa_ros.model.moves import State
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.planning.drafting import draft_moves, Outset, Steps
+from hmsa_ros.planning.drafting import check_any, draft_moves, Outset, Steps
 from hmsa_ros.planning.setpoint import Setpoint
 from hmsa_ros.planning.timeline import Draft, Model, PlannedLevel, PlannedSegment
 
@@ -32,9 +32,7 @@ def check_levels(points: Sequence[tuple[float, int]], model: Model) -> None:
     Where there are none, times do not increase or the coil has no such level: `RefusedError`.
     """
     least, most = model.options.flux_density_min, model.options.flux_density_max
-    if not points:
-        raise RefusedError(
-            Code.BAD_INPUT, 'the trajectory has no points: expected at least one')
+    check_any(points)
     previous = -1
     for number, (level, time) in enumerate(points):
         if not math.isfinite(level):

@@ -20,7 +20,7 @@ from hmsa_ros.model.units import Units
 from hmsa_ros.planning.setpoint import Setpoint
 from hmsa_ros.planning.shapers import creeping, get_shaper
 from hmsa_ros.planning.shapers.pace import PACE, Pace
-from hmsa_ros.planning.shapers.request import ERRORS, Request, Shaper
+from hmsa_ros.planning.shapers.request import ERRORS, Request, Shaper, Work
 
 #: What to do with a setpoint that ends before the move to it does.
 SHORT_SPELL = ('refuse', 'continue')
@@ -113,39 +113,33 @@ def plan_sequence(
     """
     if not setpoints:
         raise RefusedError(Code.BAD_INPUT, 'no setpoint given: expected at least one')
-    return tuple(segments(
-        setpoints, material, start=start, shaper=shaper, limits=limits, delivery=delivery,
-        order=order, units=units, short_spell=short_spell, errors=errors, pace=pace))
-
-
-def segments(
-        setpoints: Iterable[Setpoint], material: NondimensionalParameters, *,
-        start: State | None = None, shaper: str = 'two_step', limits: Limits | None = None,
-        delivery: Delivery = IDEAL, order: int = 2, units: Units | None = None,
-        short_spell: str = 'refuse',
-        errors: Uncertainty = ERRORS, pace: Pace = PACE,
-        first: Shaper | None = None) -> Generator[Segment, None, None]:
-    """
-    Plan as `plan_sequence` does, setpoint by setpoint; the first may have a shaper of its own.
-
-    Raises `RefusedError` where a setpoint cannot be had, `BadInputError` for another argument.
-    """
     if short_spell not in SHORT_SPELL:
         raise BadInputError(
             f'short_spell is {short_spell!r}: expected one of {", ".join(SHORT_SPELL)}')
-    shape = first or get_shaper(shaper)
-    limits = limits or Limits()
-    units = units or Units()
-    state = start or State(material.rest)
+    begin = Request(
+        start or State(material.rest), material.rest, material, limits or Limits(), delivery,
+        order, units or Units(), errors, pace)
+    return tuple(segments(begin, setpoints, get_shaper(shaper), short_spell))
+
+
+def segments(
+        frame: Request, setpoints: Iterable[Setpoint], shaper: Shaper, short_spell: str, *,
+        first: Shaper | None = None) -> Generator[Segment, None, None]:
+    """
+    Plan setpoint by setpoint; the first may have a shaper of its own.
+
+    Each move is that of the frame but for state and target; the state is where all begins. Raises
+    `RefusedError` where a setpoint cannot be had, `BadInputError` for another argument.
+    """
+    shape = first or shaper
+    material, delivery, units, state = frame.material, frame.delivery, frame.units, frame.state
     check_stretch(state.stretch, material, 'start stretch')
     begin = 0.0
     upcoming = iter(setpoints)
     setpoint = next(upcoming, None)
     while setpoint is not None:
         following = next(upcoming, None)
-        request = Request(
-            state, setpoint.stretch, material, limits, delivery, order, units, errors,
-            pace)
+        request = replace(frame, state=state, target=setpoint.stretch, work=Work())
         move = creeping.held(
             request, _rounded(shape(request), delivery),
             math.inf if following is None else setpoint.span)
@@ -168,7 +162,7 @@ def segments(
         begin += setpoint.span
         state = end
         setpoint = following
-        shape = get_shaper(shaper)
+        shape = shaper
 
 
 def _cut(move: Move, setpoint: Setpoint, units: Units, *, last: bool) -> Move:
