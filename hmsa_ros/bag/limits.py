@@ -91,4 +91,4 @@ def load_yaml(text: str) -> Any:
     except BagError:
         raise
     except Exception as error:  # values that do not fit their tags raise errors of any class
-        raise BagError('it is not YAML') from error
+        raise BagError(f'it is not YAML: {" ".join(str(error).split())[:200]}') from error

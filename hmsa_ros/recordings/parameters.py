@@ -1,13 +1,14 @@
 """Parameters of a run: as a recorder stored them, or from a parameter file of the nodes."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 import json
 import math
 from pathlib import Path
 from typing import Any
 
 from hmsa_ros.bag.experiment import parameters_of
-from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.bag.limits import load_yaml
+from hmsa_ros.errors import BadInputError, BagError, excerpt
 from hmsa_ros.files import read_at_most
 from hmsa_ros.interfaces import parameters as shared
 from hmsa_ros.interfaces.actuator import actuator_from, creep_from
@@ -18,7 +19,6 @@ from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 
 # Parameter files have some dozens of entries.
 _LARGEST_FILE = 1 << 20
-_DEEPEST = 32
 
 #: Node, dotted name and value of each parameter in a file; no node if all are meant.
 Entries = list[tuple[str, str, object]]
@@ -186,21 +186,19 @@ def values_of(
 def entries_of(path: Path) -> Entries:
     """Return the parameters in a file, or raise `BadInputError` if it cannot be read."""
     try:
-        content = read_at_most(path, _LARGEST_FILE, 'a parameter file of at most that')
-        document = _load(content.decode('utf-8'))
-    except (OSError, ValueError, RecursionError) as error:
-        if isinstance(error, BadInputError):
-            raise
-        reason = getattr(error, 'strerror', None) or ' '.join(str(error).split())
+        document = load_yaml(
+            read_at_most(path, _LARGEST_FILE, 'a parameter file of at most that').decode('utf-8'))
+    except BadInputError:
+        raise
+    except (OSError, ValueError, BagError) as error:
         raise BadInputError(
-            f'{path} cannot be read ({reason}): expected a parameter file (YAML)') from error
+            f'{path} cannot be read ({getattr(error, "strerror", None) or error}): expected a '
+            'parameter file (YAML)') from error
     if not isinstance(document, dict):
         raise BadInputError(
             f'{path} has no ros__parameters: expected a parameter file as hmsa init writes it')
-    flat: dict[str, object] = {}
-    _flatten(document, '', flat, 0, path)
     entries = []
-    for name, value in flat.items():
+    for name, value in _flat(document):
         whole, _, parameter = name.rpartition('ros__parameters.')
         node = whole.rstrip('.').rpartition('/')[2]
         entries.append((
@@ -208,30 +206,10 @@ def entries_of(path: Path) -> Entries:
     return entries
 
 
-def _load(text: str) -> Any:
-    """Read YAML without aliases, which ROS does not take either and which can grow endlessly."""
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        def compose_node(self, parent: Any, index: Any) -> Any:
-            if self.check_event(yaml.AliasEvent):
-                raise ValueError('it has an alias (*), which ROS does not take either')
-            return super().compose_node(parent, index)
-
-    try:
-        return yaml.load(text, Loader)
-    except yaml.YAMLError as error:
-        raise ValueError(str(error)) from error
-
-
-def _flatten(
-        value: object, name: str, found: dict[str, object], depth: int, path: Path) -> None:
-    """Collect the values of nested mappings by dotted name."""
-    if depth > _DEEPEST:
-        raise BadInputError(
-            f'{path} is nested more than {_DEEPEST} deep: expected a parameter file (YAML)')
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            _flatten(inner, f'{name}.{key}' if name else str(key), found, depth + 1, path)
-    else:
-        found[name] = value
+def _flat(values: Mapping[object, object], before: str = '') -> Iterator[tuple[str, object]]:
+    """Yield the values of nested mappings with their dotted names."""
+    for key, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f'{before}{key}.')
+        else:
+            yield f'{before}{key}', value
