@@ -369,6 +369,21 @@ def test_without_the_requests_setpoints_are_told_by_the_levels_that_last(tmp_pat
     assert 'plan-section' not in Page(page([part])).ids
 
 
+def test_a_request_that_a_busy_recorder_received_after_its_status_counts_from_the_status(
+        tmp_path, bag):
+    messages = without(simulated(), 'joint_trajectory', 'status')
+    request, = (x for _, topic, _, x in simulated() if topic.endswith('joint_trajectory'))
+    request.header.frame_id = 'a'
+    accepted = status(0, 'accepted', 'accepted')
+    accepted.values.append(STORE.types['diagnostic_msgs/msg/KeyValue'](key='request', value='a'))
+    messages += [
+        (START, '/planner/status', TYPES[STATUS], accepted),
+        (START + 2 * LEAD, '/planner/joint_trajectory', TYPES[TRAJECTORY], request)]
+    part = one(tmp_path / 'bag', messages, **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    expected, = parts_of(bag)
+    assert part.evaluation.findings == expected.evaluation.findings
+
+
 def test_unknown_parameters_are_said_to_be_unknown_and_the_plan_still_tells_the_setpoints(
         tmp_path):
     other = paper_actuator(NondimensionalParameters(zeta=0.1, j_lim=8.0))

@@ -45,7 +45,7 @@ def test_a_simulated_experiment_arrives_and_leaves_its_bag_and_a_report(start, t
         assert x['vibration'] < 1e-6
         assert x['offset_std'] < 1e-6
         assert x['vibration_std'] < 1e-6
-    assert result['exits'] == {'plant': 0, 'planner': 0, 'recorder': 0}
+    assert result['exits'] == {'controller': 0, 'recorder': 0}
     assert '<html' in (out / 'report.html').read_text()
     # The bag itself is held against rosbags behind each test.
     found, = read_runs(out / 'run')
@@ -119,7 +119,7 @@ def test_an_interrupted_experiment_brings_the_running_actuator_to_rest(start, ro
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('moment', ['plant.log', 'recorder.log', 'run/*.mcap'])
+@pytest.mark.parametrize('moment', ['controller.log', 'recorder.log', 'run/*.mcap'])
 def test_an_experiment_can_be_interrupted_at_any_moment(start, tmp_path, wait_until, moment):
     out = tmp_path / 'out'
     run = start.hmsa('run', '1.1:1', '1.2:1', '--simulate', '--out', str(out))
@@ -165,9 +165,7 @@ def test_a_simulated_experiment_with_feedback_arrives_and_records_what_is_believ
         start, tmp_path):
     file = tmp_path / 'mismatched.yaml'
     # In slow motion: a busy machine takes its time, and feedback shall correct a move in it.
-    file.write_text(
-        f'{MISMATCHED}    real_time_factor: 0.15\n    publish_rate: 500.0\n'
-        '/**/planner:\n  ros__parameters:\n    lead_time: 0.4\n')
+    file.write_text(f'{MISMATCHED}    real_time_factor: 0.3\n')
     run = start.hmsa('run', '1.1:1.5', '1.3:1.5', '--simulate', '--feedback', 'adapt',
                      '--params-file', str(file), '--out', str(tmp_path / 'out'))
     assert run.wait(RUN_SECONDS) == 0, run.output

@@ -7,36 +7,25 @@ closed.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
-import json
+from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
-from time import monotonic, time
-
-from diagnostic_msgs.msg import DiagnosticArray
-import numpy as np
-from rosgraph_msgs.msg import Clock
-from std_srvs.srv import SetBool
+from time import monotonic
+from typing import TYPE_CHECKING
 
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.parameters import BLOCK, WORDS
-from hmsa_ros.interfaces.status import Verdict, whole
-from hmsa_ros.lab.client import PlannerClient
+from hmsa_ros.interfaces.status import Verdict
 from hmsa_ros.lab.processes import NodeProcess, Session
-from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.nodes import endpoints
-from hmsa_ros.nodes.conversions import from_time
-from hmsa_ros.nodes.remote_parameters import RemoteParameters
+
+if TYPE_CHECKING:
+    from hmsa_ros.lab.watch import Watch
 
 Setpoints = Sequence[tuple[Sequence[float], float]]
 Tell = Callable[[str, float], None]
-_START_SECONDS = 20.0
-# How long the end of a sequence may keep us waiting after its time is over.
-_GRACE_SECONDS = 20.0
-# Between two looks at who is there.
-_LOOK_SECONDS = 0.5
-_SAME = 1e-9
+#: How long nodes may take to start, and time may stand still.
+START_SECONDS = 20.0
 
 
 @dataclass(frozen=True)
@@ -100,8 +89,12 @@ def prepare(folder: Path) -> None:
     ------
     BadInputError
         If it cannot be used.
+    ModuleNotFoundError
+        If there is no ROS, which nothing has imported yet.
 
     """
+    if find_spec('rclpy') is None:
+        raise ModuleNotFoundError("No module named 'rclpy'", name='rclpy')
     if (folder / 'run').exists():
         raise BadInputError(
             f'{folder} holds an earlier run: expected another folder (--out), or this one '
@@ -145,13 +138,29 @@ def conduct(
         sequence was sent, the bag is closed, and all processes that were started have ended.
 
     """
-    with Session(experiment.folder, environment) as session, PlannerClient(
+    times = [monotonic()]
+    with Session(experiment.folder, environment) as session:
+        progress('starting the nodes' if experiment.nodes else 'looking for the nodes', 0.0)
+        if experiment.nodes:
+            for node in (*experiment.nodes, _recorder(experiment, True)):
+                ENDING.check()
+                session.start(node)
+        return _conduct(experiment, session, progress, times)
+
+
+def _conduct(
+        experiment: Experiment, session: Session, progress: Tell,
+        times: list[float]) -> Conducted:
+    """Carry out an experiment whose nodes, if it has any, have been started."""
+    # ROS is imported here, while the nodes do the same.
+    from hmsa_ros.lab.client import PlannerClient
+    from hmsa_ros.lab.watch import Watch
+
+    with PlannerClient(
             namespace=experiment.namespace, joints=experiment.joints,
-            timeout=_START_SECONDS) as client:
-        watch = _Watch(client, experiment, session.check)
-        times = [monotonic()]
+            timeout=START_SECONDS) as client:
+        watch = Watch(client, experiment, session.check)
         try:
-            progress('starting the nodes' if experiment.nodes else 'looking for the nodes', 0.0)
             _begin(experiment, session, watch)
             times.append(monotonic())
             begin = watch.now
@@ -177,20 +186,16 @@ def conduct(
                 raise HmsaError(
                     f'the {name} ended with status {status}: {session.last_words(name)}')
     times.append(monotonic())
-    seconds = dict(zip(('start', 'sequence', 'end'), np.diff(times).tolist(), strict=True))
+    seconds = dict(zip(
+        ('start', 'sequence', 'end'), (y - x for x, y in pairwise(times)), strict=True))
     return Conducted(exits, measured, tuple(watch.notes), verdict, seconds, pace)
 
 
-def _begin(experiment: Experiment, session: Session, watch: '_Watch') -> None:
-    """Start what is to be started, check what runs, and wait for the recorder."""
-    for node in experiment.nodes:
-        ENDING.check()
-        session.start(node)
-    if experiment.nodes:
-        session.start(_recorder(experiment, True))
+def _begin(experiment: Experiment, session: Session, watch: 'Watch') -> None:
+    """Check what runs, and wait for the recorder."""
     watch.client.find_planner(session.check)
-    watch.client.check_alone()
     watch.read_parameters()
+    watch.client.check_alone()
     if not experiment.nodes:
         watch.check()
         session.start(_recorder(experiment, bool(watch.parameter('planner.use_sim_time'))))
@@ -207,7 +212,7 @@ def _recorder(experiment: Experiment, simulated: bool) -> NodeProcess:
         'record.topics': experiment.topics()}, experiment.namespace)
 
 
-def _carry_out(experiment: Experiment, watch: '_Watch', progress: Tell) -> Verdict:
+def _carry_out(experiment: Experiment, watch: 'Watch', progress: Tell) -> Verdict:
     """Send the sequence, and wait until the last setpoint has been watched for its span."""
     watch.sent = True
     verdict = watch.client.send(experiment.setpoints, experiment.levels)
@@ -228,177 +233,3 @@ def _carry_out(experiment: Experiment, watch: '_Watch', progress: Tell) -> Verdi
     watch.client.spin_until(
         lambda: watch.now - begin > total, 'time does not advance', report, float('inf'))
     return verdict
-
-
-class _Watch:
-    """What an experiment looks at: who is there, the recorder's readiness, and the time."""
-
-    def __init__(
-            self, client: PlannerClient, experiment: Experiment,
-            check: Callable[[], None]) -> None:
-        self.client = client
-        # That what was started runs.
-        self._check = check
-        self.sent = False
-        self.notes: list[str] = []
-        self._experiment = experiment
-        # Topics that the recorder has subscribed to, by what it says.
-        self._subscribed = 0
-        self._clock: float | None = None
-        self._looked = 0.0
-        # The time, and when it last went on.
-        self._seen = 0.0, monotonic()
-        self._over: float | None = None
-        self._parameters: dict[str, str] = {}
-        node = client.node
-        endpoints.subscribe(node, topics.DIAGNOSTICS, self._on_diagnostics)
-        endpoints.subscribe(node, topics.CLOCK_TOPIC, self._on_clock)
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            values = {x.key: x.value for x in status.values}
-            # Others may record too.
-            if values.get('bag') == str(self._experiment.bag):
-                self._subscribed = whole(values.get('subscribed', '').partition('/')[0])
-
-    def _on_clock(self, message: Clock) -> None:
-        self._clock = from_time(message.clock) / NANOSECONDS
-
-    @property
-    def now(self) -> float:
-        """Time of the nodes in s."""
-        if self._experiment.nodes or self.parameter('planner.use_sim_time'):
-            return self._clock or 0.0
-        return time()
-
-    @property
-    def recorder_ready(self) -> bool:
-        """Whether the recorder hears everything that somebody sends."""
-        sent = [x for x in self._experiment.topics() if self.client.node.count_publishers(x)]
-        return self._subscribed >= len(sent)
-
-    @property
-    def measured(self) -> bool:
-        """Whether somebody publishes samples."""
-        return bool(self.client.node.count_publishers(topics.JOINT_STATES.name))
-
-    # -- checks --------------------------------------------------------------------------------
-
-    def read_parameters(self) -> None:
-        """Ask planner and plant for their parameters; a driver of hardware may have none."""
-        space = f'/{self._experiment.namespace.strip("/")}'.rstrip('/')
-        asked = {x: RemoteParameters(self.client.node, f'{space}/{x}')
-                 for x in (topics.PLANNER, topics.PLANT)}
-
-        def poll() -> None:
-            self._check()
-            for node, remote in asked.items():
-                if not self._known(node):
-                    remote.poll(partial(self._note, node))
-
-        def known() -> bool:
-            there = {x for x, own in self.client.node.get_node_names_and_namespaces()
-                     if own == (space or '/')}
-            return all(
-                self._known(node) for node in asked if node == topics.PLANNER or node in there)
-
-        self.client.spin_until(known, 'the nodes do not give their parameters', poll)
-
-    def _known(self, node: str) -> bool:
-        return any(x.startswith(f'{node}.') for x in self._parameters)
-
-    def _note(self, node: str, found: Mapping[str, str]) -> None:
-        self._parameters |= {f'{node}.{x.partition(f"{node}.")[2]}': found[x] for x in found}
-
-    def parameter(self, name: str) -> object:
-        """Return a parameter of a node by ``'node.name'``; None if it has none."""
-        return json.loads(self._parameters.get(name, 'null'))
-
-    def check(self) -> None:
-        """
-        Make sure that what runs can do what is asked.
-
-        Raises
-        ------
-        BadInputError
-            If a node's parameters are not those of the parameter file.
-        HmsaError
-            If nobody takes the commands.
-
-        """
-        wrong = [
-            f'{name} is {self.parameter(name)} and not {value}'
-            for name, value in self._experiment.expected.items()
-            if name in self._parameters and not _same(self.parameter(name), value)]
-        if wrong:
-            raise BadInputError(
-                f'the nodes run with other parameters than the file has ({"; ".join(wrong[:3])}'
-                '): expected the same; start them with --params-file and that file')
-        for spec in BLOCK:
-            own, other = (self.parameter(f'{x}.{spec.name}')
-                          for x in (topics.PLANT, topics.PLANNER))
-            if own is not None and not _same(own, other):
-                self.notes.append(
-                    f'{spec.name} is {other} for the planner and {own} for the plant')
-        self.client.spin_until(
-            lambda: not self.client.unheard(),
-            'no node receives the commands on '
-            f'{", ".join(self.client.unheard()) or "their topics"}: '
-            'expected a plant or a driver of the coil (hmsa plant)')
-        joints = self._experiment.joints
-        if not self.client.node.count_publishers(
-                topics.of_joint(topics.FLUX_DENSITY_APPLIED, joints[0], joints).name):
-            self.notes.append(
-                'no node reports the applied levels (flux_density_applied)')
-            if not self.measured:
-                raise HmsaError(
-                    'no node reports applied levels (flux_density_applied) or samples '
-                    '(joint_states): expected a plant or a driver that does')
-
-    def look(self, end: float) -> None:
-        """
-        Make sure that the nodes are there and time goes on; the sequence is over at ``end`` s.
-
-        Raises
-        ------
-        HmsaError
-            If something has gone.
-
-        """
-        self._check()
-        moment, now = monotonic(), self.now
-        if moment - self._looked < _LOOK_SECONDS:
-            return
-        self._looked = moment
-        if now > self._seen[0]:
-            self._seen = now, moment
-        elif moment - self._seen[1] > _START_SECONDS:
-            raise HmsaError(f'time does not advance beyond {now:g} s: expected messages on /clock')
-        if not self.client.node.count_publishers(
-                topics.from_outside(topics.STATUS.name, topics.PLANNER)):
-            raise HmsaError('the planner has gone: expected it to run until the end')
-        if unheard := self.client.unheard():
-            raise HmsaError(
-                f'no node receives the commands on {", ".join(unheard)} any more: expected plant '
-                'or driver to run until the end')
-        if now > end:
-            self._over = self._over or moment
-            if moment - self._over > _GRACE_SECONDS:
-                raise HmsaError(
-                    f'the sequence has not come to its end {_GRACE_SECONDS:g} s after its time')
-
-    def unpause(self) -> None:
-        """Let simulated time run."""
-        call = endpoints.call(
-            self.client.node, topics.SET_PAUSED, topics.PLANT, SetBool.Request(data=False))
-        for condition, failure in (
-                (lambda: call.ready, 'the plant offers no service to unpause it'),
-                (lambda: call.answer() is not None, 'the plant did not answer'),
-                (lambda: self.now > 0.0, 'time does not begin to advance')):
-            self.client.spin_until(condition, failure, self._check)
-
-
-def _same(own: object, other: object) -> bool:
-    if isinstance(own, (int, float)) and isinstance(other, (int, float)):
-        return own == other or abs(own - other) <= _SAME * max(abs(own), abs(other))
-    return own == other or isinstance(other, bool) and own in WORDS[other]

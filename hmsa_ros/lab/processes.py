@@ -100,17 +100,20 @@ class Session:
         return f'{lines[-1] if lines else "it printed nothing"} (log: {self.log(name)})'
 
     def stop(self) -> dict[str, int]:
-        """End all nodes one by one, the recorder first; return exit status by node."""
+        """End the recorder, then all other nodes together; return exit status by node."""
         names = sorted(self._processes, key=lambda x: x != RECORDER)
-        for name in names:
-            process = self._processes[name]
-            if process.poll() is None:
-                process.send_signal(signal.SIGINT)
-            try:
-                process.wait(_PATIENCE_SECONDS)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        first = [x for x in names if x == RECORDER]
+        for group in (first, names[len(first):]):
+            processes = [self._processes[x] for x in group]
+            for process in processes:
+                if process.poll() is None:
+                    process.send_signal(signal.SIGINT)
+            for process in processes:
+                try:
+                    process.wait(_PATIENCE_SECONDS)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
         return {name: self._processes[name].returncode for name in names}
 
 

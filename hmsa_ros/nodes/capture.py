@@ -143,6 +143,15 @@ class RawSubscription:
         except InvalidHandle:
             return []
 
+    @property
+    def matched(self) -> bool:
+        """Whether it has found a publisher, whose messages it receives from then on."""
+        try:
+            with self.handle:
+                return bool(self.handle.get_publisher_count())
+        except InvalidHandle:
+            return False
+
     def destroy(self) -> None:
         """Stop receiving."""
         self.handle.destroy_when_not_in_use()
@@ -190,6 +199,11 @@ class Capture:
                     self._subscriptions[i] = (key, subscription)
                     self._changed = True
         self._wake()
+
+    def matched(self) -> list[Any]:
+        """Return the keys of the subscriptions that have found a publisher."""
+        with self._lock:
+            return [key for key, x in self._subscriptions if x.matched]
 
     def stop(self) -> None:
         """Pass on what has arrived so far and end the thread."""

@@ -129,6 +129,8 @@ class Recorder(ManagedNode):
         self._experiment: dict[str, str] = {'hmsa_ros.version': __version__}
         self._setpoints = SetpointLog()
         self._setpoint_topics: set[str] = set()
+        # Topics of which a publisher was found at the last look.
+        self._matched = 0
         limits = _limits(values)
         writer = _writer(values, self._experiment)
         self.folder: Path = writer.folder
@@ -169,7 +171,7 @@ class Recorder(ManagedNode):
             ParameterEvent, '/parameter_events', self._on_parameter_event, 100)
         interval = duration_from(self._parameters_in, 'record.topic_polling_interval') * 1e-9
         self.every(max(interval, 1e-3), self._on_poll)
-        self.diagnose(self._status_of_bag)
+        self._diagnose = self.diagnose(self._status_of_bag)
         self.get_logger().info(f'recording to {self.folder}')
 
     def _full_name(self, name: str) -> str:
@@ -187,6 +189,11 @@ class Recorder(ManagedNode):
         self._find_nodes()
         found = self.get_topic_names_and_types()
         self._recorded.look(found)
+        before, self._matched = self._matched, sum(
+            isinstance(x, RecordedTopic) for x in self._capture.matched())
+        if self._matched != before:
+            # At once: somebody may wait for it.
+            self._diagnose()
         for name, types in found:
             topic = _SETPOINTS.get(name.rsplit('/', 1)[-1])
             if topic is not None and topic.type in types and any(
@@ -314,6 +321,7 @@ class Recorder(ManagedNode):
             'bag': self.folder,
             'state': state,
             'subscribed': f'{len(self._recorded.topics)}/{self._recorded.wanted_count}',
+            'matched': self._matched,
             'received': sum(topic.received for topic in self._recorded.topics.values()),
             **figures(status, lost, self._before()),
             **({} if self._sim_time is None else {

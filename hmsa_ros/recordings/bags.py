@@ -151,6 +151,7 @@ class _Trajectory:
     joints: tuple[str, ...]
     stamp: int
     points: tuple[_Point, ...]
+    name: str  # of the request, if it has one
 
     @classmethod
     def of(cls, sent: int, message: Any) -> '_Trajectory':
@@ -158,7 +159,7 @@ class _Trajectory:
         return cls(sent, tuple(message.joint_names), nanoseconds_of(message.header.stamp), tuple(
             _Point(nanoseconds_of(x.time_from_start), *(
                 tuple(map(float, y)) for y in (x.positions, x.velocities, x.effort)))
-            for x in message.points))
+            for x in message.points), message.header.frame_id)
 
 
 @dataclass(frozen=True)
@@ -265,10 +266,16 @@ class _Collected:
     def _requests(self, joint: str, key: str) -> list[RecordedRequest]:
         """Return what was asked of a joint, by time."""
         requests = list(self.setpoints.get(key, ()))
+        # A busy recorder may receive a request after what the planner said of it.
+        answered: dict[str, int] = {}
+        for status in self.statuses:
+            answered.setdefault(status.values.get('request', ''), status.sent)
         for asked in self.trajectories:
             place = _place(asked.joints, joint)
             if place is not None:
-                requests.append(RecordedRequest(asked.sent, asked.stamp, tuple(
+                sent = min(asked.sent, answered.get(asked.name, asked.sent)) if asked.name \
+                    else asked.sent
+                requests.append(RecordedRequest(sent, asked.stamp, tuple(
                     (x.positions[place], x.time) for x in asked.points
                     if len(x.positions) == max(len(asked.joints), 1))))
         return sorted(requests, key=lambda x: x.sent)
