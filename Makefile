@@ -123,7 +123,8 @@ $(VENV)/.bench: $(VENV)/.installed
 	@touch $@
 
 # The installation compiles the motion, too; this is for when its sources change.
-$(VENV)/.motion: $(wildcard hmsa_ros/*.c hmsa_ros/motion/*.cpp hmsa_ros/motion/hmsa/*.hpp) | $(VENV)/.installed
+$(VENV)/.motion: $(wildcard hmsa_ros/*.c hmsa_ros/device/*.cpp \
+	hmsa_ros/device/hmsa_board/*.hpp hmsa_ros/motion/*.cpp hmsa_ros/motion/hmsa/*.hpp) | $(VENV)/.installed
 	@test -e $@ && test -z "$$(find $^ -newer $@)" \
 	|| { echo "Compiling the motion"; $(BIN)/python setup.py --quiet build_ext --inplace; }
 	@touch $@

@@ -47,6 +47,7 @@ EXTRAS_REQUIRE = {
     'test': [
         'hypothesis>=6.98',
         'mypy>=1.9',
+        'pyserial>=3.5',
         'pyte>=0.8',
         # From 9.2 on, groups of pytest-xdist 3.8 are lost: it writes to a private attribute.
         'pytest>=7.4,<9.2',
@@ -66,6 +67,10 @@ EXTRAS_REQUIRE = {
         'dask>=2024.1',
         'distributed>=2024.1',
         'pyarrow>=14.0',
+    ],
+    # Boards on a serial port.
+    'serial': [
+        'pyserial>=3.5',
     ],
     'bench': [
         'casadi>=3.6',
@@ -93,6 +98,11 @@ MOTION = Extension(
         '-std=c++17', '-O2', '-ftree-vectorize', '-ffp-contract=off', '-fno-math-errno',
         '-fno-trapping-math', '-fvisibility=hidden', '-fno-exceptions', '-fno-rtti', '-Wno-psabi',
         '-g0'])
+BOARD = Extension(
+    PACKAGE + '.device._board', [PACKAGE + '/device/_board.cpp'],
+    include_dirs=[PACKAGE + '/device'], depends=[PACKAGE + '/device/hmsa_board/board.hpp'],
+    language='c++', extra_compile_args=[
+        '-std=c++11', '-O2', '-fno-exceptions', '-fno-rtti', '-g0'])
 DEADLINE = Extension(
     PACKAGE + '._deadline', [PACKAGE + '/_deadline.c'], extra_compile_args=['-g0'])
 
@@ -120,11 +130,12 @@ setup(
     packages=find_packages(include=[PACKAGE, PACKAGE + '.*', 'hmsa_studies', 'hmsa_studies.*']),
     package_data={PACKAGE: [
         'fastdds.xml', 'fastdds_localhost.xml', 'motion/_motion.pyi', '_deadline.pyi', 'py.typed',
+        'device/_board.pyi', 'device/hmsa_board/board.hpp', 'device/hmsa_board/hmsa_board.ino',
         'report/page.css', 'report/page.js', 'report/style.mplstyle',
         *(f'cli/completion.{x}' for x in ('bash', 'zsh', 'fish')),
         *(os.path.relpath(x, os.path.join(HERE, PACKAGE)) for x in sorted(glob(
             os.path.join(HERE, PACKAGE, 'motion', 'hmsa', '*.hpp'))))]},
-    ext_modules=[MOTION, DEADLINE],
+    ext_modules=[MOTION, BOARD, DEADLINE],
     cmdclass={'build_ext': BuildMotion},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + PACKAGE]),

@@ -410,6 +410,17 @@ def test_a_device_that_keeps_time_gets_levels_ahead_and_says_when_they_took_effe
     assert (board.calls[-1], board.kept) == (('write', -0.1), [])
 
 
+def test_a_level_is_replaced_at_its_own_time_though_the_clock_is_known_better_by_then():
+    board, device = board_driver()
+    device.receive(0, START + 3000 * MS, 0.1)
+    for k in range(2, 2000, 5):
+        step(board, device, START + k * MS)
+    (first,) = board.kept
+    device.receive(0, START + 3000 * MS, 0.2)
+    step(board, device, START + 2001 * MS)
+    assert board.kept == [(first[0], 0.2)]
+
+
 def test_a_device_with_little_room_gets_levels_as_it_has_room():
     board, device = board_driver(capacity=2)
     for k in range(1, 7):

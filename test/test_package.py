@@ -25,7 +25,7 @@ PYTHONS = ('3.10', '3.11', '3.12', '3.13')
 KEYS = {
     'lz4': 'mcap-ros2-support', 'mcap': 'mcap-ros2-support',
     'mcap-ros2-support': 'mcap-ros2-support', 'zstandard': 'mcap-ros2-support',
-    'PyYAML': 'python3-yaml', 'rosbags': 'python3-rosbags-pip'}
+    'PyYAML': 'python3-yaml', 'pyserial': 'python3-serial', 'rosbags': 'python3-rosbags-pip'}
 # No key: ruff, type stubs, a terminal for tests, and plotly, without which only the page of a
 # report is missing.
 WITHOUT_KEY = {'plotly', 'pyte', 'ruff', 'types-PyYAML'}

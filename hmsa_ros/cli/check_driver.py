@@ -24,7 +24,8 @@ def add_parser(subparsers: Any) -> None:
                     'Takes about ten seconds. The exit status is 0 if all checks pass.',
         epilog='example: hmsa check-driver my_lab:Coil --set port=/dev/ttyACM0')
     parser.add_argument(
-        'hardware', metavar='MODULE:NAME', help='as in the parameter hardware of hmsa driver')
+        'hardware', metavar='MODULE:NAME',
+        help='as in the parameter hardware of hmsa driver, or serial_board')
     add_options(
         parser,
         ('--joint', 'NAME', str, 'name of the joint (default actuator)', {'default': 'actuator'}),

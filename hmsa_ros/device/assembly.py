@@ -24,7 +24,7 @@ from hmsa_ros.model.equations import Array
 _COOL = 0.9
 # The share of its saturation that a coil can reach.
 _SATURATED = 0.99
-_MEMBERS = ('open', 'clock', 'capacity')
+_MEMBERS = ('open', 'clock', 'capacity', 'description')
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class CoilModel:
 
     def __post_init__(self) -> None:
         for name in ('saturation', 'limit', 'rms', 'rms_time'):
-            _require(f'coil.{name}', getattr(self, name), positive=True)
+            require(f'coil.{name}', getattr(self, name), positive=True)
         if self.file:
             object.__setattr__(self, '_table', _table_in(Path(self.file)))
         elif not is_number(self.tesla_per_ampere) or self.tesla_per_ampere == 0.0:
@@ -128,12 +128,21 @@ class SensorScale:
 
     def __post_init__(self) -> None:
         for x in fields(self):
-            _require(f'sensor.{x.name}', getattr(self, x.name), positive=x.name == 'rest_length')
+            require(f'sensor.{x.name}', getattr(self, x.name), positive=x.name == 'rest_length')
         if self.gain == 0.0:
             raise BadInputError('sensor.gain is 0: expected another number')
 
 
-def _require(name: str, value: Any, *, positive: bool = False) -> None:
+def require(name: str, value: Any, *, positive: bool = False) -> None:
+    """
+    Refuse a setting that is no number, or not above 0.
+
+    Raises
+    ------
+    BadInputError
+        If it is refused.
+
+    """
     if not is_number(value, finite=not positive) or (positive and not value > 0.0):
         raise BadInputError(
             f'{name} is {excerpt(value)}: expected a number{" above 0" if positive else ""}')

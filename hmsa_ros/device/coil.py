@@ -57,10 +57,7 @@ class Coil:
         self._clock, self._patience = clock, round(calls.limit * NANOSECONDS)
         self.clear()
         self._next_question: int | None = None
-        if self.instrument.clock_map is not None:
-            for _ in range(ENOUGH):
-                self.instrument.ask_clock(clock)
-            self._next_question = clock() + _ASK
+        self.synchronise()
 
     def clear(self) -> None:
         """Forget what is ahead: the level is to be 0."""
@@ -220,6 +217,22 @@ class Coil:
             self._changed = self.schedule.next_stamp
 
     # -- the device's clock --------------------------------------------------------------------
+
+    def synchronise(self) -> None:
+        """
+        Learn the time of the device anew, where it has a clock.
+
+        Raises
+        ------
+        HardwareError
+            If it fails; StateLostError if it has lost its state.
+
+        """
+        if self.instrument.clock_map is not None:
+            self.instrument.forget_clock()
+            for _ in range(ENOUGH):
+                self.instrument.ask_clock(self._clock)
+            self._next_question = self._clock() + _ASK
 
     def ask_clock(self, now: int) -> bool:
         """

@@ -6,6 +6,7 @@ what its sensor saw.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 import json
 import math
 import signal
@@ -18,8 +19,8 @@ from typing import Any, cast, IO, NamedTuple
 import numpy as np
 
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
-from hmsa_ros.device.hardware import Calls, Hardware, load
-from hmsa_ros.device.protocol import Change, Sample
+from hmsa_ros.device.hardware import Calls, Hardware, Instrument, load
+from hmsa_ros.device.protocol import Change, Sample, StateLostError
 from hmsa_ros.device.watchdog import Fallback
 from hmsa_ros.device.worker import HardwareWorker
 from hmsa_ros.errors import BadInputError, HmsaError
@@ -363,14 +364,16 @@ class Trial:
         """Return whether the sensor of new hardware sees rest; None if it cannot tell."""
         if math.isnan(self._lifted):
             return None
-        hardware = self._make()
+        instrument = Instrument(self._make(), self._joint, Calls(1.0))
+        instrument.ask_clock(time_ns)
         found: list[float] = []
         until = monotonic() + 2.0 * _PHASE
         while monotonic() < until:
-            for x in _stretches(hardware.read(time_ns())):
-                found.append(x)
+            with suppress(StateLostError):
+                found += [x.stretch for x in instrument.read(time_ns())]
             sleep(1.0 / self._rate)
-        getattr(hardware, 'close', lambda: None)()
+        instrument.close()
+        found = [x for x in found if math.isfinite(x)]
         if not found:
             return None
         last = float(np.mean(found[len(found) // 2:]))
@@ -432,13 +435,6 @@ class Trial:
                 'clock', known.error, 's', _CLOCK,
                 f'its clock is known to {known.error * 1e6:.3g} us, and drifts by '
                 f'{known.drift * 1e6:.3g} ppm', 'clock() must answer at once')
-
-
-def _stretches(answer: Any) -> list[float]:
-    """Return the finite stretches of what read has returned."""
-    values = answer if isinstance(answer, list) else [answer]
-    found = [x[0] if isinstance(x, (tuple, list)) else x for x in values]
-    return [float(x) for x in found if x is not None and math.isfinite(x)]
 
 
 def _matched(seen: _Seen) -> list[tuple[Change, tuple[int, float]]]:

@@ -288,10 +288,11 @@ class HardwareDevice(Device):
         coil.repeat = False
         self.cut_off(i, self._time)
         try:
+            coil.synchronise()
             when, level = coil.instrument.write(0.0, self._time)
         except StateLostError as again:
             raise HardwareError(
-                f'{coil.instrument.name}.write lost its state twice in a row') from again
+                f'{coil.instrument.name} lost its state twice in a row') from again
         self._set(i, when, 0.0, level)
 
     def _read(self) -> None:

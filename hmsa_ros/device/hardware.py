@@ -19,6 +19,8 @@ from hmsa_ros.ending import Deadline, encoded
 from hmsa_ros.errors import BadInputError, excerpt, HmsaError
 from hmsa_ros.model.units import NANOSECONDS
 
+#: Hardware of this package, by the short names that `load` takes, too.
+SHIPPED = {'serial_board': 'hmsa_ros.device.serial_board:SerialBoard'}
 # What its methods take; all but the first two are optional.
 _TAKES: dict[str, tuple[str, ...]] = {
     'write': ('level', 'now'), 'read': ('now',), 'open': (), 'close': (),
@@ -40,8 +42,9 @@ _ROUNDING, _OFF = 1e-6, 0.01
 class Hardware(Protocol):
     """A coil's amplifier, and the sensor of its actuator; all calls must be quick."""
 
-    # It may have `limit` (T), `resolution` (T), `slew` (T/s), `open()`, which connects again, and
-    # `close()` too. All calls come from one thread, also that of the class, unless one blocks.
+    # It may have `limit` (T), `resolution` (T), `slew` (T/s), `description`, for the log at the
+    # start, `open()`, which connects again, and `close()` too. All calls come from one thread,
+    # also that of the class, unless one blocks.
     #
     # What keeps time itself has `schedule(levels)`, which takes [(stamp, level), ...] ahead and
     # replaces all that it has at or after the first stamp (an empty list is a sign of life), at
@@ -80,12 +83,14 @@ def told(error: BaseException) -> str:
         text = str(error)
     except BaseException as another:  # of an exception that cannot be written either
         text = f'no text, since {type(another).__name__} was raised meanwhile'
-    return f'{name}: {excerpt(text)}' if text else name
+    # The sentences of this package are short enough.
+    shown = text if isinstance(error, HmsaError) else excerpt(text)
+    return f'{name}: {shown}' if text else name
 
 
 def load(text: str) -> Callable[[str, Mapping[str, Any]], Hardware]:
     """
-    Return what makes the hardware of a joint by its name, found by ``'MODULE:NAME'``.
+    Return what makes the hardware of a joint by its name, ``'MODULE:NAME'`` or one of `SHIPPED`.
 
     It also takes settings, which are keyword arguments.
 
@@ -95,11 +100,11 @@ def load(text: str) -> Callable[[str, Mapping[str, Any]], Hardware]:
         If there is no such thing; what is returned raises it, too, where it fails.
 
     """
-    module, _, name = text.partition(':')
+    module, _, name = SHIPPED.get(text, text).partition(':')
     if not module or not name:
         raise BadInputError(
             f'hardware is {text!r}: expected MODULE:NAME of what makes the hardware of a joint, '
-            'as in hardware:=my_lab:Coil')
+            f'as in hardware:=my_lab:Coil, or {", ".join(SHIPPED)}')
     if os.getcwd() not in sys.path:
         # The script of a command has its own folder there instead.
         sys.path.append(os.getcwd())
@@ -113,7 +118,7 @@ def load(text: str) -> Callable[[str, Mapping[str, Any]], Hardware]:
     def made(joint: str, settings: Mapping[str, Any]) -> Hardware:
         try:
             found = make(joint, **settings)
-        except BadInputError as error:
+        except HmsaError as error:
             raise BadInputError(
                 f'hardware {text!r} of joint {joint} does not start: {error}') from error
         except BaseException as error:
@@ -231,8 +236,12 @@ class Instrument:
             self._check_signature(method, arguments)
         self.limit, self.resolution, self.slew, self._capacity = (
             self._number(x) for x in ('limit', 'resolution', 'slew', 'capacity'))
+        #: What was found, in its words.
+        self.description = str(getattr(hardware, 'description', '') or '')
         #: The device's clock against that of this host; None where there is one clock.
         self.clock_map = ClockMap() if self.has('clock') else None
+        # Stamps of ours, in the device's clock as it was known when they were handed over.
+        self._handed: dict[int, int] = {}
 
     def _check_signature(self, method: str, arguments: Sequence[str]) -> None:
         try:
@@ -376,7 +385,13 @@ class Instrument:
             If the hardware says so.
 
         """
-        self._call('schedule', [(self._theirs(x), y) for x, y in levels])
+        begin = levels[0][0] if levels else math.inf
+        known, self._handed = self._handed, {
+            x: y for x, y in self._handed.items() if begin - _ABSURD < x < begin or not levels}
+        for stamp, _ in levels:
+            # What replaces a level has its time, though the clock is known better by now.
+            self._handed[stamp] = known.get(stamp) or self._theirs(stamp)
+        self._call('schedule', [(self._handed[x], y) for x, y in levels])
 
     def applied(self, now: int) -> list[tuple[int, float]]:
         """
@@ -402,6 +417,12 @@ class Instrument:
                 f'{self._names["applied"]} returned {excerpt(answer)}: expected a list of '
                 '(stamp in ns, level in T)') from error
         return found
+
+    def forget_clock(self) -> None:
+        """Know nothing of its clock, where it has one, until it is asked."""
+        self._handed.clear()
+        if self.clock_map is not None:
+            self.clock_map = ClockMap()
 
     def ask_clock(self, clock: Callable[[], int]) -> bool:
         """

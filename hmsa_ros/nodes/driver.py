@@ -46,10 +46,11 @@ OWN = (
 
 HARDWARE = ParameterSpec(
     'hardware.name', '',
-    'What writes and reads, as MODULE:NAME: called with the name of a joint, it returns an object '
-    'with the methods write and read. The module is found as an import finds it, or in the '
-    'working directory. `hardware` alone is short for it. Other parameters hardware.* are given '
-    'to it as keyword arguments, those of a joint (left.hardware.*) before those for all.')
+    'What writes and reads: serial_board, a board on a serial port, or MODULE:NAME. Called with '
+    'the name of a joint, NAME returns an object with the methods write and read. MODULE is found '
+    'as an import finds it, or in the working directory. `hardware` alone is short for it. Other '
+    'parameters hardware.* are given to it as keyword arguments, those of a joint '
+    '(left.hardware.*) before those for all.')
 
 TIMEOUT = ParameterSpec(
     'hardware.timeout', 1.0,
@@ -189,6 +190,7 @@ def _described(device: HardwareDevice, values: JointParameters) -> str:
         optional = [x for x in OPTIONAL if coil.has(x)]
         each.append(
             f'{coil.name} for joint {name}'
+            f'{f" ({coil.description})" if coil.description else ""}'
             f'{f" with {listed(optional)}" if optional else ""}: limit {limit:g} T, resolution '
             f'{_known(coil.resolution, "T")}, slew {_known(coil.slew, "T/s")}, '
             + (f'read at {rate:g} Hz' if rate else 'not read')

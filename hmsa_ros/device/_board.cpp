@@ -1,0 +1,101 @@
+// The firmware of hmsa_board/, for the host: its state is a bytearray.
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+
+#include <new>
+
+#include "hmsa_board/board.hpp"
+
+namespace {
+
+using hmsa::Board;
+
+// The board in a bytearray that is an argument; nullptr with an exception if it is none.
+Board *board_in(PyObject *state) {
+    if (!PyByteArray_Check(state) || PyByteArray_GET_SIZE(state) != sizeof(Board)) {
+        PyErr_SetString(PyExc_TypeError, "expected what make has returned");
+        return nullptr;
+    }
+    return reinterpret_cast<Board *>(PyByteArray_AS_STRING(state));
+}
+
+PyObject *make(PyObject *, PyObject *arguments) {
+    int limit, resolution;
+    if (!PyArg_ParseTuple(arguments, "ii", &limit, &resolution)) {
+        return nullptr;
+    }
+    PyObject *state = PyByteArray_FromStringAndSize(nullptr, sizeof(Board));
+    if (state) {
+        new (PyByteArray_AS_STRING(state)) Board(limit, resolution);
+    }
+    return state;
+}
+
+PyObject *receive(PyObject *, PyObject *arguments) {
+    PyObject *state;
+    const char *text;
+    Py_ssize_t length;
+    long long now;
+    if (!PyArg_ParseTuple(arguments, "Oy#L", &state, &text, &length, &now)) {
+        return nullptr;
+    }
+    Board *board = board_in(state);
+    if (!board) {
+        return nullptr;
+    }
+    char answer[4 * hmsa::LONGEST_ANSWER];
+    Py_ssize_t filled = 0;
+    for (Py_ssize_t i = 0; i < length; ++i) {
+        board->receive(text[i], now);
+        while (filled < static_cast<Py_ssize_t>(sizeof answer) && board->send(answer[filled])) {
+            ++filled;
+        }
+    }
+    return PyBytes_FromStringAndSize(answer, filled);
+}
+
+PyObject *advance(PyObject *, PyObject *arguments) {
+    PyObject *state;
+    long long now;
+    if (!PyArg_ParseTuple(arguments, "OL", &state, &now)) {
+        return nullptr;
+    }
+    Board *board = board_in(state);
+    return board ? PyLong_FromLong(board->advance(now)) : nullptr;
+}
+
+PyObject *sample(PyObject *, PyObject *arguments) {
+    PyObject *state;
+    long long time;
+    int reading;
+    if (!PyArg_ParseTuple(arguments, "OLi", &state, &time, &reading)) {
+        return nullptr;
+    }
+    Board *board = board_in(state);
+    if (!board) {
+        return nullptr;
+    }
+    board->sample(time, reading);
+    Py_RETURN_NONE;
+}
+
+PyObject *due(PyObject *, PyObject *state) {
+    Board *board = board_in(state);
+    return board ? PyLong_FromLongLong(board->due()) : nullptr;
+}
+
+PyMethodDef methods[] = {
+    {"make", make, METH_VARARGS, "make(limit, resolution): the state of a board that has booted."},
+    {"receive", receive, METH_VARARGS, "receive(state, bytes, now): what it answers at once."},
+    {"advance", advance, METH_VARARGS, "advance(state, now): the level that it puts out."},
+    {"sample", sample, METH_VARARGS, "sample(state, time, reading): have it keep a sample."},
+    {"due", due, METH_O, "due(state): when to advance it next, -1 for never."},
+    {nullptr, nullptr, 0, nullptr}};
+
+PyModuleDef module = {
+    PyModuleDef_HEAD_INIT, "_board", "The firmware of the serial board, on the host.", -1, methods,
+    nullptr, nullptr, nullptr, nullptr};
+
+}  // namespace
+
+PyMODINIT_FUNC PyInit__board() { return PyModule_Create(&module); }

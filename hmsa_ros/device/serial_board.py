@@ -1,0 +1,250 @@
+"""
+A board on a serial line that applies levels at their times itself, and samples a sensor.
+
+``hmsa_board/board.hpp`` is its firmware and describes the protocol. Every request may be sent
+again: a line that was lost or damaged costs an attempt.
+"""
+
+from binascii import crc_hqx
+from collections.abc import Sequence
+from importlib import import_module
+import math
+from secrets import randbelow
+import sys
+from time import monotonic
+from typing import Any, NamedTuple
+
+from hmsa_ros.device.assembly import Assembly, parts, require
+from hmsa_ros.device.protocol import StateLostError
+from hmsa_ros.errors import BadInputError, HmsaError
+
+#: The port that is a simulated board; after a colon, a file for its true motion may follow.
+SIMULATED = 'sim'
+_VERSION = 1
+# Levels, readings and times are whole numbers of millionths.
+_MILLION = 1e6
+# In s: an attempt, a request, and the first one, since a port that is opened restarts some boards.
+_ATTEMPT, _PATIENCE, _BOOT = 0.04, 0.4, 4.0
+# Levels that the board has room for beyond those that it says it has: its clock and ours differ.
+_SPARE = 2
+# Values in a whole answer, and as many of them as the board can have kept.
+_PER_ANSWER, _ANSWERS = 7, 20
+
+
+class BoardError(HmsaError):
+    """A board that does not answer, or not as it should."""
+
+
+class _Answer(NamedTuple):
+    session: int
+    verb: str
+    values: list[int]
+
+
+def framed(text: str) -> bytes:
+    """Return a line with its checksum."""
+    return f'{text}*{crc_hqx(text.encode(), 0xFFFF):04X}\n'.encode()
+
+
+def _opened(port: str, baud: int) -> Any:
+    kind, _, truth = port.partition(':')
+    if kind == SIMULATED:
+        from hmsa_ros.device.simulated_board import SimulatedBoard
+
+        return SimulatedBoard(truth)
+    try:
+        serial = import_module('serial')
+    except ImportError as error:
+        raise BadInputError(
+            'pyserial, which serial ports need, is not installed: install it (pip install '
+            f'pyserial), or use the port {SIMULATED} for a simulated board') from error
+    return serial.serial_for_url(port, baud, timeout=_ATTEMPT, write_timeout=_PATIENCE,
+                                 exclusive=True)
+
+
+class Board:
+    """
+    The board as the source of a current (or voltage) in A, and as a sensor.
+
+    Parameters
+    ----------
+    port : str
+        Of pyserial: a device, or a URL such as ``socket://host:port``; ``sim`` for a simulated
+        board, or ``sim:FILE``.
+    baud : int
+        Bits per second; of no effect on USB.
+    watchdog : float
+        Time in s without a request after which the board switches off.
+
+    Raises
+    ------
+    BadInputError
+        If a setting is out of range.
+    BoardError
+        If the board does not answer.
+
+    """
+
+    def __init__(self, port: Any, baud: int = 1_000_000, watchdog: float = 0.5) -> None:
+        if not isinstance(port, str) or not port:
+            raise BadInputError(
+                f'port is {port!r}: expected a serial port, as /dev/ttyACM0, or {SIMULATED} for a '
+                'simulated board')
+        require('baud', baud, positive=True)
+        require('watchdog', watchdog, positive=True)
+        self._port, self._baud, self._watchdog = port, int(baud), round(watchdog * _MILLION)
+        self._line: Any = None
+        self._number = self._session = 0
+        self._lost = False
+        self._begin(_BOOT)
+
+    def open(self) -> None:
+        """Connect again, without a board that restarts if its port is still open."""
+        self._begin(_PATIENCE)
+
+    def close(self) -> None:
+        """Leave the line; the board switches off after its watchdog's time, if it is not off."""
+        if self._line is not None:
+            line, self._line = self._line, None
+            line.close()
+
+    def _begin(self, patience: float) -> None:
+        """Begin a session, and see whether that before has been lost."""
+        known, self._session = self._session, 1 + randbelow(2**31 - 1)
+        try:
+            version, *values, before = self._ask(
+                'H', self._session, self._watchdog, patience=patience, count=7)
+        except BoardError:
+            self._session = known
+            raise
+        self._lost = self._lost or known not in (0, before)
+        if version != _VERSION:
+            raise BoardError(
+                f'the board on {self._port} speaks version {version} of the protocol: expected '
+                f'{_VERSION}; load the firmware of this package')
+        kept, limit, resolution, *self._seen = values
+        self.capacity = kept - _SPARE
+        self.description = (
+            f'version {version} on {self._port}, {kept} levels ahead, watchdog '
+            f'{self._watchdog / _MILLION:g} s')
+        self.limit, self.resolution = limit / _MILLION, resolution / _MILLION
+
+    # -- the line ------------------------------------------------------------------------------
+
+    def _ask(
+            self, verb: str, *values: int, patience: float = _PATIENCE,
+            count: int = 0) -> list[int]:
+        """Return at least so many values that the board answers; ask again where it does not."""
+        until, answer = monotonic() + patience, None
+        while True:
+            if self._lost and verb != 'H':
+                self._lost = False
+                raise StateLostError(
+                    f'the board on {self._port} has restarted, or was out of reach for '
+                    f'{self._watchdog / _MILLION:g} s (watchdog)')
+            try:
+                if self._line is None:
+                    self._line = _opened(self._port, self._baud)
+                answer = self._attempt(verb, values) or answer
+            except HmsaError:
+                raise
+            except Exception as error:  # whatever a port that is gone raises
+                if not isinstance(error, getattr(
+                        sys.modules.get('serial'), 'SerialTimeoutException', ())):
+                    self.close()
+                    raise BoardError(
+                        f'the line {self._port} failed ({error}): check hardware.port, its cable, '
+                        'and that no other program uses it') from error
+            if answer is not None and answer.verb == verb and len(answer.values) >= count:
+                return answer.values
+            if answer is not None and answer.verb == 'L':
+                self._begin(patience)
+                answer = None
+                continue
+            if monotonic() > until:
+                why = 'does not answer' if answer is None else 'is full' if (
+                    answer.verb == 'F') else f'answers {answer}'
+                raise BoardError(
+                    f'the board on {self._port} {why}, {patience:g} s after it was asked {verb}: '
+                    'expected the firmware of this package, at the same baud')
+
+    def _attempt(self, verb: str, values: Sequence[int]) -> _Answer | None:
+        self._number = (self._number + 1) % 65536
+        self._line.reset_input_buffer()
+        self._line.write(b'\n' + framed(
+            ' '.join(map(str, (self._number, self._session, verb, *values)))))
+        text, until = b'', monotonic() + _ATTEMPT
+        while monotonic() < until:
+            text += self._line.read(max(self._line.in_waiting, 1))
+            *lines, text = text.split(b'\n')
+            for line in lines:
+                answer = _read(line, self._number)
+                if answer is not None:
+                    return answer
+        return None
+
+    # -- what hardware has ---------------------------------------------------------------------
+
+    def clock(self) -> int:
+        """Return the time of the board in ns."""
+        return 1000 * self._ask('T', count=1)[0]
+
+    def write(self, current: float, now: int) -> tuple[int, float]:
+        """Put a current in A out now; return when, and the one that is put out."""
+        when, level, events = self._ask('W', round(current * _MILLION), count=3)
+        # What was ahead is dropped, and what took effect before is past.
+        self._seen[0] = events
+        return 1000 * when, level / _MILLION
+
+    def schedule(self, levels: Sequence[tuple[int, float]]) -> None:
+        """Have the board put currents in A out at its times in ns."""
+        for stamp, current in levels:
+            self._ask('S', round(stamp / 1000), round(current * _MILLION))
+        if not levels:
+            self._ask('K')
+
+    def applied(self) -> list[tuple[int, float]]:
+        """Return times in ns and currents in A that took effect."""
+        return [(when, level) for level, when in self._new('A', 0)]
+
+    def read(self, now: int) -> list[tuple[float, float, int]]:
+        """Return new readings, no rate, and their times in ns."""
+        return [(reading, math.nan, when) for reading, when in self._new('M', 1)]
+
+    def _new(self, verb: str, series: int) -> list[tuple[float, int]]:
+        """Return values and their times in ns that have come since this was last asked."""
+        found: list[tuple[float, int]] = []
+        for _ in range(_ANSWERS):
+            first, *values = self._ask(verb, self._seen[series] + 1, count=1)
+            when = 0
+            for since, value in zip(values[::2], values[1::2], strict=True):
+                when += since
+                found.append((value / _MILLION, 1000 * when))
+            if values:
+                self._seen[series] = first - 1 + len(values) // 2
+            if len(values) < 2 * _PER_ANSWER:
+                break
+        return found
+
+
+def _read(line: bytes, number: int) -> _Answer | None:
+    """Return what a line answers to a request; None if it is damaged, or answers another."""
+    try:
+        text = line.decode('ascii').rpartition('*')[0]
+        if framed(text) != line + b'\n':
+            return None
+        theirs, session, verb, *values = text.split(' ')
+        answer = _Answer(int(session), verb, [int(x) for x in values])
+        return answer if int(theirs) == number else None
+    except ValueError:
+        return None
+
+
+class SerialBoard(Assembly):
+    """A serial board, its coil and its sensor, as ``hardware:=serial_board``."""
+
+    def __init__(
+            self, joint: str, port: Any = '', baud: int = 1_000_000, watchdog: float = 0.5,
+            **settings: Any) -> None:
+        coil, scale = parts(settings)
+        super().__init__(Board(port, baud, watchdog), coil, scale)

@@ -1,0 +1,118 @@
+"""The twin of a serial board: its firmware before a simulated coil, actuator and laser."""
+
+import math
+from pathlib import Path
+from random import Random
+from time import monotonic_ns
+from typing import TextIO
+
+from hmsa_ros.device import _board
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.model.simulation import ActuatorSimulation
+
+#: What a driver of it needs to be given: T/A, and the length of the block in mm.
+TESLA_PER_AMPERE, REST_LENGTH = 0.05, 20.0
+# In uA.
+_LIMIT, _RESOLUTION = 10_000_000, 100
+# In us of its clock, which runs fast by so much.
+_PERIOD, _FAST = 1000, 40e-6
+_NOISE = 1e-3  # in mm
+
+
+class SimulatedBoard:
+    """
+    A board and its serial line, with the members of a port of pyserial that are needed.
+
+    Time passes when it is asked: the firmware applies each level exactly when it is due.
+
+    Parameters
+    ----------
+    truth : str
+        File for the true motion, as a CSV; empty for none.
+
+    Raises
+    ------
+    BadInputError
+        If the file cannot be written.
+
+    """
+
+    def __init__(self, truth: str = '') -> None:
+        self._begun = monotonic_ns()
+        self._block = ActuatorSimulation(paper_actuator(), time=0)
+        self._random = Random(1)
+        self._level = 0
+        self._answer = b''
+        self._truth: TextIO | None = None
+        if truth:
+            try:
+                self._truth = Path(truth).open('w', encoding='utf-8')  # noqa: SIM115
+            except OSError as error:
+                raise BadInputError(
+                    f'{truth}, for the true motion of a simulated board, cannot be written '
+                    f'({error.strerror}): expected a file in a folder that exists') from error
+            self._truth.write('time,stretch,rate,flux_density\n')
+        self.restart()
+
+    def restart(self) -> None:
+        """Boot: the coil is off, and its clock begins at 0."""
+        self._board = _board.make(_LIMIT, _RESOLUTION)
+        self._booted = monotonic_ns()
+        self._next_sample = 0
+
+    def _host(self, time: int) -> int:
+        """Return the time in ns since the beginning at one in us of its clock."""
+        return self._booted - self._begun + round(1000 * time / (1.0 + _FAST))
+
+    def advance(self) -> int:
+        """Have it do what is due by now; return the time of its clock in us."""
+        now = math.floor((monotonic_ns() - self._booted) * (1.0 + _FAST) / 1000)
+        while True:
+            due = _board.due(self._board)
+            time = min(self._next_sample, now if due < 0 else due, now)
+            level = _board.advance(self._board, time)
+            if level != self._level:
+                self._level = level
+                self._block.command(self._host(time), level * 1e-6 * TESLA_PER_AMPERE)
+            if time == self._next_sample:
+                self._sample(time)
+            elif time == now:
+                return now
+
+    def _sample(self, time: int) -> None:
+        block = self._block
+        block.advance(max(self._host(time), block.time))
+        _board.sample(self._board, time, round(1e6 * (
+            REST_LENGTH * block.stretch + self._random.gauss(0.0, _NOISE))))
+        self._next_sample += _PERIOD
+        if self._truth is not None:
+            self._truth.write(f'{block.time / 1e9:.6f},{block.stretch!r},{block.rate!r},'
+                              f'{self._level * 1e-6 * TESLA_PER_AMPERE:g}\n')
+
+    # -- the port ------------------------------------------------------------------------------
+
+    def write(self, text: bytes) -> None:
+        """Take bytes from the host."""
+        self._answer += _board.receive(self._board, text, self.advance())
+
+    @property
+    def in_waiting(self) -> int:
+        """How many bytes there are to be read."""
+        return len(self._answer)
+
+    def read(self, size: int) -> bytes:
+        """Return bytes for the host."""
+        found, self._answer = self._answer[:size], self._answer[size:]
+        return found
+
+    def reset_input_buffer(self) -> None:
+        """Drop what has not been read."""
+        self._answer = b''
+
+    def close(self) -> None:
+        """Leave the line, and complete the file."""
+        self.advance()
+        if self._truth is not None:
+            self._truth.close()
+            self._truth = None
