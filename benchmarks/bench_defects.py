@@ -3,7 +3,7 @@ What `hmsa identify` says of actuators that are not as the model has them.
 
     python -m benchmarks defects [--runs N] [--quick]
 
-Recordings come from `benchmarks.defects`: SciPy integrates actuators with damping, chain limit,
+Recordings come from `benchmarks.defects`: SciPy integrates actuators with damping, J_lim,
 modulus and remanence drawn at random, each with one defect of a size drawn at random, and a sensor
 with white, coloured, quantised or jittered noise, at 4 to 60 samples a period. Others have no
 defect but few samples of large noise, or samples at rest alone. The fit begins from a data sheet
@@ -43,7 +43,7 @@ KINDS: dict[str, tuple[str, dict[str, tuple[float, float]]]] = {
     'slow': ('0.7 to 2 samples a period', {}),
     'rest': ('16 samples, all of them at rest', {})}
 _SEED = 1
-# Of a step, whose stretch cannot determine the chain limit.
+# Of a step, whose stretch cannot determine J_lim.
 _WITHOUT_LIMIT = tuple(x for x in DEFAULT_FREE if x != 'chain_limit')
 # What may be wrong of a kind, the least share that is identified where the model is right, and
 # between what the coverage of its intervals lies but by this chance.

@@ -21,7 +21,7 @@ Series = list[Decimal]
 
 @dataclass(frozen=True)
 class Actuator:
-    """Damping, chain limit and shape of Eq. 11, taken at their exact binary values."""
+    """Damping, J_lim and shape of Eq. 11, taken at their exact binary values."""
 
     zeta: float = 0.2
     j_lim: float = 5.0

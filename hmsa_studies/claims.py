@@ -27,7 +27,7 @@ from hmsa_studies import paper_data
 from hmsa_studies.paper_data import Run
 
 _PAPER = NondimensionalParameters(zeta=0.2, j_lim=5.0)
-#: A chain limit that makes no difference any more: the neo-Hookean solid.
+#: J_lim that makes no difference any more: the neo-Hookean solid.
 _NO_LIMIT = 1e9
 #: Share of the step within which a response counts as settled.
 _SETTLED = 0.05

@@ -168,7 +168,7 @@ def test_robustness_takes_the_actuator_of_a_file_with_its_law_and_its_coil(
     # In seconds, too: G is 2 c10 = 10 kPa, and L sqrt(rho/G) 4.359 ms.
     assert found['arrival_seconds'] == pytest.approx(
         found['arrival'] * 0.01 * math.sqrt(1900.0 / 1e4), rel=1e-9)
-    # Known, neither law nor lag leaves anything; and there is no chain limit to be in error.
+    # Known, neither law nor lag leaves anything; and there is no J_lim to be in error.
     assert found['residual'] < 1e-8
     assert found['worst']['G']['residual'] > 0.05
     assert list(found['curves']) == ['G', 'zeta']

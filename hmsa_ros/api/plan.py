@@ -1,7 +1,7 @@
 """A plan: what to send to the coil and when, and the motion that it predicts."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 import math
 from pathlib import Path
@@ -18,27 +18,33 @@ from hmsa_ros.planning.sequence import Segment
 from hmsa_ros.recordings.tables import write_table
 from hmsa_ros.table import Column, frame, Table
 
-#: Column of the levels after the first and before the last.
-BETWEEN = 'between'
 _MOST_BETWEEN = 4
 
 
-def between(segment: Segment, time: float, shown: Callable[[float], float]) -> str:
+def table_of(
+        segments: Sequence[Segment], columns: Sequence[Column], values: Iterable[Sequence[Any]],
+        between: Column, time: float, shown: Callable[[float], float],
+        caption: str = '') -> Table:
+    """
+    Return a table of moves: some values of each, other levels where one has more than two, status.
+
+    ``time`` is the unit of time, and ``shown`` takes a load to what is shown of it.
+    """
+    inside = [_between(x, time, shown) for x in segments]
+    many = any(inside)
+    return Table(
+        (*columns, *[between] * many, Column('status')),
+        tuple((*x, *[y] * many, str(z.move.code))
+              for x, y, z in zip(values, inside, segments, strict=True)),
+        caption, tuple(note for x in segments for note in x.notes()))
+
+
+def _between(segment: Segment, time: float, shown: Callable[[float], float]) -> str:
     """Return the levels between the first and the last of a move, each at its time; or nothing."""
     inside = segment.move.levels[1:-1]
     return ', '.join(
         f'{shown(x.load):.6g} at {x.time * time:.6g}' for x in inside
     ) if len(inside) <= _MOST_BETWEEN else f'{len(inside)} levels'
-
-
-def with_between(table: Table) -> Table:
-    """Return a table of moves without its column of levels between where no move has any."""
-    if any(table[BETWEEN]):
-        return table
-    place = [x.name for x in table.columns].index(BETWEEN)
-    return replace(
-        table, columns=table.columns[:place] + table.columns[place + 1:],
-        rows=tuple(x[:place] + x[place + 1:] for x in table.rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,20 +121,15 @@ class Plan:
     def report(self) -> Table:
         """Return the levels of each setpoint, its move time and its status."""
         units, name = self.actuator.model.units, self.actuator.block.coordinate.name
-        rows = []
-        for x in self.segments:
-            shaped = x.shaped
-            rows.append((
-                x.setpoint.stretch, x.setpoint.span * units.time,
-                x.move.levels[0].load * units.load if shaped else None,
-                x.move.duration * units.time if shaped and math.isfinite(x.move.duration)
-                else None, x.held * units.load,
-                between(x, units.time, lambda load: load * units.load), str(x.move.code)))
-        return with_between(Table((
-            Column(name), Column('duration', 's'), Column('first level', 'T'),
-            Column('move time', 's'), Column('last level', 'T'),
-            Column(BETWEEN, 'T at s'), Column('status')), tuple(rows),
-            notes=tuple(note for x in self.segments for note in x.notes())))
+        return table_of(
+            self.segments, (
+                Column(name), Column('duration', 's'), Column('first level', 'T'),
+                Column('move time', 's'), Column('last level', 'T')),
+            [(x.setpoint.stretch, x.setpoint.span * units.time,
+              x.move.levels[0].load * units.load if x.shaped else None,
+              x.move.duration * units.time if x.shaped and math.isfinite(x.move.duration)
+              else None, x.held * units.load) for x in self.segments],
+            Column('between', 'T at s'), units.time, lambda load: load * units.load)
 
     def simulate(
             self, *, truth: Actuator | None = None, noise: float = 0.0,

@@ -10,7 +10,7 @@ from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import setpoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
-from hmsa_ros.table import Column, Table
+from hmsa_ros.table import Column
 
 if TYPE_CHECKING:
     from hmsa_ros.api.actuator import Actuator
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
     Without one, a file of levels to write is a `BadInputError`.
     """
     si = arguments.params_file is not None
-    from hmsa_ros.api.plan import BETWEEN, between, with_between
+    from hmsa_ros.api.plan import table_of
     from hmsa_ros.model.equations import signed_root
 
     facts, amplifiers = {}, None
@@ -107,8 +107,11 @@ def run(arguments: argparse.Namespace) -> int:
             Column('flux_density_1', 'T')]
         if arguments.tesla_per_ampere is not None:
             shown += [Column('current_p', 'A'), Column('current_1', 'A')]
-        inside = [between(x, units.time, lambda load: load * units.load) for x in segments]
-        middle = Column(BETWEEN, 'T at s')
+        unit, middle = units.time, Column('between', 'T at s')
+
+        def level(load: float) -> float:
+            return load * units.load
+
         caption = (f'c1 {group.c1:.6g}, zeta {group.zeta:.6g}, time unit L sqrt(rho/G) '
                    f'{units.time:.6g} s')
     else:
@@ -120,19 +123,20 @@ def run(arguments: argparse.Namespace) -> int:
         segments = _nondimensional(arguments, group)
         rows = [_row(x) for x in segments]
         shown = [Column('span', _TIME), Column('b_p'), Column('tau_p', _TIME), Column('b_1')]
-        inside = [between(x, 1.0, lambda load: float(signed_root(load))) for x in segments]
-        middle = Column(BETWEEN, 'b at tau')
+        unit, middle = 1.0, Column('between', 'b at tau')
+
+        def level(load: float) -> float:
+            return float(signed_root(load))
+
         caption = 'nondimensional as in the paper, b = sqrt(Br B/(mu0 G)); in seconds and tesla ' \
                   'with --params-file'
     if arguments.json:
         print(json_text({**facts, 'segments': rows, **(
             {} if amplifiers is None else {'amplifiers': amplifiers.records()})}))
         return 0
-    print(with_between(Table(
-        (Column(group.coordinate.name), *shown, middle, Column('status')),
-        tuple((x['stretch'], *(x[y.name] for y in shown), z, x['status'])
-              for x, z in zip(rows, inside, strict=True)), caption,
-        tuple(note for x in segments for note in x.notes()))))
+    print(table_of(
+        segments, (Column(group.coordinate.name), *shown),
+        [(x['stretch'], *(x[y.name] for y in shown)) for x in rows], middle, unit, level, caption))
     if arguments.out is not None:
         print(f'{arguments.out} written')
     if amplifiers is not None:

@@ -21,7 +21,7 @@ from hmsa_ros.model.laws.coordinate import Coordinate, coordinate_of
 from hmsa_ros.model.parameters import ActuatorParameters
 
 #: Standard deviations where no identification gives any: of the logarithm for parameters that
-#: are sought by it, of the value in SI otherwise. That of the damping and of the chain limit is a
+#: are sought by it, of the value in SI otherwise. That of the damping and of J_lim is a
 #: share of the value.
 DEVIATIONS = {
     'shear_modulus': 0.15, 'density': 0.1, 'remanence': 0.1, 'time_unit': 0.1,

@@ -261,7 +261,7 @@ class _Search:
 
 
 def _stride(values: Mapping[str, float], free: Sequence[str], step: Array) -> float:
-    """Return the share of a step that no logarithm, and no chain limit, leaps with."""
+    """Return the share of a step that no logarithm, and no J_lim, leaps with."""
     share = 1.0
     for name, change in zip(free, step.tolist(), strict=True):
         quantity, limit = quantities.quantity_of(name), _STRIDE

@@ -96,7 +96,7 @@ def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, .
     Return the names of free parameters, each once.
 
     ``actuator.`` or ``law.`` before a name is dropped, and the modulus may have the name that it
-    has in the law. With a law in place of Gent the chain limit is not sought, but constants of the
+    has in the law. With a law in place of Gent J_lim is not sought, but constants of the
     law may be: ``law.c10``, or for all of a list ``law.mu`` and for its first ``law.mu.1``. Raises
     `BadInputError` if a name is unknown, none is given, or two exclude each other.
     """
@@ -286,7 +286,7 @@ def to_coordinate(name: str, value: float) -> float:
 
 
 def from_coordinate(name: str, x: float) -> float:
-    """Return the value of a coordinate; a chain limit beyond all data is infinite."""
+    """Return the value of a coordinate; a J_lim beyond all data is infinite."""
     scale = quantity_of(name).scale
     if scale == 'log':
         return math.exp(min(max(x, -230.0), 230.0))

@@ -1,7 +1,7 @@
 """
 Start values out of the data alone: levels at rest, and the spectrum of the ringing.
 
-The mean stretch at the end of each level gives the drive and the chain limit; a decaying
+The mean stretch at the end of each level gives the drive and J_lim; a decaying
 oscillation fitted after each change of level gives frequency and decay, and with the inertia
 the modulus and the damping. Frequencies above half the rate of the samples appear folded, so
 that several are handed out.
@@ -115,7 +115,7 @@ def _evaluated(what: int, values: Array, material: Array) -> Array:
 
 def static(
         recording: Recording, values: Mapping[str, float], free: Sequence[str]) -> Static:
-    """Return what the levels at rest say; law and chain limit, unless that is free, are kept."""
+    """Return what the levels at rest say; law and J_lim, unless that is free, are kept."""
     limits = _CHAIN_LIMITS if 'chain_limit' in free else (values['chain_limit'],)
     usual = 5.0 if 'chain_limit' in free else values['chain_limit']
     rests = []

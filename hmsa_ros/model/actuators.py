@@ -32,7 +32,7 @@ _LARGEST_LOAD = 1e9
 
 
 def check_stretch(stretch: float, material: Material, name: str = 'stretch') -> None:
-    """Refuse with `BadInputError` a stretch outside the limits of a group or chain limit."""
+    """Refuse with `BadInputError` a stretch beyond the limits of a group, or of a J_lim."""
     lower, upper = stretch_limits(material)
     if not lower < stretch < upper:
         elastic = getattr(material, 'law', None)

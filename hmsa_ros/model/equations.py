@@ -3,7 +3,7 @@ The actuator's equations for arrays: energies, forces, equilibrium, limits, line
 
 Every function takes arrays or scalars, broadcast against each other, and returns float64,
 NaN outside the limits. Stretch comes first, then rate and load, then the material, a group or
-the chain limit of a Gent block. The load is the signed
+J_lim of a Gent block. The load is the signed
 ``beta = Br B/(mu0 G)``; the paper's b is ``sign(beta) sqrt|beta|``. Equation numbers are those
 of Polymers 2022, 14, 3037. The equations themselves are in `hmsa_ros.model.law`.
 """
@@ -19,7 +19,7 @@ from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParamete
 Array = NDArray[np.float64]
 #: What functions accept: older NumPy types do not know what ``linspace`` returns.
 Floats = NDArray[np.floating[Any]]
-# A number is the chain limit of a Gent block.
+# A number is J_lim of a Gent block.
 Material = NondimensionalParameters | float
 
 

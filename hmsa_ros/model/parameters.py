@@ -168,7 +168,7 @@ class ActuatorParameters:
     damping_coefficient : float
         c of Eq. 9 in N s/m, at least 0.
     law : Elastic, optional
-        Elastic energy in units of G, in place of the Gent model: the chain limit is then without
+        Elastic energy in units of G, in place of the Gent model: J_lim is then without
         effect.
     creep : Creep
         Branches beside the law, for planning; default none.

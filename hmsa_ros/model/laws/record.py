@@ -76,7 +76,7 @@ class Law:
     #: From the values of the constants, and of the actuator, to the shear modulus at small strain
     #: and what is left of the law in units of it; none for Gent and its limit.
     scaled: Callable[[Mapping[str, Any]], tuple[float, Elastic]] | None = None
-    endless: bool = False  #: whether the chain limit is infinite, whatever the parameter says
+    endless: bool = False  #: whether J_lim is infinite, whatever the parameter says
     #: From the values of the constants to those that are in a file which they name.
     completed: Callable[[Mapping[str, Any]], dict[str, Any]] | None = None
 
