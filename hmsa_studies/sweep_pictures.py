@@ -198,8 +198,9 @@ def _curves(
     x = _scale(axis.name) * View.places(axis)
     order = np.argsort(x, kind='stable')
     x, values = x[order], values[:, order]
-    for place, (label, look, found) in enumerate(
-            zip(map(worded, view.labels), looks.CASES, values, strict=False)):
+    for place, (label, found) in enumerate(
+            zip(map(worded, view.labels), values, strict=True)):
+        look = looks.case(place)
         if view.samples > 1:
             for (low, high), alpha in zip(BANDS, (0.16, 0.3), strict=True):
                 edges = _quantile(found, low), _quantile(found, high)
@@ -229,7 +230,9 @@ def _curves(
 
 def _shares(panel: Axes, view: View, name: str, values: Array) -> None:
     """Draw the share of the samples below a number, with the median and 5 to 95 %."""
-    for label, look, found in zip(map(worded, view.labels), looks.CASES, values, strict=False):
+    for place, (label, found) in enumerate(
+            zip(map(worded, view.labels), values, strict=True)):
+        look = looks.case(place)
         known = np.sort(found[np.isfinite(found)])
         if known.size == 0:
             continue

@@ -281,6 +281,15 @@ class Starter:
 
 
 @pytest.fixture
+def handlers() -> Iterator[None]:
+    """Give back the signal handlers that a node takes over."""
+    kept = {x: signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    yield
+    for number, handler in kept.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture
 def start(
         ros_env: Mapping[str, str],
         tmp_path_factory: pytest.TempPathFactory) -> Iterator[Starter]:

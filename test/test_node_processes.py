@@ -1,6 +1,5 @@
 """Planner and plant as processes: how they end, how they refuse to start, and their loop."""
 
-from collections.abc import Iterator
 import re
 import signal
 import subprocess
@@ -71,15 +70,6 @@ BAD_OF_A_NODE = {
             'parameter publish_rate is 0.0: expected float, 0.001 to 1e+06 Hz'),
     },
 }
-
-
-@pytest.fixture
-def handlers() -> Iterator[None]:
-    """Give back the signal handlers that a node takes over."""
-    kept = {x: signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    yield
-    for number, handler in kept.items():
-        signal.signal(number, handler)
 
 
 @pytest.mark.parametrize(('node', 'name'), [

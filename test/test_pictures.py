@@ -20,7 +20,7 @@ from hmsa_ros.model.residual import percent
 from hmsa_ros.report import style
 from hmsa_ros.report.charts import commanded
 from hmsa_ros.report.curves import Curve, decimate, through
-from hmsa_ros.report.looks import CASES, Look, SHAPERS
+from hmsa_ros.report.looks import case, CASES, Look, SHAPERS
 from hmsa_ros.report.paper import KINDS, named, Paper
 from hmsa_ros.report.picture import draw
 from hmsa_studies.sweep_pictures import label_of, worded
@@ -65,6 +65,13 @@ def test_shapers_differ_in_colour_dash_and_marker_for_every_vision(
         assert len({getattr(x, part) for x in looks}) == len(looks)
     seen = [cielab(x.colour, VISIONS[vision]) for x in looks]
     assert min(np.linalg.norm(x - y) for i, x in enumerate(seen) for y in seen[:i]) > SEEN
+
+
+def test_more_curves_than_colours_differ_in_dash_and_marker() -> None:
+    more = [case(x) for x in range(24)]
+    assert tuple(more[:len(CASES)]) == CASES
+    for part in ('dash', 'marker'):
+        assert len({(x.colour, getattr(x, part)) for x in more}) == len(more)
 
 
 @pytest.mark.parametrize(('width', 'letters'), [(85.0, 7.0), (120.0, 8.0), (183.0, 9.0)])

@@ -26,6 +26,7 @@ from hmsa_ros.bag.qos import Qos
 from hmsa_ros.bag.reader import BagReader, read_messages
 from hmsa_ros.bag.recover import recover
 from hmsa_ros.bag.writer import BagWriter, Topic
+from hmsa_ros.cli import main
 
 pytestmark = pytest.mark.ros
 TALKER = Path(__file__).parent / 'talker.py'
@@ -253,12 +254,11 @@ def test_a_full_disk_is_told_and_nothing_is_lost_when_there_is_room_again(
     assert reader.complete
 
 
-def test_an_existing_folder_is_refused_in_one_line(start, tmp_path):
-    process = start.hmsa('recorder', '--ros-args', '-p', f'storage.uri:={tmp_path}')
-    assert process.wait() == 2
-    assert process.stderr.strip().splitlines()[-1] == (
+def test_an_existing_folder_is_refused_in_one_line(ros_env, handlers, tmp_path, capfd):
+    assert main(['recorder', '--ros-args', '-p', f'storage.uri:={tmp_path}']) == 2
+    assert capfd.readouterr().err == (
         f'hmsa: error: {tmp_path} exists: expected the name of a new bag; choose another name or '
-        'remove it')
+        'remove it\n')
 
 
 @pytest.mark.parametrize(('parameter', 'expected'), [
@@ -269,11 +269,11 @@ def test_an_existing_folder_is_refused_in_one_line(start, tmp_path):
     ('record.regex:="("', 'expected a regular expression'),
     ('record.topics:=3', 'expected a list of strings'),
 ])
-def test_bad_parameters_are_refused_in_one_line(start, tmp_path, parameter, expected):
-    process = start.hmsa('recorder', '--ros-args', '-p', f'storage.uri:={tmp_path / "bag"}',
-                         '-p', parameter)
-    assert process.wait() == 2
-    line, = process.stderr.strip().splitlines()
+def test_bad_parameters_are_refused_in_one_line(
+        ros_env, handlers, tmp_path, capfd, parameter, expected):
+    assert main(['recorder', '--ros-args', '-p', f'storage.uri:={tmp_path / "bag"}',
+                 '-p', parameter]) == 2
+    line, = capfd.readouterr().err.splitlines()
     assert line.startswith('hmsa: error: ')
     assert expected in line
     assert not (tmp_path / 'bag').exists()

@@ -83,6 +83,7 @@ def test_adapting_corrects_the_first_move_and_plans_the_second_with_what_was_lea
     assert 'plans use it' in estimates(loop)[-1].message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('factor', [0.9, 1.1])
 def test_adapting_knows_the_creep_of_the_block(factor):
     block = replace(paper_actuator(), creep=Creep((0.1, 0.1, 0.05), (0.002, 0.02, 0.2)))
@@ -103,7 +104,8 @@ def moved(loop, target):
 
 
 @pytest.mark.parametrize('factor', [0.8, 1.2])
-@pytest.mark.parametrize('creep', [Creep(), Creep((0.1, 0.05), (0.09, 0.9))])
+@pytest.mark.parametrize('creep', [
+    Creep(), pytest.param(Creep((0.1, 0.05), (0.09, 0.9)), marks=pytest.mark.slow)])
 def test_a_cautious_first_move_takes_longer_and_arrives_and_the_next_one_does_not(factor, creep):
     # Unit of time 44 ms; a camera.
     block = replace(SCENARIOS[2].block, creep=creep)

@@ -28,6 +28,12 @@ def tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding='utf-8'))
 
 
+@cache
+def nodes(path: Path) -> tuple[ast.AST, ...]:
+    """Return all nodes of a file's syntax tree."""
+    return tuple(ast.walk(tree(path)))
+
+
 def public_functions(path: Path) -> Iterator[Function]:
     """Walk the functions and methods that a user of a module can call."""
     pending: list[ast.stmt] = tree(path).body
@@ -52,7 +58,7 @@ def own_nodes(function: Function) -> Iterator[ast.AST]:
 
 
 def test_names_of_tests_are_sentences():
-    names = {path: [x.name for x in ast.walk(tree(path))
+    names = {path: [x.name for x in nodes(path)
                     if isinstance(x, Function) and x.name.startswith('test_')] for path in TESTS}
     assert [name_of(path) for path in TESTS if not names[path]] == []
     assert [(name_of(path), name) for path in TESTS for name in names[path]
@@ -64,7 +70,7 @@ def test_modules_of_tests_say_what_they_test():
 
 
 def test_package_raises_errors_and_does_not_assert():
-    assert [(name_of(path), node.lineno) for path in PACKAGE for node in ast.walk(tree(path))
+    assert [(name_of(path), node.lineno) for path in PACKAGE for node in nodes(path)
             if isinstance(node, ast.Assert)] == []
 
 
@@ -84,6 +90,6 @@ def test_public_function_that_raises_says_so():
 
 def test_tests_wait_on_conditions_and_do_not_sleep():
     sleeps = [
-        (name_of(path), node.lineno) for path in TESTS for node in ast.walk(tree(path))
+        (name_of(path), node.lineno) for path in TESTS for node in nodes(path)
         if isinstance(node, ast.Call) and ast.unparse(node.func) in {'time.sleep', 'sleep'}]
     assert sleeps == []

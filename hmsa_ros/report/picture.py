@@ -55,7 +55,7 @@ def draw(
         axes: dict[str, Axes] = figure.subplot_mosaic(
             rows, height_ratios=heights)  # type: ignore[arg-type]
         for number, part in enumerate(parts):
-            look = looks.RECORDED if len(parts) == 1 else looks.CASES[number % len(looks.CASES)]
+            look = looks.RECORDED if len(parts) == 1 else looks.case(number)
             _draw_run(axes, part, unit, look, times, alone=len(parts) == 1)
             for i in shown:
                 if i < len(part.evaluation.results):
