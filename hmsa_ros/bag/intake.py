@@ -34,12 +34,35 @@ class Problems:
 
 
 @dataclass
+class Intake:
+    """What is taken in of all files of a bag, within a limit in bytes for chunks and messages."""
+
+    max_chunk_size: int
+    problems: Problems
+    kept: int = 0  #: bytes of schemas, channels and metadata
+
+    def check_size(self, size: int, what: str) -> None:
+        """Raise `BagError` for what is larger, in bytes, than the memory it may take."""
+        if size > self.max_chunk_size:
+            raise BagError(f'a {what} of {size} bytes is larger than the {self.max_chunk_size} '
+                           'bytes allowed')
+
+    def keep(self, size: int) -> None:
+        """Count what is kept of the small records; raise `BagError` for too much of it."""
+        if self.kept + size > limits.KEPT_SIZE:
+            raise BagError(f'schemas, channels and metadata are larger than '
+                           f'{limits.KEPT_SIZE} bytes')
+        self.kept += size
+
+
+@dataclass
 class ScannedFile:
     """What a file holds; records by their id, metadata records by name."""
 
     path: Path
     number: int  #: its place in the bag
     size: int  #: in bytes
+    intake: Intake
     complete: bool = False  #: whether it was closed by its writer
     damaged: bool = False  #: whether something in it does not agree with the rest
     counted: bool = False  #: whether `counts` were counted, and not only read
@@ -51,73 +74,49 @@ class ScannedFile:
     data_end: int = 0
     data_crc: int = 0  #: CRC-32 of the data; 0 for none
 
+    def problem(self, sentence: str) -> None:
+        """Note that something is damaged."""
+        self.damaged = True
+        self.intake.problems.add(f'{self.path.name}{sentence}')
 
-class Intake:
-    """Takes in what a file holds, within a limit in bytes for chunks and for messages."""
-
-    def __init__(self, max_chunk_size: int, problems: Problems) -> None:
-        self._max_chunk_size = max_chunk_size
-        self._problems = problems
-        self._kept = 0
-
-    def problem(self, file: ScannedFile, sentence: str) -> None:
-        """Note that something in a file is damaged."""
-        file.damaged = True
-        self._problems.add(f'{file.path.name}{sentence}')
-
-    def add_block(self, file: ScannedFile, block: Block, offset: int) -> None:
+    def add_block(self, block: Block, offset: int) -> None:
         """Take in a chunk that is not too large."""
         try:
-            self.check_size(max(block.size, block.length), 'chunk')
+            self.intake.check_size(max(block.size, block.length), 'chunk')
         except BagError as error:
-            self.problem(file, f': {error}, at byte {offset}: skipped')
+            self.problem(f': {error}, at byte {offset}: skipped')
         else:
-            file.blocks.append(block)
+            self.blocks.append(block)
 
-    def check_size(self, size: int, what: str) -> None:
-        """Raise `BagError` for what is larger, in bytes, than the memory it may take."""
-        if size > self._max_chunk_size:
-            raise BagError(f'a {what} of {size} bytes is larger than the {self._max_chunk_size} '
-                           'bytes allowed')
-
-    def take(self, file: ScannedFile, record: McapRecord) -> None:
+    def take(self, record: McapRecord) -> None:
         """Take in a schema, channel or metadata, or raise `BagError` if it is too large."""
         if isinstance(record, Schema):
-            if self._is_new(file, file.schemas, record):
-                self._keep(len(record.data))
+            if self._is_new(self.schemas, record):
+                self.intake.keep(len(record.data))
                 if len(record.data) > limits.DEFINITION_SIZE:
                     raise BagError(
                         f'the definition of {record.name} has {len(record.data)} bytes, more '
                         f'than {limits.DEFINITION_SIZE}')
-                file.schemas[record.id] = record
+                self.schemas[record.id] = record
         elif isinstance(record, Channel):
-            if self._is_new(file, file.channels, record):
-                self._keep(sum(map(len, record.metadata.values())) + len(record.topic))
-                file.channels[record.id] = record
+            if self._is_new(self.channels, record):
+                self.intake.keep(sum(map(len, record.metadata.values())) + len(record.topic))
+                self.channels[record.id] = record
         elif isinstance(record, Metadata):
-            values = file.metadata.setdefault(record.name, {})
-            self._keep(len(record.name) + sum(
+            values = self.metadata.setdefault(record.name, {})
+            self.intake.keep(len(record.name) + sum(
                 len(value) + (0 if key in values else len(key) + _ENTRY_BYTES)
                 for key, value in record.metadata.items() if values.get(key) != value))
             values.update(record.metadata)
 
-    def _is_new(self, file: ScannedFile, known: Mapping[int, _Declared],
-                record: _Declared) -> bool:
+    def _is_new(self, known: Mapping[int, _Declared], record: _Declared) -> bool:
         """Return whether a declaration is to be taken in."""
         what = type(record).__name__.lower()
         if record.id in known:
             if known[record.id] != record:
-                self.problem(file, f': {what} {record.id} is declared in two ways')
+                self.problem(f': {what} {record.id} is declared in two ways')
             return False
         if len(known) >= limits.CHANNELS:
-            self.problem(file, f' declares more than {limits.CHANNELS} of {what}: the rest is '
-                               'skipped')
+            self.problem(f' declares more than {limits.CHANNELS} of {what}: the rest is skipped')
             return False
         return True
-
-    def _keep(self, size: int) -> None:
-        """Count what is kept of the small records, and refuse too much of it."""
-        if self._kept + size > limits.KEPT_SIZE:
-            raise BagError(f'schemas, channels and metadata are larger than '
-                           f'{limits.KEPT_SIZE} bytes')
-        self._kept += size

@@ -95,14 +95,14 @@ class BagReader:
         self._max_chunk_size = max_chunk_size
         self._problems = Problems()
         self.problems = self._problems.sentences
-        self._intake = Intake(max_chunk_size, self._problems)
+        intake = Intake(max_chunk_size, self._problems)
         folder = Folder(self.path, self._problems)
         paths = folder.find()
         self.metadata = folder.metadata
         self._files: list[ScannedFile] = []
         for file_path in paths:
             try:
-                self._files.append(scan(self._intake, file_path, len(self._files)))
+                self._files.append(scan(intake, file_path, len(self._files)))
             except BagError as error:
                 self._problems.add(str(error))
             except BadInputError as error:
@@ -196,9 +196,9 @@ class BagReader:
                 return
             if sum(len(cursor.content) for cursor in active) + block.size > most:
                 # Every chunk so far reaches beyond the start of this one.
-                self._intake.problem(
-                    self._files[block.file], f': more than {most} bytes of chunks overlap in '
-                    f'time, at byte {block.offset}: skipped')
+                self._files[block.file].problem(
+                    f': more than {most} bytes of chunks overlap in time, at byte '
+                    f'{block.offset}: skipped')
             else:
                 cursor = self._cursor(
                     block, wanted, 0 if start is None else start, _NEVER if end is None else end)
@@ -220,7 +220,7 @@ class BagReader:
         """Return the messages by topic; counted where statistics and CRC cannot be trusted."""
         result = dict.fromkeys(self.topics, 0)
         for file in self._files:
-            check_data(self._intake, file)
+            check_data(file)
             if file.damaged and not file.counted:
                 self._count(file)
             for number, count in file.counts.items():
@@ -238,8 +238,7 @@ class BagReader:
                 found.update(cursor.counts())
         file.counts, file.counted = dict(found), True
         if found.total() < said:
-            self._intake.problem(
-                file, f': {said - found.total()} of {said} messages cannot be read')
+            file.problem(f': {said - found.total()} of {said} messages cannot be read')
 
     def _cursor(
             self, block: Block, topics: Collection[str] | None = None, start: int = 0,
@@ -255,20 +254,18 @@ class BagReader:
             with file.path.open('rb') as stream:
                 content = block.content(stream.fileno())
         except (BagError, OSError) as error:
-            self._intake.problem(file, f': {error}, at byte {block.offset}: skipped')
+            file.problem(f': {error}, at byte {block.offset}: skipped')
             return None
         cursor = Cursor((block.file, block.offset), content, topic_of, start, end)
         if cursor.problem:
-            self._intake.problem(
-                file, f': {cursor.problem}, at byte {block.offset}: skipped')
+            file.problem(f': {cursor.problem}, at byte {block.offset}: skipped')
         return cursor
 
     def _topic_of(self, file: ScannedFile, number: int) -> str | None:
         """Return the topic of a channel, None if its messages are skipped."""
         channel = file.channels.get(number)
         if channel is None:
-            self._intake.problem(
-                file, f': channel {number} is not declared: its messages are skipped')
+            file.problem(f': channel {number} is not declared: its messages are skipped')
             return None
         known = self.topics.get(channel.topic)
         schema = file.schemas.get(channel.schema_id)

@@ -30,18 +30,18 @@ def scan(intake: Intake, path: Path, number: int) -> ScannedFile:
                 raise BadInputError(f'{path} is not an MCAP file: it begins with '
                                     f'{magic!r}, expected {MAGIC!r}')
             descriptor = stream.fileno()
-            file = ScannedFile(path, number, size)
-            if not read_summary(intake, descriptor, file):
+            file = ScannedFile(path, number, size, intake)
+            if not read_summary(descriptor, file):
                 file = replace(
                     file, schemas={}, channels={}, blocks=[], metadata={}, counts={})
-                walk(intake, descriptor, file)
+                walk(descriptor, file)
             return file
     except OSError as error:
         raise BadInputError(
             f'{path} cannot be read ({error.strerror}): expected an MCAP file') from error
 
 
-def check_data(intake: Intake, file: ScannedFile) -> None:
+def check_data(file: ScannedFile) -> None:
     """Hold the data of a file against their CRC, unless that would take long."""
     crc, offset = 0, 0
     if not file.data_crc or file.damaged or file.data_end > limits.CHECKED_SIZE:
@@ -54,4 +54,4 @@ def check_data(intake: Intake, file: ScannedFile) -> None:
             crc = zlib.crc32(data, crc)
             offset += len(data)
     if crc != file.data_crc:
-        intake.problem(file, ' is damaged: the CRC of its data differs')
+        file.problem(' is damaged: the CRC of its data differs')

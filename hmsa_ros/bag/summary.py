@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Metadata, MetadataIndex, Statistics
 
 from hmsa_ros.bag import limits, records
-from hmsa_ros.bag.intake import Intake, ScannedFile
+from hmsa_ros.bag.intake import ScannedFile
 from hmsa_ros.bag.records import Block, MAGIC, PREFIX
 from hmsa_ros.errors import BagError
 
@@ -21,7 +21,7 @@ _FOOTER_SIZE = PREFIX.size + 20
 _DATA_END_SIZE = PREFIX.size + 4
 
 
-def read_summary(intake: Intake, descriptor: int, file: ScannedFile) -> bool:
+def read_summary(descriptor: int, file: ScannedFile) -> bool:
     """Take in a file by its summary; False if that is missing or not to be trusted."""
     tail_size = _FOOTER_SIZE + len(MAGIC)
     tail = os.pread(descriptor, tail_size, max(0, file.size - tail_size))
@@ -39,16 +39,14 @@ def read_summary(intake: Intake, descriptor: int, file: ScannedFile) -> bool:
         summary = records.read_exactly(descriptor, end - start, start)
         if footer.summary_crc not in (0, zlib.crc32(tail[:25], zlib.crc32(summary))):
             raise BagError('its CRC differs')
-        return _take_summary(intake, descriptor, file, summary, start)
+        return _take_summary(descriptor, file, summary, start)
     except BagError as error:
-        intake.problem(file, f': the summary cannot be used ({error}): '
-                           'the file is read record by record')
+        file.problem(
+            f': the summary cannot be used ({error}): the file is read record by record')
         return False
 
 
-def _take_summary(
-        intake: Intake, descriptor: int, file: ScannedFile, summary: bytes,
-        start: int) -> bool:
+def _take_summary(descriptor: int, file: ScannedFile, summary: bytes, start: int) -> bool:
     """Take in the records of a summary; False if they are not complete."""
     chunks: list[ChunkIndex] = []
     notes: list[MetadataIndex] = []
@@ -64,7 +62,7 @@ def _take_summary(
             statistics = record
         elif record is not None:
             declared += isinstance(record, Channel)
-            intake.take(file, record)
+            file.take(record)
     if statistics is None or statistics.message_count and not chunks \
             or statistics.channel_count and not declared:
         return False
@@ -72,17 +70,16 @@ def _take_summary(
     file.counts = dict(statistics.channel_message_counts)
     end_record = records.read_exactly(descriptor, _DATA_END_SIZE, start - _DATA_END_SIZE)
     if not end_record.startswith(PREFIX.pack(Opcode.DATA_END, 4)):
-        intake.problem(file, f' is damaged at byte {start - _DATA_END_SIZE}: no end of data')
+        file.problem(f' is damaged at byte {start - _DATA_END_SIZE}: no end of data')
     file.data_end = start - _DATA_END_SIZE
     file.data_crc = records.parse(DataEnd, end_record[PREFIX.size:]).data_section_crc
-    _find_chunks(intake, descriptor, file, chunks)
+    _find_chunks(descriptor, file, chunks)
     for entry in notes:
-        _find_metadata(intake, descriptor, file, entry)
+        _find_metadata(descriptor, file, entry)
     return True
 
 
-def _find_chunks(
-        intake: Intake, descriptor: int, file: ScannedFile, chunks: list[ChunkIndex]) -> None:
+def _find_chunks(descriptor: int, file: ScannedFile, chunks: list[ChunkIndex]) -> None:
     """Hold the heads of the chunks against the index."""
     before = len(MAGIC)
     for index in sorted(chunks, key=lambda index: index.chunk_start_offset):
@@ -103,13 +100,12 @@ def _find_chunks(
         except BagError:
             found = None
         if block != found or not head.startswith(PREFIX.pack(Opcode.CHUNK, length)):
-            intake.problem(file, f' is damaged at byte {offset}: the chunk there is not as '
-                               'the index says, and is read as that says')
-        intake.add_block(file, block, offset)
+            file.problem(f' is damaged at byte {offset}: the chunk there is not as the index '
+                         'says, and is read as that says')
+        file.add_block(block, offset)
 
 
-def _find_metadata(
-        intake: Intake, descriptor: int, file: ScannedFile, index: MetadataIndex) -> None:
+def _find_metadata(descriptor: int, file: ScannedFile, index: MetadataIndex) -> None:
     """Take in a metadata record that the summary names."""
     try:
         if not PREFIX.size <= index.length <= limits.RECORD_SIZE:
@@ -120,9 +116,9 @@ def _find_metadata(
         record = records.parse(Metadata, data[PREFIX.size:])
         if record.name != index.name:
             raise BagError('a metadata record is not called as the index says')
-        intake.take(file, record)
+        file.take(record)
     except (BagError, OverflowError) as error:
-        intake.problem(file, f': {error}, at byte {index.offset}: skipped')
+        file.problem(f': {error}, at byte {index.offset}: skipped')
 
 
 def _check(statistics: Statistics, chunks: list[ChunkIndex], declared: int) -> None:

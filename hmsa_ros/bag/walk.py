@@ -9,7 +9,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Footer, McapRecord, Schema, Statistics
 
 from hmsa_ros.bag import limits, records
-from hmsa_ros.bag.intake import Intake, ScannedFile
+from hmsa_ros.bag.intake import ScannedFile
 from hmsa_ros.bag.records import Block, MAGIC, PREFIX
 from hmsa_ros.errors import BagError
 
@@ -20,7 +20,7 @@ _PASSED_OVER = frozenset(
     (Opcode.ATTACHMENT, Opcode.ATTACHMENT_INDEX, Opcode.SUMMARY_OFFSET))
 
 
-def walk(intake: Intake, descriptor: int, file: ScannedFile) -> None:
+def walk(descriptor: int, file: ScannedFile) -> None:
     """Take in a file record by record, and count its messages."""
     offset, ended, statistics = len(MAGIC), False, None
     run: list[int] = []  # offset, start and end of the messages outside chunks in a row
@@ -41,15 +41,14 @@ def walk(intake: Intake, descriptor: int, file: ScannedFile) -> None:
             break
         try:
             if len(file.blocks) > limits.CHUNKS:
-                intake.problem(file, f' has more than {limits.CHUNKS} chunks: the rest is '
-                                   'skipped')
+                file.problem(f' has more than {limits.CHUNKS} chunks: the rest is skipped')
                 break
             if opcode == Opcode.MESSAGE:
                 if length < records.MESSAGE_FIXED:
                     raise BagError('a message record ends early')
-                intake.check_size(length, 'message')
+                file.intake.check_size(length, 'message')
                 if chunked:
-                    intake.problem(file, ' has messages outside its chunks')
+                    file.problem(' has messages outside its chunks')
                 log_time = records.MESSAGE_HEAD.unpack_from(head)[4]
                 if run and offset - run[0] >= _RUN_BYTES:
                     end_run()
@@ -60,33 +59,32 @@ def walk(intake: Intake, descriptor: int, file: ScannedFile) -> None:
             else:
                 end_run()
                 chunked = chunked or opcode == Opcode.CHUNK
-                record = _read_record(intake, descriptor, file, offset, head)
+                record = _read_record(descriptor, file, offset, head)
                 statistics = record if isinstance(record, Statistics) else statistics
                 ended = isinstance(record, Footer) and os.pread(
                     descriptor, len(MAGIC), end) == MAGIC
         except BagError as error:
             end_run()
-            intake.problem(file, f': {error}, at byte {offset}: skipped')
+            file.problem(f': {error}, at byte {offset}: skipped')
         offset = end
     end_run()
     if not ended:
-        intake.problem(file, f' is not complete: it can be read up to byte {offset} of '
-                           f'{file.size}')
+        file.problem(f' is not complete: it can be read up to byte {offset} of {file.size}')
     file.complete = ended
-    _count(intake, descriptor, file)
+    _count(descriptor, file)
     found = sum(file.counts.values())
     if statistics is not None and statistics.message_count != found:
-        intake.problem(file, f' holds {found} messages that can be read: it says '
-                           f'{statistics.message_count}')
+        file.problem(
+            f' holds {found} messages that can be read: it says {statistics.message_count}')
 
 
-def _read_record(intake: Intake, descriptor: int, file: ScannedFile, offset: int,
-        head: bytes) -> McapRecord | None:
+def _read_record(
+        descriptor: int, file: ScannedFile, offset: int, head: bytes) -> McapRecord | None:
     """Take in one record that is no message."""
     opcode, length = PREFIX.unpack_from(head)
     content = head[PREFIX.size:]
     if opcode == Opcode.CHUNK:
-        intake.add_block(file, Block.of_chunk(file.number, offset, content, length), offset)
+        file.add_block(Block.of_chunk(file.number, offset, content, length), offset)
     elif opcode == Opcode.MESSAGE_INDEX:
         if length < 6 or struct.unpack_from('<I', content, 2)[0] != length - 6:
             raise BagError('a message index record ends early')
@@ -98,31 +96,30 @@ def _read_record(intake: Intake, descriptor: int, file: ScannedFile, offset: int
             opcode, records.read_exactly(descriptor, length, offset + PREFIX.size))
         if record is None:
             raise BagError(f'a record is of the unknown kind {opcode:#x}')
-        intake.take(file, record)
+        file.take(record)
         return record
     return None
 
 
-def _count(intake: Intake, descriptor: int, file: ScannedFile) -> None:
+def _count(descriptor: int, file: ScannedFile) -> None:
     """Go through all chunks: for what is declared in them, and for what is true of them."""
     blocks, file.blocks, file.counted = file.blocks, [], True
     for block in blocks:
         times: list[int] = []
         try:
-            for channel, time in _messages(intake, file, block.content(descriptor)):
+            for channel, time in _messages(file, block.content(descriptor)):
                 file.counts[channel] = file.counts.get(channel, 0) + 1
                 times[:] = (min(times[0], time), max(times[1], time)) if times else (
                     time, time)
         except BagError as error:
-            intake.problem(file, f': {error}, at byte {block.offset}: skipped')
+            file.problem(f': {error}, at byte {block.offset}: skipped')
         if times and (block.start, block.end) != tuple(times):
-            intake.problem(file, f': a chunk has other times than it says, at byte '
-                               f'{block.offset}')
+            file.problem(f': a chunk has other times than it says, at byte {block.offset}')
         if times:
             file.blocks.append(replace(block, start=times[0], end=times[1]))
 
 
-def _messages(intake: Intake, file: ScannedFile, content: bytes) -> Iterator[tuple[int, int]]:
+def _messages(file: ScannedFile, content: bytes) -> Iterator[tuple[int, int]]:
     """Return channel and log time of each message, and take in what else is there."""
     unpack = records.MESSAGE_HEAD.unpack_from
     for opcode, start, end in records.split(content):
@@ -134,6 +131,6 @@ def _messages(intake: Intake, file: ScannedFile, content: bytes) -> Iterator[tup
                 record = records.parse_any(opcode, content[start:end])
                 if not isinstance(record, (Schema, Channel)):
                     raise BagError(f'a chunk holds a record of the kind {opcode:#x}')
-                intake.take(file, record)
+                file.take(record)
             except BagError as error:
-                intake.problem(file, f': {error}: skipped')
+                file.problem(f': {error}: skipped')

@@ -6,7 +6,8 @@ hands it to the operating system, ``metadata.yaml`` exists from the start, and a
 half way is undone. Message payloads are stored as given.
 """
 
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 import contextlib
 import errno
 import itertools
@@ -15,8 +16,8 @@ import os
 from pathlib import Path
 import re
 
+from hmsa_ros import __version__
 from hmsa_ros.bag import metadata, qos
-from hmsa_ros.bag.contents import Contents
 from hmsa_ros.bag.framing import Entry
 from hmsa_ros.bag.output import OutputFile, PRESETS, RESERVE_STEP
 from hmsa_ros.bag.records import MESSAGE_HEAD
@@ -84,9 +85,13 @@ class BagWriter:
         self.folder = Path(folder)
         # In metadata and messages, which are UTF-8, whatever the folder's name is.
         self._stem = re.sub('[\ud800-\udfff]', '_', self.folder.name)
-        self._contents = Contents(custom_data or {}, ros_distro)
-        self.custom_data = self._contents.custom_data
-        self.dropped = self._contents.dropped
+        self._ros_distro = ros_distro
+        self._topics: list[Topic] = []
+        self._closed_files: list[metadata.FileMetadata] = []
+        self._counts: Counter[int] = Counter()  # messages written, by the number of their topic
+        self.custom_data: dict[str, str] = {}
+        self.dropped: Counter[str] = Counter()
+        self._add(custom_data or {})
         self._preset = PRESETS[preset]
         self._chunk_size = chunk_size
         self._fsync = fsync
@@ -139,16 +144,15 @@ class BagWriter:
 
     def topic_counts(self) -> dict[str, int]:
         """Return the number of messages written."""
-        return self._contents.counts()
+        return {topic.name: self._counts[number] for number, topic in enumerate(self._topics)}
 
     def add_topic(self, topic: Topic) -> int:
         """Announce a topic and return its number, or raise `BagError` beyond `MAX_CHANNELS`."""
         topic.check()
-        contents = self._contents
-        number = number_of(topic, contents.topics)
-        if number < len(contents.topics):
+        number = number_of(topic, self._topics)
+        if number < len(self._topics):
             # Its first profiles hold for every file.
-            known = contents.topics[number]
+            known = self._topics[number]
             if set(topic.profiles) - set(known.profiles):
                 self.note({qos.LATER + topic.name: qos.to_yaml(topic.profiles)})
             return number
@@ -156,7 +160,7 @@ class BagWriter:
             raise BagError(f'a bag cannot have more than {MAX_CHANNELS} topics')
         if self._file is not None:
             self._file.declare(topic)
-        contents.topics.append(topic)
+        self._topics.append(topic)
         return number
 
     def write(self, entries: Iterable[Entry]) -> None:
@@ -176,12 +180,12 @@ class BagWriter:
 
     def note(self, values: Mapping[str, str]) -> None:
         """Add to the custom data: in ``metadata.yaml``, and in the file at once or at its end."""
-        self._contents.note(values)
+        self._add(values)
         file = self._file
         if file is not None:
             # What changes all the time would be more than the messages are.
             if file.notes_size <= max(_NOTES_SIZE, file.size // 16):
-                file.note(self._contents.notes())
+                file.note(self._notes())
             self._write_metadata()
 
     def flush(self) -> None:
@@ -207,7 +211,7 @@ class BagWriter:
 
     def drop_pending(self) -> None:
         """Forget the messages that wait for the next flush, counting them in `dropped`."""
-        self._contents.lose(entry[0] for entry in self._waiting)
+        self.dropped.update(self._topics[entry[0]].name for entry in self._waiting)
         self._waiting, self._waiting_size = [], 0
 
     def abandon(self) -> None:
@@ -221,7 +225,9 @@ class BagWriter:
         try:
             file.check_still_there()
         except OSError:
-            self._contents.lose_file(file)
+            for number, count in file.counts.items():
+                self.dropped[self._topics[number].name] += count
+                self._counts[number] -= count
             file.close()
             self._file = None
             return
@@ -264,8 +270,8 @@ class BagWriter:
                 file = self._file = OutputFile(self.folder / name, number, self._preset)
                 break
         try:
-            file.describe(self._contents.serialized(file), self._contents.notes())
-            for topic in self._contents.topics:
+            file.describe(self._serialized(file), self._notes())
+            for topic in self._topics:
                 file.declare(topic)
             self._write_metadata()
         except OSError:
@@ -288,7 +294,7 @@ class BagWriter:
         if self._file is None:
             raise OSError('no file is open')
         self._file.write(self._waiting, self._waiting_size)
-        self._contents.count(map(_TOPIC_OF, self._waiting))
+        self._counts.update(map(_TOPIC_OF, self._waiting))
         self._waiting, self._waiting_size = [], 0
 
     def _finish_file(self) -> None:
@@ -297,19 +303,52 @@ class BagWriter:
         if file is None:
             return
         file.check_still_there()
-        file.finish(self._contents.serialized(file), self._contents.notes(), fsync=self._fsync)
+        file.finish(self._serialized(file), self._notes(), fsync=self._fsync)
         self._forget_file(file)
         self._write_metadata()
 
     def _forget_file(self, file: OutputFile) -> None:
         """Note a closed file among the files written."""
-        self._contents.files.append(file.summary())
+        self._closed_files.append(file.summary())
         self._file = None
 
     def _write_metadata(self) -> None:
         """Bring ``metadata.yaml`` up to date."""
-        self._contents.ended = self._closed
-        metadata.write(self.folder, self._contents.describe(self._file))
+        files = [*self._closed_files, *([self._file.summary()] if self._file else [])]
+        ended = {} if self._closed else {metadata.NOT_ENDED: 'true'}
+        metadata.write(self.folder, self._metadata(
+            files, self._counts, {**self.custom_data, **ended}))
+
+    def _add(self, values: Mapping[str, str]) -> None:
+        """Add to the custom data; what UTF-8 cannot hold is written as its codes."""
+        self.custom_data.update({_storable(x): _storable(y) for x, y in values.items()})
+
+    def _notes(self) -> dict[str, str]:
+        """Return what a file says of the experiment."""
+        return {'version': __version__, **self.custom_data}
+
+    def _serialized(self, file: OutputFile) -> str:
+        """Return the metadata as rosbag2 has them in a file, about that file alone."""
+        return metadata.to_yaml(
+            self._metadata([file.summary()], file.counts, self.custom_data), outer_key=False)
+
+    def _metadata(
+            self, files: Sequence[metadata.FileMetadata], counts: Mapping[int, int],
+            custom_data: Mapping[str, str]) -> metadata.BagMetadata:
+        filled = [file for file in files if file.message_count]
+        start = min((file.start_ns for file in filled), default=metadata.NO_TIME)
+        end = max((file.start_ns + file.duration_ns for file in filled), default=start)
+        return metadata.BagMetadata(
+            start, end - start, sum(file.message_count for file in files),
+            tuple(metadata.TopicMetadata(
+                topic.name, topic.type, 'cdr', topic.profiles, topic.type_hash,
+                counts.get(number, 0)) for number, topic in enumerate(self._topics)),
+            tuple(files), custom_data, self._ros_distro)
+
+
+def _storable(text: str) -> str:
+    """Return a text with what UTF-8 cannot hold written as its codes."""
+    return text.encode('utf-8', 'backslashreplace').decode()
 
 
 def _make(folder: Path) -> None:
