@@ -81,7 +81,7 @@ template <class R, class System, int NB = 0> struct Swing {
         set(rtol, i, tolerance);
         const double fast = frequency + 3 * zeta, root = sqrt(sqrt(sqrt(tolerance)));
         // A fixed phase of the local oscillation. Where the force turns, the frequency vanishes.
-        set(h, i, 4 * root / (fast + 1e-9));
+        set(h, i, 7 * root / (fast + 1e-9));
         set(t, i, 0);
         set(steps, i, 0);
         set(still, i, at_rest * move * fast);

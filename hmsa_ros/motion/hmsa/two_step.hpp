@@ -28,7 +28,15 @@ struct Wanted {
 // room to a limit.
 constexpr double linear = 1e-6;
 constexpr int most_passes = 80, newton_passes = 8, most_stuck = 4, most_crossing = 200000;
-constexpr double coarse = 1e-7, farthest = 1e3;
+constexpr double coarse = 3e-7, farthest = 1e3;
+
+// What the cubic through two points, with a slope at each, adds to the line through the first at a
+// share of the way from it to the second.
+inline double beyond_line(double share, double rise, double way, double slope, double other)
+{
+    const double bend = way * (slope + other) - 2 * rise;
+    return share * share * (rise - way * slope - bend + share * bend);
+}
 
 // Newton on d = direction (beta_1 - beta_p) > 0, kept inside a bracket: at d = 0 the motion
 // overshoots the target, at a large d it stops short. The difference is the unknown because it
@@ -46,6 +54,9 @@ template <class System, int NB = 0> struct Search {
     double fine, enough, tolerance, least, most, top, guess, low, high, d;
     int pass, times_stuck;
     bool rough;
+    // Of the turning point before: d, its excess, and the slope of d by that; its time, and the slope
+    // of that by the load; how far d went from there as a share, and how exact the pass was.
+    struct { double d, excess, slope, time, time_by_load, went, exact; } before;
     Plan plan;
 
     double load() const { return held - direction * d; }
@@ -124,6 +135,7 @@ template <class System, int NB = 0> struct Search {
             guess = most < infinity() ? 0.5 * most : 1;
         low = 0, high = most, d = guess;
         pass = times_stuck = 0;
+        before.went = infinity();
         rough = wanted.rough;
         return true;
     }
@@ -141,11 +153,11 @@ template <class System, int NB = 0> struct Search {
             return ended(not_converged);
         const double end = event.stretch, miss = end - target, beta = load();
         const bool turn = event.status == turned;
-        double change = infinity();
+        double change = infinity(), excess = 0, slope = 0;
         if (turn) {
-            const double excess = log1p(miss / (target - lower)) - log1p(-miss / (upper - target));
-            change = direction * excess
-                / (event.by_load * (1 / (end - lower) + 1 / (upper - end)));
+            excess = log1p(miss / (target - lower)) - log1p(-miss / (upper - target));
+            slope = -direction / (event.by_load * (1 / (end - lower) + 1 / (upper - end)));
+            change = -excess * slope;
         }
         if (event.status != no_turn && direction * miss > 0)
             low = max(low, d);
@@ -163,6 +175,7 @@ template <class System, int NB = 0> struct Search {
                 // Coarse passes have misled the search: begin again.
                 tolerance = fine;
                 low = 0, high = most, d = guess;
+                before.went = infinity();
                 return pass == most_passes && ended(not_converged);
             }
             if (lost)
@@ -179,20 +192,36 @@ template <class System, int NB = 0> struct Search {
         }
         const bool near = rough ? relative < 0.1 && next > 1e-3 * abs(guess)
                                 : tolerance <= fine && relative <= enough && abs(miss) <= 1e-6 * move;
-        if (turn && near) {
+        // Cubics through this turning point and the one before, with both slopes, miss by the square
+        // of the product of both distances, where Newton misses by that of one; by more where Newton
+        // has come nearer by little.
+        const double nearer = relative / before.went, squared = nearer * nearer;
+        const bool bent = !near && turn && !rough && tolerance <= fine && next == d + change
+            && relative * before.went <= enough && squared * before.exact <= fine
+            && squared * squared * relative <= 0.1 * fine && abs(miss) <= 1e-4 * move;
+        if (bent)
+            next += beyond_line(-excess / (before.excess - excess), before.d - d,
+                before.excess - excess, slope, before.slope);
+        if (turn && (near || bent)) {
             if (next < least)
                 return ended(indistinguishable);
-            const double moved = direction * (next - d);
+            const double moved = direction * (next - d), back = direction * (d - before.d);
             plan = {two_step, beta - moved, event.time - event.time_by_load * moved, beta_1, pass};
+            if (bent)
+                plan.tau_p += beyond_line(
+                    -moved / back, before.time - event.time, back, event.time_by_load, before.time_by_load);
             return true;
         }
+        before = {d, excess, slope, event.time, event.time_by_load, turn ? relative : infinity(),
+            tolerance * (1 + target) / move};
         d = next;
         if (d > top)
             return ended(no_two_step);
         if (relative < 0.1 && tolerance > fine) {
-            // What quadratic convergence leaves for the next pass to resolve.
+            // What convergence leaves for the next pass to resolve.
             tolerance = max(fine, min(tolerance, 1e-2 * relative * relative));
-            if (tolerance < 1e3 * fine) {
+            const bool last = turn && !rough && abs(excess) < 0.05 && relative * relative * relative < enough;
+            if (last || tolerance < 1e3 * fine) {
                 tolerance = fine;
                 low = 0, high = most;
             }
