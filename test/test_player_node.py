@@ -23,6 +23,7 @@ from hmsa_ros.bag.definitions import message_definition, type_hash
 from hmsa_ros.bag.info import summarize
 from hmsa_ros.bag.qos import Qos
 from hmsa_ros.bag.writer import BagWriter, Topic
+from hmsa_ros.cli import main
 from hmsa_ros.lab.launching import REPLAY
 
 pytestmark = pytest.mark.ros
@@ -425,11 +426,11 @@ def test_an_empty_bag_ends_at_once(play, tmp_path):
     (('storage.uri:={bag}', 'play.regex_to_filter:="("'), 'expected a regular expression'),
     (('storage.uri:={bag}', 'play.wait_for_subscribers:=[/b]'), 'expected topics that are sent'),
 ])
-def test_bad_input_is_refused_in_one_line(start, tmp_path, parameters, expected):
+def test_bad_input_is_refused_in_one_line(
+        ros_env, handlers, tmp_path, capfd, parameters, expected):
     bag = write_bag(tmp_path / 'bag', [('/a', 0, 0)])
-    process = start.hmsa('player', '--ros-args', *(
-        part for parameter in parameters for part in ('-p', parameter.format(bag=bag))))
-    assert process.wait() == 2
-    line, = process.stderr.strip().splitlines()
+    assert main(['player', '--ros-args', *(
+        part for parameter in parameters for part in ('-p', parameter.format(bag=bag)))]) == 2
+    line, = capfd.readouterr().err.splitlines()
     assert line.startswith('hmsa: error: ')
     assert expected in line

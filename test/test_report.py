@@ -369,16 +369,21 @@ def test_without_the_requests_setpoints_are_told_by_the_levels_that_last(tmp_pat
     assert 'plan-section' not in Page(page([part])).ids
 
 
-def test_a_request_that_a_busy_recorder_received_after_its_status_counts_from_the_status(
-        tmp_path, bag):
+@pytest.mark.parametrize('late', [2 * LEAD, -LEAD])
+def test_a_request_that_a_recorder_received_out_of_order_counts_from_its_own_status(
+        tmp_path, bag, late):
     messages = without(simulated(), 'joint_trajectory', 'status')
     request, = (x for _, topic, _, x in simulated() if topic.endswith('joint_trajectory'))
-    request.header.frame_id = 'a'
-    accepted = status(0, 'accepted', 'accepted')
-    accepted.values.append(STORE.types['diagnostic_msgs/msg/KeyValue'](key='request', value='a'))
+    request.header.frame_id = 'b'
+    earlier, own = status(0, 'arrived', 'arrived'), status(0, 'accepted', 'accepted')
+    for told, name, plan in ((earlier, 'a', '1'), (own, 'b', '2')):
+        told.values += [STORE.types['diagnostic_msgs/msg/KeyValue'](key=key, value=value)
+                        for key, value in (('request', name), ('plan', plan))]
     messages += [
-        (START, '/planner/status', TYPES[STATUS], accepted),
-        (START + 2 * LEAD, '/planner/joint_trajectory', TYPES[TRAJECTORY], request)]
+        # What is latched comes when the recorder is matched.
+        (START - 2, '/planner/status', TYPES[STATUS], earlier),
+        (START + 1, '/planner/status', TYPES[STATUS], own),
+        (START + late, '/planner/joint_trajectory', TYPES[TRAJECTORY], request)]
     part = one(tmp_path / 'bag', messages, **parameters(planner=ACTUATOR, plant=ACTUATOR))
     expected, = parts_of(bag)
     assert part.evaluation.findings == expected.evaluation.findings

@@ -266,19 +266,27 @@ class _Collected:
     def _requests(self, joint: str, key: str) -> list[RecordedRequest]:
         """Return what was asked of a joint, by time."""
         requests = list(self.setpoints.get(key, ()))
-        # A busy recorder may receive a request after what the planner said of it.
-        answered: dict[str, int] = {}
-        for status in self.statuses:
-            answered.setdefault(status.values.get('request', ''), status.sent)
         for asked in self.trajectories:
             place = _place(asked.joints, joint)
             if place is not None:
-                sent = min(asked.sent, answered.get(asked.name, asked.sent)) if asked.name \
-                    else asked.sent
-                requests.append(RecordedRequest(sent, asked.stamp, tuple(
+                requests.append(RecordedRequest(self._sent(asked), asked.stamp, tuple(
                     (x.positions[place], x.time) for x in asked.points
                     if len(x.positions) == max(len(asked.joints), 1))))
         return sorted(requests, key=lambda x: x.sent)
+
+    def _sent(self, asked: _Trajectory) -> int:
+        """
+        Return when a request was recorded, after all that was said before its own status.
+
+        A recorder may receive it after that status, and latched news of an earlier one after it.
+        """
+        own = [x.values.get('request') == asked.name for x in self.statuses]
+        if not asked.name or True not in own:
+            return asked.sent
+        place = own.index(True)
+        answered = self.statuses[place].sent
+        before = self.statuses[place - 1].sent + 1 if place else min(asked.sent, answered)
+        return asked.sent if before <= asked.sent <= answered else min(before, answered)
 
     def _verdicts(self, joint: str, joints: Sequence[str]) -> Iterable[Verdict]:
         """Return what the planner said, with the target of a joint."""
