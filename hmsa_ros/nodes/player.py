@@ -160,7 +160,7 @@ class Player(ManagedNode):
             self, self._reader, self._filter(), own_clock=self._clock_out is not None)
         self._audience = Audience(
             self, self._senders, self._names('play.wait_for_subscribers'),
-            self._names('play.wait_for_nodes'), self._recorder())
+            self._names('play.wait_for_nodes'), ''.join(self._names('play.wait_for_recorder')))
         followers = self._names('play.wait_for_samples')
         if followers and self._clock_out is None:
             raise BadInputError(
@@ -204,13 +204,9 @@ class Player(ManagedNode):
 
     def _names(self, parameter: str) -> tuple[str, ...]:
         """Return the full names of topics or nodes in a parameter."""
+        given = self._values[parameter]
         return tuple(expand_topic_name(name, self.get_name(), self.get_namespace())
-                     for name in self._values[parameter])
-
-    def _recorder(self) -> str:
-        """Return the full name of the recorder to wait for, empty for none."""
-        name = self._values['play.wait_for_recorder']
-        return str(expand_topic_name(name, self.get_name(), self.get_namespace())) if name else ''
+                     for name in ([given] if isinstance(given, str) else given) if name)
 
     def _filter(self) -> Filter:
         values = self._values
