@@ -264,7 +264,7 @@ def test_without_pyserial_it_says_how_to_install_it(monkeypatch):
     def missing(name):
         raise ImportError(errno.ENOENT, name)
 
-    monkeypatch.setattr('hmsa_ros.device.serial_board.import_module', missing)
+    monkeypatch.setattr('hmsa_ros.device.line.import_module', missing)
     with pytest.raises(HmsaError, match='pip install pyserial'):
         Board('/dev/ttyACM0')
 

@@ -20,7 +20,9 @@ from hmsa_ros.errors import BadInputError, excerpt, HmsaError
 from hmsa_ros.model.units import NANOSECONDS
 
 #: Hardware of this package, by the short names that `load` takes, too.
-SHIPPED = {'serial_board': 'hmsa_ros.device.serial_board:SerialBoard'}
+SHIPPED = {
+    'serial_board': 'hmsa_ros.device.serial_board:SerialBoard',
+    'scpi_supply': 'hmsa_ros.device.scpi_supply:ScpiSupply'}
 # What its methods take; all but the first two are optional.
 _TAKES: dict[str, tuple[str, ...]] = {
     'write': ('level', 'now'), 'read': ('now',), 'open': (), 'close': (),

@@ -7,7 +7,6 @@ again: a line that was lost or damaged costs an attempt.
 
 from binascii import crc_hqx
 from collections.abc import Sequence
-from importlib import import_module
 import math
 from secrets import randbelow
 import sys
@@ -15,11 +14,10 @@ from time import monotonic
 from typing import Any, NamedTuple
 
 from hmsa_ros.device.assembly import Assembly, parts, require
+from hmsa_ros.device.line import open_line
 from hmsa_ros.device.protocol import StateLostError
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.errors import HmsaError
 
-#: The port that is a simulated board; after a colon, a file for its true motion may follow.
-SIMULATED = 'sim'
 _VERSION = 1
 # Levels, readings and times are whole numbers of millionths.
 _MILLION = 1e6
@@ -46,22 +44,6 @@ def framed(text: str) -> bytes:
     return f'{text}*{crc_hqx(text.encode(), 0xFFFF):04X}\n'.encode()
 
 
-def _opened(port: str, baud: int) -> Any:
-    kind, _, truth = port.partition(':')
-    if kind == SIMULATED:
-        from hmsa_ros.device.simulated_board import SimulatedBoard
-
-        return SimulatedBoard(truth)
-    try:
-        serial = import_module('serial')
-    except ImportError as error:
-        raise BadInputError(
-            'pyserial, which serial ports need, is not installed: install it (pip install '
-            f'pyserial), or use the port {SIMULATED} for a simulated board') from error
-    return serial.serial_for_url(port, baud, timeout=_ATTEMPT, write_timeout=_PATIENCE,
-                                 exclusive=True)
-
-
 class Board:
     """
     The board as the source of a current (or voltage) in A, and as a sensor.
@@ -69,8 +51,7 @@ class Board:
     Parameters
     ----------
     port : str
-        Of pyserial: a device, or a URL such as ``socket://host:port``; ``sim`` for a simulated
-        board, or ``sim:FILE``.
+        As of `open_line`; ``sim:FILE`` writes the true motion of a simulated board.
     baud : int
         Bits per second; of no effect on USB.
     watchdog : float
@@ -86,10 +67,6 @@ class Board:
     """
 
     def __init__(self, port: Any, baud: int = 1_000_000, watchdog: float = 0.5) -> None:
-        if not isinstance(port, str) or not port:
-            raise BadInputError(
-                f'port is {port!r}: expected a serial port, as /dev/ttyACM0, or {SIMULATED} for a '
-                'simulated board')
         require('baud', baud, positive=True)
         require('watchdog', watchdog, positive=True)
         self._port, self._baud, self._watchdog = port, int(baud), round(watchdog * _MILLION)
@@ -144,7 +121,10 @@ class Board:
                     f'{self._watchdog / _MILLION:g} s (watchdog)')
             try:
                 if self._line is None:
-                    self._line = _opened(self._port, self._baud)
+                    from hmsa_ros.device.simulated_board import SimulatedBoard
+
+                    self._line = open_line(
+                        self._port, self._baud, _ATTEMPT, _PATIENCE, SimulatedBoard)
                 answer = self._attempt(verb, values) or answer
             except HmsaError:
                 raise

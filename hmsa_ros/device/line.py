@@ -1,0 +1,50 @@
+"""Lines to instruments: the ports of pyserial, and simulated ones."""
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+from hmsa_ros.errors import BadInputError
+
+#: The port that is a simulated instrument; what follows a colon is given to it.
+SIMULATED = 'sim'
+
+
+def open_line(
+        port: Any, baud: int, timeout: float, patience: float,
+        simulate: Callable[[str], Any]) -> Any:
+    """
+    Return a port, as of pyserial.
+
+    Parameters
+    ----------
+    port : str
+        A device, a URL such as ``socket://host:port``, or `SIMULATED`.
+    baud : int
+        Bits per second.
+    timeout, patience : float
+        Longest time in s that a read, and a write, may take.
+    simulate : callable
+        Returns a simulated instrument for what follows the colon.
+
+    Raises
+    ------
+    BadInputError
+        If there is no such port to be had.
+
+    """
+    if not isinstance(port, str) or not port:
+        raise BadInputError(
+            f'port is {port!r}: expected a serial port, as /dev/ttyACM0, or {SIMULATED} for a '
+            'simulated instrument')
+    kind, _, rest = port.partition(':')
+    if kind == SIMULATED:
+        return simulate(rest)
+    try:
+        serial = import_module('serial')
+    except ImportError as error:
+        raise BadInputError(
+            'pyserial, which serial ports need, is not installed: install it (pip install '
+            f'pyserial), or use the port {SIMULATED} for a simulated instrument') from error
+    return serial.serial_for_url(
+        port, baud, timeout=timeout, write_timeout=patience, exclusive=True)

@@ -1,0 +1,150 @@
+"""A bench supply as a source of current, by SCPI on a serial line or raw TCP."""
+
+import math
+import re
+from time import monotonic, monotonic_ns
+from typing import Any
+
+from hmsa_ros.device.assembly import Assembly, parts, require
+from hmsa_ros.device.line import open_line
+from hmsa_ros.device.protocol import StateLostError
+from hmsa_ros.errors import HmsaError
+
+# In s: an attempt, and a request.
+_ATTEMPT, _PATIENCE = 0.2, 0.5
+# Steps that the output of a supply has at least.
+_STEPS = 4096
+_NUMBER = r'([-+]?[\d.]+(?:[eE][-+]?\d+)?)'
+# Of the current, whether the output is on, and the oldest error.
+_STATE = re.compile(rf'{_NUMBER};\s*(0|1|ON|OFF);\s*([-+]?\d+),?\s*(.*)')
+
+
+class SupplyError(HmsaError):
+    """A supply that does not answer, or reports an error."""
+
+
+class Supply:
+    """
+    The supply as the source of a current in A.
+
+    It must take several commands in a line, as IEEE 488.2 has it: each level is confirmed by the
+    current that is set, by the state of the output, and by the error queue, in one exchange.
+
+    Parameters
+    ----------
+    port : str
+        As of `open_line`: ``socket://host:port`` for TCP.
+    baud : int
+        Bits per second of a serial port.
+    voltage : float
+        Voltage limit in V; infinite for that of the supply.
+    resolution : float, optional
+        Step of the current in A; default a 4096th of the largest.
+
+    Raises
+    ------
+    BadInputError
+        If a setting is out of range.
+    SupplyError
+        If the supply does not answer, or reports an error.
+
+    """
+
+    def __init__(
+            self, port: Any, baud: int = 9600, voltage: float = math.inf,
+            resolution: float | None = None) -> None:
+        require('baud', baud, positive=True)
+        require('voltage', voltage, positive=True)
+        require('resolution', 1.0 if resolution is None else resolution, positive=True)
+        self._port, self._baud, self._voltage = port, int(baud), voltage
+        self._line: Any = None
+        self.open()
+        self.resolution = self.limit / _STEPS if resolution is None else resolution
+
+    def open(self) -> None:
+        """Connect (again), and put it in the mode of a current source, at 0 A."""
+        self.close()
+        self.description = self._ask('*CLS;*IDN?', re.compile('(.+)'))[0].strip()
+        limit = '' if self._voltage == math.inf else f'VOLT {self._voltage:g};:'
+        self._set(f'FUNC:MODE CURR;:{limit}CURR 0;:OUTP ON')
+        self.limit = float(self._ask('CURR? MAX', re.compile(_NUMBER))[0])
+
+    def close(self) -> None:
+        """Switch the output off, and leave the line."""
+        line, self._line = self._line, None
+        if line is not None:
+            try:
+                line.write(b'OUTP OFF\n')
+            finally:
+                line.close()
+
+    def write(self, current: float, now: int) -> tuple[int, float]:
+        """
+        Set a current in A; return when, about the middle of the exchange, and the one set.
+
+        Raises
+        ------
+        SupplyError
+            If the supply does not answer, or refuses.
+        StateLostError
+            If its output was off; it is on again, at 0 A.
+
+        """
+        begun = monotonic_ns()
+        level, on = self._set(f'CURR {current:.6g}')
+        if not on:
+            self._set('FUNC:MODE CURR;:CURR 0;:OUTP ON')
+            raise StateLostError(f'the output of the supply on {self._port} was off')
+        return now + (monotonic_ns() - begun) // 2, level
+
+    def _set(self, text: str) -> tuple[float, bool]:
+        """Carry a command out; return the current that is set, and whether the output is on."""
+        level, on, number, why = self._ask(f'{text};:CURR?;:OUTP?;:SYST:ERR?', _STATE)
+        if int(number):
+            raise SupplyError(
+                f'the supply on {self._port} refuses {text} (error {number} {why}): expected one '
+                'with the SCPI commands FUNC:MODE, CURR, VOLT and OUTP, and levels in its limits')
+        return float(level), on in ('1', 'ON')
+
+    def _ask(self, text: str, expected: 're.Pattern[str]') -> tuple[str, ...]:
+        """Return the parts of an answer; ask again where it is not as expected."""
+        until, answer = monotonic() + _PATIENCE, ''
+        while True:
+            try:
+                if self._line is None:
+                    from hmsa_ros.device.simulated_supply import SimulatedSupply
+
+                    self._line = open_line(
+                        self._port, self._baud, _ATTEMPT, _PATIENCE, SimulatedSupply)
+                self._line.reset_input_buffer()
+                self._line.write(f'{text}\n'.encode())
+                answer = self._read()
+            except HmsaError:
+                raise
+            except Exception as error:  # whatever a port that is gone raises
+                self._line = None
+                raise SupplyError(
+                    f'the line {self._port} failed ({error}): check hardware.port, its cable, '
+                    'and that no other program uses it') from error
+            if found := expected.fullmatch(answer):
+                return found.groups()
+            if monotonic() > until:
+                raise SupplyError(
+                    f'the supply on {self._port} answers {answer!r} to {text}: expected a supply '
+                    'that speaks SCPI, at the same baud')
+
+    def _read(self) -> str:
+        text, until = b'', monotonic() + _ATTEMPT
+        while not text.endswith(b'\n') and monotonic() < until:
+            text += self._line.read(max(self._line.in_waiting, 1))
+        return text.decode('ascii', 'replace').strip()
+
+
+class ScpiSupply(Assembly):
+    """A bench supply and its coil, as ``hardware:=scpi_supply``."""
+
+    def __init__(
+            self, joint: str, port: Any = '', baud: int = 9600, voltage: float = math.inf,
+            resolution: float | None = None, **settings: Any) -> None:
+        coil, scale = parts(settings)
+        super().__init__(Supply(port, baud, voltage, resolution), coil, scale)
