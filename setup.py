@@ -122,7 +122,7 @@ class BuildMotion(build_ext):
         super().build_extension(ext)
 
 
-NODES = ('planner', 'plant', 'driver', 'recorder', 'player', 'controller')
+NODES = ('planner', 'plant', 'driver', 'recorder', 'player', 'sense', 'controller')
 
 setup(
     name=PACKAGE,

@@ -179,7 +179,7 @@ def test_every_launch_and_parameter_file_is_installed_where_ros_looks(setup):
 def test_every_script_names_a_function_that_exists(setup):
     scripts = dict(script.split(' = ') for script in setup['scripts'])
     assert set(scripts) == {
-        'hmsa', 'planner', 'plant', 'driver', 'recorder', 'player', 'controller'}
+        'hmsa', 'planner', 'plant', 'driver', 'recorder', 'player', 'sense', 'controller'}
     for target in scripts.values():
         module, function = target.split(':')
         assert callable(getattr(import_module(module), function))

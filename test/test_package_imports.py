@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+from hmsa_ros.cli.node import NODES
+
 ROOT = Path(__file__).resolve().parent.parent
 ROS = ('rclpy', 'rcl_interfaces', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs',
        'geometry_msgs', 'rosgraph_msgs', 'rosidl_runtime_py', 'sensor_msgs', 'std_msgs',
@@ -108,7 +110,7 @@ def test_nodes_do_not_import_without_ros_so_the_blocking_works():
 
 def test_commands_that_need_ros_say_how_to_get_it_where_there_is_none(tmp_path):
     commands = [
-        *([x] for x in ('planner', 'plant', 'driver', 'recorder', 'player', 'controller')),
+        *([x] for x in NODES),
         ['demo'], ['run', '1.1:0.1'], ['run', '1.1:0.1', '--simulate'], ['send', '1.1:0.1'],
         ['watch', '--once']]
     result = run(BLOCKED.format(blocked=ROS) + f"""
@@ -157,9 +159,8 @@ assert main(['report', 'run.csv']) == 2
 
 
 def test_nodes_start_without_scipy_which_takes_longer_to_load_than_all_else():
-    nodes = ('planner', 'plant', 'driver', 'recorder', 'player', 'controller')
     result = run(BLOCKED.format(blocked=('scipy',)) + ''.join(
-        f'import hmsa_ros.nodes.{x}\n' for x in nodes)
+        f'import hmsa_ros.nodes.{x}\n' for x in NODES)
         # What `hmsa run` evaluates its bag with.
         + 'import hmsa_ros.report.comparison, hmsa_ros.report.evaluation')
     assert (result.returncode, result.stderr) == (0, '')

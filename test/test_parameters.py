@@ -37,6 +37,8 @@ DIMENSIONLESS = {
     'actuator.chain_limit', 'initial_stretch', 'real_time_factor', 'robust_order', 'play.rate',
     'play.read_ahead_queue_size', 'play.realtime_priority', 'record.queue_depth',
     'reset_stretch', 'seed', 'law.alpha', 'law.lambda_m', 'law.stretch', 'step_count',
+    # In one unit of length, whichever.
+    'sensor.gain', 'sensor.offset', 'sensor.rest_length',
     'smooth_periods', 'stretch_bias', 'stretch_gain', 'stretch_noise', 'viscoelastic.ratio',
     'viscoelastic.exponent', 'viscoelastic.stress',
     # Each number of them has its own unit.

@@ -12,6 +12,7 @@ NODES = {
     'driver': 'drive real hardware in the place of the plant',
     'recorder': 'record topics to a bag',
     'player': 'replay a bag',
+    'sense': 'publish the stretch that a camera or another sensor sees',
     'controller': 'planner and plant, or driver, in one process and one loop',
 }
 _EXAMPLES = {
@@ -20,6 +21,7 @@ _EXAMPLES = {
     'driver': '-p hardware:=my_lab:Coil',
     'recorder': '-p storage.uri:=my_run -p record.all_topics:=true',
     'player': '-p storage.uri:=my_run',
+    'sense': '-p topic:=/block/pose -p sensor.rest_length:=0.02',
     'controller': '--params-file actuator.yaml -p lead_time:=0.003',
 }
 

@@ -19,6 +19,7 @@ from hmsa_ros.device.hardware import is_number, readings
 from hmsa_ros.device.protocol import StateLostError
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.equations import Array
+from hmsa_ros.model.units import NANOSECONDS
 
 # A coil that was too warm must cool to this share of its limit before it is used again.
 _COOL = 0.9
@@ -131,6 +132,15 @@ class SensorScale:
             require(f'sensor.{x.name}', getattr(self, x.name), positive=x.name == 'rest_length')
         if self.gain == 0.0:
             raise BadInputError('sensor.gain is 0: expected another number')
+
+    def stretch(self, reading: float) -> float:
+        """Return the stretch at a reading."""
+        return (self.gain * reading + self.offset) / self.rest_length
+
+    @property
+    def latency_ns(self) -> int:
+        """The latency in ns."""
+        return round(self.latency * NANOSECONDS)
 
 
 def require(name: str, value: Any, *, positive: bool = False) -> None:
@@ -277,11 +287,9 @@ class Assembly:
         if not hasattr(self.sensor, 'read'):
             return []
         scale = self.scale
-        latency = round(scale.latency * 1e9)
         return [
-            ((scale.gain * x.stretch + scale.offset) / scale.rest_length,
-             scale.gain * x.rate / scale.rest_length,
-             (now if x.stamp is None else x.stamp) - latency)
+            (scale.stretch(x.stretch), scale.gain * x.rate / scale.rest_length,
+             (now if x.stamp is None else x.stamp) - scale.latency_ns)
             for x in readings(self.sensor.read(now))]
 
     def close(self) -> None:

@@ -63,7 +63,8 @@ PLANT = 'plant'
 DRIVER = 'driver'
 RECORDER = 'recorder'
 PLAYER = 'player'
-NODES = (PLANNER, PLANT, DRIVER, RECORDER, PLAYER)
+SENSE = 'sense'
+NODES = (PLANNER, PLANT, DRIVER, RECORDER, PLAYER, SENSE)
 
 _FIELD = 'sensor_msgs/msg/MagneticField'
 _FLOAT = 'std_msgs/msg/Float64'
@@ -124,7 +125,7 @@ DISTURBANCE_FORCE = Topic(
 JOINT_STATES = Topic(
     'joint_states', 'sensor_msgs/msg/JointState', SAMPLES,
     'Samples of the actuator: position is stretch, velocity stretch rate in 1/s, effort the '
-    'applied flux density in tesla.', publishers=(PLANT, DRIVER), subscribers=(PLANNER,))
+    'applied flux density in tesla.', publishers=(PLANT, DRIVER, SENSE), subscribers=(PLANNER,))
 STRETCH = Topic(
     'stretch', _FLOAT, SAMPLES, 'The stretch alone, for plotting and echo.',
     publishers=(PLANT, DRIVER))

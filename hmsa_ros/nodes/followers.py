@@ -4,12 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from rclpy.node import Node
-from sensor_msgs.msg import JointState
 
 from hmsa_ros.interfaces import topics
 from hmsa_ros.nodes import endpoints
-from hmsa_ros.nodes.capture import decode
-from hmsa_ros.nodes.conversions import from_time
+from hmsa_ros.nodes.cdr import stamp_of
 
 
 class Followers:
@@ -31,8 +29,7 @@ class Followers:
         for name, subscription in self._subscriptions.items():
             while taken := subscription.take():
                 for x in taken[-2:]:
-                    stamp = from_time(decode(x.data, JointState).header.stamp)
-                    self._stamps[name] = self._stamps[name][1], stamp
+                    self._stamps[name] = self._stamps[name][1], stamp_of(x.data)
         # The next sample may be due after the end only.
         return {name: end - last for name, (before, last) in self._stamps.items()
                 if not before or 2 * last - before <= end}
