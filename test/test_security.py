@@ -186,7 +186,7 @@ def test_only_plant_player_and_replay_may_be_the_authority_on_time():
 
 def test_a_player_may_send_commands_and_forces_in_a_replay_alone():
     assert GRANTS['/hmsa/replay'] - GRANTS['/hmsa/player'] == {
-        ('publish', COMMAND), ('publish', '/disturbance_force')}
+        ('publish', COMMAND), ('publish', '/disturbance_force'), ('subscribe', '/joint_states')}
     assert GRANTS['/hmsa/player'] < GRANTS['/hmsa/replay']
 
 
@@ -243,7 +243,8 @@ def test_policies_grant_exactly_what_the_nodes_do(tmp_path, start, ros):
     player = start.hmsa(
         'player', '--ros-args', '-p', f'storage.uri:={bag}', '-p', 'play.rate:=0.001',
         '-p', 'play.clock_publish_frequency:=100.0', '-p', 'play.discovery_time:=0.0',
-        '-p', f'play.allow_commands:=[{COMMAND}]')
+        '-p', f'play.allow_commands:=[{COMMAND}]',
+        '-p', f'play.wait_for_samples:=[{topics.JOINT_STATES.name}]')
     watch(ros, ('player', 'plant', 'recorder'), seen,
           lambda: nothing_left('plant', 'recorder')()
           and GRANTS['/hmsa/replay'] <= seen.get('player', set()),
@@ -264,6 +265,16 @@ def test_policies_grant_exactly_what_a_driver_does(start, ros):
     watch(ros, ['driver'], seen, lambda: seen.get('driver', set()) >= enclave_of('driver'),
           'all that a driver may do')
     assert seen['driver'] == enclave_of('driver')
+
+
+@pytest.mark.ros
+def test_policies_grant_exactly_what_a_sensor_does_beside_its_topic(start, ros):
+    seen: dict[str, set[Grant]] = {}
+    start.hmsa('sense', '--ros-args', '-p', 'topic:=pose', '-p',
+               'type:=geometry_msgs/msg/PoseStamped')
+    granted = GRANTS['/hmsa/sense'] | {('subscribe', '/pose')}
+    watch(ros, ['sense'], seen, lambda: seen.get('sense', set()) >= granted, 'all it may do')
+    assert seen['sense'] == granted
 
 
 @pytest.mark.ros
