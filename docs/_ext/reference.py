@@ -40,8 +40,7 @@ PACKAGES = Path(errors.__file__).parent.parent
 # RT04), results with a name (RT02).
 IGNORED = frozenset({'ES01', 'EX01', 'SA01', 'GL02', 'GL03', 'PR03', 'PR08', 'RT04', 'RT02'})
 # Modules without anything to call from outside; ros_launch is imported by ROS 2's launch alone.
-NOT_PUBLIC = re.compile(
-    r'\.(__main__|cli|_motion|law|ros_launch)\b')
+NOT_PUBLIC = re.compile(r'\.(_\w+|cli|law|ros_launch)\b')
 
 
 def declared(kind: type) -> list[Any]:

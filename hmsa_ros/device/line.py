@@ -27,6 +27,11 @@ def open_line(
     simulate : callable
         Returns a simulated instrument for what follows the colon.
 
+    Returns
+    -------
+    object
+        With ``read``, ``write`` and ``close`` as of `serial.Serial`.
+
     Raises
     ------
     BadInputError
