@@ -157,6 +157,18 @@ def test_a_sensor_that_jumps_or_freezes_is_not_trusted_and_the_estimate_stays():
             oracle.BLOCK.shear_modulus, rel=0.01)
 
 
+def test_a_sensor_that_freezes_at_rest_is_told_from_one_without_noise():
+    times = np.arange(-0.1, 0.02, 1e-3)
+    for noise, factor, trusted in ((NOISE, 1.0, False), (0.0, 1.0, True), (0.0, 1.2, True)):
+        ringing = 0.01 * (factor - 1.0) * np.exp(-40.0 * (times + 0.1)) * np.cos(700.0 * times)
+        samples = 1.0 + ringing + noise * np.random.default_rng(0).standard_normal(len(times))
+        samples[-12:] = samples[-12]
+        estimator, found = run(samples, times=times)
+        assert found.trusted is trusted
+        assert ('without its noise' in found.trouble, estimator.screening.frozen > 0) == (
+            not trusted, not trusted)
+
+
 def test_trust_returns_with_the_sensor():
     samples = measured(oracle.BLOCK)
     samples[60:90] += 0.05

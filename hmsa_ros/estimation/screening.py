@@ -1,5 +1,8 @@
 """Samples that cannot be right: no number, a frozen sensor, a jump."""
 
+from collections.abc import Sequence
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +16,8 @@ _FOUND = 12
 # So many equal values in a row, while motion of so many deviations is expected, come from a
 # sensor that is frozen.
 _EQUAL, _MOTION = 4, 8.0
+# So many do so at rest, too, after so many samples there of which most went up and down by noise.
+_STILL, _ENOUGH, _MOST = 8, 20, 0.5
 
 
 class Screening:
@@ -36,6 +41,8 @@ class Screening:
         self.trouble = ''  # why nothing should be built on samples
         self._in_a_row = self._fitted = 0
         self._last: list[tuple[float, float]] = []
+        # At rest: samples, those of them that turn back, and values equal to the one before.
+        self._resting = self._turns = self._same = 0
 
     def refuse_ahead(self, seconds: float) -> None:
         """Refuse a sample whose timestamp lies so far ahead of the clock."""
@@ -71,6 +78,10 @@ class Screening:
             self.frozen += 1
             self._reject('the sensor repeats the same value while the actuator should move')
             return False
+        if max(motion) - min(motion) <= noise and self._stands_still(values):
+            self.frozen += 1
+            self._reject('the sensor repeats the same value, without its noise')
+            return False
         off = value - expected
         if abs(off) > self._gate * spread:
             self.rejected += 1
@@ -83,6 +94,18 @@ class Screening:
         if self._fitted >= _FOUND:
             self.trouble = ''
         return True
+
+    def _stands_still(self, values: Sequence[float]) -> bool:
+        """Take in the last values at rest; return whether they have ceased to scatter."""
+        before, last = values[-2:] if len(values) > 1 else (math.nan, values[0])
+        self._same = self._same + 1 if last == before else 0
+        if self._same:
+            return self._same >= _STILL and self._resting >= _ENOUGH and (
+                self._turns > _MOST * self._resting)
+        self._resting += 1
+        # Vibration does not turn back from sample to sample.
+        self._turns += len(values) > 2 and (last - before) * (before - values[-3]) < 0.0
+        return False
 
     def _reject(self, why: str) -> None:
         self._in_a_row += 1
