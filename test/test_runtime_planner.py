@@ -632,8 +632,11 @@ def test_clock_that_is_set_back_drops_the_plan_and_tells_so_once():
     assert rig.planner.plan.levels[0].stretch == 1.0
 
 
-def test_a_device_without_receipts_that_takes_over_from_another_is_noticed():
+@pytest.mark.parametrize('receipts', [False, True])
+def test_a_device_that_takes_over_from_another_is_sent_no_level_of_before(receipts):
     rig = Rig(settings=replace(QUIET, heartbeat_period=10 * MS))
+    if receipts:
+        rig.runtime.received('a', rig.now, 0, cut_off=False)
     reporters = {b'old'}
     rig.runtime.hearing.reporters = lambda joint: frozenset(reporters)
     rig.runtime.request(trajectory(*SEQUENCE))
@@ -641,9 +644,12 @@ def test_a_device_without_receipts_that_takes_over_from_another_is_noticed():
     assert rig.status.progress.state != 'idle'
     # Both for a moment, as at no time there is none.
     reporters.add(b'new')
-    rig.run(rig.now + 20 * MS)
+    rig.run(rig.now + 10 * MS)
+    sent = len(rig.sent)
+    rig.run(rig.now + 10 * MS)
     reporters.remove(b'old')
     rig.run(rig.now + 20 * MS)
+    assert len(rig.sent) == sent
     assert sum('plant or driver of joint a came after the commands were sent' in x
                for x in rig.notes()) == 1
 

@@ -75,10 +75,7 @@ class Hearing:
         return next((x for x in verdicts if x is not None), None)
 
     def _relieved(self, joint: str) -> bool:
-        """Return whether another device took over from one that gives no receipts."""
-        if joint in self.receipts:
-            # They show it.
-            return False
+        """Return whether another device took over: before its first receipt, or without any."""
         before, now = self._reporters.get(joint, frozenset()), self.reporters(joint)
         self._reporters[joint] = now or before
         # Where there was none before, it is only found one topic after the other.
