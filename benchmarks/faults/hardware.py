@@ -130,7 +130,7 @@ FAULTS.fault(
     'driver_garbage', 'a driver whose board answers garbage',
     'half a line, then right answers again',
     'the coil is off within command_timeout, exit 1')(
-        lambda rig: _failed(rig, 'KS', '#*;S 1.', 'SerialCoil.'))
+        lambda rig: _failed(rig, 'KS', '#*;S 1.', 'SerialCoil'))
 
 
 @FAULTS.fault(
