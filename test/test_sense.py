@@ -41,6 +41,14 @@ def test_the_distance_counts_from_the_reference_at_the_same_time():
     assert readings.due(0) == [(15, 5.0), (40, pytest.approx(np.sqrt(25.25), rel=1e-15))]
 
 
+def test_a_reference_may_be_as_long_as_it_likes():
+    readings = Readings(reference=True)
+    for stamp in range(1, 3000):
+        readings.take_reference(stamp, one(stamp))
+    readings.take(2500, one(2501), 0)
+    assert readings.due(0) == [(2500, 1.0)]
+
+
 def filled(kind):
     """Return a message whose fields of a reading are 1, 2, 3."""
     message = interface_class(kind)()

@@ -1,7 +1,6 @@
 """Readings of a sensor in the order in which they were taken, against those of a reference."""
 
 from bisect import bisect_right, insort
-from collections import deque
 import heapq
 
 import numpy as np
@@ -32,7 +31,7 @@ class Readings:
         self._window, self._needs_reference = window, reference
         # By timestamp: what is waiting, with the time until which it does and its number.
         self._waiting: list[tuple[int, int, int, Array]] = []
-        self._reference: deque[tuple[int, Array]] = deque(maxlen=_KEPT)
+        self._reference: list[tuple[int, Array]] = []
         self._last = 0
         self.count = 0  # of the readings that were taken in
         self.late = 0  # of those left out since a later one was given out before
@@ -48,6 +47,7 @@ class Readings:
     def take_reference(self, stamp: int, reading: Array) -> None:
         """Take a reading of the reference."""
         insort(self._reference, (stamp, reading), key=lambda x: x[0])
+        del self._reference[:-_KEPT]
 
     def due(self, now: int) -> list[tuple[int, float]]:
         """Return timestamps and numbers of the readings for which nothing is waited any more."""
@@ -69,7 +69,7 @@ class Readings:
         return min((x[1] for x in self._waiting), default=None)
 
     def _at(self, stamp: int) -> Array:
-        """Return the reference at a time from its first reading on, after the last one that."""
+        """Return the reference at a time from its first reading on; the last one holds on."""
         place = bisect_right(self._reference, stamp, key=lambda x: x[0])
         before, reading = self._reference[place - 1]
         if place == len(self._reference):
