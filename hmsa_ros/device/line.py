@@ -53,3 +53,28 @@ def open_line(
             f'pyserial), or use the port {SIMULATED} for a simulated instrument') from error
     return serial.serial_for_url(
         port, baud, timeout=timeout, write_timeout=patience, exclusive=True)
+
+
+class SimulatedLine:
+    """
+    What a host reads from a simulated instrument, by the members of a port of pyserial it needs.
+
+    A subclass has ``write``, which may add to ``_answer``, and ``close``.
+    """
+
+    def __init__(self) -> None:
+        self._answer = b''
+
+    @property
+    def in_waiting(self) -> int:
+        """How many bytes there are to be read."""
+        return len(self._answer)
+
+    def read(self, size: int) -> bytes:
+        """Return bytes for the host."""
+        found, self._answer = self._answer[:size], self._answer[size:]
+        return found
+
+    def reset_input_buffer(self) -> None:
+        """Drop what has not been read."""
+        self._answer = b''

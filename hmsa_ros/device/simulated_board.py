@@ -7,6 +7,7 @@ from time import monotonic_ns
 from typing import TextIO
 
 from hmsa_ros.device import _board
+from hmsa_ros.device.line import SimulatedLine
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.model.simulation import ActuatorSimulation
@@ -20,9 +21,9 @@ _PERIOD, _FAST = 1000, 40e-6
 _NOISE = 1e-3  # in mm
 
 
-class SimulatedBoard:
+class SimulatedBoard(SimulatedLine):
     """
-    A board and its serial line, with the members of a port of pyserial that are needed.
+    A board and its serial line.
 
     Time passes when it is asked: the firmware applies each level exactly when it is due.
 
@@ -39,11 +40,11 @@ class SimulatedBoard:
     """
 
     def __init__(self, truth: str = '') -> None:
+        super().__init__()
         self._begun = monotonic_ns()
         self._block = ActuatorSimulation(paper_actuator(), time=0)
         self._random = Random(1)
         self._level = 0
-        self._answer = b''
         self._truth: TextIO | None = None
         if truth:
             try:
@@ -95,20 +96,6 @@ class SimulatedBoard:
     def write(self, text: bytes) -> None:
         """Take bytes from the host."""
         self._answer += _board.receive(self._board, text, self.advance())
-
-    @property
-    def in_waiting(self) -> int:
-        """How many bytes there are to be read."""
-        return len(self._answer)
-
-    def read(self, size: int) -> bytes:
-        """Return bytes for the host."""
-        found, self._answer = self._answer[:size], self._answer[size:]
-        return found
-
-    def reset_input_buffer(self) -> None:
-        """Drop what has not been read."""
-        self._answer = b''
 
     def close(self) -> None:
         """Leave the line, and complete the file."""

@@ -2,15 +2,18 @@
 
 from collections import deque
 
+from hmsa_ros.device.line import SimulatedLine
 
-class SimulatedSupply:
-    """A bipolar supply of 10 A and its line, with the members of a port that are needed."""
+
+class SimulatedSupply(SimulatedLine):
+    """A bipolar supply of 10 A and its line."""
 
     limit, step = 10.0, 10.0 / 2**15
 
     def __init__(self, rest: str = '') -> None:
+        super().__init__()
         self.restart()
-        self._text, self._answer = '', b''
+        self._text = ''
 
     def restart(self) -> None:
         """Switch it on: as a source of voltage, with its output off."""
@@ -60,20 +63,6 @@ class SimulatedSupply:
             answers = [x for x in map(self._obey, line.split(';')) if x is not None]
             if answers:
                 self._answer += f'{";".join(answers)}\n'.encode()
-
-    @property
-    def in_waiting(self) -> int:
-        """How many bytes there are to be read."""
-        return len(self._answer)
-
-    def read(self, size: int) -> bytes:
-        """Return bytes for the host."""
-        found, self._answer = self._answer[:size], self._answer[size:]
-        return found
-
-    def reset_input_buffer(self) -> None:
-        """Drop what has not been read."""
-        self._answer = b''
 
     def close(self) -> None:
         """Leave the line."""
