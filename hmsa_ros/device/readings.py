@@ -64,10 +64,6 @@ class Readings:
             found.append((stamp, float(number)))
         return found
 
-    def wake(self) -> int | None:
-        """Return the time in ns at which the next reading is due; None for none."""
-        return min((x[1] for x in self._waiting), default=None)
-
     def _at(self, stamp: int) -> Array:
         """Return the reference at a time from its first reading on; the last one holds on."""
         place = bisect_right(self._reference, stamp, key=lambda x: x[0])

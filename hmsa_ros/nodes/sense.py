@@ -31,19 +31,21 @@ _LOOK_SECONDS, _SILENT = 0.2, 2 * NANOSECONDS
 # Whatever a sensor offers is taken: a best-effort subscription fits both.
 _QUALITY = topics.Quality(1000, reliable=False)
 
+_DEFAULT = SensorScale()
 SCALE = (
     ParameterSpec(
-        'sensor.gain', 1.0,
+        'sensor.gain', _DEFAULT.gain,
         'Length per unit of the reading; negative where the reading falls as the actuator '
         'extends.', '', -1e12, 1e12),
     ParameterSpec(
-        'sensor.offset', 0.0, 'Length at reading 0, in the same unit.', '', -1e12, 1e12),
+        'sensor.offset', _DEFAULT.offset,
+        'Length at reading 0, in the same unit.', '', -1e12, 1e12),
     ParameterSpec(
-        'sensor.rest_length', 1.0, 'Length of the actuator without a field, in the same unit.', '',
-        1e-12, 1e12),
+        'sensor.rest_length', _DEFAULT.rest_length,
+        'Length of the actuator without a field, in the same unit.', '', 1e-12, 1e12),
     ParameterSpec(
-        'sensor.latency', 0.0, 'Time by which the timestamps of the readings are too late.', 's',
-        -10.0, 10.0),
+        'sensor.latency', _DEFAULT.latency,
+        'Time by which the timestamps of the readings are too late.', 's', -10.0, 10.0),
 )
 
 PARAMETERS = (
