@@ -421,7 +421,7 @@ class Instrument:
         return found
 
     def forget_clock(self) -> None:
-        """Know nothing of its clock, where it has one, until it is asked."""
+        """Forget what its clock has shown, where it has one."""
         self._handed.clear()
         if self.clock_map is not None:
             self.clock_map = ClockMap()
