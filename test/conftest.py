@@ -361,11 +361,18 @@ class RosSide:
     def publisher(
             self, message_type: type[Any] | str, topic: str, qos: Any = 1000,
             subscribers: int = 1) -> Any:
-        """Return a publisher that already has so many subscribers."""
+        """
+        Return a publisher that already has so many subscribers.
+
+        A node that `Served` runs knows of the publisher then: what it sends from here on arrives.
+        """
         message_type, qos = bound(message_type, qos)
+        before = {x: x.get_publisher_count() for x in Served.subscriptions()}
         publisher = self.node.create_publisher(message_type, topic, qos)
         self.spin_until(
-            lambda: publisher.get_subscription_count() >= subscribers,
+            lambda: publisher.get_subscription_count() >= subscribers
+            and all(x.get_publisher_count() > count for x, count in before.items()
+                    if x.topic_name == publisher.topic_name),
             f'{subscribers} subscribers of {topic}')
         return publisher
 
@@ -471,6 +478,11 @@ class Served:
     def publishers(cls) -> list[Any]:
         """Return the publishers of all nodes that run."""
         return [x for served in cls.running for node in served.nodes for x in node.publishers]
+
+    @classmethod
+    def subscriptions(cls) -> list[Any]:
+        """Return the subscriptions of all nodes that run."""
+        return [x for served in cls.running for node in served.nodes for x in node.subscriptions]
 
     @classmethod
     def views(cls) -> list[Any]:

@@ -19,6 +19,7 @@ from hmsa_ros.bag.writer import BagWriter, Topic
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.model.simulation import ActuatorSimulation
+from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes.conversions import from_time, to_command
 from hmsa_ros.recordings.verify import verify
 
@@ -269,8 +270,9 @@ def test_late_commands_a_slow_coil_creep_and_the_watchdog_come_out_again(start, 
                    "the plant's parameters in the bag")
     applied = ros.collect(MagneticField, 'flux_density_applied')
     for flux_density in (0.01, 0.02):
-        # Nobody could send a command later than this.
-        publisher.publish(to_command(1, flux_density, ''))
+        # A minute late, by the same clock.
+        late = ros.node.get_clock().now().nanoseconds - 60 * NANOSECONDS
+        publisher.publish(to_command(late, flux_density, ''))
         ros.spin_until(
             lambda flux_density=flux_density: applied
             and applied[-1].magnetic_field.z == flux_density, 'the level')

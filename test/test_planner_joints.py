@@ -265,7 +265,7 @@ def test_some_joints_only_by_parameter_and_one_by_its_own_setpoint(rig):
 
 
 def test_first_request_waits_for_the_state_in_force(rig, ros):
-    planner = rig()
+    planner = rig('-p', 'takeover_timeout:=60.0')
     samples = endpoints.publisher(ros.node, topics.JOINT_STATES)
     ros.spin_until(lambda: planner.planner.count_publishers('joint_states'), 'the publisher')
     driver = planner.driver
