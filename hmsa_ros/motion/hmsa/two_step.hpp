@@ -183,7 +183,7 @@ template <class System, int NB = 0> struct Search {
             if (turn && abs(miss) <= 1e-7 * move && (closed || abs(change) <= 1e-13 * d))
                 next = d;  // as near as rounding allows
             else if (closed)
-                return ended(not_converged);
+                return ended(high < 100 * least ? indistinguishable : not_converged);
             else if (high == infinity())
                 next = 4 * d;
             else
