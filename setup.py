@@ -26,6 +26,7 @@ README = 'README.md' if os.path.exists(os.path.join(HERE, 'README.md')) else Non
 INSTALL_REQUIRES = [
     'setuptools',
     'PyYAML>=6.0',
+    'jinja2>=3.0',
     'lz4>=4.0',
     'matplotlib>=3.6',
     'mcap>=1.6',
@@ -132,6 +133,7 @@ setup(
         'fastdds.xml', 'fastdds_localhost.xml', 'motion/_motion.pyi', '_deadline.pyi', 'py.typed',
         'device/_board.pyi', 'device/hmsa_board/board.hpp', 'device/hmsa_board/hmsa_board.ino',
         'report/page.css', 'report/page.js', 'report/style.mplstyle',
+        *(f'report/{x}.html' for x in ('page', 'parts', 'run', 'identified', 'conformance')),
         *(f'cli/completion.{x}' for x in ('bash', 'zsh', 'fish')),
         *(os.path.relpath(x, os.path.join(HERE, PACKAGE)) for x in sorted(glob(
             os.path.join(HERE, PACKAGE, 'motion', 'hmsa', '*.hpp'))))]},

@@ -1,12 +1,10 @@
 """An identification as one HTML page: data, fit, residuals, intervals, what is confounded."""
 
-from html import escape
 import math
 from typing import Any
 
 import numpy as np
 
-from hmsa_ros import __version__
 from hmsa_ros.identification.recording import Course
 from hmsa_ros.identification.response import respond
 from hmsa_ros.identification.result import Identification
@@ -15,8 +13,8 @@ from hmsa_ros.report.charts import axis as _axis
 from hmsa_ros.report.charts import Figure, label
 from hmsa_ros.report.curves import BUCKETS, decimate, numbers
 from hmsa_ros.report.looks import BLACK, BLUE, GREY, VERMILION
-from hmsa_ros.report.page import document, placed, text
-from hmsa_ros.report.tables import Cell, cell, table
+from hmsa_ros.report.page import document
+from hmsa_ros.report.tables import Cell, cell, PageTable, table
 
 _LAGS = 60
 # Points of the fitted curve, in time units, and how many at most.
@@ -28,30 +26,19 @@ _HEADINGS = {
 
 def page(found: Identification) -> str:
     """Return the HTML page of an identification."""
-    figures = [_motion(found), _residuals(found), _correlation(found)]
     name = found.recording.label
-    tiles = [
-        (_HEADINGS[found.verdict], 'verdict'), (f'{found.noise_std:.3g}', 'noise of a sample'),
-        (str(found.samples), 'samples'), (f'{found.residual_rms:.3g}', 'residual, rms'),
-        (f'{float(found.whiteness.autocorrelation[1]):.2f}', 'autocorrelation at one sample')]
-    notes = ''.join(f'<li>{escape(x)}</li>' for x in (found.reason, *found.warnings))
-    body = [
-        f'<h1>{escape(name)}: identification</h1>',
-        '<div class="tiles">' + ''.join(
-            f'<div><b>{escape(x)}</b><span>{escape(y)}</span></div>' for x, y in tiles)
-        + '</div>', f'<ul class="notes">{notes}</ul>',
-        '<section id="parameters"><h2>Parameters</h2>' + _parameters(found) + '</section>',
-        '<section id="motion-section"><h2>Data and fit</h2>' + text(
-            f'Above, the level of the field; below, the {found.recording.coordinate.name}: '
-            'measured, and as the fitted actuator moves.') + placed(figures[0]) + '</section>',
-        '<section id="residual-section"><h2>Residuals</h2>' + text(
-            'Measured less fitted. Nothing but noise should be left: no swing, no trend, no '
-            'bursts at the changes of level.') + placed(figures[1]) + text(
-            'Autocorrelation of the residuals; 95 % of the bars of white noise lie between the '
-            'lines.') + placed(figures[2]) + _marks(found) + '</section>',
-        '<section id="pairs"><h2>What is confounded</h2>' + _pairs(found) + '</section>',
-        f'<footer class="soft"><p>Written by hmsa_ros {__version__}.</p></footer>']
-    return document(f'{name} – identification', body, figures)
+    return document(
+        'identified.html', f'{name} – identification',
+        [_motion(found), _residuals(found), _correlation(found)], name=name,
+        summary=(
+            (_HEADINGS[found.verdict], 'verdict'), (f'{found.noise_std:.3g}', 'noise of a sample'),
+            (found.samples, 'samples'), (f'{found.residual_rms:.3g}', 'residual, rms'),
+            (f'{float(found.whiteness.autocorrelation[1]):.2f}',
+             'autocorrelation at one sample')),
+        remarks=(found.reason, *found.warnings), coordinate=found.recording.coordinate.name,
+        parameters=_parameters(found), marks=_marks(found), pairs=_pairs(found),
+        confounded='; '.join(
+            f'{one} and {other} ({x:.3f})' for one, other, x in found.confounded()))
 
 
 def _unit(found: Identification) -> tuple[float, str]:
@@ -136,7 +123,7 @@ def _correlation(found: Identification) -> Figure:
         'xaxis': _axis('lag (samples)'), 'yaxis': _axis('autocorrelation')})
 
 
-def _parameters(found: Identification) -> str:
+def _parameters(found: Identification) -> PageTable:
     rows: list[list[Cell | str]] = []
     for key in found.parameters:
         name, x = found.shown(key)
@@ -149,30 +136,20 @@ def _parameters(found: Identification) -> str:
         else:
             rows.append([name, x.unit or '1', cell(x.value), '', '', '', 'fixed'])
     return table(
-        'parameter-table', 'Low and high bound the 95 % interval.',
+        'parameter-table',
         ['parameter', 'unit', 'value', 'deviation', 'low', 'high', 'deviation [%]'], rows)
 
 
-def _marks(found: Identification) -> str:
-    rows: list[list[Cell | str]] = [
+def _marks(found: Identification) -> PageTable:
+    return table('signature-table', ['searched for', 'share [%]', 'deviations', 'found'], [
         [x.name, cell(100.0 * x.share, '.3g'), cell(x.deviations, '.3g'),
-         'yes' if x.found else 'no'] for x in found.signatures]
-    return table(
-        'signature-table', 'What the residuals were searched for: the share of them that it '
-        'explains, and its size in standard deviations.',
-        ['searched for', 'share [%]', 'deviations', 'found'], rows) if rows else ''
+         'yes' if x.found else 'no'] for x in found.signatures])
 
 
-def _pairs(found: Identification) -> str:
+def _pairs(found: Identification) -> PageTable | None:
     if len(found.names) < 2:
-        return text('There is one free parameter.')
+        return None
     matrix = found.correlation
     names = [found.shown(x)[0] for x in found.names]
-    rows: list[list[Cell | str]] = [
-        [name, *(cell(float(x), '.3f') for x in matrix[i])]
-        for i, name in enumerate(names)]
-    words = '; '.join(f'{one} and {other} ({x:.3f})' for one, other, x in found.confounded())
-    return text(
-        f'The data hardly distinguish {words}.' if words else
-        'No pair has a correlation of 0.95 or more.') + table(
-            'correlation-table', 'Correlation of the estimates.', ['', *names], rows)
+    return table('correlation-table', ['', *names], [
+        [name, *(cell(float(x), '.3f') for x in matrix[i])] for i, name in enumerate(names)])

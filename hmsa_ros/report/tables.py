@@ -2,12 +2,9 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 import math
 
 from hmsa_ros.model.residual import percent
-
-_LONG_TABLE = 25
 
 
 @dataclass(frozen=True)
@@ -22,43 +19,26 @@ Row = list[Cell | str]
 Values = list[Cell | str | float]
 
 
-def table(
-        key: str, caption: str, header: Sequence[str],
-        rows: Sequence[Row]) -> str:
-    """Return a table with a button that copies it."""
+@dataclass(frozen=True)
+class PageTable:
+    """A table by its place: headings, each with whether its cells are numbers, and rows."""
+
+    key: str
+    columns: tuple[tuple[str, bool], ...]
+    rows: Sequence[Row]
+
+
+def table(key: str, header: Sequence[str], rows: Sequence[Row]) -> PageTable:
+    """Return a table; a run on its own needs no name in every row."""
     if header[0] in ('run', 'bag') and len({row[0] for row in rows}) <= 1:
-        # A run on its own needs no name in every row.
         header, rows = header[1:], [row[1:] for row in rows]
-    numeric = [any(
-        isinstance(row[i], Cell) for row in rows) for i in range(len(header))]
-    kinds = [' class="number"' if x else '' for x in numeric]
-    long = ' long' if len(rows) > _LONG_TABLE else ''
-    lines = [
-        f'<p class="soft" id="{key}-caption">{escape(caption)}</p>',
-        f'<div class="scroll{long}" tabindex="0" role="region" '
-        f'aria-labelledby="{key}-caption">'
-        f'<table id="{key}" aria-labelledby="{key}-caption"><thead><tr>',
-        *(f'<th scope="col"{kind}>{escape(x)}</th>'
-          for x, kind in zip(header, kinds, strict=True)), '</tr></thead><tbody>']
-    for row in rows:
-        lines.append('<tr>')
-        for cell, kind in zip(row, kinds, strict=True):
-            if isinstance(cell, str):
-                lines.append(f'<td{kind}>{escape(cell)}</td>')
-            else:
-                value = '' if cell.value is None else f' data-value="{cell.value!r}"'
-                lines.append(f'<td{kind}{value}>{escape(cell.shown)}</td>')
-        lines.append('</tr>')
-    return ''.join([
-        *lines, '</tbody></table></div>',
-        f'<button type="button" data-table="{key}">Copy table</button>'])
+    return PageTable(key, tuple(
+        (x, any(isinstance(row[i], Cell) for row in rows)) for i, x in enumerate(header)), rows)
 
 
-def formatted(
-        key: str, caption: str, columns: Mapping[str, str],
-        rows: Iterable[Values]) -> str:
+def formatted(key: str, columns: Mapping[str, str], rows: Iterable[Values]) -> PageTable:
     """Return a table of values, each in the format of its column; texts and cells as they are."""
-    return table(key, caption, list(columns), [[
+    return table(key, list(columns), [[
         x if isinstance(x, (str, Cell)) else cell(x, form)
         for x, form in zip(row, columns.values(), strict=True)] for row in rows])
 
