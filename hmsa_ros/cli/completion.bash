@@ -1,3 +1,4 @@
+{% macro keys(command, option) %}{% for x in option.names %}{{ (command.path ~ ':' ~ x)|quote }}{{ ' | ' if not loop.last }}{% endfor %}{% endmacro %}
 # Completion of hmsa for bash: eval "$(hmsa completion bash)"
 _hmsa_words() {
   local each
@@ -17,16 +18,22 @@ _hmsa() {
     word=${COMP_WORDS[i]}
     if [[ $word == --ros-args ]]; then at='--ros-args'; break; fi
     case "${at:+$at }$word" in
-      @paths@) at="${at:+$at }$word" ;;
+      {{ paths|join(' | ') }}) at="${at:+$at }$word" ;;
     esac
   done
   case "$at:$prev" in
-@values@
+{% for command in commands %}
+{% for option in command.options if option.value %}
+    {{ keys(command, option) }}) {{ {'one': '_hmsa_words ' ~ option.choices|join(' '), 'file': '_hmsa_files -f', 'folder': '_hmsa_files -d', 'any': ':'}[option.value] }}; return ;;
+{% endfor %}
+{% endfor %}
     '--ros-args:--params-file') _hmsa_files -f; return ;;
     --ros-args:-[pr] | '--ros-args:--log-level') return ;;
   esac
   case "$at" in
-@words@
+{% for command in commands %}
+    {{ command.path|quote }}) {{ '_hmsa_files -f; ' if command.files }}_hmsa_words {{ command.offered|join(' ') }} ;;
+{% endfor %}
     '--ros-args') _hmsa_words -p -r --params-file --log-level --enclave --disable-rosout-logs ;;
   esac
 }

@@ -38,6 +38,11 @@ class Command:
     words: dict[str, str] = field(default_factory=dict)
     files: bool = False  # whether positional arguments are files
 
+    @property
+    def offered(self) -> dict[str, str]:
+        """Words and options, and what they mean."""
+        return {**self.words, **{x: option.text for option in self.options for x in option.names}}
+
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
@@ -47,20 +52,22 @@ def add_parser(subparsers: Any) -> None:
                     'In ~/.bashrc or ~/.zshrc: eval "$(hmsa completion bash)", or zsh. For '
                     'fish: hmsa completion fish > ~/.config/fish/completions/hmsa.fish',
         epilog='example: hmsa completion bash')
-    parser.add_argument('shell', choices=tuple(_SCRIPTS), help='the shell')
+    parser.add_argument('shell', choices=('bash', 'zsh', 'fish'), help='the shell')
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the script."""
+    """Print the script, from the template for the shell beside this file."""
+    import jinja2  # no other command needs it
+
     from hmsa_ros.cli import build_parser
 
     commands = list(commands_of(build_parser()))
-    fill, between = _SCRIPTS[arguments.shell]
-    text = Path(__file__).with_suffix(f'.{arguments.shell}').read_text(encoding='utf-8')
-    text = text.replace('@paths@', between.join(_quote(x.path) for x in commands if x.path))
-    for name, lines in fill(commands).items():
-        text = text.replace(f'@{name}@', '\n'.join(lines))
-    print(text, end='')
+    scripts = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent), trim_blocks=True,
+        keep_trailing_newline=True)
+    scripts.filters['quote'] = _quote
+    print(scripts.get_template(f'completion.{arguments.shell}').render(
+        commands=commands, paths=[_quote(x.path) for x in commands if x.path]), end='')
     return 0
 
 
@@ -107,83 +114,3 @@ def _option(action: argparse.Action) -> Option:
 def _quote(text: str) -> str:
     """Return a text in single quotes, as all three shells read it."""
     return "'" + text.replace("'", '’') + "'"
-
-
-def _valued(commands: list[Command]) -> Iterator[tuple[str, Option]]:
-    """Walk the options that take a value, each with its cases for bash and zsh."""
-    for command in commands:
-        for option in command.options:
-            if option.value:
-                yield ' | '.join(_quote(f'{command.path}:{x}') for x in option.names), option
-
-
-# bash ----------------------------------------------------------------------------------------
-
-def _bash(commands: list[Command]) -> dict[str, list[str]]:
-    """Return what fills the script for bash."""
-    words = []
-    for command in commands:
-        names = [*command.words, *(y for x in command.options for y in x.names)]
-        also = '_hmsa_files -f; ' if command.files else ''
-        words.append(f'    {_quote(command.path)}) {also}_hmsa_words {" ".join(names)} ;;')
-    return {'words': words, 'values': [
-        f'    {keys}) {_bash_value(x)}; return ;;' for keys, x in _valued(commands)]}
-
-
-def _bash_value(option: Option) -> str:
-    return {
-        'one': f'_hmsa_words {" ".join(option.choices)}', 'file': '_hmsa_files -f',
-        'folder': '_hmsa_files -d', 'any': ':'}[option.value]
-
-
-# zsh -----------------------------------------------------------------------------------------
-
-def _zsh(commands: list[Command]) -> dict[str, list[str]]:
-    """Return what fills the script for zsh."""
-    words = []
-    for command in commands:
-        also = '; _files' if command.files else ''
-        words.append(
-            f'    ({_quote(command.path)}) _hmsa_offer {_zsh_pairs(command)}{also} ;;')
-    return {'words': words, 'values': [
-        f'    ({keys}) {_zsh_value(x)}; return ;;' for keys, x in _valued(commands)]}
-
-
-def _zsh_value(option: Option) -> str:
-    return {
-        'one': f'compadd -- {" ".join(option.choices)}', 'file': '_files',
-        'folder': '_files -/', 'any': "_message 'value'"}[option.value]
-
-
-def _zsh_pairs(command: Command) -> str:
-    pairs = [*command.words.items(), *(
-        (name, option.text) for option in command.options for name in option.names)]
-    return ' '.join(
-        _quote(f'{name}:{text.replace(":", chr(92) + ":")}' if text else name)
-        for name, text in pairs)
-
-
-# fish ----------------------------------------------------------------------------------------
-
-def _fish(commands: list[Command]) -> dict[str, list[str]]:
-    """Return what fills the script for fish."""
-    lines = []
-    for command in commands:
-        begin = f'complete -c hmsa -n {_quote(f"__hmsa_at {chr(34)}{command.path}{chr(34)}")}'
-        for word, text in command.words.items():
-            lines.append(f'{begin} -a {word} -d {_quote(text)}')
-        if command.files:
-            lines.append(f'{begin} -F')
-        for option in command.options:
-            names = ' '.join(
-                f'-l {x[2:]}' if x.startswith('--') else f'-s {x[1:]}' for x in option.names)
-            value = {
-                '': '', 'any': ' -x', 'file': ' -r -F',
-                'folder': " -x -a '(__fish_complete_directories)'",
-                'one': f' -x -a {_quote(" ".join(option.choices))}'}[option.value]
-            lines.append(f'{begin} {names}{value} -d {_quote(option.text)}')
-    return {'words': lines}
-
-
-# What fills the script of each shell, which lies beside this file, and joins its paths.
-_SCRIPTS = {'bash': (_bash, ' | '), 'zsh': (_zsh, ' | '), 'fish': (_fish, ' ')}
