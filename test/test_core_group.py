@@ -451,6 +451,17 @@ def test_rest_is_believed_where_the_model_would_have_it_move():
     assert (state.stretch, state.rate) == (1.3, 0.0)
 
 
+@pytest.mark.parametrize('seen', [0.998, 1.0005, 1.004])
+def test_noise_of_a_sensor_at_rest_is_no_motion(seen):
+    planner = Planner(paper_actuator(), Options())
+    fresh = planner.request(SOME, None, START)
+    planner = Planner(paper_actuator(), Options())
+    planner.take_over(START - MS, seen, 0.0, 0.0)
+    found = planner.request(SOME, None, START)
+    assert [x.flux_density for x in found.levels[1:]] == [
+        x.flux_density for x in fresh.levels[1:]]
+
+
 @pytest.mark.parametrize('state', [
     (math.nan, 0.0, 0.0), (3.0, 0.0, 0.0), (1.0, math.inf, 0.0), (1.0, 0.0, math.nan)])
 def test_impossible_state_in_force_is_refused(state):

@@ -19,8 +19,9 @@ from hmsa_ros.planning.timeline import ALWAYS, Draft, Model, Plan, PlannedLevel,
 # Stretch rates of a sample below this share of the natural frequency are rest, where the model
 # would have it move: the model is off then, and not the actuator in motion.
 _SAMPLED_AT_REST = 1e-4
-# How far the model may be off a sample at rest to be believed nevertheless.
-_AGREES = 1e-3
+# How far the model may be off a sample at rest to be believed nevertheless, and without a field,
+# where every model rests alike and the difference is noise or bias of the sensor.
+_AGREES, _AGREES_WITHOUT_FIELD = 1e-3, 5e-3
 # Amplitude of stretch up to which drafts hold that were begun before news came.
 _LITTLE = 1e-4
 # Levels that are kept for news of when they took effect.
@@ -86,10 +87,12 @@ class RunningPlan:
                 f'state in force is rate {rate:g} 1/s, flux density {in_force:g} T: expected '
                 'finite numbers')
         begin = PlannedLevel(stamp, level, stretch, rate, in_force, model)
-        held = equilibrium_stretch(level / model.units.load, model.material)
+        held = float(equilibrium_stretch(level / model.units.load, model.material))
         at_rest = abs(rate) * model.units.time <= _SAMPLED_AT_REST * self.model.frequency(stretch)
-        if at_rest and level == in_force and abs(float(held) - stretch) > _AGREES:
-            begin = replace(begin, stamp=ALWAYS, rate=0.0)
+        if at_rest and level == in_force:
+            agrees = abs(held - stretch) <= (_AGREES if level else _AGREES_WITHOUT_FIELD)
+            begin = replace(
+                begin, stamp=ALWAYS, rate=0.0, stretch=held if agrees else stretch)
         if not _can_be_followed(begin):
             raise BadInputError(
                 f'state in force is stretch {stretch:g}, rate {rate:g} 1/s, flux density '
