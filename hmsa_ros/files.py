@@ -90,3 +90,20 @@ def require_arrow() -> tuple[Any, Any]:
             'pyarrow, which writes Parquet, is not installed: install it (pip install '
             'pyarrow) or write to a file that ends in .csv') from error
     return pyarrow, parquet
+
+
+def yaml_text(value: Any) -> str:
+    """Return a value as every reader of YAML takes it, numbers with a point."""
+    if isinstance(value, bool):
+        return 'true' if value else 'false'
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            return '.nan' if math.isnan(value) else '.inf' if value > 0.0 else '-.inf'
+        text = repr(value)
+        mantissa, letter, exponent = text.partition('e')
+        return f'{mantissa}.0e{exponent}' if letter and '.' not in mantissa else text
+    if isinstance(value, list):
+        return f'[{", ".join(yaml_text(x) for x in value)}]'
+    if isinstance(value, str):
+        return "'" + value.replace("'", "''") + "'"
+    return str(value)

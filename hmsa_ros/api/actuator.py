@@ -20,7 +20,7 @@ from hmsa_ros.api.arguments import (
 )
 from hmsa_ros.api.facts import facts
 from hmsa_ros.errors import BadInputError, excerpt
-from hmsa_ros.files import write_text
+from hmsa_ros.files import write_text, yaml_text
 from hmsa_ros.interfaces.actuator import actuator_from, model_from, parameters_of
 from hmsa_ros.interfaces.parameters import (
     CREEP_TOLERANCE,
@@ -577,8 +577,6 @@ class Actuator:
             If it cannot be written.
 
         """
-        from hmsa_ros.identification.files import yaml_text
-
         write_text(Path(path), '\n'.join([
             '/**:', '  ros__parameters:',
             *(f'    {x}: {yaml_text(y)}' for x, y in self.parameters.items())]) + '\n')

@@ -1,6 +1,7 @@
 """``hmsa identify``: the parameters of an actuator out of a recording."""
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 import sys
@@ -69,7 +70,9 @@ def run(arguments: argparse.Namespace) -> int:
         If a parameter is both free and known.
 
     """
-    _check_targets(arguments)
+    check_targets(
+        [x for x in (arguments.out, arguments.report) if x is not None],
+        [x for x in (arguments.recording, arguments.commands) if x is not None])
 
     from hmsa_ros.identification.files import file_text, read_belief
     from hmsa_ros.identification.identify import identify
@@ -77,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.identification.quantities import free_of
 
     belief = read_belief(arguments.params_file)
-    known, uncertain = _known(arguments.known)
+    known, uncertain = known_of(arguments.known)
     named = [x.strip(' +') for x in arguments.free.split(',')]
     if both := [x for x in known if x in named]:
         raise BadInputError(f'{both[0]} is free and known: expected it in --free or in --known')
@@ -128,8 +131,8 @@ def run(arguments: argparse.Namespace) -> int:
     return 3 if good else 1
 
 
-def _known(text: str) -> tuple[dict[str, float], dict[str, float]]:
-    """Return values and standard deviations by name."""
+def known_of(text: str) -> tuple[dict[str, float], dict[str, float]]:
+    """Return values and standard deviations of --known by name; raise `BadInputError`."""
     from hmsa_ros.identification.quantities import GEOMETRY, QUANTITIES
 
     values, deviations = {}, {}
@@ -150,13 +153,10 @@ def _known(text: str) -> tuple[dict[str, float], dict[str, float]]:
     return values, deviations
 
 
-def _check_targets(arguments: argparse.Namespace) -> None:
-    """Refuse what cannot be written before anything is read."""
-    targets = [x for x in (arguments.out, arguments.report) if x is not None]
-    sources = [x.resolve() for x in (
-        arguments.recording, arguments.commands) if x is not None]
+def check_targets(targets: Sequence[Path], sources: Sequence[Path] = ()) -> None:
+    """Refuse what cannot be written, with `BadInputError`, before anything is read or moved."""
     for target in targets:
-        if target.is_dir() or target.resolve() in sources or not (
+        if target.is_dir() or target.resolve() in [x.resolve() for x in sources] or not (
                 target.resolve().parent.is_dir()):
             raise BadInputError(
                 f'cannot write {target}: expected a file of its own in a folder that exists')

@@ -20,7 +20,7 @@ from hmsa_ros.cli.quantities import (
     Quantity,
 )
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import json_text, write_text
+from hmsa_ros.files import json_text, write_text, yaml_text
 from hmsa_ros.interfaces.parameters import LAW, LAW_NAME, PUBLISH_RATE
 
 if TYPE_CHECKING:
@@ -298,8 +298,6 @@ def table(found: 'Scales', actuator: 'ActuatorParameters') -> list[str]:
 
 def file_text(path: Path, made: 'Actuator', joints: list[str]) -> str:
     """Return the parameter file in ROS 2's YAML; its name and the scales go into comments."""
-    from hmsa_ros.identification.files import yaml_text
-
     actuator, found = made.block, made.scales
     lines = [
         '# Parameters of an actuator for planner and plant, written by hmsa init:',

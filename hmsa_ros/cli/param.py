@@ -5,7 +5,7 @@ from typing import Any
 
 from hmsa_ros.cli.options import add_options, JSON, NAMESPACE, TIMEOUT, timeout_of
 from hmsa_ros.ending import ENDING
-from hmsa_ros.files import json_text
+from hmsa_ros.files import json_text, yaml_text
 
 
 def add_parser(subparsers: Any) -> None:
@@ -49,7 +49,6 @@ def _get(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json_text(found))
         return 0
-    from hmsa_ros.identification.files import yaml_text
 
     for name, value in found.items():
         print(f'{name}: {yaml_text(value)}')

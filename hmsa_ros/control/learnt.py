@@ -9,8 +9,8 @@ import numpy as np
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation import Estimate
-from hmsa_ros.files import write_text
-from hmsa_ros.identification.files import known_lines, yaml_text
+from hmsa_ros.files import write_text, yaml_text
+from hmsa_ros.identification.files import known_lines
 from hmsa_ros.identification.known import Known
 from hmsa_ros.identification.quantities import derivative, QUANTITIES, values_of
 from hmsa_ros.interfaces.actuator import parameters_of

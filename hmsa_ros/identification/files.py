@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import yaml_text
 from hmsa_ros.identification import quantities
 from hmsa_ros.identification.known import Known, PREFIX
 from hmsa_ros.identification.result import Identification
@@ -242,20 +243,3 @@ def _line(key: str, value: Any, found: Identification, *names: str) -> str:
             f'{"" if alone else f"{name} "}standard deviation {estimate.std:.3g}{unit}, 95 % '
             f'interval {estimate.low:.6g} to {estimate.high:.6g}')
     return f'{line}  # {"; ".join(notes)}' if notes else line
-
-
-def yaml_text(value: Any) -> str:
-    """Return a value as every reader of YAML takes it, numbers with a point."""
-    if isinstance(value, bool):
-        return 'true' if value else 'false'
-    if isinstance(value, float):
-        if not math.isfinite(value):
-            return '.nan' if math.isnan(value) else '.inf' if value > 0.0 else '-.inf'
-        text = repr(value)
-        mantissa, letter, exponent = text.partition('e')
-        return f'{mantissa}.0e{exponent}' if letter and '.' not in mantissa else text
-    if isinstance(value, list):
-        return f'[{", ".join(yaml_text(x) for x in value)}]'
-    if isinstance(value, str):
-        return "'" + value.replace("'", "''") + "'"
-    return str(value)

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 import ctypes
 from dataclasses import dataclass
-import json
 import os
 from pathlib import Path
 import signal
@@ -11,6 +10,7 @@ import subprocess
 import sys
 
 from hmsa_ros.errors import HmsaError
+from hmsa_ros.files import yaml_text
 from hmsa_ros.interfaces.topics import RECORDER
 from hmsa_ros.middleware import RANGE
 
@@ -40,8 +40,7 @@ class NodeProcess:
         if self.params_file:
             words += ['--params-file', self.params_file]
         for key, value in self.parameters.items():
-            # JSON is YAML, and in it a string that looks like a number stays a string.
-            words += ['-p', f'{key}:={json.dumps(value)}']
+            words += ['-p', f'{key}:={yaml_text(value)}']
         return words
 
     def command(self) -> list[str]:

@@ -1,0 +1,152 @@
+"""``hmsa tune``: from the data sheet to moves without vibration, as one guided run."""
+
+import argparse
+from dataclasses import asdict, replace
+from datetime import datetime
+import os
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+from hmsa_ros.cli.identify import check_targets, known_of
+from hmsa_ros.cli.options import add_options, NAMESPACE
+from hmsa_ros.cli.progress import progress
+from hmsa_ros.cli.setpoints import setpoint_of_joints
+from hmsa_ros.ending import ENDING
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import json_text, write_text
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from hmsa_ros.lab.processes import NodeProcess
+    from hmsa_ros.lab.tuning import Nodes, Tuned
+    from hmsa_ros.recordings.parameters import Entries
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        'tune', help='measure an actuator, choose a shaper, and show before and after',
+        description='Make the moves as they are, record an excitation, identify the actuator '
+                    'from it, compare the shapers on what is known then, write the parameters, '
+                    'and make the moves again. Works with the running planner and plant or '
+                    'driver, which gets the new parameters, or with simulated ones. Ctrl-C '
+                    'brings the actuator to rest.',
+        epilog='example: hmsa tune 1.10:0.5 1.00:0.5 --simulate --params-file actuator.yaml')
+    parser.add_argument(
+        'setpoints', nargs='+', type=setpoint_of_joints, metavar='STRETCH:SECONDS',
+        help='moves to tune for: target stretch, or deflection of a beam, and duration in s')
+    add_options(
+        parser,
+        ('--simulate', 'start a planner and a plant for each run, in simulated time'),
+        ('--params-file', 'YAML', Path,
+         'parameter file with what is known (default: the parameters of the running planner, or '
+         'the defaults with --simulate)'),
+        ('--duration', 'S', float,
+         'duration of the excitation in s (default 180 periods of the actuator)'),
+        ('--stretch-min', 'X', float,
+         'minimum stretch of the excitation (default half the range of the moves below it)'),
+        ('--stretch-max', 'X', float,
+         'maximum stretch of the excitation (default half the range of the moves above it)'),
+        ('--free', 'NAME,...', str,
+         'parameters to identify, as in hmsa identify; what the residuals show is added',
+         {'default': ''}),
+        ('--known', 'NAME=VALUE[+-STD],...', str, 'fixed values, as in hmsa identify',
+         {'default': ''}),
+        ('--accept', 'also continue with a model that is rejected for a defect that costs at '
+                     'most 5 %% of a step'),
+        ('--out', 'YAML', Path,
+         'parameter file to write (default actuator.yaml in the folder of the runs); an existing '
+         'file is replaced'),
+        ('--report', 'HTML', Path,
+         'page to write, with the moves before and after; an existing file is replaced'),
+        ('--folder', 'DIR', Path,
+         'folder for the bags of the runs (default hmsa_tune/ plus date and time)'),
+        ('--json', 'print the result as JSON'),
+        NAMESPACE)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Carry it out; refuse setpoints of several joints with `BadInputError`."""
+    if any(len(x) > 1 for x, _ in arguments.setpoints):
+        raise BadInputError(
+            'setpoints name several joints: expected one stretch each; tune one joint at a time, '
+            'with a planner of its own')
+    folder = arguments.folder or Path('hmsa_tune') / datetime.now().strftime('%Y-%m-%d_%H-%M-%S')
+    check_targets([x for x in (arguments.out, arguments.report) if x is not None])
+    known, uncertain = known_of(arguments.known)
+    if arguments.simulate:
+        from hmsa_ros.lab.processes import local_environment
+        # Set before anything of ROS is imported: this process joins the nodes' domain.
+        os.environ.update(local_environment())
+    from hmsa_ros.lab.experiment import prepare
+    from hmsa_ros.lab.tuning import tune, Tuning
+
+    prepare(folder)
+    ENDING.note()
+    entries, nodes = _nodes(arguments)
+    tuning = Tuning(
+        folder, tuple(arguments.setpoints), arguments.out or folder / 'actuator.yaml', entries,
+        nodes, arguments.namespace, arguments.duration, arguments.stretch_min,
+        arguments.stretch_max, arguments.free, known, uncertain, arguments.accept)
+    try:
+        with progress() as update:
+            found = tune(tuning, dict(os.environ), update)
+    except KeyboardInterrupt:
+        return ENDING.status
+    if arguments.report is not None:
+        from hmsa_ros.report.page import page
+
+        write_text(arguments.report, page(found.parts))
+    verdict, reason = found.verdict
+    if arguments.json:
+        print(json_text({
+            'verdict': verdict, 'reason': reason, 'identified': found.identified.record(),
+            'shapers': [asdict(x) for x in found.shapers], 'shaper': found.shaper,
+            **{x.run.label: [y.to_dict() for y in x.evaluation.findings] for x in found.parts},
+            'file': None if found.file is None else str(found.file), 'folder': str(folder),
+            'report': None if arguments.report is None else str(arguments.report)}))
+    else:
+        _print(found, folder, arguments.report)
+    return 0 if verdict == 'tuned' else 1
+
+
+def _nodes(arguments: argparse.Namespace) -> 'tuple[Entries, Nodes]':
+    """Return what is known, and what starts nodes with parameters of the planner."""
+    from hmsa_ros.lab.tuning import known_to
+    from hmsa_ros.recordings.parameters import entries_of, read_parameter_file
+
+    path: Path | None = arguments.params_file
+    if not arguments.simulate:
+        return (known_to(arguments.namespace) if path is None else entries_of(path)), (
+            lambda settings: ())
+    from hmsa_ros.interfaces.topics import PLANNER
+    from hmsa_ros.lab.simulated import simulated_nodes
+
+    expected = {} if path is None else dict(read_parameter_file(path))
+    node, = simulated_nodes(expected, str(path or ''), arguments.namespace)
+
+    def nodes(settings: 'Mapping[str, object]') -> 'tuple[NodeProcess, ...]':
+        return replace(node, parameters={
+            **node.parameters, **{f'{PLANNER}:{x}': y for x, y in settings.items()}}),
+
+    return ([] if path is None else [x for x in entries_of(path) if x[0] != 'plant']), nodes
+
+
+def _print(found: 'Tuned', folder: Path, report: Path | None) -> None:
+    from hmsa_ros.report.comparison import comparison
+
+    print(found.identified.report())
+    for each in found.shapers:
+        print(f'shaper   {each.shaper:<12}' + (
+            f'not possible: {each.reason}' if each.reason else
+            f'vibration at most {100.0 * each.vibration:.2g} % of the step, moves take up to '
+            f'{1e3 * each.move_time:.4g} ms') + ('  (chosen)' if each.shaper == found.shaper
+                                                 else ''))
+    if found.parts[0].evaluation.findings:
+        print(comparison(found.parts))
+    for line in (
+            f'verdict  {found.verdict[0]}: {found.verdict[1]}',
+            *([] if found.file is None else [f'file     {found.file}']), f'runs     {folder}',
+            *([] if report is None else [f'report   {report}'])):
+        print(line)

@@ -1,0 +1,291 @@
+"""
+From an actuator as its data sheet has it to moves without vibration, as one guided run.
+
+Moves as they are, an excitation, an identification, a choice among the shapers, a parameter file,
+and the same moves again.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+import yaml
+
+from hmsa_ros.api.actuator import Actuator
+from hmsa_ros.api.choice import choose, compare_shapers, Expected
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.files import write_text, yaml_text
+from hmsa_ros.identification.excitation import Bounds, excite
+from hmsa_ros.identification.files import Belief, file_text, read_belief
+from hmsa_ros.identification.identify import identify
+from hmsa_ros.identification.known import PREFIX
+from hmsa_ros.identification.quantities import free_of
+from hmsa_ros.identification.result import Identification
+from hmsa_ros.identification.runs import recording_of
+from hmsa_ros.interfaces.topics import PLANNER
+from hmsa_ros.judge import worst
+from hmsa_ros.lab.experiment import conduct, Experiment, prepare, Tell
+from hmsa_ros.recordings.bags import read_run
+from hmsa_ros.recordings.parameters import Entries
+from hmsa_ros.report.arrivals import Part
+from hmsa_ros.report.evaluation import evaluate
+from hmsa_ros.report.looks import RUNS
+from hmsa_ros.report.timing import timing
+
+if TYPE_CHECKING:
+    from hmsa_ros.lab.processes import NodeProcess
+
+# Vibration, as a share of the step, below which the quickest shaper is taken.
+_QUIET = 0.01
+# Identifications, each with what the one before has named.
+_MOST_TRIES = 4
+_DELAYS = ('coil_time_constant', 'sensor_latency')
+# How far beyond the setpoints the excitation goes, as a share of their range.
+_BEYOND = 0.5
+
+Nodes = Callable[[Mapping[str, object]], 'tuple[NodeProcess, ...]']
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What is tuned, and how."""
+
+    folder: Path  #: for the bags of all runs
+    setpoints: tuple[tuple[tuple[float, ...], float], ...]  #: stretch and duration in s
+    out: Path  #: parameter file to write
+    entries: Entries  #: what is known, as in a parameter file
+    #: nodes to start with parameters of the planner; none where nodes run
+    nodes: Nodes
+    namespace: str = ''
+    duration: float | None = None  #: of the excitation in s
+    stretch_min: float | None = None  #: of the excitation; default somewhat below the setpoints
+    stretch_max: float | None = None  #: default somewhat above them
+    free: str = ''  #: as ``hmsa identify`` takes it
+    known: Mapping[str, float] = field(default_factory=dict)  #: in SI
+    uncertain: Mapping[str, float] = field(default_factory=dict)  #: standard deviations of these
+    accept: bool = False  #: whether to go on with a small defect that is named
+
+
+@dataclass(frozen=True, eq=False)
+class Tuned:
+    """What has become of it; what comes after a failure is empty."""
+
+    before: Part
+    identified: Identification
+    shapers: tuple[Expected, ...] = ()
+    shaper: str = ''
+    file: Path | None = None
+    after: Part | None = None
+
+    @property
+    def parts(self) -> list[Part]:
+        """The runs of the setpoints."""
+        runs = [self.before, *([] if self.after is None else [self.after])]
+        return [replace(x, colour=y) for x, y in zip(runs, RUNS, strict=False)] if (
+            len(runs) > 1) else runs
+
+    @property
+    def verdict(self) -> tuple[str, str]:
+        """The verdict on the whole, and why, with what to do next."""
+        if self.after is None:
+            return self.identified.verdict, self.identified.reason
+        found = worst(self.after.evaluation.findings)
+        if found is None:
+            return 'unobserved', 'the bag shows no setpoint after tuning'
+        if found.arrived:
+            return 'tuned', 'all moves arrived and stayed within tolerance'
+        if found.verdict in ('undecided', 'unobserved'):
+            return str(found.verdict), found.message
+        lacks = self.identified.cost
+        return str(found.verdict), found.message + (
+            f'; what the model lacks costs {100.0 * lacks:.2g} % of a step' if lacks else
+            '; the identification shows no defect: look for what has changed since, or use '
+            'hmsa run --feedback adapt')
+
+
+def tune(tuning: Tuning, environment: Mapping[str, str], progress: Tell) -> Tuned:
+    """
+    Carry it out.
+
+    Parameters
+    ----------
+    tuning : Tuning
+        In a folder that can be made.
+    environment : mapping of str to str
+        Of the processes; this process must live in the same ROS domain.
+    progress : callable
+        Called with what is going on and the share of it that is done.
+
+    Returns
+    -------
+    Tuned
+        Without a file and moves after it where the actuator was not identified.
+
+    Raises
+    ------
+    HmsaError
+        If a run does not come to its end, or the planner does not take what was found.
+
+    """
+    belief = read_belief(None, tuning.entries)
+    before = _moves(tuning, 'before', {}, environment, progress)
+    progress('designing the excitation', 0.0)
+    levels = _excitation(tuning, belief, before)
+    excited = _conducted(tuning, Experiment(
+        tuning.folder / 'excitation', (), tuning.nodes({}), tuning.namespace, levels=levels),
+        environment, progress, 'excitation')
+    progress('identifying', 0.0)
+    found = _identified(tuning, belief, excited)
+    if found.verdict != 'identified' and not (tuning.accept and found.acceptable):
+        return Tuned(before, found)
+    progress('comparing shapers', 0.0)
+    settings = _settings(file_text(found, belief, str(excited), datetime.now().astimezone()))
+    shapers = compare_shapers(
+        Actuator.from_parameters(settings), [(x[0], span) for x, span in tuning.setpoints],
+        read_belief(None, [('', x, y) for x, y in settings.items()]).known)
+    shaper = choose(shapers, _QUIET).shaper
+    text = file_text(
+        found, replace(belief, settings={**belief.settings, 'shaper': shaper}),
+        str(excited), datetime.now().astimezone())
+    write_text(tuning.out, text)
+    settings = _settings(text)
+    if not tuning.nodes({}):
+        _apply(tuning, settings)
+    after = _moves(tuning, 'after', settings, environment, progress)
+    return Tuned(before, found, tuple(shapers), shaper, tuning.out, after)
+
+
+def known_to(namespace: str) -> Entries:
+    """
+    Return what the running planner knows of the one actuator that it has, as in a parameter file.
+
+    Raises
+    ------
+    BadInputError
+        If it has several.
+    HmsaError
+        If there is no planner.
+
+    """
+    from hmsa_ros.lab.remote import RemoteNode
+
+    with RemoteNode(PLANNER, namespace) as planner:
+        values = planner.get()
+    if len(values['joints']) > 1:
+        raise BadInputError(
+            f'the planner has the joints {", ".join(values["joints"])}: expected one; tune each '
+            'with a planner of its own')
+    return [(PLANNER, x, y) for x, y in _of_planner(values).items() if y is not None]
+
+
+def _of_planner(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the planner has of an actuator among all that a file may hold."""
+    from hmsa_ros.nodes.planning import OWN
+
+    own = {x.name for x in OWN}
+    return {x: y for x, y in settings.items() if x in own}
+
+
+def _settings(text: str) -> dict[str, Any]:
+    found: dict[str, Any] = yaml.safe_load(text)['/**']['ros__parameters']
+    return found
+
+
+def _conducted(
+        tuning: Tuning, experiment: Experiment, environment: Mapping[str, str], progress: Tell,
+        what: str) -> Path:
+    """Carry out an experiment in its folder; return its bag."""
+    prepare(experiment.folder)
+    done = conduct(experiment, environment, lambda text, share: progress(f'{what}: {text}', share))
+    if not done.measured:
+        raise HmsaError(
+            'no node publishes joint_states: expected a plant, or a driver with a sensor')
+    # That an unknown actuator does not come to rest where predicted is no failure.
+    if experiment.levels and done.verdict.failure and not done.verdict.measured:
+        raise HmsaError(f'the excitation failed: {done.verdict.failure}')
+    return experiment.bag
+
+
+def _moves(
+        tuning: Tuning, name: str, settings: Mapping[str, object],
+        environment: Mapping[str, str], progress: Tell) -> Part:
+    """Make the moves; return what was measured of them."""
+    bag = _conducted(tuning, Experiment(
+        tuning.folder / name, tuning.setpoints, tuning.nodes(_of_planner(settings)),
+        tuning.namespace),
+        environment, progress, name)
+    run = replace(read_run(bag), label=name)
+    return Part(run, evaluate(run), timing(run))
+
+
+def _excitation(
+        tuning: Tuning, belief: Belief, before: Part) -> list[tuple[float, float]]:
+    """Return the levels to record, for a sensor as it has been seen."""
+    rest = belief.actuator.rest
+    stretches = [rest, *(x[0] for x, _ in tuning.setpoints)]
+    beyond = _BEYOND * (max(stretches) - min(stretches))
+    time = before.run.time
+    found = excite(
+        belief.actuator, Bounds(
+            belief.number('flux_density_min', -0.5), belief.number('flux_density_max', 0.5),
+            belief.number('slew_limit', 0.0) or float('inf'),
+            min(stretches) - beyond if tuning.stretch_min is None else tuning.stretch_min,
+            max(stretches) + beyond if tuning.stretch_max is None else tuning.stretch_max),
+        duration=tuning.duration, rate=1e9 * (len(time) - 1) / float(time[-1] - time[0]),
+        free=free_of(tuning.free, belief.actuator.law, tuning.known)).best
+    return list(zip(found.level_times.tolist(), found.levels.tolist(), strict=True))
+
+
+def _identified(tuning: Tuning, belief: Belief, bag: Path) -> Identification:
+    """Identify, with what residuals name added to what is free."""
+    recording, block, coil = recording_of(read_run(bag), belief.actuator)
+    known = {**coil, **belief.others, **tuning.known}
+
+    def fit(free: tuple[str, ...]) -> Identification:
+        return identify(
+            recording, free=free, actuator=block, known={
+                x: y for x, y in known.items() if x not in free}, uncertain=tuning.uncertain)
+
+    free = free_of(tuning.free, block.law, tuning.known)
+    found = fit(free)
+    for _ in range(_MOST_TRIES):
+        named = max(
+            (x for x in found.signatures if x.found and x.remedy), key=lambda x: x.share,
+            default=None)
+        more = () if named is None else tuple(
+            x for x in named.remedy.split(',') if x not in free and x not in tuning.known)
+        if found.verdict == 'identified' or not more:
+            break
+        # A lag and a latency look alike until one of them is there, or both.
+        ways = [more, *([*((x,) for x in _DELAYS if x not in (*more, *free, *tuning.known)),
+                         tuple(x for x in _DELAYS if x not in (*free, *tuning.known))]
+                        if set(more) & set(_DELAYS) else [])]
+        tried = [(x, fit((*free, *x))) for x in dict.fromkeys(ways)]
+        added, found = next(
+            (x for x in tried if x[1].verdict == 'identified'),
+            min(tried, key=lambda x: x[1].residual_rms))
+        free = (*free, *added)
+    if found.verdict == 'not_identifiable' and not tuning.free:
+        # Moves that hardly feel the limit of the chains are planned as well with the one given.
+        without = tuple(x for x in free if x != 'chain_limit')
+        found = min(found, fit(without), key=lambda x: x.verdict != 'identified')
+    return found
+
+
+def _apply(tuning: Tuning, settings: Mapping[str, Any]) -> None:
+    """Give the running planner what was found."""
+    from hmsa_ros.lab.remote import RemoteNode
+
+    with RemoteNode(PLANNER, tuning.namespace) as planner:
+        before = planner.get()
+        changed = {x: y for x, y in settings.items() if x in before and before[x] != y
+                   and not x.startswith(PREFIX)}
+        try:
+            for name, value in changed.items():
+                planner.set(name, value if isinstance(value, str) else yaml_text(value))
+        except BadInputError as error:
+            raise HmsaError(
+                f'{tuning.out} is written, and the running planner does not take it ({error}): '
+                f'start it again with --params-file {tuning.out}, then hmsa run') from error
