@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     out: Path | None = arguments.report
     if out is not None and not out.resolve().parent.is_dir():
         raise BadInputError(f'cannot write {out}: expected a file in a folder that exists')
-    settings = dict(_setting(x) for x in arguments.set)
+    settings = dict(setting(x) for x in arguments.set)
     with progress() as update:
         found = Trial(
             arguments.hardware, arguments.joint, settings, level=arguments.limit,
@@ -72,8 +72,8 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if found.passed else 1
 
 
-def _setting(text: str) -> tuple[str, Any]:
-    """Return a keyword argument; its value is read as YAML, as ROS reads parameters."""
+def setting(text: str) -> tuple[str, Any]:
+    """Return a keyword argument, its value read as in YAML; what is none is a `BadInputError`."""
     import yaml
 
     key, given, value = text.partition('=')

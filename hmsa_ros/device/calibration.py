@@ -1,0 +1,328 @@
+"""What readings of a field probe say of a coil: its constant, saturation, table and hysteresis."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+import math
+from threading import Event, Thread
+from time import time_ns
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import t as student
+
+from hmsa_ros.device.assembly import CoilModel
+from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
+from hmsa_ros.device.hardware import Calls, Hardware, load
+from hmsa_ros.device.watchdog import Fallback
+from hmsa_ros.device.worker import HardwareWorker
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.units import NANOSECONDS
+
+# Readings that a fit needs at the least.
+_FEWEST = 4
+# Share of the range that a model may miss where scatter does not explain it, and a saturation that
+# the readings do not show, in units of the largest field.
+_MISSES, _FAR = 0.005, 20.0
+# In s: between signs of life for a watchdog, silence that switches off, and waiting for a start.
+_BEAT, _SILENCE, _START = 0.1, 1.0, 10.0
+# Rate in Hz at which the hardware is looked after.
+_RATE = 50.0
+# Currents closer than this share of their range are one.
+_SAME = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class CoilCalibration:
+    """
+    A coil as a field probe has seen it.
+
+    Attributes
+    ----------
+    tesla_per_ampere, std : float
+        At small currents, and the standard deviation.
+    interval : (float, float)
+        95 % interval of it.
+    saturation : float
+        B_s in T of ``B_s tanh(tesla_per_ampere I / B_s)``; infinite where it does not show.
+    offset : float
+        Reading in T without a current.
+    misses : float
+        Largest distance of a mean reading from the model, as a share of the range.
+    hysteresis : float
+        Largest distance of the mean readings at one current while it rises and while it falls, as
+        a share of the range; NaN where no current was approached from both sides.
+    current, flux_density : ndarray, shape (m,)
+        Mean readings less the offset at each current, by current.
+    model : str
+        What to use: ``number``, ``saturation`` or ``table``.
+
+    """
+
+    tesla_per_ampere: float
+    std: float
+    interval: tuple[float, float]
+    saturation: float
+    offset: float
+    misses: float
+    hysteresis: float
+    current: Array
+    flux_density: Array
+    model: str
+
+    def settings(self, table: str) -> dict[str, Any]:
+        """Return the settings ``hardware.coil.*`` of a driver; a table is in a file."""
+        if self.model == 'table':
+            return {'hardware.coil.file': table}
+        return {'hardware.coil.tesla_per_ampere': self.tesla_per_ampere} | (
+            {'hardware.coil.saturation': self.saturation} if self.model == 'saturation' else {})
+
+
+def calibrate_coil(current: Array, flux_density: Array) -> CoilCalibration:
+    """
+    Fit a coil to readings of a field probe.
+
+    Parameters
+    ----------
+    current : ndarray, shape (n,)
+        Current in A (or voltage in V) of the source at each reading, in the order of the readings.
+    flux_density : ndarray, shape (n,)
+        Reading in T, with any offset of the probe.
+
+    Returns
+    -------
+    CoilCalibration
+        With the simplest model that the readings allow.
+
+    Raises
+    ------
+    BadInputError
+        If there are too few currents, or the readings do not follow them.
+
+    """
+    if not np.all(np.isfinite(current) & np.isfinite(flux_density)):
+        raise BadInputError('readings are not all finite: expected numbers, in A and T')
+    places = np.unique(np.round(current / max(float(np.ptp(current)), 1e-300) / _SAME))
+    if len(current) < _FEWEST or len(places) < _FEWEST or not (
+            np.min(current) <= 0.0 <= np.max(current)):
+        raise BadInputError(
+            f'{len(current)} readings at {len(places)} currents: expected at least {_FEWEST} '
+            'currents with 0 A within their range')
+    span = float(np.ptp(flux_density))
+    if span == 0.0:
+        raise BadInputError(
+            f'all readings are {flux_density[0]:g} T: they do not follow the current; look after '
+            'the probe and its direction')
+    straight = _fit(current, flux_density, saturating=False)
+    bent = _fit(current, flux_density, saturating=True)
+    at, mean, hysteresis = _means(current, flux_density)
+    better = len(current) * math.log(
+        max(float(np.sum(straight[2]**2)), 1e-300) / max(float(np.sum(bent[2]**2)), 1e-300))
+    saturates = better > 10.0 and abs(bent[0][2]) < _FAR * span
+    values, deviation, _ = bent if saturates else straight
+    slope, offset = float(values[0]), float(values[1])
+    saturation = abs(float(values[2])) if saturates else math.inf
+    if slope == 0.0 or not deviation < 0.2 * abs(slope):
+        raise BadInputError(
+            f'the readings do not follow the current ({slope:.3g} T/A, standard deviation '
+            f'{deviation:.3g}): expected a field that rises or falls with it; look after the '
+            'probe and its direction')
+    misses = float(np.max(np.abs(mean - _model(at, *values)))) / span
+    half = float(student.ppf(0.975, len(current) - len(values))) * deviation
+    # Both branches of a loop miss a curve in their middle by half of the hysteresis.
+    allowed = _MISSES + 0.5 * (0.0 if math.isnan(hysteresis) else hysteresis)
+    model = 'table' if misses > allowed else 'saturation' if saturates else 'number'
+    return CoilCalibration(
+        slope, deviation, (slope - half, slope + half), saturation, offset, misses, hysteresis,
+        at, mean - float(np.interp(0.0, at, mean)), model)
+
+
+def _model(current: Array, slope: float, offset: float, saturation: float = math.inf) -> Array:
+    found: Array = offset + (
+        slope * current if saturation == math.inf
+        else saturation * np.tanh(slope * current / saturation))
+    return found
+
+
+def _fit(current: Array, flux_density: Array, *, saturating: bool) -> tuple[Array, float, Array]:
+    """Return slope, offset and, with saturation, B_s; the slope's deviation; and residuals."""
+    slope, offset = np.polyfit(current, flux_density, 1)
+    largest = float(np.max(np.abs(flux_density - offset))) or 1.0
+    scale = np.array([slope or 1.0, largest, largest])[:3 if saturating else 2]
+    start = np.array([slope, offset, 2.0 * largest])[:len(scale)] / scale
+
+    def off(values: Array) -> Array:
+        found: Array = (_model(current, *(values * scale)) - flux_density) / largest
+        return found
+
+    found = least_squares(off, start, x_scale='jac', xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    freedom = max(len(current) - len(scale), 1)
+    covariance = np.linalg.pinv(found.jac.T @ found.jac) * 2.0 * found.cost / freedom
+    return found.x * scale, float(abs(scale[0]) * math.sqrt(covariance[0, 0])), found.fun
+
+
+def _means(current: Array, flux_density: Array) -> tuple[Array, Array, float]:
+    """Return currents, mean readings at each, and the hysteresis as a share of the range."""
+    size = float(np.ptp(current))
+    places = np.round(current / size / _SAME).astype(np.int64)
+    before = np.concatenate([[np.nan], current[:-1]])
+    # Of readings at one current, the first says from which side it was approached.
+    side = np.sign(current - before)
+    for i in range(1, len(side)):
+        if places[i] == places[i - 1]:
+            side[i] = side[i - 1]
+    at, mean, apart = [], [], [math.nan]
+    for place in np.unique(places):
+        here = places == place
+        at.append(float(np.mean(current[here])))
+        branches = [flux_density[here & (side == x)] for x in (1.0, -1.0)]
+        if all(len(x) for x in branches):
+            rising, falling = (float(np.mean(x)) for x in branches)
+            apart.append(abs(rising - falling) / float(np.ptp(flux_density)))
+            mean.append(0.5 * (rising + falling))
+        else:
+            mean.append(float(np.mean(flux_density[here])))
+    return np.array(at), np.array(mean), float(np.nanmax(apart)) if len(apart) > 1 else math.nan
+
+
+# -- the guided run ---------------------------------------------------------------------------
+
+
+def loop(largest: float, steps: int) -> list[float]:
+    """Return levels from 0 up to the largest one, down to its negative, and back to 0."""
+    up = np.linspace(0.0, largest, steps + 1)
+    return [float(x) for x in (*up, *up[-2::-1], *-up[1:], *-up[-2::-1])]
+
+
+class HeldCoil:
+    """A coil that holds a level, with signs of life for its watchdog; `held_coil` makes it."""
+
+    def __init__(self, worker: HardwareWorker, coil: CoilModel) -> None:
+        self._worker, self.coil = worker, coil
+        self._level = self._sent = 0.0
+        self._over = Event()
+        self._beats = Thread(target=self._beat, name='beat', daemon=True)
+        self._beats.start()
+
+    def _beat(self) -> None:
+        while not self._over.wait(_BEAT):
+            level = self._level
+            self._worker.receive(0, time_ns(), level)
+            self._sent = level
+            self._worker.look_after()
+            for queue in (self._worker.changes, self._worker.samples, self._worker.notices):
+                queue()
+
+    def hold(self, level: float, seconds: float) -> float:
+        """
+        Hold a level in T for some time in s; return the current in A that it needs.
+
+        Raises
+        ------
+        HmsaError
+            If the hardware fails.
+
+        """
+        self._level = level
+        while self._sent != level and self._worker.failure is None:
+            self._over.wait(_BEAT)
+        self._over.wait(seconds)
+        if failure := self._worker.failure or self._worker.trouble:
+            raise HmsaError(f'the coil does not hold {level:g} T: {failure}')
+        return self.coil.current(level)
+
+    def close(self) -> None:
+        """Switch off, and wait for it."""
+        self._over.set()
+        self._beats.join()
+        self._worker.close()
+
+
+@contextmanager
+def held_coil(
+        name: str, settings: Mapping[str, Any], limit: float,
+        joint: str = 'actuator') -> Iterator[HeldCoil]:
+    """
+    Start hardware whose coil is to be calibrated; it is off at the end, however that comes.
+
+    Parameters
+    ----------
+    name : str
+        ``MODULE:NAME``, or one that is shipped.
+    settings : mapping
+        Its keyword arguments.
+    limit : float
+        Largest flux density in T.
+    joint : str
+        Name it is called with.
+
+    Raises
+    ------
+    BadInputError
+        If it does not start, or has no coil of currents.
+    HmsaError
+        If it hangs at the start.
+
+    """
+    made: list[Hardware] = []
+
+    def make() -> HardwareDevice:
+        made.append(load(name)(joint, settings))
+        return HardwareDevice(
+            [HardwareJoint(made[0], limit, Fallback(_SILENCE, 'zero'))], time=time_ns(),
+            period=round(NANOSECONDS / _RATE), calls=Calls(1.0))
+
+    worker = HardwareWorker(make, time_ns)
+    try:
+        if not worker.started(_START):
+            raise HmsaError(
+                f'{name} has not started within {_START:g} s: expected a first write that returns')
+        coil = getattr(made[0], 'coil', None)
+        if not isinstance(coil, CoilModel):
+            raise BadInputError(
+                f'{name} has no coil of currents: expected an Assembly of a source and a '
+                'CoilModel (hmsa_ros.device.assembly); for another class, give a CSV of readings '
+                'with the columns current and flux_density')
+        held = HeldCoil(worker, coil)
+        try:
+            yield held
+        finally:
+            held.close()
+    finally:
+        worker.close()
+
+
+def read_loop(
+        held: HeldCoil, levels: list[float], settle: float, read: Callable[[float], float],
+        progress: Callable[[str, float], None]) -> tuple[Array, Array]:
+    """
+    Hold each level, and have the field read.
+
+    Parameters
+    ----------
+    held : HeldCoil
+        In force.
+    levels : list of float
+        In T.
+    settle : float
+        Time in s at each level before it is read.
+    read : callable
+        Called with the current in A; returns the flux density in T.
+    progress : callable
+        Called with what is going on and the share that is done.
+
+    Returns
+    -------
+    (ndarray, ndarray), shape (n,)
+        Currents in A and readings in T.
+
+    """
+    rows = []
+    for i, level in enumerate(levels):
+        current = held.hold(level, settle)
+        progress(f'{current:.4g} A', i / len(levels))
+        rows.append((current, read(current)))
+    found: Array = np.array(rows)
+    return found[:, 0], found[:, 1]

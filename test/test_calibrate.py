@@ -1,0 +1,135 @@
+"""Calibration of a coil: blind to the truth, for every kind of coil, and off at the end."""
+
+import json
+import math
+import sys
+
+import numpy as np
+import pytest
+
+from hmsa_ros.cli import main
+from hmsa_ros.device.assembly import Assembly, CoilModel
+from hmsa_ros.device.calibration import calibrate_coil, loop
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.recordings.parameters import entries_of
+
+# Amperes of a loop, in its order.
+LOOP = np.array(loop(8.0, 8))
+
+
+def readings(slope, saturation=math.inf, hysteresis=0.0, noise=2e-4, seed=0):
+    """Return what a probe with an offset reads of a coil with a loop that is an ellipse."""
+    flux = slope * LOOP if saturation == math.inf else saturation * np.tanh(
+        slope * LOOP / saturation)
+    rising = np.sign(np.diff(LOOP, prepend=-1.0))
+    flux = flux - rising * 0.5 * hysteresis * np.ptp(flux) * (1.0 - (LOOP / 8.0) ** 2)
+    return flux + 1e-3 + np.random.default_rng(seed).normal(0.0, noise, len(LOOP))
+
+
+@pytest.mark.parametrize('saturation', [math.inf, 0.5])
+@pytest.mark.parametrize('hysteresis', [0.0, 0.02])
+def test_the_constant_is_right_to_a_fifth_of_a_percent_in_nearly_all_runs(saturation, hysteresis):
+    drawn = np.random.default_rng(4).uniform(0.0475, 0.0525, 100)
+    found = [calibrate_coil(LOOP, readings(x, saturation, hysteresis, seed=i))
+             for i, x in enumerate(drawn)]
+    off = np.abs([x.tesla_per_ampere for x in found] / drawn - 1.0)
+    assert np.sum(off < 2e-3) >= 97
+    inside = [x.interval[0] < y < x.interval[1] for x, y in zip(found, drawn, strict=True)]
+    assert sum(inside) >= 90
+    for x in found:
+        assert x.model == ('number' if saturation == math.inf else 'saturation')
+        assert x.hysteresis == pytest.approx(hysteresis, abs=2e-3)
+        assert x.offset == pytest.approx(1e-3, abs=5e-4)
+        if saturation < math.inf:
+            assert x.saturation == pytest.approx(saturation, rel=0.02)
+
+
+def test_a_coil_like_no_model_gets_a_table_that_the_driver_takes(tmp_path, capsys):
+    source, out = tmp_path / 'readings.csv', tmp_path / 'coil.yaml'
+    flux = 0.05 * LOOP + 0.02 * np.maximum(LOOP, 0.0)
+    source.write_text('current [A],flux_density [mT]\n' + ''.join(
+        f'{x},{1e3 * y}\n' for x, y in zip(LOOP, flux, strict=True)))
+    assert main(['calibrate', 'coil', str(source), '--out', str(out)]) == 0
+    assert 'table' in capsys.readouterr().out
+    settings = {x.removeprefix('hardware.coil.'): y for _, x, y in entries_of(out)}
+    coil = CoilModel(**settings)
+    for current in (-8.0, 2.0, 8.0):
+        expected = 0.05 * current + 0.02 * max(current, 0.0)
+        assert coil.flux_density(current) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize(('current', 'flux', 'what'), [
+    ([0.0, 1.0, 2.0], [0.0, 1.0, 2.0], 'at least 4 currents'),
+    ([1.0, 2.0, 3.0, 4.0], [1.0, 2.0, 3.0, 4.0], 'with 0 A'),
+    ([-1.0, 0.0, 1.0, 2.0], [0.0, math.nan, 0.0, 0.0], 'not all finite'),
+    ([-2.0, -1.0, 0.0, 1.0, 2.0], [0.3, -0.2, 0.1, 0.2, -0.3], 'do not follow'),
+    ([-2.0, -1.0, 0.0, 1.0, 2.0], [0.1] * 5, 'do not follow')])
+def test_readings_that_tell_nothing_are_refused(current, flux, what):
+    with pytest.raises(BadInputError, match=what):
+        calibrate_coil(np.array(current), np.array(flux))
+
+
+class Supply:
+    """A source of current, and the field of its coil for a probe, 4 % stronger than assumed."""
+
+    amperes = 0.0
+    written: list[float] = []
+
+    def __init__(self, joint='', **settings):
+        pass
+
+    def write(self, level, now):
+        Supply.amperes = level
+        Supply.written.append(level)
+
+    def read(self, now=0):
+        return 0.052 * Supply.amperes if now == 0 else []
+
+
+def coil(joint):
+    """Return it with its coil."""
+    return Assembly(Supply(), CoilModel(0.05))
+
+
+@pytest.mark.parametrize('typed', [False, True])
+def test_a_guided_run_measures_the_coil_and_leaves_it_off(typed, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'bench_under_test', sys.modules[__name__])
+    monkeypatch.setattr('builtins.input', lambda _: f'{1e3 * 0.052 * Supply.amperes} mT')
+    Supply.written.clear()
+    probe = [] if typed else ['--probe', 'bench_under_test:Supply']
+    assert main([
+        'calibrate', 'coil', 'bench_under_test:coil', *probe, '--limit', '0.1', '--steps', '3',
+        '--settle', '0.1', '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found['tesla_per_ampere'] == pytest.approx(0.052, rel=1e-6)
+    assert found['model'] == 'number'
+    assert max(map(abs, Supply.written)) == pytest.approx(2.0)
+    assert Supply.amperes == 0.0
+
+
+def test_an_interrupt_leaves_the_coil_off(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'bench_under_test', sys.modules[__name__])
+    asked = []
+
+    def interrupted(text):
+        asked.append(text)
+        if len(asked) == 3:
+            raise KeyboardInterrupt
+        return '0'
+
+    monkeypatch.setattr('builtins.input', interrupted)
+    main(['calibrate', 'coil', 'bench_under_test:coil', '--limit', '0.1', '--settle', '0.1'])
+    assert len(asked) == 3
+    assert Supply.amperes == 0.0
+
+
+@pytest.mark.parametrize(('words', 'what'), [
+    (('bench_under_test:Supply',), 'no coil of currents'),
+    (('bench_under_test:nothing',), 'cannot be loaded'),
+    (('bench_under_test:coil', '--probe', 'bench_under_test:nothing'), '--probe'),
+    (('bench_under_test:coil', '--limit', '0'), '--limit'), (('missing.csv',), 'missing.csv')])
+def test_what_cannot_be_calibrated_is_refused(words, what, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, 'bench_under_test', sys.modules[__name__])
+    assert main(['calibrate', 'coil', *words]) == 2
+    assert what in capsys.readouterr().err
+    assert Supply.amperes == 0.0
