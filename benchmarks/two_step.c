@@ -16,6 +16,8 @@
  *     GUESS=0   guess half way between the two holding loads
  *     GUESS=2   energy balance, shrunk by what damping takes from a linear oscillator
  *     COARSE=x  first pass at tolerance x, the next ones as fine as they can use
+ *     CUBICS    land by a Taylor series of third order, and end by cubics through the last two
+ *               turning points, without the pass that would confirm them
  */
 #define _POSIX_C_SOURCE 199309L
 #include <math.h>
@@ -132,10 +134,11 @@ static double resize(double h, double error)
     return h * fmin(6, fmax(0.2, 0.9 * pow(fmax(error, 1e-12), -0.125)));
 }
 
-/* First turning point in a direction: time, stretch and its derivative. Returns 0 for none. */
+/* First turning point in a direction: time and stretch, with their derivatives by the load.
+   Returns 0 for none. */
 static int turning_point(
     double l, int direction, double beta, double rtol, double *time, double *stretch,
-    double *slope)
+    double *slope, double *time_slope)
 {
     vec y = {l}, end;
     double t = 0, a;
@@ -164,25 +167,39 @@ static int turning_point(
         if (root > 0 && x > 0 && x <= h)
             dt = x;
     }
+#ifdef CUBICS
+    const double enough = pow(rtol, 0.375);
+#else
+    const double enough = 1e-6;
+#endif
+    double jerk = 0;
+    vec by;
     for (int n = 0; n < 12; n++) {
         step(y, beta, dt, rtol, &end, &a);
         y = end;
         t += dt;
-        a = derivative(y, beta)[1];
+        by = derivative(y, beta);
+        a = by[1];
         if (direction * a >= 0) {
             dt = 0.25 * h;
             continue;
         }
         dt = -y[1] / a;
-        if (fabs(y[1]) <= 1e-6 * size)
+#ifdef CUBICS
+        jerk = derivative((vec){y[0], y[1], y[1], a}, beta)[3]
+            - derivative((vec){y[0], y[1], 0, 0}, beta)[3];
+        dt -= 0.5 * jerk / a * dt * dt;
+#endif
+        if (fabs(y[1]) <= enough * size)
             break;
     }
     *time = t + dt;
-    *stretch = y[0] + 0.5 * y[1] * dt;
+    *stretch = y[0] + dt * (y[1] + dt * (0.5 * a + jerk / 6 * dt));
 #ifdef SECANT
-    *slope = 0;
+    *slope = *time_slope = 0;
 #else
-    *slope = y[2] + y[3] * dt;
+    *slope = y[2] + dt * (y[3] + 0.5 * by[3] * dt);
+    *time_slope = -(y[3] + by[3] * dt) / (a + jerk * dt);
 #endif
     return 1;
 }
@@ -204,6 +221,16 @@ static double first_guess(double l, double target, double beta_1)
     return delta * 2 * decay / (1 + decay);
 }
 
+#ifdef CUBICS
+/* What the cubic through two points, with a slope at each, adds to the line through the first at a
+   share of the way from it to the second. */
+static double beyond_line(double share, double rise, double way, double slope, double other)
+{
+    const double bend = way * (slope + other) - 2 * rise;
+    return share * share * (rise - way * slope - bend + share * bend);
+}
+#endif
+
 /* Load and time of the two-step command. Returns the number of passes, 0 for failure. */
 static int two_step(double l, double target, double rtol, double *beta_p, double *tau_p)
 {
@@ -214,16 +241,21 @@ static int two_step(double l, double target, double rtol, double *beta_p, double
 #ifdef SECANT
     double old_d = 0, old_excess = 0;
 #endif
+#ifdef CUBICS
+    double old_d = 0, old_excess = 0, old_slope = 0, old_time = 0, old_time_slope = 0;
+    double went = INFINITY, exact = INFINITY;
+#endif
 #ifdef COARSE
     double tolerance = fmax(rtol, COARSE);
 #else
     double tolerance = rtol;
 #endif
     for (int pass = 1; pass <= 80; pass++) {
-        double time = 0, end, slope;
+        double time = 0, end = 0, slope = 1, time_slope = 0;
         const double beta = beta_1 - direction * d;
         double change = INFINITY;
-        if (turning_point(l, direction, beta, tolerance, &time, &end, &slope)) {
+        if (turning_point(l, direction, beta, tolerance, &time, &end, &slope,
+                &time_slope)) {
             const double excess = direction * (end - target);
             if (fabs(excess) > 1e3 * tolerance) {
                 if (excess > 0)
@@ -245,6 +277,27 @@ static int two_step(double l, double target, double rtol, double *beta_p, double
         if (!(low < next && next < high))
             next = 0.5 * (low + high);
         const double relative = fabs(next - d) / d;
+#ifdef CUBICS
+        const double excess = direction * (end - target), move = fabs(target - l);
+        const double squared = relative / went * (relative / went);
+        const int bent = tolerance <= rtol && next == d + change && relative * went <= 0.1 * sqrt(rtol)
+            && squared * exact <= rtol && squared * squared * relative <= 0.1 * rtol
+            && fabs(excess) <= 1e-4 * move;
+        if (bent) {
+            /* The slope of d by the excess, and of the time by d. */
+            const double back = old_d - d, rise = old_excess - excess;
+            next += beyond_line(-excess / rise, back, rise, -1 / slope, -1 / old_slope);
+            const double moved = next - d;
+            *beta_p = beta_1 - direction * next;
+            *tau_p = time - direction * time_slope * moved + beyond_line(
+                moved / back, old_time - time, back, -direction * time_slope,
+                -direction * old_time_slope);
+            return pass;
+        }
+        old_d = d, old_excess = excess, old_slope = slope;
+        old_time = time, old_time_slope = time_slope, went = relative;
+        exact = tolerance * (1 + target) / move;
+#endif
         d = next;
 #ifdef SECANT
         const int enough = relative * relative <= 0.01 * rtol || relative <= 0.1 * rtol;
