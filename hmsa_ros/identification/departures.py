@@ -152,8 +152,10 @@ def departures(
                 signatures[-1].found):
             seconds = _DEVIATIONS * spread / norm
             late = seconds, seconds * way
-        # An offset of the stamps is the commonest, and hides best.
-        least = 0.0 if 'latency' in one.name and not _DELAYS.intersection(fit.free) else _HINT
+        # An offset of the stamps is the commonest, and hides best; a gain that nobody gave is next.
+        late_or_off = 'latency' in one.name and not _DELAYS.intersection(fit.free) or (
+            one.remedy == GAIN and GAIN not in given)
+        least = 0.0 if late_or_off else _HINT
         if deviations > least:
             hint = np.maximum(
                 hint, (way / norm) ** 2 * max(size ** 2 - _MEDIAN * spread ** 2, 0.0))
