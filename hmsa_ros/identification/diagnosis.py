@@ -34,6 +34,10 @@ _FEW_WORDS = 4  # frequencies that are named
 _FIRST_KEPT = ('density', 'chain_limit', 'stretch_gain')  # what is known soonest from elsewhere
 _WORTH_SAYING = 0.3  # deviations by which something moves a parameter
 _NUMERICAL = 1e-6  # residuals below this are those of the integration
+# How to see what a model lacks that has no name.
+_LOOK = '; see the figures of --report page.html'
+# What frequencies follow from.
+_TIMED = {'shear_modulus', 'density', 'time_unit'}
 DISTANT = 0.1  # residual over motion from which on nothing was fitted
 # What soft actuators have, with a wide margin, in SI, and the power of the time in it.
 _USUAL = {'shear_modulus': (100.0, 1e8, -2), 'density': (100.0, 2e4, 2),
@@ -119,7 +123,8 @@ def weakness(fit: Fit, deviation: float, factors: Array) -> Weakness | None:
         f'{_listed(list(names))} cannot be identified from this recording: {listed}. Instead, '
         f'{"; or ".join(advice[:3])}; or ' + (
             f'keep what is known, as with --free=-{kept} or --known {kept}=VALUE+-STD'
-            if kept in quantities.DEFAULT_FREE else f'leave {kept} out of --free')))
+            if kept in quantities.DEFAULT_FREE else f'leave {kept} out, as with '
+            f'{freeing(fit, [kept])}')))
 
 
 def _change(fit: Fit, place: int, change: float, first: float) -> str:
@@ -136,6 +141,13 @@ def _change(fit: Fit, place: int, change: float, first: float) -> str:
     if kind == 'inverse':
         change = -change * fit.values[name]
     return f'{name} {100.0 * change:+.3g} %'
+
+
+def freeing(fit: Fit, without: Collection[str]) -> str:
+    """Return the option that frees what a fit did, but for some parameters."""
+    # Where the motion begins is freed by itself.
+    kept = [x for x in fit.free if x not in without and not x.startswith('initial_')]
+    return f'--free {",".join(kept or quantities.DEFAULT_FREE[3:])}'
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -251,31 +263,31 @@ def misfit(
         return (
             f'no motion of the model is like the recorded one: {figures}, against a motion of '
             f'{motion:.3g} rms; check that times are in s and levels in tesla, of one clock and '
-            f'one run, and that --params-file describes the actuator{_remedy(seen)}')
+            f'one run, and that --params-file describes the actuator{_remedy(seen) or _LOOK}')
     if fit.scale < _NUMERICAL:
         return ''
     if seen:
         words = '; '.join(
             f'{x.name} ({x.share:.0%} of them, {x.deviations:.0f} standard deviations)'
             for x in seen[:3])
-        return f'the model leaves {figures}, which look like {words}{_remedy(seen)}'
+        return f'the model leaves {figures}, which look like {words}{_remedy(seen) or _LOOK}'
     lost = int(np.count_nonzero(fit.weights < _OUT))
     if lost > 1 and mistaken(fit):
         return (
             f'{lost} samples right after changes of level are not those of the model, which '
             f'leaves {figures} elsewhere: the model does not describe the motion; check the '
-            'times of the levels, and record more samples in motion')
+            f'times of the levels, and record more samples in motion{_LOOK}')
     if alike is not None:
         return '' if alike.p_value > _CHANCE else (
             f'the model leaves {figures}, and {alike.size:.2g} of them rms, after equal changes '
             f'of level the same (by chance with a probability of {alike.p_value:.2g}): an effect '
-            'is missing from the model; see the figures of --report')
+            f'is missing from the model{_LOOK}')
     ratio = in_motion(fit)
     if not found.white and ratio > _IN_MOTION and fit.recording.quantum == 0.0 and (
             abs(float(found.autocorrelation[1])) > 0.3):
         return (
             f'the model leaves {figures}, {ratio:.1f} times as large in fast motion as in '
-            'slow: a motion is missing from the model; see the figures of --report')
+            f'slow: a motion is missing from the model{_LOOK}')
     return ''
 
 
@@ -362,4 +374,5 @@ def alike(best: Fit, others: Sequence[Fit]) -> str:
     return (
         f'these frequencies fit alike: {_listed(words)}; record '
         f'at more than {2.0 * frequencies[-1]:.3g} samples per second, or give a --params-file '
-        'whose shear_modulus and density are known, and free what is not')
+        'whose shear_modulus and density are known, and free what is not, as with '
+        f'--params-file actuator.yaml {freeing(best, _TIMED)}')

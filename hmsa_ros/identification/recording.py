@@ -118,7 +118,8 @@ class Recording:
         if np.max(np.abs(self.levels)) > _STRONGEST:
             raise BadInputError(
                 f'{self.label} has flux densities up to {np.max(np.abs(self.levels)):.6g} T: '
-                f'expected at most {_STRONGEST:g} T; is it in mT?')
+                f'expected at most {_STRONGEST:g} T; if they are in mT, write '
+                '"flux_density [mT]" in the header of the CSV')
         spread = float(np.quantile(self.stretch, 0.99) - np.quantile(self.stretch, 0.01))
         # White noise spreads by 4.65 of its deviation, and so much from one sample to the next.
         jitter = float(np.median(np.abs(np.diff(self.stretch)))) / 0.954

@@ -81,7 +81,8 @@ def search(
     if not found:
         raise BadInputError(
             f'no start value leads to a motion that {recording.label} could be compared with: '
-            'expected levels in T that the actuator of --params-file can hold')
+            'expected levels in T that the actuator of --params-file can hold, as those of hmsa '
+            'excite --params-file actuator.yaml --out levels.csv')
     best, agreed = _best(found)
     if not best.converged:
         best = fit(recording, best.values, free) or best
