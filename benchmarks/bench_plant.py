@@ -16,8 +16,9 @@ from scipy.integrate import odeint, solve_ivp
 from benchmarks.contenders import acceleration, holding_load
 from benchmarks.measure import Contender, loosest, race, Report, stopwatch
 from benchmarks.reference import Actuator, response
+from hmsa_ros.model.moves import Level, State
 from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.simulation import RTOL, simulate
+from hmsa_ros.model.simulation import RTOL, sampled
 
 LIMIT = 1e-9
 ACTUATOR = Actuator(zeta=0.2, j_lim=5.0, c1=2.0)
@@ -57,8 +58,9 @@ class Sequence:
 
 def _package(sequence: Sequence) -> Simulation:
     def run(rtol: float) -> np.ndarray:
-        return simulate(
-            sequence.switches, sequence.loads, sequence.times, MATERIAL, rtol=rtol)[0]
+        levels = [Level(*x) for x in zip(
+            sequence.switches.tolist(), sequence.loads.tolist(), strict=True)]
+        return sampled(levels, State(1.0), sequence.times, MATERIAL, rtol=rtol)[0]
     return run
 
 

@@ -19,18 +19,16 @@ import os
 from pathlib import Path
 import random
 import signal
-import subprocess
 import tempfile
 import threading
 from time import perf_counter, process_time, sleep
 
 import numpy as np
 
-from benchmarks import contenders
 from benchmarks.sheet import Sheet
 from hmsa_ros import motion
 from hmsa_ros.model.law import pack
-from hmsa_ros.planning.two_step import HOLD_TOLERANCE, plan_two_step_batch, RTOL
+from hmsa_ros.planning.two_step import Groups, HOLD_TOLERANCE, plan_two_step_batch, RTOL
 from hmsa_studies.chunks import Chunks, LEAST_ROWS
 from hmsa_studies.engine import compute
 from hmsa_studies.executors import dask, local_processes
@@ -161,7 +159,7 @@ def _alone(size):
     """Return the plans a second of the kernel on one core."""
     zeta, j_lim = (np.resize(parse_grid(x, x), size) for x in ('0:1.5:1000', '4:9:997'))
     begin = perf_counter()
-    plan_two_step_batch(1.0, 1.1, zeta=zeta, j_lim=j_lim, workers=1)
+    plan_two_step_batch(1.0, 1.1, Groups(zeta=zeta, j_lim=j_lim), workers=1)
     return size / (perf_counter() - begin)
 
 
@@ -172,25 +170,20 @@ def _spent():
 
 
 def lockstep(*, quick):
-    """Compare moves in lock-step with one after the other, here and in C, by processor time."""
+    """Compare moves in lock-step with one after the other, by processor time."""
     size = 1000
     zeta, j_lim = (np.resize(parse_grid(x, x), size) for x in ('0:1.5:1000', '4:9:997'))
-    moves = ''.join(
-        f'1 1.1 {x!r} {y!r} 2\n' for x, y in zip(zeta.tolist(), j_lim.tolist(), strict=True))
     repeats = 1 if quick else 20
-    with tempfile.TemporaryDirectory() as name:
-        entries = {
-            'package, 2 moves in lock-step, baseline': _batch(zeta, j_lim, repeats, wide=False),
-            'package, 4 moves in lock-step, AVX2': _batch(zeta, j_lim, repeats, wide=True),
-            **{f'C, {words}': _in_c(Path(name), lanes, moves, repeats) for lanes, words in (
-                (1, 'one move after the other'), (4, '4 moves in lock-step'),
-                (8, '8 moves in lock-step'))}}
-        times = dict.fromkeys(entries, float('inf'))
-        loads = {}
-        for _ in range(1 if quick else 10):
-            for words, run in entries.items():
-                spent, loads[words] = run()
-                times[words] = min(times[words], spent)
+    entries = {
+        'one move after the other': _one_by_one(zeta, j_lim, repeats),
+        '2 moves in lock-step, baseline': _batch(zeta, j_lim, repeats, wide=False),
+        '4 moves in lock-step, AVX2': _batch(zeta, j_lim, repeats, wide=True)}
+    times = dict.fromkeys(entries, float('inf'))
+    loads = {}
+    for _ in range(1 if quick else 10):
+        for words, run in entries.items():
+            spent, loads[words] = run()
+            times[words] = min(times[words], spent)
     first = next(iter(times))
     apart = {x: float(np.max(np.abs(y / loads[first] - 1.0))) for x, y in loads.items()}
     return Sheet(
@@ -199,6 +192,20 @@ def lockstep(*, quick):
         [[x, f'{1e6 * y:.2f} us', f'{1.0 / y:,.0f}', f'{y / times[first]:.3f}',
           f'{apart[x]:.0e}' if apart[x] else '-'] for x, y in times.items()],
         {'times': times, 'apart': apart})
+
+
+def _one_by_one(zeta, j_lim, repeats):
+    """Return what times the search for one move after the other, as `_batch` does."""
+    materials = pack(zeta, j_lim, np.full(zeta.size, 2.0))
+
+    def run():
+        begin = process_time()
+        for _ in range(repeats):
+            found = [motion.two_step(1.0, 0.0, 1.1, x, -np.inf, np.inf, RTOL, HOLD_TOLERANCE)[1]
+                     for x in materials]
+        return (process_time() - begin) / repeats / zeta.size, np.array(found)
+
+    return run
 
 
 def _batch(zeta, j_lim, repeats, *, wide):
@@ -216,20 +223,4 @@ def _batch(zeta, j_lim, repeats, *, wide):
         return (process_time() - begin) / repeats / zeta.size, results[0].copy()
 
     run()
-    return run
-
-
-def _in_c(folder, lanes, moves, repeats):
-    """Return what times lanes.c in the same way."""
-    program = contenders.compile_c(folder, f'lanes{lanes}', [
-        f'-DLANES={lanes}', '-O3', '-march=native', '-mprefer-vector-width=512',
-        '-fno-math-errno'], 'lanes.c')
-
-    def run():
-        done = subprocess.run(
-            [str(program), repr(RTOL), str(repeats)], input=moves, capture_output=True, text=True,
-            check=True)
-        *plans, times = done.stdout.splitlines()
-        return 1e-9 * float(times.split()[0]), np.array([float(x.split()[0]) for x in plans])
-
     return run

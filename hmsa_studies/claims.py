@@ -22,7 +22,7 @@ from hmsa_ros.model.equations import (
 from hmsa_ros.model.parameters import NondimensionalParameters
 from hmsa_ros.model.residual import residual_vibration
 from hmsa_ros.model.simulation import simulate
-from hmsa_ros.planning.two_step import CODES, plan_two_step, plan_two_step_batch
+from hmsa_ros.planning.two_step import CODES, Groups, plan_two_step, plan_two_step_batch
 from hmsa_studies import paper_data
 from hmsa_studies.paper_data import Run
 
@@ -118,7 +118,7 @@ def _inequality() -> Iterator[str]:
     yield 'signed b_p^2 against the force at the target, J_lim 5, c1 2:'
     start, target, zeta = _moves(
         np.round(np.arange(0.6, 1.65, 0.1), 2), [0.0, 0.2, 0.4, 0.8, 1.2])
-    plans = plan_two_step_batch(start, target, zeta=zeta)
+    plans = plan_two_step_batch(start, target, Groups(zeta=zeta))
     planned = np.array([str(CODES[x]) == 'two_step' for x in plans.status.tolist()])
     up = target > start
     lower = plans.beta_p < plans.beta_1
@@ -235,7 +235,7 @@ def _extensibility() -> Iterator[str]:
     j_lim = np.linspace(*paper_data.J_LIM_RANGE, 200)
     start, target, zeta = _moves(np.round(np.arange(0.7, 1.45, 0.1), 2), [0.0, 0.2, 1.0])
     plans = plan_two_step_batch(
-        start[:, None], target[:, None], zeta=zeta[:, None], j_lim=j_lim)
+        start[:, None], target[:, None], Groups(zeta=zeta[:, None], j_lim=j_lim))
     rises = np.all(np.diff(plans.tau_p, axis=1) > 0.0, axis=1)
     falls = np.all(np.diff(np.abs(plans.beta_p), axis=1) < 0.0, axis=1)
     holding = np.all(np.diff(np.abs(plans.beta_1), axis=1) < 0.0, axis=1) | (target == 1.0)
@@ -246,7 +246,7 @@ def _extensibility() -> Iterator[str]:
     yield (f'  |b_p| falls all the way in {np.count_nonzero(falls & ~across)} of '
            f'{np.count_nonzero(~across)} cases that stay on one side of 1, and in '
            f'{np.count_nonzero(falls & across)} of {np.count_nonzero(across)} that cross it')
-    crossing = plan_two_step_batch(0.8, 1.2, zeta=0.2, j_lim=[0.5, 10.0])
+    crossing = plan_two_step_batch(0.8, 1.2, Groups(zeta=0.2, j_lim=[0.5, 10.0]))
     b_p = signed_root(crossing.beta_p)
     yield f'  0.8 to 1.2, zeta 0.2: b_p {b_p[0]:.4f} at J_lim 0.5, {b_p[1]:.4f} at 10'
 

@@ -20,7 +20,7 @@ from hmsa_ros.model.simulation import simulate
 from hmsa_ros.model.status import Code
 from hmsa_ros.planning.sequence import plan_sequence, Segment
 from hmsa_ros.planning.setpoint import Setpoint
-from hmsa_ros.planning.two_step import CODES, plan_two_step_batch
+from hmsa_ros.planning.two_step import CODES, Groups, plan_two_step_batch
 
 #: Span of each setpoint, as stated in the paper.
 SPAN = 10.0
@@ -160,7 +160,7 @@ def damping_sweep(points: int = SWEEP_POINTS) -> Sweep:
     start, target = 1.0, EXPANSION[0]
     critical = float(critical_zeta(target, _PAPER))
     near = critical * np.linspace(0.9, 1.1, 4001)
-    plans = plan_two_step_batch(start, target, zeta=near, j_lim=_PAPER.j_lim, c1=_PAPER.c1)
+    plans = plan_two_step_batch(start, target, Groups(zeta=near, j_lim=_PAPER.j_lim, c1=_PAPER.c1))
     ended = [
         CODES[status] in (Code.TOO_DAMPED, Code.INDISTINGUISHABLE) or difference < _RESOLVED
         for status, difference in zip(
@@ -192,7 +192,7 @@ def chain_limit_sweep(points: int = SWEEP_POINTS) -> Sweep:
 
 
 def _sweep(start: float, target: float, zeta: Array, j_lim: Array, critical: float) -> Sweep:
-    plans = plan_two_step_batch(start, target, zeta=zeta, j_lim=j_lim, c1=_PAPER.c1)
+    plans = plan_two_step_batch(start, target, Groups(zeta=zeta, j_lim=j_lim, c1=_PAPER.c1))
     status = tuple(str(CODES[x]) for x in plans.status.tolist())
     return Sweep(
         start, target, zeta, j_lim, status, plans.tau_p, plans.beta_p, plans.beta_1, critical)

@@ -16,7 +16,8 @@ from hmsa_ros.model.moves import Move, State
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.sequence import plan_sequence
 from hmsa_ros.planning.setpoint import Setpoint
-from hmsa_ros.planning.two_step import CODES, plan_two_step_batch
+from hmsa_ros.planning.shapers.request import Request
+from hmsa_ros.planning.two_step import CODES, Groups, plan_two_step_batch
 from hmsa_studies.residual import Actual, arrival_of
 from hmsa_studies.settings import Setting
 
@@ -52,7 +53,7 @@ def by_batch(
         elastic: Elastic | None = None, *, workers: int = 0) -> Plans:
     """Return two-step plans from rest on ideal hardware without limits."""
     found = plan_two_step_batch(
-        start, target, zeta=zeta, j_lim=j_lim, c1=c1, elastic=elastic, workers=workers)
+        start, target, Groups(zeta=zeta, j_lim=j_lim, c1=c1, elastic=elastic), workers=workers)
     return Plans(_PLACES[found.status], np.array([found.beta_p, found.tau_p, found.beta_1]))
 
 
@@ -156,9 +157,11 @@ def _planned(setting: Setting, start: float, target: float, shaper: str) -> _Pla
     load = float(law.elastic_force(target, material.packed))
     try:
         move = plan_sequence(
-            [Setpoint(target, math.inf)], material, start=State(start), shaper=shaper,
-            limits=setting.limits, delivery=setting.delivery, units=setting.units,
-            errors=setting.errors)[0].move
+            [Setpoint(target, math.inf)],
+            Request.of(
+                material, State(start), limits=setting.limits, delivery=setting.delivery,
+                units=setting.units, errors=setting.errors),
+            shaper)[0].move
     except RefusedError as error:
         return _Planned(error.code, None, load)
     except BadInputError:

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from hmsa_ros.model.delivery import Delivery, IDEAL, ramps
+from hmsa_ros.model.delivery import Delivery, IDEAL
 from hmsa_ros.model.equations import (
     Array,
     critical_zeta,
@@ -15,11 +15,12 @@ from hmsa_ros.model.equations import (
     natural_frequency,
 )
 from hmsa_ros.model.mismatch import Errors
-from hmsa_ros.model.moves import Level, Move
+from hmsa_ros.model.moves import Level, Move, State
 from hmsa_ros.model.parameters import NondimensionalParameters
 from hmsa_ros.model.residual import residual_vibration
-from hmsa_ros.model.simulation import simulate
+from hmsa_ros.model.simulation import sampled
 from hmsa_ros.model.status import Code
+from hmsa_ros.motion import STRETCH
 from hmsa_ros.planning.two_step import plan_two_step
 from hmsa_studies.settings import Setting
 
@@ -85,15 +86,11 @@ class Actual:
     def response(self, move: Move, start: float, times: Floats) -> Array:
         """Sample the stretch from rest where the model's load for the start really holds it."""
         held = float(elastic_force(start, self.model)) / self.load
-        end = float(times[-1]) / self.time
-        levels = [Level(x.time / self.time, x.load / self.load) for x in move.levels]
-        rows, _ = ramps(
-            [x for x in levels if x.time <= end] or levels[:1], held, end, self.delivery.slew)
-        switches, loads, slopes = np.array(rows).T
-        stretch, _ = simulate(
-            switches, loads, times / self.time, self.material, slopes=slopes,
-            stretch=float(equilibrium_stretch(held, self.material)), lag=self.delivery.lag,
-            field=held)
+        stretch: Array = sampled(
+            [Level(x.time / self.time, x.load / self.load) for x in move.levels],
+            State(float(equilibrium_stretch(held, self.material)), load=held),
+            np.asarray(times / self.time, dtype=np.float64), self.material,
+            self.delivery)[STRETCH]
         return stretch
 
     def rest(self, move: Move) -> float:

@@ -19,6 +19,9 @@ from matplotlib.patches import Rectangle
 import numpy as np
 from PIL import Image
 
+from hmsa_ros.model.delivery import ramps
+from hmsa_ros.planning.shapers.request import Request
+
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
@@ -28,7 +31,7 @@ from hmsa_ros.interfaces.parameters import BLOCK  # noqa: E402
 from hmsa_ros.lab.adapting import second_act  # noqa: E402
 from hmsa_ros.lab.demo import SEQUENCE  # noqa: E402
 from hmsa_ros.model.creep import Creep  # noqa: E402
-from hmsa_ros.model.delivery import Delivery, pieces  # noqa: E402
+from hmsa_ros.model.delivery import Delivery  # noqa: E402
 from hmsa_ros.model.equations import elastic_force, stretch_limits  # noqa: E402
 from hmsa_ros.model.laws import LAWS  # noqa: E402
 from hmsa_ros.model.laws.bending import centreline  # noqa: E402
@@ -135,10 +138,10 @@ def deliveries(path: Path) -> None:
         rows = figure.subplots(2, 3, sharex=True, sharey='row', height_ratios=[1.0, 1.2])
         for i, (title, delivery) in enumerate(cases):
             segment, = plan_sequence(
-                [Setpoint(1.4, 20 * period)], MATERIAL, start=State(1.0, 0.0, 0.0),
-                delivery=delivery)
+                [Setpoint(1.4, 20 * period)],
+                Request.of(MATERIAL, State(1.0, 0.0, 0.0), delivery=delivery))
             levels = segment.move.levels
-            switches, loads, slopes, _ = pieces(levels, holding, 3.0, delivery.slew)
+            switches, loads, slopes = np.array(ramps(levels, holding, 3.0, delivery.slew)[0]).T
             stretch, _ = simulate(switches, loads, time, MATERIAL, slopes=slopes)
             command = np.zeros_like(time)
             for at, load, slope in zip(switches, loads, slopes, strict=True):
@@ -210,7 +213,7 @@ def creep(path: Path) -> None:
     with style.picture(path, 4.2, SCREEN) as figure:
         rows = figure.subplots(3, 1, sharex=True, height_ratios=[1.0, 1.2, 0.9])
         for material, name, look in curves:
-            segments = plan_sequence(setpoints, material, delivery=grid)
+            segments = plan_sequence(setpoints, Request.of(material, delivery=grid))
             levels = [(x.begin + y.time, y.load) for x in segments for y in x.move.levels]
             switches, loads = np.array([x for x in levels if x[0] < time[-1]]).T
             stretch, _ = simulate(switches, loads, time, creeping)

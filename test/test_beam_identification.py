@@ -28,6 +28,7 @@ from hmsa_ros.identification.quantities import derivative, values_of
 from hmsa_ros.identification.recording import Course
 from hmsa_ros.identification.response import respond
 from hmsa_ros.model import equations
+from hmsa_ros.model.laws.coordinate import DEFLECTION
 
 BEAM = silicone()
 PERIOD = 2.0 * np.pi * BEAM.time_unit / float(
@@ -71,8 +72,12 @@ def test_derivatives_are_those_of_the_equation_of_the_angle(name, change):
         wanted, abs=3e-4 * np.max(np.abs(wanted)))
 
 
+def of_beam(times, deflection, level_times=LEVEL_TIMES, levels=LEVELS):
+    return Recording(times, deflection, level_times, levels, coordinate=DEFLECTION)
+
+
 def test_modulus_damping_remanence_and_bias_are_found_within_their_deviations():
-    found = identify(TIMES, seen() + 0.01, LEVEL_TIMES, LEVELS, actuator=START)
+    found = identify(of_beam(TIMES, seen() + 0.01), actuator=START)
     assert found.verdict == 'identified'
     for name, value in (TRUE | {'stretch_bias': 0.01}).items():
         estimate = found.parameters[name]
@@ -85,8 +90,8 @@ def test_modulus_damping_remanence_and_bias_are_found_within_their_deviations():
 @pytest.mark.slow
 @pytest.mark.parametrize(('every', 'noise'), [(1, 1e-3), (3, 5e-3)])
 def test_errors_of_many_runs_are_as_large_as_the_deviations_say(every, noise):
-    runs = [identify(TIMES[::every], seen(noise, seed)[::every], LEVEL_TIMES, LEVELS,
-                     actuator=START) for seed in range(60)]
+    runs = [identify(of_beam(TIMES[::every], seen(noise, seed)[::every]), actuator=START)
+            for seed in range(60)]
     off = np.array([[(x.parameters[name].value - value) / x.parameters[name].std
                      for name, value in TRUE.items()] for x in runs])
     assert all(x.verdict == 'identified' for x in runs)
@@ -97,7 +102,7 @@ def test_errors_of_many_runs_are_as_large_as_the_deviations_say(every, noise):
 def test_begin_in_motion_frees_the_initial_deflection():
     late = slice(20, None)
     found = identify(
-        TIMES[late], seen()[late], LEVEL_TIMES[1:], LEVELS[1:], actuator=START)
+        of_beam(TIMES[late], seen()[late], LEVEL_TIMES[1:], LEVELS[1:]), actuator=START)
     assert found.verdict == 'identified'
     assert 'initial_stretch' in found.names
     estimate = found.parameters['shear_modulus']
@@ -150,8 +155,7 @@ def test_a_chain_of_links_is_found_within_percents_and_rejected_where_its_modes_
     times, deflection = chain.follow([(4.0 * PERIOD, x) for x in LEVELS[1:]], 120)
     once = np.append(True, np.diff(times) > 1e-9)
     noisy = deflection + noise * np.random.default_rng(0).standard_normal(len(times))
-    found = identify(
-        0.1 + times[once], noisy[once], LEVEL_TIMES, LEVELS, actuator=START)
+    found = identify(of_beam(0.1 + times[once], noisy[once]), actuator=START)
     assert found.verdict == verdict
     for name, within in (
             ('shear_modulus', 0.01), ('damping_coefficient', 0.05), ('remanence', 0.015)):

@@ -20,6 +20,7 @@ from hmsa_ros.model.parameters import NondimensionalParameters
 from hmsa_ros.planning.sequence import plan_sequence
 from hmsa_ros.planning.setpoint import Setpoint
 from hmsa_ros.planning.shapers import SHAPERS
+from hmsa_ros.planning.shapers.request import Request
 
 STRETCHES = np.linspace(0.7, 1.8, 23)
 CONSTANTS = {
@@ -63,9 +64,11 @@ def test_no_combination_is_refused_and_exact_ones_end_at_rest(law):
         delivery = Delivery(
             period=period * unit, slew=slew * held / unit, lag=lag * unit)
         move = plan_sequence(
-            [Setpoint(target, math.inf)], replace(material, creep=replace(
-                creep, times=tuple(x * unit for x in creep.times))),
-            shaper=name, delivery=delivery, limits=Limits(-20.0 * held, 20.0 * held))[0].move
+            [Setpoint(target, math.inf)], Request.of(
+                replace(material, creep=replace(
+                    creep, times=tuple(x * unit for x in creep.times))),
+                delivery=delivery, limits=Limits(-20.0 * held, 20.0 * held)),
+            name)[0].move
         assert move.levels
         if law == 'gent' and name in EXACT and number % 7 == 0:
             judged += 1

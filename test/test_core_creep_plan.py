@@ -12,6 +12,7 @@ from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.delivery import Delivery, IDEAL
 from hmsa_ros.model.moves import Limits, State
 from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa_ros.model.simulation import follow
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.planner import Options, Planner
 from hmsa_ros.planning.sequence import plan_sequence
@@ -63,7 +64,7 @@ def test_a_creeping_block_rests_after_a_move_and_after_the_next_one_right_away(
         material, shaper, delivery, wanted):
     segments = plan_sequence(
         [Setpoint(1.4, 24 * 0.27), Setpoint(1.1, 100 * 0.27), Setpoint(0.9, math.inf)],
-        material, shaper=shaper, delivery=delivery)
+        Request.of(material, delivery=delivery), shaper=shaper)
     assert segments[1].start.followed != ()
     for share, said in left(segments, material.creep, delivery=delivery):
         assert share <= said
@@ -115,7 +116,7 @@ def test_a_planner_follows_creep_over_requests_and_a_stop():
 
 def test_once_relaxed_the_next_plan_is_one_from_rest():
     here = plan_sequence([Setpoint(1.4, 4000.0), Setpoint(1.1, math.inf)], ONE)[1]
-    fresh, = plan_sequence([Setpoint(1.1, math.inf)], ONE, start=State(1.4))
+    fresh, = plan_sequence([Setpoint(1.1, math.inf)], Request.of(ONE, State(1.4)))
     assert here.move.levels[0].load == pytest.approx(fresh.move.levels[0].load, rel=1e-9)
     assert here.move.duration == pytest.approx(fresh.move.duration, rel=1e-9)
 
@@ -134,7 +135,7 @@ def test_levels_that_follow_creep_keep_inside_the_coil():
     assert highest > segment.move.levels[-1].load
     with pytest.raises(RefusedError, match='stretch 1.4 needs a flux density of'):
         plan_sequence(
-            [Setpoint(1.4, math.inf)], ONE, limits=Limits(-1.0, 0.999 * highest))
+            [Setpoint(1.4, math.inf)], Request.of(ONE, limits=Limits(-1.0, 0.999 * highest)))
 
 
 @pytest.mark.parametrize('delivery', [
@@ -156,7 +157,7 @@ def test_of_a_creeping_block_in_error_minimax_leaves_less_than_the_chain(deliver
     worst = []
     for shaper in ('robust', 'minimax'):
         move = plan_sequence(
-            [Setpoint(1.4, math.inf)], THREE, shaper=shaper, delivery=delivery)[0].move
+            [Setpoint(1.4, math.inf)], Request.of(THREE, delivery=delivery), shaper=shaper)[0].move
         assert str(move.code) == shaper
         left = []
         for error in (-0.1, 0.1):
@@ -181,7 +182,7 @@ def test_of_a_creeping_block_in_error_minimax_leaves_less_than_the_chain(deliver
 @pytest.mark.parametrize('name', ['zv', 'zvd', 'ei', 'minimax'])
 def test_what_rings_on_after_a_move_is_predicted_at_the_levels_that_follow_creep(name, delivery):
     move = plan_sequence(
-        [Setpoint(1.2, math.inf)], THREE, shaper=name, delivery=delivery)[0].move
+        [Setpoint(1.2, math.inf)], Request.of(THREE, delivery=delivery), shaper=name)[0].move
     levels = [(x.time, x.load) for x in move.levels]
     place = len(levels) - len(move.tail)
     for number in (place, place + 3, place + 9):
@@ -215,7 +216,7 @@ def test_one_plan_from_two_ends_says_what_creep_is_not_planned_for():
 @pytest.mark.parametrize('start', [State(1.0), State(1.1, 0.2, 0.3)], ids=['rest', 'moving'])
 @pytest.mark.parametrize('creep', [Creep(), ONE.creep, THREE.creep], ids=['none', 'one', 'three'])
 @pytest.mark.parametrize('lag', [0.0, 0.1, 0.5])
-def test_one_search_finds_the_levels_to_which_others_lead_step_by_step(
+def test_one_search_finds_two_levels_and_another_ends_where_they_do(
         lag, creep, start, monkeypatch):
     request = Request(start, 1.25, replace(ONE, creep=creep), delivery=Delivery(lag=lag))
     with monkeypatch.context() as alone:
@@ -225,6 +226,7 @@ def test_one_search_finds_the_levels_to_which_others_lead_step_by_step(
     with monkeypatch.context() as without:
         without.setattr('hmsa_ros.motion.two_step_late', lambda *_: (5, *[math.nan] * 5))
         slowly = get_shaper('two_step')(request)
-    for level, expected in zip(move.levels, slowly.levels, strict=True):
-        assert level.load == pytest.approx(expected.load, rel=0.0, abs=2e-11)
-        assert level.time == pytest.approx(expected.time, rel=0.0, abs=2e-11)
+    for found in (move, slowly):
+        end = follow(
+            found.levels[:-1], request.start, found.duration, request.material, request.delivery)
+        assert (end.stretch, end.rate) == pytest.approx((1.25, 0.0), abs=1e-10)

@@ -9,9 +9,9 @@ from scipy.integrate import solve_ivp
 
 from hmsa_ros.model.delivery import Delivery, ramps
 from hmsa_ros.model.equations import elastic_force
-from hmsa_ros.model.moves import Limits, State
+from hmsa_ros.model.moves import Level, Limits, State
 from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation, simulate
+from hmsa_ros.model.simulation import ActuatorSimulation, sampled
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.planner import Options, Planner
 from hmsa_ros.planning.sequence import plan_sequence
@@ -114,13 +114,14 @@ def test_limits_that_leave_no_room_to_settle_the_field_are_named():
 def test_predicted_motion_under_a_lag_is_that_of_the_independent_integration(slew):
     delivery = Delivery(slew=slew, lag=0.2)
     segments = plan_sequence(
-        [Setpoint(1.2, 0.7), Setpoint(0.9, math.inf)], PAPER, delivery=delivery,
+        [Setpoint(1.2, 0.7), Setpoint(0.9, math.inf)], Request.of(PAPER, delivery=delivery),
         short_spell='continue')
     request = Request(segments[1].start, 0.9, PAPER, delivery=delivery)
     assert segments[1].start.load != segments[1].start.amplifier
     assert np.max(np.abs(np.subtract(
         end_of(segments[1].move, request), (0.9, 0.0, elastic_force(0.9, PAPER))))) < 1e-9
-    late, _ = simulate([0.0], [1.0], [1.0], PAPER, lag=0.2, field=0.0)
+    late = sampled(
+        [Level(0.0, 1.0)], State(1.0, load=0.0), np.ones(1), PAPER, Delivery(lag=0.2))[0]
     assert late[0] == pytest.approx(solve_ivp(
         rates, (0.0, 1.0), [1.0, 0.0, 0.0], method='DOP853', rtol=1e-12, atol=1e-13,
         args=(1.0, 0.0, 0.2)).y[0, -1], abs=1e-10)

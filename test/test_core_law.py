@@ -19,7 +19,7 @@ from hmsa_ros.model.parameters import NondimensionalParameters
 from hmsa_ros.model.simulation import simulate
 from hmsa_ros.model.status import Code
 from hmsa_ros.motion.theta import CONSTANT
-from hmsa_ros.planning.two_step import plan_two_step, plan_two_step_batch
+from hmsa_ros.planning.two_step import Groups, plan_two_step, plan_two_step_batch
 
 NEO_HOOKEAN = NondimensionalParameters(j_lim=math.inf)
 
@@ -65,7 +65,7 @@ def test_a_neo_hookean_plan_is_that_of_an_independent_solution(start, target):
 
 
 def test_a_batch_plans_both_laws_side_by_side():
-    batch = plan_two_step_batch(1.0, 1.3, j_lim=[5.0, 1e14, math.inf])
+    batch = plan_two_step_batch(1.0, 1.3, Groups(j_lim=[5.0, 1e14, math.inf]))
     assert batch.beta_p[0] != batch.beta_p[2]
     assert batch.beta_p[1] == pytest.approx(batch.beta_p[2], rel=1e-11)
 

@@ -14,6 +14,7 @@ from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import identify
 from hmsa_ros.identification.files import read_belief
+from hmsa_ros.identification.recording import Recording
 from hmsa_ros.interfaces.actuator import actuator_from, parameters_of
 from hmsa_ros.interfaces.parameters import BLOCK
 from hmsa_ros.model.actuators import check_stretch, unheld
@@ -28,7 +29,7 @@ from hmsa_ros.model.laws import LAWS
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.model.simulation import simulate
 from hmsa_ros.model.status import Code
-from hmsa_ros.planning.two_step import plan_two_step, plan_two_step_batch
+from hmsa_ros.planning.two_step import Groups, plan_two_step, plan_two_step_batch
 from hmsa_ros.recordings.parameters import read_parameter_file, recorded
 
 L = sympy.Symbol('l', positive=True)
@@ -170,7 +171,7 @@ def test_a_batch_plans_a_law_as_single_plans_do():
     group = block('ogden').nondimensional
     targets = np.array([0.7, 1.1, 1.5])
     batch = plan_two_step_batch(
-        1.0, targets, zeta=group.zeta, c1=group.c1, elastic=group.law)
+        1.0, targets, Groups(zeta=group.zeta, c1=group.c1, elastic=group.law))
     assert batch.beta_p.tolist() == [plan_two_step(1.0, x, group).beta_p for x in targets]
 
 
@@ -286,4 +287,5 @@ def test_identification_scales_a_law_and_keeps_the_ratios_of_its_constants(tmp_p
     assert found.shear_modulus == pytest.approx(true.shear_modulus, rel=2e-3)
     assert parameters_of(found)['law.mu'] == pytest.approx([6e3, -1500.0, 10.0], rel=2e-3)
     with pytest.raises(BadInputError, match='chain_limit is free: expected none for law ogden'):
-        identify(times, noisy, begins, levels, free=('chain_limit',), actuator=true)
+        identify(
+            Recording(times, noisy, begins, levels), free=('chain_limit',), actuator=true)

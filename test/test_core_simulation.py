@@ -11,9 +11,16 @@ from scipy.integrate import solve_ivp, trapezoid
 
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.equations import damping, elastic_force, energy, equilibrium_stretch, mass
+from hmsa_ros.model.moves import Level, State
 from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa_ros.model.schedule import CommandSchedule
-from hmsa_ros.model.simulation import ActuatorSimulation, longest_motion, simulate, unshaped
+from hmsa_ros.model.simulation import (
+    ActuatorSimulation,
+    longest_motion,
+    sampled,
+    simulate,
+    unshaped,
+)
 from hmsa_ros.planning.sequence import plan_sequence
 from hmsa_ros.planning.setpoint import Setpoint
 
@@ -90,9 +97,10 @@ def test_ramps_are_followed():
 
 
 def test_a_tighter_tolerance_is_closer():
-    exact = np.array(simulate([0.0], [1.0], [5.0], PAPER))[:, 0]
+    levels, end = [Level(0.0, 1.0)], np.array([5.0])
+    exact = sampled(levels, State(1.0), end, PAPER)[:2, 0]
     errors = [
-        np.max(np.abs(np.array(simulate([0.0], [1.0], [5.0], PAPER, rtol=rtol))[:, 0] - exact))
+        np.max(np.abs(sampled(levels, State(1.0), end, PAPER, rtol=rtol)[:2, 0] - exact))
         for rtol in (1e-4, 1e-7, 1e-10)]
     assert errors[0] > errors[1] > errors[2]
     assert errors[2] < 1e-8

@@ -28,10 +28,11 @@ from hmsa_ros.model.equations import (
     stretch_limits,
 )
 from hmsa_ros.model.law import gent_limits, pack
+from hmsa_ros.model.moves import Level, State
 from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.simulation import simulate
+from hmsa_ros.model.simulation import sampled
 from hmsa_ros.model.status import Code
-from hmsa_ros.planning.two_step import CODES, plan_two_step, plan_two_step_batch, TwoStep
+from hmsa_ros.planning.two_step import CODES, Groups, plan_two_step, plan_two_step_batch, TwoStep
 
 PAPER = NondimensionalParameters()
 # Agreement with the independent solution, relative.
@@ -160,12 +161,11 @@ def test_vanishing_damping_leads_continuously_to_the_closed_form():
 
 @pytest.mark.parametrize('zeta', [0.0, 0.4])
 def test_the_integration_is_as_exact_as_asked(zeta):
-    times, loads = [0.0, 0.7], [0.5, 0.2]
+    levels = [Level(0.0, 0.5), Level(0.7, 0.2)]
     exact = follow((1.0, 0.3), [(0.7, 0.5), (1.3, 0.2)], zeta, 5.0, 2.0)
     for rtol in (1e-6, 1e-9, 1e-12):
-        end = simulate(
-            times, loads, [2.0], group(zeta), stretch=1.0, rate=0.3, rtol=rtol)
-        assert [float(x[0]) for x in end] == pytest.approx(exact, abs=20.0 * rtol)
+        end = sampled(levels, State(1.0, 0.3), np.array([2.0]), group(zeta), rtol=rtol)
+        assert end[:2, 0].tolist() == pytest.approx(exact, abs=20.0 * rtol)
 
 
 def test_sensitivities_are_derivatives_by_the_load():
@@ -195,7 +195,7 @@ def test_turning_points_are_those_of_the_independent_integration():
 @pytest.mark.parametrize('zeta', [0.0, 0.2, 1.1])
 def test_the_intermediate_load_grows_with_the_target(zeta):
     targets = np.concatenate([np.linspace(0.26, 0.999, 300), np.linspace(1.001, 2.69, 300)])
-    batch = plan_two_step_batch(1.0, targets, zeta=zeta)
+    batch = plan_two_step_batch(1.0, targets, Groups(zeta=zeta))
     assert np.all(batch.status == TWO_STEP)
     assert np.all(np.diff(batch.beta_p) > 0.0)
     assert np.all(np.diff(batch.beta_1) > 0.0)
@@ -535,6 +535,12 @@ def random_rows(count):
         'rate': random.choice([0.0, 1.0], count) * random.normal(0.0, 1.0, count)}
 
 
+def batch_of(rows):
+    return plan_two_step_batch(
+        rows['start'], rows['target'], Groups(rows['zeta'], rows['j_lim'], rows['c1']),
+        rate=rows['rate'])
+
+
 def assert_row_is_single(batch, rows, i):
     plan = plan_two_step(
         rows['start'][i], rows['target'][i],
@@ -547,7 +553,7 @@ def assert_row_is_single(batch, rows, i):
 
 def test_a_batch_is_its_single_plans():
     rows = random_rows(120)
-    batch = plan_two_step_batch(**rows)
+    batch = batch_of(rows)
     for i in range(120):
         assert_row_is_single(batch, rows, i)
     assert len(set(batch.status.tolist())) >= 2
@@ -564,7 +570,7 @@ def test_bad_rows_carry_their_code_and_spoil_no_other():
     rows['rate'][31] = 0.0
     for i, (name, value, _) in bad.items():
         rows[name][i] = value
-    batch = plan_two_step_batch(**rows)
+    batch = batch_of(rows)
     for i in range(40):
         if i in bad:
             assert CODES[int(batch.status[i])] is bad[i][2]
@@ -626,7 +632,8 @@ def test_the_plan_of_a_row_is_the_same_to_the_bit_in_any_batch():
 def test_plans_of_a_batch_end_at_rest_by_an_integration_of_its_own():
     start, target, zeta, j_lim, _ = blocks_from_rest(400)
     rows = np.flatnonzero((np.abs(target - start) > 0.05) & (j_lim > 0.5) & (j_lim < 50.0))[:12]
-    batch = plan_two_step_batch(start[rows], target[rows], zeta=zeta[rows], j_lim=j_lim[rows])
+    batch = plan_two_step_batch(
+        start[rows], target[rows], Groups(zeta=zeta[rows], j_lim=j_lim[rows]))
     for i, row in enumerate(rows):
         plan = TwoStep(
             CODES[int(batch.status[i])], batch.beta_p[i], batch.tau_p[i], batch.beta_1[i], 0)
@@ -638,7 +645,7 @@ def test_plans_of_a_batch_end_at_rest_by_an_integration_of_its_own():
 
 
 def test_batches_broadcast_their_arguments():
-    batch = plan_two_step_batch([[1.0], [1.2]], [1.1, 1.3, 1.4], zeta=0.2)
+    batch = plan_two_step_batch([[1.0], [1.2]], [1.1, 1.3, 1.4], Groups(zeta=0.2))
     assert batch.status.shape == batch.beta_p.shape == (2, 3)
     assert batch.beta_p[1, 2] == pytest.approx(plan_two_step(1.2, 1.4, PAPER).beta_p, rel=1e-11)
     assert plan_two_step_batch(1.0, 1.1).beta_p.shape == ()

@@ -25,6 +25,7 @@ from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa_ros.model.simulation import ActuatorSimulation, follow, sampled, with_followed
 from hmsa_ros.planning.sequence import plan_sequence
 from hmsa_ros.planning.setpoint import Setpoint
+from hmsa_ros.planning.shapers.request import Request
 
 MS = 1_000_000
 ONE = NondimensionalParameters(creep=Creep((0.2,), (2.0,), 'power_law', ((4.0,), (0.3,))))
@@ -56,12 +57,11 @@ def test_the_plant_moves_as_scipy_says_and_the_nearer_the_smaller_the_tolerance(
     _, _, state = judged(levels, TWO.creep, end / 1e9 / block.time_unit)
     # Stamps are rounded to nanoseconds.
     assert simulation.stretch == pytest.approx(state[0], abs=1e-7)
-    switches, loads = np.array(levels).T.copy()
     _, _, state = judged(levels, TWO.creep, 14.0)
     errors = []
     for rtol in (1e-6, 1e-8, 1e-10, 1e-12):
         found = sampled(
-            switches, loads, np.zeros(3), np.array([14.0]), State(1.0), TWO, rtol)[:, 0]
+            [Level(*x) for x in levels], State(1.0), np.array([14.0]), TWO, rtol=rtol)[:, 0]
         errors.append(abs(found[0] - state[0]))
     assert errors[-1] < 1e-9
     # Of order 8: a step a tenth of the tolerance's eighth root.
@@ -86,8 +86,8 @@ def test_after_the_vibration_branches_relax_alone_as_they_do_in_the_motion():
 def test_a_block_whose_branches_flow_rests_after_a_move_and_after_the_next_one(
         material, shaper, delivery, wanted):
     segments = plan_sequence(
-        [Setpoint(1.4, 24 * 0.27), Setpoint(1.1, math.inf)], material, shaper=shaper,
-        delivery=delivery)
+        [Setpoint(1.4, 24 * 0.27), Setpoint(1.1, math.inf)],
+        Request.of(material, delivery=delivery), shaper=shaper)
     move = segments[0].move
     levels = move.levels[:len(move.levels) - len(move.tail)]
     end = ended([(x.time, x.load) for x in levels], material.creep, move.duration, delivery)

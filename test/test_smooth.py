@@ -182,8 +182,8 @@ def test_what_cannot_be_had_is_refused_with_the_limits():
 def test_a_creeping_block_is_moved_smoothly_and_held_after(delivery):
     creep = Creep((0.1, 0.2), (0.4, 3.0))
     segments = plan_sequence(
-        [Setpoint(1.4, 4.0), Setpoint(1.1, math.inf)], replace(PAPER, creep=creep),
-        shaper='smooth', delivery=delivery)
+        [Setpoint(1.4, 4.0), Setpoint(1.1, math.inf)],
+        Request.of(replace(PAPER, creep=creep), delivery=delivery), shaper='smooth')
     end = segments[1].begin + 12.0
     levels = [(x.begin + y.time, y.load) for x in segments for y in x.move.levels]
     times, stretch, _ = judged(

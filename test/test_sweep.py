@@ -19,7 +19,7 @@ from hmsa_ros.model.moves import State
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.shapers.two_step import two_step
-from hmsa_ros.planning.two_step import plan_two_step_batch
+from hmsa_ros.planning.two_step import Groups, plan_two_step_batch
 from hmsa_ros.recordings.parameters import read_parameter_file, values_of
 from hmsa_studies.axes import Belief, draw, NOTHING, parse_values, Spread
 from hmsa_studies.residual import Actual, Errors
@@ -195,10 +195,10 @@ def test_a_law_of_many_constants_takes_no_room_for_each_row(monkeypatch):
     curve = LAWS['yeoh'].scaled({'law.c10': 1.0, 'law.c20': 0.1, 'law.c30': 0.0})[1]
     targets = np.linspace(0.9, 1.3, 500)
     zeta = np.linspace(0.0, 0.1, 500)
-    found = plan_two_step_batch(1.0, targets, zeta=zeta, elastic=curve)
+    found = plan_two_step_batch(1.0, targets, Groups(zeta=zeta, elastic=curve))
     assert max(sizes) <= 1000 < sum(sizes)
     monkeypatch.undo()
-    again = plan_two_step_batch(1.0, targets, zeta=zeta, elastic=curve)
+    again = plan_two_step_batch(1.0, targets, Groups(zeta=zeta, elastic=curve))
     assert np.array_equal(found.tau_p, again.tau_p, equal_nan=True)
 
 

@@ -41,7 +41,7 @@ from hmsa_ros.planning.scales import Coil, Scales, scales
 from hmsa_ros.planning.sequence import plan_sequence
 from hmsa_ros.planning.setpoint import impossible, Setpoint
 from hmsa_ros.planning.shapers.pace import Pace
-from hmsa_ros.planning.shapers.request import as_errors, ERRORS
+from hmsa_ros.planning.shapers.request import as_errors, ERRORS, Request
 from hmsa_ros.planning.timeline import Model
 from hmsa_ros.recordings.parameters import read_parameter_file, values_of
 from hmsa_ros.table import Column, Table
@@ -458,11 +458,14 @@ class Actuator:
         segments = plan_sequence(
             [Setpoint(x, y / unit) for x, y in zip(
                 stretches.tolist(), durations.tolist(), strict=True)],
-            model.material, shaper=shaper, limits=model.limits, units=model.units, order=order,
-            start=State(model.material.rest if start is None else number(start, 'start')),
-            delivery=replace(model.delivery, period=number(period, 'period', 's') / unit),
-            errors=self._errors(shaper) if errors is None else as_errors(errors),
-            pace=Pace(periods, max_rate * unit), short_spell=short_spell)
+            Request.of(
+                model.material,
+                State(model.material.rest if start is None else number(start, 'start')),
+                limits=model.limits, units=model.units, order=order,
+                delivery=replace(model.delivery, period=number(period, 'period', 's') / unit),
+                errors=self._errors(shaper) if errors is None else as_errors(errors),
+                pace=Pace(periods, max_rate * unit)),
+            shaper, short_spell)
         return Plan(self, segments, shaper)
 
     def _errors(self, shaper: str) -> Uncertainty:
@@ -520,7 +523,7 @@ class Actuator:
         1.178
 
         """
-        from hmsa_ros.api.motion import simulated
+        from hmsa_ros.api.motion import Sampling, simulated
         from hmsa_ros.identification.tables import read_levels
 
         if isinstance(levels, (str, Path)):
@@ -528,8 +531,7 @@ class Actuator:
         else:
             times, values = columns_of(levels, ('time', 'flux_density'), 'levels')
         return simulated(
-            self, times, values, until=until, rate=rate, noise=noise, seed=seed, start=start,
-            label=label)
+            self, times, values, start, Sampling(until, rate, noise, seed, label))
 
     def amplifiers(self, setpoints: Any, **more: Any) -> Table:
         """

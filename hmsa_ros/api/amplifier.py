@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 # changes in the time of its fastest move.
 _SLOWEST, _FASTEST = 0.1, 15.0
 _DECADE = (1.0, 2.0, 5.0)
+# What is known of a coil, with its units.
+_COIL = {'inductance': 'H', 'resistance': 'ohm', 'tesla_per_ampere': 'T/A'}
 
 
 def amplifiers(
-        actuator: 'Actuator', setpoints: Any, *, shaper: str = 'two_step',
-        slew_limits: Sequence[float] | None = None, bandwidths: Sequence[float] | None = None,
-        inductance: float | None = None, resistance: float | None = None,
-        tesla_per_ampere: float | None = None, **more: Any) -> Table:
+        actuator: 'Actuator', setpoints: Any, *, slew_limits: Sequence[float] | None = None,
+        bandwidths: Sequence[float] | None = None, **more: Any) -> Table:
     """
     Plan a sequence for amplifiers from fast to slow; see `Actuator.amplifiers`.
 
@@ -36,28 +36,27 @@ def amplifiers(
         If an argument is of another type or out of range.
 
     """
-    coil = {'inductance': (inductance, 'H'), 'resistance': (resistance, 'ohm'),
-            'tesla_per_ampere': (tesla_per_ampere, 'T/A')}
+    given = {x: more.pop(x, None) for x in _COIL}
     numbers = {
-        x: number(y, x, unit, above=0.0) for x, (y, unit) in coil.items() if y is not None}
+        x: number(y, x, _COIL[x], above=0.0) for x, y in given.items() if y is not None}
     if numbers and 'tesla_per_ampere' not in numbers:
         raise BadInputError(
             'tesla_per_ampere is missing: expected it with inductance and resistance')
     ideal = actuator.replace(slew_limit=math.inf, coil_time_constant=0.0)
-    best = ideal.plan(setpoints, shaper, **more)
+    best = ideal.plan(setpoints, **more)
     fastest = float(np.min(best.move_times))
     swing = float(np.max(np.abs(np.diff(np.append(_before(best), best.flux_densities)))))
     if not 0.0 < fastest < math.inf or not swing:
         raise BadInputError(
-            f'shaper {shaper} has no moves of a finite duration here: expected one that has, such '
-            'as two_step')
+            f'shaper {best.shaper} has no moves of a finite duration here: expected one that has, '
+            'such as two_step')
     if slew_limits is None:
         slew_limits = _series(swing / fastest)
     rows = [_row(best, best, math.inf, math.inf, numbers)]
     notes = []
     if bandwidths is None:
         bandwidths = _series(1.0 / fastest)
-        if len(numbers) == len(coil):
+        if len(numbers) == len(_COIL):
             own = numbers['resistance'] / (2.0 * math.pi * numbers['inductance'])
             bandwidths = sorted({*bandwidths, own}, reverse=True)
             notes.append(
@@ -69,7 +68,7 @@ def amplifiers(
             plan = ideal.replace(
                 slew_limit=number(slew, 'slew limit', 'T/s'), coil_time_constant=0.0
                 if math.isinf(band) else 0.5 / (math.pi * number(band, 'bandwidth', 'Hz'))
-            ).plan(setpoints, shaper, **more)
+            ).plan(setpoints, **more)
         except RefusedError as error:
             rows.append((slew, band, *(None for _ in rows[0][2:])))
             notes.append(f'{_named(slew, band)}: {error}')
@@ -80,13 +79,13 @@ def amplifiers(
                Column('field', 'mT', '.4g')]
     if 'tesla_per_ampere' in numbers:
         columns += [Column('current', 'A', '.3g'), Column('change', 'A/s', '.3g')]
-    if len(numbers) == len(coil):
+    if len(numbers) == len(_COIL):
         columns += [Column('voltage', 'V', '.3g'), Column('power', 'W', '.3g')]
     return Table(tuple(columns), tuple(rows), (
         '∞: no limit; slew: of ramps; bandwidth: of a first-order lag; lost: against ideal steps, '
         'in the longest move; field: largest magnitude of a level' + (
             '; voltage: L dI/dt + R I, its largest magnitude; power: that voltage times the '
-            'largest current' if len(numbers) == len(coil) else '')), tuple(notes))
+            'largest current' if len(numbers) == len(_COIL) else '')), tuple(notes))
 
 
 def _named(slew: float, band: float) -> str:
@@ -132,7 +131,7 @@ def _row(
         change = 2.0 * math.pi * band * (wanted - at) / factor
         current = at / factor
     row += (most / factor, float(np.max(np.abs(change))))
-    if len(coil) == 3:
+    if len(coil) == len(_COIL):
         volts = float(np.max(np.abs(
             coil['inductance'] * change + coil['resistance'] * current)))
         row += (volts, volts * most / factor)

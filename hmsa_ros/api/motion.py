@@ -10,11 +10,10 @@ import numpy as np
 
 from hmsa_ros.api.arguments import number
 from hmsa_ros.errors import BadInputError, excerpt
-from hmsa_ros.model.delivery import ramps
 from hmsa_ros.model.equations import Array, elastic_force, natural_frequency
 from hmsa_ros.model.moves import Level as Load
 from hmsa_ros.model.moves import State
-from hmsa_ros.model.simulation import check_stretch, longest_motion, RTOL, sampled
+from hmsa_ros.model.simulation import check_stretch, longest_motion, sampled
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.levels import Level
 from hmsa_ros.recordings.record import RecordedRequest, Run
@@ -271,15 +270,25 @@ def _paper(settings: dict[str, Any]) -> 'Paper':
             'and dpi, and data') from error
 
 
+@dataclass(frozen=True)
+class Sampling:
+    """How a simulated motion is sampled, as the arguments of `Actuator.simulate`."""
+
+    until: float | None
+    rate: float | None
+    noise: float
+    seed: int
+    label: str
+
+
 def simulated(
-        truth: 'Actuator', times: Array, levels: Array, *, until: float | None,
-        rate: float | None, noise: float, seed: int, start: float | None, label: str,
+        truth: 'Actuator', times: Array, levels: Array, start: float | None, sampling: Sampling,
         plan: 'Plan | None' = None) -> Motion:
     """
     Simulate levels in T from times in s on; a plan adds what was asked and predicted.
 
-    Other arguments are as of `Actuator.simulate`. Raises `BadInputError` for what cannot be used,
-    `HmsaError` for levels that cannot be followed.
+    The start is a stretch at rest, without a field by default. Raises `BadInputError` for what
+    cannot be used, `HmsaError` for levels that cannot be followed.
     """
     back = np.flatnonzero(np.diff(times) <= 0.0)
     if len(back) or times[0] < 0.0 or not np.all(np.isfinite(times) & np.isfinite(levels)):
@@ -297,18 +306,19 @@ def simulated(
             'flux_density_limits (in a parameter file flux_density_max) that allow it')
     begin = number(model.material.rest if start is None else start, 'start')
     check_stretch(begin, model.material, 'start stretch')
-    end = _end(truth, times, levels, until, plan)
-    hertz = _rate(truth, rate)
+    end = _end(truth, times, levels, sampling.until, plan)
+    hertz = _rate(truth, sampling.rate)
     if end * hertz > _MOST_SAMPLES:
         raise BadInputError(
             f'{end:g} s at {hertz:g} Hz are {end * hertz:.3g} samples: expected at most '
             f'{_MOST_SAMPLES}; give a lower rate or an earlier end (until)')
-    noise = number(noise, 'noise', least=0.0)
+    noise = number(sampling.noise, 'noise', least=0.0)
     stamps = np.round(np.arange(int(end * hertz * (1.0 + 1e-12)) + 1) / hertz * NANOSECONDS
                       ).astype(np.int64)
     stretch, speed, field = response(truth, times, levels, stamps / NANOSECONDS, begin)
     switched = np.round(times * NANOSECONDS).astype(np.int64).tolist()
-    stretch = stretch + noise * np.random.default_rng(seed).standard_normal(len(stretch))
+    stretch = stretch + noise * np.random.default_rng(
+        sampling.seed).standard_normal(len(stretch))
     commands = tuple(
         Level(stamp, level, -_AHEAD) for stamp, level in zip(
             switched, levels.tolist(), strict=True))
@@ -328,7 +338,7 @@ def simulated(
         f'{node}.{name}': value for node, each in (('planner', believed), ('plant', truth))
         for name, value in each.parameters.items()} | {'plant.stretch_noise': noise}
     return Motion(Run(
-        str(label), '', Path(str(label)), stamps, stamps, stretch, speed, field,
+        str(sampling.label), '', Path(str(sampling.label)), stamps, stamps, stretch, speed, field,
         commands, commands, plans=(planned,) if planned else (), requests=asked,
         parameters=parameters, plant=truth.block, planner=believed.block, parameters_known=True,
         origin='simulated'))
@@ -345,11 +355,7 @@ def response(
         times.tolist(), levels.tolist(), strict=True)]
     if loads[0].time > 0.0:
         loads.insert(0, Load(0.0, held))
-    wanted = at / units.time
-    parts, _ = ramps(loads, held, max(float(wanted[-1]), loads[-1].time), delivery.slew)
-    switches, values, slopes = np.array(parts).T.copy()
-    rows = sampled(
-        switches, values, slopes, wanted, State(start, load=held), material, RTOL, delivery.lag)
+    rows = sampled(loads, State(start, load=held), at / units.time, material, delivery)
     return rows[0], rows[1] / units.time, rows[2] * units.load
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from hmsa_ros.api.actuator import Actuator
 from hmsa_ros.api.arguments import number
-from hmsa_ros.api.motion import Motion, simulated
+from hmsa_ros.api.motion import Motion, Sampling, simulated
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.equations import Array
 from hmsa_ros.planning.sequence import Segment
@@ -177,8 +177,8 @@ class Plan:
                 f'truth is {excerpt(truth)}: expected an Actuator, such as '
                 'block.scaled(shear_modulus=1.1)')
         return simulated(
-            truth or self.actuator, self.times, self.flux_densities, until=until, rate=rate,
-            noise=noise, seed=seed, start=self.segments[0].start.stretch, label=label, plan=self)
+            truth or self.actuator, self.times, self.flux_densities,
+            self.segments[0].start.stretch, Sampling(until, rate, noise, seed, label), self)
 
     def plot(self, path: str | Path | None = None, **paper: Any) -> Any:
         """Draw the motion that the plan predicts, as `Motion.plot` does."""

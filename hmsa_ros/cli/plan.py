@@ -10,6 +10,7 @@ from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import setpoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
+from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.table import Column
 
 if TYPE_CHECKING:
@@ -220,12 +221,13 @@ def _nondimensional(
     errors = _errors(arguments)
     try:
         return plan_sequence(
-            [Setpoint(*x) for x in arguments.setpoints], group,
-            start=State(group.rest if arguments.start is None else arguments.start),
-            shaper=arguments.shaper or 'two_step', units=Units(
-                time_name=f' {_TIME}', load_name=f' {_LOAD}'), order=arguments.order,
-            errors=ERRORS if errors is None else as_errors(errors),
-            pace=Pace(arguments.periods, arguments.max_rate))
+            [Setpoint(*x) for x in arguments.setpoints],
+            Request.of(
+                group, State(group.rest if arguments.start is None else arguments.start),
+                units=Units(time_name=f' {_TIME}', load_name=f' {_LOAD}'), order=arguments.order,
+                errors=ERRORS if errors is None else as_errors(errors),
+                pace=Pace(arguments.periods, arguments.max_rate)),
+            arguments.shaper or 'two_step')
     except RefusedError as error:
         if error.code is not Code.SPELL_TOO_SHORT:
             raise

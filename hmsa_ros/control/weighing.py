@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from hmsa_ros.control.lateness import Lateness
 from hmsa_ros.errors import HmsaError
-from hmsa_ros.model.delivery import pieces
 from hmsa_ros.model.moves import Level
-from hmsa_ros.model.simulation import simulate
+from hmsa_ros.model.simulation import sampled
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.timeline import Draft, Plan, PlannedLevel
 
@@ -105,12 +104,9 @@ def _left(
               if one.time < other.time]
     state = start.at(begin)
     try:
-        switches, loads, slopes, _ = pieces(
-            course, state.ramps_from, model.time(end - begin), model.delivery.slew)
-        stretch, rate = simulate(
-            switches, loads, [model.time(x - begin) for x in looks], model.material,
-            stretch=state.stretch, rate=state.rate, slopes=slopes, lag=model.delivery.lag,
-            field=state.load, followed=state.followed)
+        stretch, rate, *_ = sampled(
+            course, state, np.array([model.time(x - begin) for x in looks]), model.material,
+            model.delivery)
     except HmsaError:
         return _LOST
     return sum(

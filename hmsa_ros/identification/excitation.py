@@ -26,6 +26,7 @@ from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.status import RefusedError
 from hmsa_ros.planning.sequence import plan_sequence
 from hmsa_ros.planning.setpoint import Setpoint
+from hmsa_ros.planning.shapers.request import Request
 
 _PATTERN = 5  # levels in the pattern that is repeated
 # Tries to find the largest pattern inside the limits, what they aim at, and what is large enough.
@@ -225,8 +226,8 @@ class Designer:
                 limits = Limits(self._bounds.flux_density_min / self._unit,
                                 self._bounds.flux_density_max / self._unit)
                 segment, = plan_sequence(
-                    [Setpoint(self._group.rest, math.inf)], self._group, start=start,
-                    limits=limits, delivery=Delivery(slew=slew))
+                    [Setpoint(self._group.rest, math.inf)],
+                    Request.of(self._group, start, limits=limits, delivery=Delivery(slew=slew)))
                 if math.isfinite(segment.move.duration):
                     more = [
                         (end + x.time * time, x.load * self._unit) for x in segment.move.levels]

@@ -5,7 +5,6 @@ from dataclasses import replace
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import diagnosis, quantities
@@ -31,23 +30,16 @@ _SHAPED = 0.15
 
 
 def identify(
-        time: ArrayLike | Recording, stretch: ArrayLike | None = None,
-        level_times: ArrayLike | None = None, levels: ArrayLike | None = None, *,
-        free: Sequence[str] = quantities.DEFAULT_FREE, actuator: ActuatorParameters | None = None,
-        known: Mapping[str, float] | None = None,
-        uncertain: Mapping[str, float] | None = None, slew_limit: float = math.inf
-) -> Identification:
+        recording: Recording, free: Sequence[str] = quantities.DEFAULT_FREE, *,
+        actuator: ActuatorParameters | None = None, known: Mapping[str, float] | None = None,
+        uncertain: Mapping[str, float] | None = None) -> Identification:
     """
     Find the parameters of an actuator in a recording of its motion.
 
     Parameters
     ----------
-    time : array_like, shape (n,), or Recording
-        Times of the samples in s, increasing; or all of the measured in one record.
-    stretch : array_like, shape (n,)
-        Measured stretch.
-    level_times, levels : array_like, shape (m,)
-        Flux density in T in force from each time in s on.
+    recording : Recording
+        What was measured.
     free : sequence of str
         What is sought, names of `hmsa_ros.identification.quantities.QUANTITIES`.
     actuator : ActuatorParameters, optional
@@ -57,8 +49,6 @@ def identify(
         that is not among these may be 2 % off: where that would not show, intervals hold it.
     uncertain : mapping of str to float, optional
         Standard deviations of what is known, by name; intervals hold what they do.
-    slew_limit : float
-        Rate in T/s at which the amplifier ramps; infinite for steps.
 
     Returns
     -------
@@ -72,21 +62,10 @@ def identify(
 
     """
     actuator = actuator or paper_actuator()
-    if isinstance(time, Recording):
-        recording = time
-        if recording.coordinate != actuator.coordinate:
-            raise BadInputError(
-                f'{recording.label} has {recording.coordinate.plural}: expected '
-                f'{actuator.coordinate.plural}, as the law of the actuator has')
-    else:
-        if stretch is None or level_times is None or levels is None:
-            raise BadInputError(
-                'stretch, level_times or levels is missing: expected all three beside time')
-        recording = Recording(
-            np.asarray(time, dtype=np.float64), np.asarray(stretch, dtype=np.float64),
-            np.atleast_1d(np.asarray(level_times, dtype=np.float64)),
-            np.atleast_1d(np.asarray(levels, dtype=np.float64)), slew_limit,
-            coordinate=actuator.coordinate)
+    if recording.coordinate != actuator.coordinate:
+        raise BadInputError(
+            f'{recording.label} has {recording.coordinate.plural}: expected '
+            f'{actuator.coordinate.plural}, as the law of the actuator has')
     free = quantities.check_free(free, actuator.law)
     known, uncertain = known or {}, uncertain or {}
     values = _values(actuator, known, uncertain, free)
@@ -195,8 +174,8 @@ def _conclude(
     elif not reason and not best.converged:
         reason = (
             f'the search did not converge from {tried} starts: the best fit leaves residuals '
-            f'of {best.scale:.3g}; give a --params-file with closer values, or free fewer '
-            'parameters')
+            f'of {best.scale:.3g}; give a file with closer values (--params-file actuator.yaml), '
+            f'or free fewer parameters, as with {diagnosis.freeing(best, best.free[-1:])}')
     elif not reason:
         verdict = 'identified'
         reason = (
@@ -241,7 +220,7 @@ def _warnings(
     if _shaped(best):
         found.append(
             'all moves are shaped so that nothing rings: they carry about a sixth of the '
-            'information of unshaped steps; record what hmsa excite proposes')
+            'information of unshaped steps; record what hmsa excite --out levels.csv proposes')
     return found
 
 

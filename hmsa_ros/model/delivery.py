@@ -10,10 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
-import numpy as np
-
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.equations import Array
 from hmsa_ros.model.moves import Level
 
 # Time constants after which nothing is left of a lag.
@@ -70,20 +67,6 @@ IDEAL = Delivery()
 Piece = tuple[float, float, float]
 
 
-def pieces(
-        levels: Sequence[Level], load: float, end: float,
-        slew: float) -> tuple[Array, Array, Array, float]:
-    """
-    Return switches, loads and slopes (m,) of the load that levels make, and the last load.
-
-    From ``switches[i]`` on the load is ``loads[i] + slopes[i] (t - switches[i])``. Levels are by
-    time, the first at the start, and ``load`` is in force before; ``end`` is not before the last.
-    """
-    rows, load = ramps(levels, load, end, slew)
-    switches, loads, slopes = np.array(rows).T
-    return switches, loads, slopes, load
-
-
 def late(pieces: Sequence[Piece], end: float, field: float, lag: float) -> float:
     """Return the load that a lagging field has reached at a time after the amplifier's pieces."""
     for i, (begin, load, slope) in enumerate(pieces):
@@ -96,7 +79,12 @@ def late(pieces: Sequence[Piece], end: float, field: float, lag: float) -> float
 def ramps(
         levels: Sequence[Level], load: float, end: float,
         slew: float) -> tuple[list[Piece], float]:
-    """Return `pieces` without arrays: switch, load and slope of each; and the last load."""
+    """
+    Return the pieces of the load that levels make, and the last load.
+
+    Levels are by time, the first at the start, and ``load`` is in force before; ``end`` is not
+    before the last.
+    """
     rows: list[Piece] = []
     for number, level in enumerate(levels):
         until = levels[number + 1].time if number + 1 < len(levels) else end

@@ -16,7 +16,7 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model import law
 from hmsa_ros.model.actuators import Actuators, check_stretch, RTOL, Setup
 from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.delivery import Delivery, Piece, ramps
+from hmsa_ros.model.delivery import Delivery, IDEAL, Piece, ramps
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.flows.record import MAXWELL
 from hmsa_ros.model.moves import Level, State
@@ -24,8 +24,8 @@ from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParamete
 from hmsa_ros.model.schedule import CommandSchedule
 
 __all__ = [
-    'ActuatorSimulation', 'check_stretch', 'follow', 'longest_motion', 'RTOL', 'simulate',
-    'too_large', 'unshaped']
+    'ActuatorSimulation', 'check_stretch', 'follow', 'longest_motion', 'RTOL', 'sampled',
+    'simulate', 'too_large', 'unshaped']
 
 # Time constants after which nothing is left of a motion, and periods after which nobody knows
 # its phase.
@@ -39,10 +39,9 @@ _STUCK = 'the integration ran out of steps: the load is too large to follow'
 def simulate(
         switches: ArrayLike, loads: ArrayLike, times: ArrayLike,
         material: NondimensionalParameters, *, stretch: float | None = None, rate: float = 0.0,
-        slopes: ArrayLike | None = None, rtol: float = RTOL, lag: float = 0.0,
-        field: float = math.nan, followed: Sequence[float] = ()) -> tuple[Array, Array]:
+        slopes: ArrayLike | None = None) -> tuple[Array, Array]:
     """
-    Sample the response to a piecewise constant or linear load.
+    Sample the response to a piecewise constant or linear load; `sampled` that to levels.
 
     Parameters
     ----------
@@ -58,14 +57,6 @@ def simulate(
         State at the first switch; default at rest without a field.
     slopes : array_like, shape (m,), optional
         Change of the load per unit of time from each switch on; default none.
-    rtol : float
-        Relative tolerance.
-    lag : float
-        Time constant with which the field follows these loads; 0 for at once.
-    field : float
-        Load in force at the first switch, for a lag; default the first of ``loads``.
-    followed : sequence of float
-        What the Maxwell branches have followed at the first switch; default relaxed.
 
     Returns
     -------
@@ -95,9 +86,8 @@ def simulate(
             'switches and times must not decrease, and no time may lie before the first switch')
     stretch = material.rest if stretch is None else stretch
     check_stretch(stretch, material)
-    rows = sampled(
-        switches, loads, slope, times, State(stretch, rate, field, followed=tuple(followed)),
-        material, rtol, lag)
+    rows = _sampled(
+        np.column_stack([switches, loads, slope]), State(stretch, rate), times, material)
     return rows[motion.STRETCH], rows[motion.RATE]
 
 
@@ -108,9 +98,7 @@ def follow(
     pieces, last = ramps(levels, state.ramps_from, end, delivery.slew)
     if material.creep or delivery.lag > 0.0:
         return _follow_slowly(pieces, last, state, end, material, delivery)
-    switches, loads, slopes = np.array(pieces).T.copy()
-    stretch, rate, *_ = sampled(
-        switches, loads, slopes, np.array([float(end)]), state, material, RTOL)[:, 0].tolist()
+    stretch, rate, *_ = _sampled(pieces, state, np.array([float(end)]), material)[:, 0].tolist()
     return State(stretch, rate, last)
 
 
@@ -146,9 +134,23 @@ def flow_rates(material: NondimensionalParameters, above: Array) -> Array:
 
 
 def sampled(
-        switches: Array, loads: Array, slopes: Array, times: Array, state: State,
-        material: NondimensionalParameters, rtol: float, lag: float = 0.0) -> Array:
-    """Return stretch, rate, field and what branches follow, (3 + n, m), or raise `HmsaError`."""
+        levels: Sequence[Level], state: State, times: Array, material: NondimensionalParameters,
+        delivery: Delivery = IDEAL, rtol: float = RTOL) -> Array:
+    """
+    Return stretch, rate, field and what n branches follow under levels, shape (3 + n, m).
+
+    The state is that where the first level begins; times (m,) do not decrease. A load too large to
+    follow is an `HmsaError`.
+    """
+    pieces, _ = ramps(
+        levels, state.ramps_from, max(float(times[-1]), levels[-1].time), delivery.slew)
+    return _sampled(pieces, state, times, material, delivery.lag, rtol)
+
+
+def _sampled(
+        pieces: Sequence[Piece] | Array, state: State, times: Array,
+        material: NondimensionalParameters, lag: float = 0.0, rtol: float = RTOL) -> Array:
+    switches, loads, slopes = np.array(pieces).T.copy()
     branches = with_followed(material, followed_by(state, material))
     out = np.empty((motion.FOLLOWED + len(branches), times.size))
     if not motion.sample(
@@ -162,14 +164,12 @@ def _follow_slowly(
         pieces: Sequence[Piece], last: float, state: State, end: float,
         material: NondimensionalParameters, delivery: Delivery) -> State:
     """Integrate until vibration has ended; from then on branches relax alone."""
-    switches, loads, slopes = np.array(pieces).T.copy()
     rings, amplifier = end, last if delivery.lag > 0.0 else None
     if material.creep:
         rings = min(end, max(pieces[-1][0], 0.0) + longest_motion(last, material)
                     + delivery.settling(0.0))
-    stretch, rate, field, *followed = sampled(
-        switches, loads, slopes, np.array([float(rings)]), state, material, RTOL,
-        delivery.lag)[:, 0].tolist()
+    stretch, rate, field, *followed = _sampled(
+        pieces, state, np.array([float(rings)]), material, delivery.lag)[:, 0].tolist()
     if rings == end:
         return State(
             stretch, rate, last if amplifier is None else field, amplifier, tuple(followed))

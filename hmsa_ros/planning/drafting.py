@@ -267,7 +267,7 @@ def _meeting(outset: Outset, state: State, following: int) -> int | None:
     if (level.stamp != planned.begin or level.model is not outset.model
             or outset.stale is not None and place < outset.stale):
         return None
-    here = PlannedLevel.of(level.stamp, level.flux_density, state, level.model)
+    here = PlannedLevel(level.stamp, level.flux_density, state, level.model)
     return place if agree(here, level) else None
 
 
@@ -314,7 +314,7 @@ def _placed(
         elif number:
             state = model.follow(state, segment.move.levels[number - 1].load, level.time - time)
         time = level.time
-        levels.append(PlannedLevel.of(
+        levels.append(PlannedLevel(
             start + model.ns(time), level.load * model.units.load, state, model))
     duration = segment.move.duration
     return levels, PlannedSegment(

@@ -205,10 +205,9 @@ def _rests(draft: Draft, segment: PlannedSegment) -> bool:
     model = level.model
     # What creeps has relaxed further by then.
     return not model.material.creep and (
-        abs(level.rate) * model.units.time <= _AT_REST
+        abs(level.state.rate) <= _AT_REST
         and math.isclose(
-            level.in_force / model.units.load, model.holding(level.stretch), rel_tol=_AT_REST,
-            abs_tol=_AT_REST))
+            level.state.load, model.holding(level.stretch), rel_tol=_AT_REST, abs_tol=_AT_REST))
 
 
 def _samples(plan: Plan, stamps: Sequence[int]) -> list[tuple[float, float, float]]:

@@ -183,17 +183,15 @@ class History:
 
 def agree(one: PlannedLevel, other: PlannedLevel) -> bool:
     """Return whether two predictions are the same but for what rounding makes of them."""
-    model = one.model
+    x, y, unit = one.state, other.state, one.model.units.load
     return (
-        abs(one.stretch - other.stretch) <= _AS_PLANNED
-        and abs(one.rate - other.rate) * model.units.time
-        <= _AS_PLANNED * model.frequency(one.stretch)
-        and _same(one.in_force, other.in_force)
-        and (one.amplifier is None) is (other.amplifier is None)
-        and _same(one.amplifier or 0.0, other.amplifier or 0.0)
-        and len(one.followed) == len(other.followed)
-        and all(abs(x - y) <= _AS_PLANNED for x, y in zip(
-            one.followed, other.followed, strict=True)))
+        abs(x.stretch - y.stretch) <= _AS_PLANNED
+        and abs(x.rate - y.rate) <= _AS_PLANNED * one.model.frequency(x.stretch)
+        and (x.amplifier is None) is (y.amplifier is None)
+        and _same(x.load * unit, y.load * unit)
+        and _same(x.ramps_from * unit, y.ramps_from * unit)
+        and len(x.followed) == len(y.followed)
+        and all(abs(a - b) <= _AS_PLANNED for a, b in zip(x.followed, y.followed, strict=True)))
 
 
 def _beyond(level: float, limit: float) -> bool:

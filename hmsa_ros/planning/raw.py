@@ -71,12 +71,12 @@ def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Steps[D
                     f'{model.options.period / NANOSECONDS:g} s: expected levels farther apart')
             _check_motion(number - 1, before, state, stamp)
             state = model.follow(
-                state, before.flux_density / model.units.load, model.time(stamp - before.stamp))
-        levels.append(PlannedLevel.of(stamp, flux_density, state, model))
+                state, before.load, model.time(stamp - before.stamp))
+        levels.append(PlannedLevel(stamp, flux_density, state, model))
         yield
     last = levels[-1]
     _check_motion(len(points) - 1, last, state, None)
-    rest = float(equilibrium_stretch(last.flux_density / model.units.load, model.material))
+    rest = float(equilibrium_stretch(last.load, model.material))
     settled = model.ns(_settling(last, state))
     period = _period(model, rest)
     times = [last.stamp + settled + round(i * period / _SAMPLES)
@@ -101,8 +101,7 @@ def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Steps[D
 
 def _settling(level: PlannedLevel, state: State) -> float:
     """Return the nondimensional time that the field takes to get to a level."""
-    model = level.model
-    return model.delivery.settling(level.flux_density / model.units.load - state.ramps_from)
+    return level.model.delivery.settling(level.load - state.ramps_from)
 
 
 def _period(model: Model, stretch: float) -> float:
@@ -118,7 +117,7 @@ def _check_motion(number: int, level: PlannedLevel, state: State, end: int | Non
     lower, upper = stretch_limits(model.material)
     home = model.material.rest
     least, most = (home + _MARGIN * (x - home) for x in (lower, upper))
-    rest = float(equilibrium_stretch(level.flux_density / model.units.load, model.material))
+    rest = float(equilibrium_stretch(level.load, model.material))
     if least < rest < most:
         step = _period(model, rest) / _SAMPLES
         last = level.stamp + model.ns(_settling(level, state)) + round(

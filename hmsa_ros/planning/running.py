@@ -50,9 +50,9 @@ class RunningPlan:
 
     def restart(self) -> None:
         """Drop all plans: at rest where it was before the first request, as the clock begins."""
-        flux_density = self.model.holding(self._initial) * self.model.units.load
+        load = self.model.holding(self._initial)
         self._begin_with(PlannedLevel(
-            ALWAYS, flux_density, self._initial, 0.0, flux_density, self.model))
+            ALWAYS, load * self.model.units.load, State(self._initial, 0.0, load), self.model))
 
     def clock_set(self, by: int) -> None:
         """Take in that the clock was set ahead by some ns: what is planned goes on as before."""
@@ -86,13 +86,14 @@ class RunningPlan:
             raise BadInputError(
                 f'state in force is rate {rate:g} 1/s, flux density {in_force:g} T: expected '
                 'finite numbers')
-        begin = PlannedLevel(stamp, level, stretch, rate, in_force, model)
-        held = float(equilibrium_stretch(level / model.units.load, model.material))
-        at_rest = abs(rate) * model.units.time <= _SAMPLED_AT_REST * self.model.frequency(stretch)
+        begin = PlannedLevel(stamp, level, State(
+            stretch, rate * model.units.time, in_force / model.units.load), model)
+        held = float(equilibrium_stretch(begin.load, model.material))
+        at_rest = abs(begin.state.rate) <= _SAMPLED_AT_REST * model.frequency(stretch)
         if at_rest and level == in_force:
             agrees = abs(held - stretch) <= (_AGREES if level else _AGREES_WITHOUT_FIELD)
-            begin = replace(
-                begin, stamp=ALWAYS, rate=0.0, stretch=held if agrees else stretch)
+            begin = replace(begin, stamp=ALWAYS, state=replace(
+                begin.state, rate=0.0, stretch=held if agrees else stretch))
         if not _can_be_followed(begin):
             raise BadInputError(
                 f'state in force is stretch {stretch:g}, rate {rate:g} 1/s, flux density '
@@ -106,7 +107,7 @@ class RunningPlan:
         more = 2.0 * flux_density
         return options.flux_density_min <= flux_density <= options.flux_density_max or (
             math.isfinite(more) and _can_be_followed(PlannedLevel(
-                0, more, model.actuator.rest, 0.0, 0.0, model)))
+                0, more, State(model.actuator.rest, 0.0, 0.0), model)))
 
     def abandon(self, now: int) -> None:
         """Drop what is ahead at a time in ns, sent or not, and the setpoints: nobody obeys."""
@@ -243,7 +244,7 @@ class RunningPlan:
         # It has had as much less momentum: omega times the delay, of the change of its rest.
         level = self._history.levels[self._history.known]
         model = level.model
-        stretch = equilibrium_stretch(level.flux_density / model.units.load, model.material)
+        stretch = equilibrium_stretch(level.load, model.material)
         stiffness = elastic_stiffness(stretch, model.material)
         return float(
             abs(model.time(late) * change / model.units.load / stiffness)
@@ -260,7 +261,7 @@ class RunningPlan:
         known, rest = history.levels[history.known], history.levels[history.known + 1:]
         time = min(now, rest[0].stamp) if self.awaiting else now
         if time > known.stamp:
-            known = PlannedLevel.of(time, known.flux_density, known.at(time), known.model)
+            known = PlannedLevel(time, known.flux_density, known.at(time), known.model)
         return known, rest
 
     def _remember(self, history: History) -> None:
@@ -302,7 +303,7 @@ def _running(plan: Plan, begin: int, now: int) -> tuple[PlannedSegment, ...]:
 
 def _can_be_followed(level: PlannedLevel) -> bool:
     """Return whether motion from a level on can be predicted until it has settled."""
-    model, load = level.model, level.flux_density / level.model.units.load
+    model, load = level.model, level.load
     if level.stamp == ALWAYS:
         return True
     period = 2.0 * math.pi / model.frequency(model.actuator.rest)

@@ -16,7 +16,7 @@ from hmsa_ros.model.equations import (
 from hmsa_ros.model.law import boundary
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.status import Code
-from hmsa_ros.planning.two_step import CODES, plan_two_step, plan_two_step_batch
+from hmsa_ros.planning.two_step import CODES, Groups, plan_two_step, plan_two_step_batch
 
 #: Stretches whose flux density is given, where the coil reaches them, and deflections of a beam.
 STRETCHES = (0.6, 0.8, 0.9, 1.05, 1.1, 1.2, 1.4, 2.0)
@@ -92,8 +92,9 @@ def scales(actuator: ActuatorParameters, coil: Coil) -> Scales:
         if material.zeta > _OVERDAMPED * np.max(critical_zeta(targets, material)):
             return home
         plans = plan_two_step_batch(
-            home, targets, zeta=material.zeta, j_lim=material.j_lim, c1=material.c1,
-            load_limits=loads, elastic=material.law)
+            home, targets,
+            Groups(zeta=material.zeta, j_lim=material.j_lim, c1=material.c1, elastic=material.law),
+            load_limits=loads)
         both = np.stack([plans.beta_p, plans.beta_1])
         good = np.array([CODES[x] is Code.TWO_STEP for x in plans.status.tolist()]) & np.all(
             (both >= loads[0]) & (both <= loads[1]), axis=0)

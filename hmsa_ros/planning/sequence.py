@@ -8,19 +8,18 @@ import math
 import numpy as np
 
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.delivery import Delivery, IDEAL, Piece, ramps
+from hmsa_ros.model.delivery import Delivery, ramps
 from hmsa_ros.model.equations import elastic_force, natural_frequency
 from hmsa_ros.model.laws.record import ENDLESS
-from hmsa_ros.model.mismatch import Uncertainty
-from hmsa_ros.model.moves import Level, Limits, Move, State
+from hmsa_ros.model.moves import Level, Move, State
 from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.simulation import check_stretch, follow, longest_motion, simulate
+from hmsa_ros.model.simulation import check_stretch, follow, longest_motion, sampled
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import Units
+from hmsa_ros.motion import STRETCH
 from hmsa_ros.planning.setpoint import Setpoint
 from hmsa_ros.planning.shapers import creeping, get_shaper
-from hmsa_ros.planning.shapers.pace import PACE, Pace
-from hmsa_ros.planning.shapers.request import ERRORS, Request, Shaper, Work
+from hmsa_ros.planning.shapers.request import Request, Shaper, Work
 
 #: What to do with a setpoint that ends before the move to it does.
 SHORT_SPELL = ('refuse', 'continue')
@@ -62,12 +61,8 @@ class Segment:
 
 
 def plan_sequence(
-        setpoints: Sequence[Setpoint], material: NondimensionalParameters, *,
-        start: State | None = None, shaper: str = 'two_step', limits: Limits | None = None,
-        delivery: Delivery = IDEAL, order: int = 2, units: Units | None = None,
-        short_spell: str = 'refuse',
-        errors: Uncertainty = ERRORS,
-        pace: Pace = PACE) -> tuple[Segment, ...]:
+        setpoints: Sequence[Setpoint], frame: Request | NondimensionalParameters,
+        shaper: str = 'two_step', short_spell: str = 'refuse') -> tuple[Segment, ...]:
     """
     Plan a sequence of setpoints.
 
@@ -75,28 +70,15 @@ def plan_sequence(
     ----------
     setpoints : sequence of Setpoint
         At least one.
-    material : NondimensionalParameters
-        zeta, J_lim and c1.
-    start : State, optional
-        Default: stretch 1 at rest (Eq. 12).
+    frame : Request or NondimensionalParameters
+        What all moves share, and the state from which the first one starts; or a material alone,
+        to start at rest without a field, on ideal hardware. With a command period, spans must be
+        multiples of it. The next move starts from what the rounded command leads to.
     shaper : str
         Name of a shaper.
-    limits : Limits, optional
-        Admissible loads; default none.
-    delivery : Delivery
-        How commands reach the coil; default at any time and at once. With a period, spans
-        must be multiples of it. The next move starts from what the rounded command leads to.
-    order : int
-        Of the robust shaper, at least 1.
-    units : Units, optional
-        For the messages; default nondimensional.
     short_spell : {'refuse', 'continue'}
         For a span that ends before the move: refuse, or plan the next move from the state that
         is really reached; the last move is then finished after its span.
-    errors : tuple of float or Ellipsoid
-        Of G, damping coefficient and J_lim, as shares, for which minimax plans.
-    pace : Pace
-        How fast the shaper smooth moves; the rate per unit of nondimensional time.
 
     Returns
     -------
@@ -116,9 +98,7 @@ def plan_sequence(
     if short_spell not in SHORT_SPELL:
         raise BadInputError(
             f'short_spell is {short_spell!r}: expected one of {", ".join(SHORT_SPELL)}')
-    begin = Request(
-        start or State(material.rest), material.rest, material, limits or Limits(), delivery,
-        order, units or Units(), errors, pace)
+    begin = frame if isinstance(frame, Request) else Request.of(frame)
     return tuple(segments(begin, setpoints, get_shaper(shaper), short_spell))
 
 
@@ -194,10 +174,11 @@ def _follow(
     if move.tail:
         return _follow_tail(state, move, end, setpoint.stretch, material, delivery)
     parts, last = ramps(move.levels, state.ramps_from, end, delivery.slew)
+    ramped = max(parts[-1][0], 0.0)
     settled = longest_motion(last, material) + delivery.settling(0.0)
     if not material.creep:
-        end = min(end, max(parts[-1][0], 0.0) + settled)
-    _check_known(state, parts, end, setpoint.stretch, material, delivery.lag)
+        end = min(end, ramped + settled)
+    _check_known(state, move.levels, (ramped, end), setpoint.stretch, material, delivery)
     return follow(move.levels, state, end, material, delivery)
 
 
@@ -206,9 +187,9 @@ def _follow_tail(
         delivery: Delivery) -> State:
     """Return the state at a time after the arrival, where what branches do is known."""
     if move.duration > 0.0:
-        parts, _ = ramps(
-            move.until(move.duration).levels, state.ramps_from, move.duration, delivery.slew)
-        _check_known(state, parts, move.duration, target, material, delivery.lag)
+        _check_known(
+            state, move.until(move.duration).levels, (move.duration,) * 2, target, material,
+            delivery)
     place = bisect_right(move.levels, end, key=lambda x: x.time) - 1
     level = move.levels[place]
     return follow(
@@ -217,19 +198,20 @@ def _follow_tail(
 
 
 def _check_known(
-        state: State, parts: Sequence[Piece], end: float, target: float,
-        material: NondimensionalParameters, lag: float) -> None:
-    """Refuse a move that swings to where nothing is known of the elastic force."""
+        state: State, levels: Sequence[Level], ends: tuple[float, float], target: float,
+        material: NondimensionalParameters, delivery: Delivery) -> None:
+    """
+    Refuse a move that swings to where nothing is known of the elastic force.
+
+    Ends are those of the last ramp and of what is looked at.
+    """
     elastic = material.law
     if elastic is None or elastic.limits == ENDLESS:
         return
     # The first swing about the last level is the widest.
     swing = 2.0 * math.pi / float(natural_frequency(target, material))
-    times = np.linspace(parts[0][0], min(end, max(parts[-1][0], 0.0) + swing), _LOOK)
-    switches, loads, slopes = np.array(parts).T
-    stretch, _ = simulate(
-        switches, loads, times, material, rtol=_LOOK_RTOL, stretch=state.stretch,
-        rate=state.rate, slopes=slopes, lag=lag, field=state.load, followed=state.followed)
+    times = np.linspace(levels[0].time, min(ends[1], ends[0] + swing), _LOOK)
+    stretch = sampled(levels, state, times, material, delivery, _LOOK_RTOL)[STRETCH]
     for widest, beyond in ((np.min(stretch), -1.0), (np.max(stretch), 1.0)):
         limit = elastic.limits[beyond > 0.0]
         if beyond * (widest - limit) > 0.0:

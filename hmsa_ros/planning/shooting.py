@@ -50,6 +50,11 @@ class Template:
             *_derivatives(len(levels), tuple(unknowns)))
 
 
+def heights(levels: Sequence[Level]) -> Template:
+    """Return the template of a guess with all heights but the last free."""
+    return Template.of(levels, [('load', i) for i in range(len(levels) - 1)])
+
+
 @lru_cache(maxsize=256)
 def _derivatives(count: int, unknowns: tuple[tuple[str, int], ...]) -> tuple[Array, Array]:
     """Return the derivatives of times and loads, which nobody may change."""
@@ -126,10 +131,13 @@ def approach(
     return found
 
 
-def on_time(found: Attempt, heights: int, request: 'Request') -> Attempt:
+def on_time(found: Attempt, count: int, request: 'Request') -> Attempt:
     """Solve once more for the first heights, at times that commands can carry if they can."""
     if found is None or request.delivery.resolution == 0.0:
         return found
-    rounded = [Level(request.delivery.rounded(x.time), x.load) for x in found[0]]
-    free = [('load', i) for i in range(heights)]
+    # Later ones by a little more, so that ramps still fit.
+    resolution = request.delivery.resolution
+    rounded = [Level(request.delivery.rounded(x.time) + i * resolution, x.load)
+               for i, x in enumerate(found[0])]
+    free = [('load', i) for i in range(count)]
     return solve(Template.of(rounded, free), request) or found

@@ -11,25 +11,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import math
 
+import numpy as np
+
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model import law
-from hmsa_ros.model.delivery import Delivery, IDEAL, pieces
+from hmsa_ros.model.delivery import Delivery, IDEAL
 from hmsa_ros.model.mismatch import Uncertainty
 from hmsa_ros.model.moves import Level, Limits, State
 from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters
-from hmsa_ros.model.simulation import follow, longest_motion, simulate
+from hmsa_ros.model.simulation import follow, longest_motion, sampled
 from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS, Units
 from hmsa_ros.planning.sequence import SHORT_SPELL
 from hmsa_ros.planning.shapers import creeping, get_shaper
 from hmsa_ros.planning.shapers.pace import PACE, Pace
 from hmsa_ros.planning.shapers.request import as_errors, ERRORS
-
-
-def scaled(value: float | None, unit: float) -> float | None:
-    """Return a value in another unit, if there is one."""
-    return None if value is None else value * unit
-
 
 #: Stamp of a level that has been in force at rest for ever.
 ALWAYS = -2**62
@@ -117,10 +113,10 @@ class Model:
         """Return a state of another model in the units of this one."""
         if other is self:
             return state
+        loads = other.units.load / self.units.load
         return State(
-            state.stretch, state.rate / other.units.time * self.units.time,
-            state.load * other.units.load / self.units.load,
-            scaled(scaled(state.amplifier, other.units.load), 1.0 / self.units.load),
+            state.stretch, state.rate / other.units.time * self.units.time, state.load * loads,
+            None if state.amplifier is None else state.amplifier * loads,
             creeping.carried(state, other.material, self.material))
 
 
@@ -130,15 +126,30 @@ class PlannedLevel:
 
     stamp: int  #: in ns, from which it applies
     flux_density: float  #: in T
-    stretch: float
-    rate: float  #: in 1/s
-    in_force: float  #: in T, from which a slew limit ramps to the level
+    state: State  #: in the units of the model
     model: Model = field(repr=False)  #: of the motion from the stamp on
-    amplifier: float | None = None  #: its output in T; None where the field does not lag behind it
-    #: By Maxwell branches, in units of G; empty where they have relaxed.
-    followed: tuple[float, ...] = ()
     #: Stamp in ns with which it was sent, where what was sent before it has come later.
     sent_for: int | None = None
+
+    @property
+    def stretch(self) -> float:
+        """Stretch at the stamp."""
+        return self.state.stretch
+
+    @property
+    def rate(self) -> float:
+        """Stretch rate at the stamp in 1/s."""
+        return self.state.rate / self.model.units.time
+
+    @property
+    def in_force(self) -> float:
+        """Flux density in T at the stamp, from which a slew limit ramps to the level."""
+        return self.state.load * self.model.units.load
+
+    @property
+    def load(self) -> float:
+        """The level without a dimension."""
+        return self.flux_density / self.model.units.load
 
     @property
     def due(self) -> int:
@@ -153,28 +164,19 @@ class PlannedLevel:
 
     def at(self, time: int) -> State:
         """Predict the nondimensional state at a time in ns; before the stamp, as at the stamp."""
-        model = self.model
         if self.stamp == ALWAYS:
-            return State(self.stretch, 0.0, self.in_force / model.units.load)
-        return model.follow(
-            self._begin(), self.flux_density / model.units.load,
-            min(max(model.time(time - self.stamp), 0.0), self._longest()))
-
-    def _begin(self) -> State:
-        """Return the state at the stamp in the units of the model."""
-        units = self.model.units
-        return State(
-            self.stretch, self.rate * units.time, self.in_force / units.load,
-            scaled(self.amplifier, 1.0 / units.load), self.followed)
+            return self.state
+        return self.model.follow(
+            self.state, self.load,
+            min(max(self.model.time(time - self.stamp), 0.0), self._longest()))
 
     def _longest(self) -> float:
         """Return for how long the motion is worth following."""
         model = self.model
         if model.material.creep:
             return math.inf
-        end = self.flux_density / model.units.load
-        return model.delivery.settling(end - self._begin().ramps_from) \
-            + longest_motion(end, model.material)
+        return model.delivery.settling(self.load - self.state.ramps_from) \
+            + longest_motion(self.load, model.material)
 
     def sample(self, times: Sequence[int]) -> list[tuple[float, float]]:
         """Predict stretch and rate (1/s) at times in ns, not decreasing, from the stamp on."""
@@ -183,29 +185,15 @@ class PlannedLevel:
         model = self.model
         if model.material.creep:
             return [(x.stretch, x.rate / model.units.time) for x in map(self.at, times)]
-        end = self.flux_density / model.units.load
         longest = self._longest()
-        after = [min(model.time(x - self.stamp), longest) for x in times]
-        switches, loads, slopes, _ = pieces(
-            (Level(0.0, end),), self._begin().ramps_from, after[-1], model.delivery.slew)
-        stretch, rate = simulate(
-            switches, loads, after, model.material, stretch=self.stretch,
-            rate=self.rate * model.units.time, slopes=slopes, lag=model.delivery.lag,
-            field=self.in_force / model.units.load)
+        after = np.array([min(model.time(x - self.stamp), longest) for x in times])
+        stretch, rate, *_ = sampled(
+            (Level(0.0, self.load),), self.state, after, model.material, model.delivery)
         return list(zip(stretch.tolist(), (rate / model.units.time).tolist(), strict=True))
-
-    @classmethod
-    def of(cls, stamp: int, flux_density: float, state: State, model: Model) -> 'PlannedLevel':
-        """Return a level in T from a stamp in ns on, where the actuator is in a model's state."""
-        units = model.units
-        return cls(
-            stamp, flux_density, state.stretch, state.rate / units.time, state.load * units.load,
-            model, scaled(state.amplifier, units.load), state.followed)
 
     def after(self, level: 'PlannedLevel') -> 'PlannedLevel':
         """Return this level with what is predicted at its stamp if another one precedes it."""
-        found = self.of(self.stamp, self.flux_density, level.at(self.stamp), level.model)
-        return replace(found, model=self.model, sent_for=self.sent_for)
+        return replace(self, state=self.model.taken_from(level.at(self.stamp), level.model))
 
 
 @dataclass(frozen=True, slots=True)

@@ -118,24 +118,36 @@ class TwoStepBatch:
     beta_1: NDArray[np.float64]
 
 
+class Groups(NamedTuple):
+    """Numbers of `NondimensionalParameters` as arrays, and the law of them all."""
+
+    zeta: ArrayLike = 0.2
+    j_lim: ArrayLike = 5.0
+    c1: ArrayLike = 2.0
+    elastic: Elastic | None = None  #: in place of ``j_lim``
+
+
+#: The paper's.
+USUAL = Groups()
+
+
 def plan_two_step_batch(
-        start: ArrayLike, target: ArrayLike, *, zeta: ArrayLike = 0.2,
-        j_lim: ArrayLike = 5.0, c1: ArrayLike = 2.0, rate: ArrayLike = 0.0,
-        load_limits: tuple[float, float] = (-math.inf, math.inf),
-        rtol: float = RTOL, elastic: Elastic | None = None, workers: int = 0) -> TwoStepBatch:
+        start: ArrayLike, target: ArrayLike, groups: Groups = USUAL, *,
+        rate: ArrayLike = 0.0, load_limits: tuple[float, float] = (-math.inf, math.inf),
+        rtol: float = RTOL, workers: int = 0) -> TwoStepBatch:
     """
     Plan many moves at once, over all cores.
 
     Parameters
     ----------
-    start, target, zeta, j_lim, c1, rate : array_like
-        As for `plan_two_step`, broadcast against each other.
+    start, target, rate : array_like
+        As for `plan_two_step`, broadcast against each other and the groups.
+    groups : Groups
+        Materials.
     load_limits : tuple of float
         Admissible loads.
     rtol : float
         Relative tolerance, 1e-14 to 1e-4.
-    elastic : Elastic, optional
-        The law of all rows, in place of ``j_lim``.
     workers : int
         Threads; 0 for one a core.
 
@@ -153,12 +165,13 @@ def plan_two_step_batch(
     if not 1e-14 <= rtol <= 1e-4:
         raise BadInputError(f'rtol is {rtol!r}: expected 1e-14 to 1e-4')
     try:
-        given = [np.asarray(a, dtype=np.float64) for a in (start, rate, target, zeta, j_lim, c1)]
+        given = [np.asarray(a, dtype=np.float64) for a in (start, rate, target, *groups[:3])]
         shape = np.broadcast_shapes(*(a.shape for a in given))
     except ValueError as error:
         raise BadInputError(f'the arrays do not broadcast against each other: {error}') from error
     # Where there is but one material, it is packed once.
     alike = all(a.size == 1 for a in given[3:])
+    elastic = groups.elastic
     columns = [np.broadcast_to(a, shape).flatten() for a in given[:3 if alike else 6]]
     material = law.pack(
         given[3].item(), given[4].item(), given[5].item(), elastic) if alike else None

@@ -13,7 +13,7 @@ import numpy as np
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces.topics import PLANNER
 from hmsa_ros.judge import Finding, rests_from, Tolerances
-from hmsa_ros.model.delivery import late, pieces
+from hmsa_ros.model.delivery import Delivery
 from hmsa_ros.model.equations import (
     Array,
     elastic_force,
@@ -25,7 +25,7 @@ from hmsa_ros.model.moves import Level as PlannedLoad
 from hmsa_ros.model.moves import State
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.residual import residual_vibration
-from hmsa_ros.model.simulation import RTOL, sampled, simulate
+from hmsa_ros.model.simulation import follow, sampled
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.levels import in_force, Level, without_repeats
 from hmsa_ros.recordings.parameters import creep_of
@@ -217,13 +217,10 @@ def _plain(
         material = replace(
             run.plant, creep=creep_of(run.parameters, run.joint)).nondimensional
         held = float(elastic_force(start, material))
-        switches, loads, slopes, _ = pieces(
+        stretch, rate, *_ = sampled(
             [PlannedLoad(x / unit, y.flux_densities[-1] / run.plant.flux_density_unit)
-             for x, y in zip(begins, moves, strict=True)], held, float(grid[-1]) / unit,
-            _slew(run, run.plant, 'plant'))
-        stretch, rate = simulate(
-            switches, loads, grid / unit, material, stretch=start, slopes=slopes,
-            lag=run.number('plant.coil_time_constant') / unit, field=held)
+             for x, y in zip(begins, moves, strict=True)], State(start, load=held), grid / unit,
+            material, _delivery(run, run.plant, 'plant'))
     except HmsaError:
         return nothing
     return Curve(
@@ -231,10 +228,12 @@ def _plain(
         np.concatenate([np.zeros_like(before), rate / unit]))
 
 
-def _slew(run: Run, actuator: ActuatorParameters, node: str) -> float:
-    """Return the slew limit of a node without a dimension; infinite for none."""
-    return run.number(f'{node}.slew_limit') / actuator.flux_density_unit \
-        * actuator.time_unit or math.inf
+def _delivery(run: Run, actuator: ActuatorParameters, node: str) -> Delivery:
+    """Return how levels reach the coil of a node."""
+    unit = actuator.time_unit
+    return Delivery(
+        slew=run.number(f'{node}.slew_limit') / actuator.flux_density_unit * unit or math.inf,
+        lag=run.number(f'{node}.coil_time_constant') / unit)
 
 
 def period_of(run: Run) -> float:
@@ -279,43 +278,26 @@ def _predict(run: Run, plan: Sequence[Level], stamps: Times) -> tuple[Array, Arr
     plan = [x for x in plan if lower < x.stretch < upper]
     if not plan:
         return predicted[0], predicted[1]
-    slew = _slew(run, actuator, 'planner')
-    lag = run.number('planner.coil_time_constant') / actuator.time_unit
-    load = field = float(elastic_force(plan[0].stretch, material))
-    followed: tuple[float, ...] = ()
+    unit, delivery = actuator.time_unit, _delivery(run, actuator, 'planner')
+    state = State(plan[0].stretch, load=float(elastic_force(plan[0].stretch, material)))
     for i, point in enumerate(plan):
         until = plan[i + 1].stamp if i + 1 < len(plan) else max(int(run.time[-1]), point.stamp)
-        duration = (until - point.stamp) / NANOSECONDS / actuator.time_unit
-        if math.isinf(slew):
-            load = point.flux_density / actuator.flux_density_unit
-        switches, loads, slopes, load = pieces(
-            (PlannedLoad(0.0, point.flux_density / actuator.flux_density_unit),), load,
-            duration, slew)
-        begun = field
-        if lag:
-            field = late(list(zip(switches, loads, slopes, strict=True)), duration, field, lag)
+        level = PlannedLoad(0.0, point.flux_density / actuator.flux_density_unit)
+        state = replace(state, stretch=point.stretch, rate=point.rate * unit)
         part = slice(
             int(np.searchsorted(stamps, point.stamp)), int(np.searchsorted(
                 stamps, until, side='right' if i + 1 == len(plan) else 'left')))
-        if part.start == part.stop and not creep:
-            continue
-        times = (stamps[part] - point.stamp) / NANOSECONDS / actuator.time_unit
-        rate = point.rate * actuator.time_unit
         try:
-            if creep:
-                rows = sampled(
-                    switches, loads, slopes, np.append(times, duration),
-                    State(point.stretch, rate, begun, followed=followed), material, RTOL, lag)
-                predicted[:, part] = rows[:2, :-1]
-                followed = tuple(rows[3:, -1].tolist())
-                continue
-            predicted[:, part] = simulate(
-                switches, loads, times, material, stretch=point.stretch, rate=rate,
-                slopes=slopes, lag=lag, field=begun)
+            if part.start < part.stop:
+                predicted[:, part] = sampled(
+                    (level,), state, (stamps[part] - point.stamp) / NANOSECONDS / unit, material,
+                    delivery)[:2]
+            state = follow(
+                (level,), state, (until - point.stamp) / NANOSECONDS / unit, material, delivery)
         except HmsaError:
             # A plan of other parameters than are known here: nothing to compare.
             continue
-    return predicted[0], predicted[1] / actuator.time_unit
+    return predicted[0], predicted[1] / unit
 
 
 @dataclass(frozen=True)

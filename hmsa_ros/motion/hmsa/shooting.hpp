@@ -33,6 +33,8 @@ template <class System, int P> struct Shooting {
     // As shares of the move: what the last step may leave, and what is accepted where rounding ends
     // the search. And the share of the distance that a fine pass has to leave less than.
     static constexpr double last = 1e-12, accepted = 1e-10, slowest = 0.1;
+    // What rounding leaves of any move.
+    static constexpr double rounded = 1e-12;
 
     const System &system;
     const Shot &shot;
@@ -286,7 +288,7 @@ template <class System, int P> struct Shooting {
             if (measuring) {
                 lasts = fits ? whole() : lasts;
                 const bool slow = !(now < slowest * before);
-                if (slow && now <= accepted * move)
+                if (slow && now <= max(accepted * move, rounded))
                     return true;  // as near as rounding allows
                 if (slow && (rtol == fine || !(now < infinity())))
                     return false;
@@ -325,7 +327,7 @@ template <class System, int P> struct Shooting {
                 if (!finite(step[c]))
                     return false;
             share = 1;
-            if (size <= near * move) {
+            if (size <= max(near * move, 10 * rounded)) {
                 measuring = true;
                 tolerance = fine, before = infinity();
                 for (int c = 0; c < n; c++)

@@ -1,10 +1,8 @@
 """
 Moves of an elastomer that creeps, and the levels that keep it at rest afterwards.
 
-A branch adds stiffness to a fast motion: level and duration of a move are found from those
-without branches, while their stiffness grows. At arrival the branches still hold something. To
-stay at rest the level has to follow it, psi'(l_d) + sum h_i exp(-t/tau_i) for Maxwell branches,
-as a staircase.
+At arrival the branches still hold something. To stay at rest the level has to follow it,
+psi'(l_d) + sum h_i exp(-t/tau_i) for Maxwell branches, as a staircase.
 """
 
 from collections.abc import Sequence
@@ -15,7 +13,7 @@ import numpy as np
 
 from hmsa_ros import motion
 from hmsa_ros.model import law
-from hmsa_ros.model.delivery import Delivery, IDEAL, ramps
+from hmsa_ros.model.delivery import ramps
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.moves import Level, Move, State
 from hmsa_ros.model.parameters import NondimensionalParameters
@@ -23,21 +21,16 @@ from hmsa_ros.model.simulation import (
     follow,
     followed_by,
     longest_motion,
-    paces,
-    RTOL,
     sampled,
     with_followed,
 )
 from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.shapers.lagged import free_heights
 from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.planning.shooting import approach, Attempt, solve, Template
 
 # The least move that counts, and how much more a staircase may leave than is worked out.
 _LEAST_MOVE, _SURE = 1e-3, 1.25
 # Levels of a staircase at the most.
 _MOST = 300
-_SHORTEST_STRIDE = 0.03
 # Codes of moves that leave vibration, even if the model is exact.
 _RINGING = (Code.LINEAR, Code.MINIMAX)
 # Time for which a target is held at the least.
@@ -57,67 +50,9 @@ def carried(
     return found if np.all(np.isfinite(found)) else ()
 
 
-def _product(one: Sequence[float], other: Sequence[float]) -> float:
-    return sum(x * y for x, y in zip(one, other, strict=True))
-
-
-def with_branches(
-        request: Request, plain: Sequence[Level], free: Sequence[tuple[str, int]],
-        delivery: Delivery | None = None) -> Attempt:
-    """Solve for the free numbers of levels with branches, given those without them."""
-    # A free first level pushes as much harder as the branches are stiff; times shrink with it.
-    material, state = request.material, request.state
-    creep = material.creep.held
-    # How much of a branch a motion as fast as this feels.
-    speeds = paces(material, request.behind(request.target)) / request.frequency
-    felt = (1.0 / (1.0 + speeds ** 2)).tolist()
-    force = float(law.elastic_force(state.stretch, material.packed))
-    held = request.behind(state.stretch).tolist()
-    loads = {i for kind, i in free if kind == 'load'}
-    times = {i for kind, i in free if kind == 'time'}
-
-    def grown(share: float) -> list[float]:
-        return [(1.0 + ratio) ** share - 1.0 for ratio in creep.ratios]
-
-    def stiffer(levels: tuple[Level, ...], share: float, aim: float) -> Attempt:
-        before, after = grown(share), grown(aim)
-        stiffness = (1.0 + _product(felt, after)) / (1.0 + _product(felt, before))
-        # Ramps and grid stay as they are.
-        faster = math.sqrt(stiffness) if times else 1.0
-        guess = [Level(
-            x.time / faster, x.load if i not in loads else
-            force + _product(after, held) + stiffness * (x.load - force - _product(before, held)))
-            for i, x in enumerate(levels)]
-        there = request if aim == 1.0 else replace(request, material=replace(
-            material, creep=replace(creep, ratios=tuple(after))))
-        found = solve(Template.of(guess, free), there, delivery)
-        return found and (found[0][:len(plain)], found[1]) if aim < 1.0 else found
-
-    return approach(tuple(plain), stiffer, _SHORTEST_STRIDE)
-
-
-def two_levels(request: Request, plain: Move) -> Attempt:
-    """Solve for level and duration with branches, given those without them."""
-    return with_branches(request, plain.levels, [('load', 0), ('time', 1)], IDEAL)
-
-
-def free_levels(request: Request) -> Move:
-    """Come to rest by two levels of free heights; `RefusedError` if the limits have none."""
-    found = free_heights(request, [('load', 0), ('load', 1)])
-    if found is None:
-        raise RefusedError(
-            Code.NO_TWO_STEP,
-            f'no two flux densities within the limits bring {request.named_target} of this '
-            'creeping elastomer to rest: expected wider limits, a smaller move or several '
-            'setpoints')
-    return Move(Code.MINIMUM_TIME, *found, (
-        f'no single intermediate flux density within the limits leads to rest at '
-        f'{request.target:g}: two are used'))
-
-
 def arrival(request: Request, found: Move) -> State:
     """Return the state to which a move leads, at rest at the target."""
-    end = replace(request.state, load=request.field)
+    end = request.start
     if found.duration > 0.0:
         # The last level counts where it is ramped to.
         end = follow(
@@ -178,12 +113,10 @@ def _passed(
     """Return the states at times at which levels begin, where the block is not at rest."""
     delivery = request.delivery
     rows, _ = ramps(levels, request.load, float(times[-1]), delivery.slew)
-    switches, loads, slopes = np.array(rows).T.copy()
+    switches, loads, _ = zip(*rows, strict=True)
     outputs = np.interp(times, switches, loads) if delivery.slew < math.inf else np.array(
         [request.load, *(x.load for x in levels)])[len(levels) - len(times):-1]
-    found = sampled(
-        switches, loads, slopes, times, replace(request.state, load=request.field),
-        request.material, RTOL, delivery.lag)
+    found = sampled(levels, request.start, times, request.material, delivery)
     lags = delivery.lag > 0.0
     return tuple(
         State(stretch, rate, field if lags else output, output if lags else None, tuple(followed))

@@ -1,8 +1,7 @@
 """Full push, full brake, hold: on ideal hardware the fastest command within load limits."""
 
-from collections.abc import Callable
-import contextlib
 from dataclasses import replace
+from itertools import pairwise
 import math
 
 import numpy as np
@@ -10,130 +9,161 @@ import numpy as np
 from hmsa_ros import motion
 from hmsa_ros.model import law
 from hmsa_ros.model.moves import Level, Move, State
-from hmsa_ros.model.simulation import sampled
+from hmsa_ros.model.simulation import paces, sampled
 from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.shapers.creeping import with_branches
-from hmsa_ros.planning.shapers.lagged import (
-    at_rest,
-    fastest_on_grid,
-    in_order,
-    push_brake_push,
-    three_levels,
-)
+from hmsa_ros.planning.shapers.free import at_rest, free_levels, unknowns
 from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.planning.shooting import Attempt, on_time, solve, Template
+from hmsa_ros.planning.shooting import (
+    approach,
+    Attempt,
+    first_kept,
+    heights,
+    on_time,
+    solve,
+    Template,
+)
 
 _RTOL = 1e-12
-_AT_REST = 1e-9
 # Room that is left below the limits, as a share, for what rounded times ask of the levels.
 _MARGIN = 1e-4
 # Periods to add on the grid where the least number gives no solution.
 _MORE_PERIODS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 2), (3, 3))
+# Behind a lag: the share of a command by which longer ones are, and of the last level in lags.
+_STRIDES, _PUSH = 12, math.log(2.0)
 # Heights to try, as shares of what the limits allow.
 _SHARES = (1.0, 0.5, 0.25, 0.1, 0.05)
-_MOST_STEPS = 20_000
-# Of the time of the switch, as a share.
-_ZERO_TOLERANCE = 1e-13
+# Strides in which a push is followed, in radians of the vibration, and how many at the most.
+_STRIDE, _MOST_STEPS = 0.05, 8_000
+_SHORTEST_STRIDE = 0.03
 
 
 def push_brake(request: Request, reason: str = '') -> Move:
     """
     Push with the load limit on one side, brake with the other, then hold.
 
-    With bounded load the fastest transfer is bang-bang with one switch. It exists from any
-    state, moving ones and those above critical damping included, as long as the limits leave
-    room on both sides of the target's own load: `RefusedError` otherwise. Without limits, a push
-    of twice the move's change of load is used. ``reason`` is why it takes the place of another.
+    With bounded load the fastest transfer is bang-bang with one switch, and behind a lag with two.
+    It exists from any state, moving ones and those above critical damping included, as long as the
+    limits leave room on both sides of the target's own load: `RefusedError` otherwise. Without
+    limits, a push of twice the move's change of load is used. ``reason`` is why it takes the place
+    of another.
     """
     holding = request.holding_load()
-    state, target = request.state, request.target
-    if request.delivery.lag > 0.0:
-        return _late(request, holding, reason)
-    if abs(target - state.stretch) <= _AT_REST and abs(state.rate) <= _AT_REST * request.frequency:
+    if at_rest(request):
         return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
     least, most = _bounds(request, holding)
+    lags = request.delivery.lag > 0.0
+    if lags and request.delivery.period > 0.0:
+        found = _fastest_on_grid(request, least, most)
+        if found is not None:
+            return Move(Code.MINIMUM_TIME, *found, reason)
+        return replace(free_levels(request), reason=reason)
     for share in _SHARES:
         # On a grid and through ramps full height may leave no time to switch.
-        found = _attempt(
-            request, holding, holding + share * (least - holding),
-            holding + share * (most - holding))
+        low, high = holding + share * (least - holding), holding + share * (most - holding)
+        up = _direction(request, low, high) > 0.0
+        found = _attempt(request, *((high, low) if up else (low, high)))
         if found is not None and request.keeps(found[0]):
             return Move(Code.MINIMUM_TIME, *found, reason)
+    if lags:
+        return replace(free_levels(request), reason=reason)
     raise RefusedError(
         Code.NOT_CONVERGED,
         f'no command of two levels within the limits was found from {request.named_state} to '
-        f'rest at {target:g}')
+        f'rest at {request.target:g}')
 
 
-def _late(request: Request, holding: float, reason: str) -> Move:
-    """Push, brake and push again, so that the field arrives with the stretch."""
-    if at_rest(request):
-        return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
-    if request.delivery.period > 0.0:
-        found = fastest_on_grid(request, _bounds(request, holding))
-        if found is not None:
-            return Move(Code.MINIMUM_TIME, *found, reason)
-        return three_levels(request, Code.MINIMUM_TIME, reason)
-    least, most = _bounds(request, holding)
-    elastic = replace(request, material=request.material.elastic)
-    for share in _SHARES:
-        low, high = holding + share * (least - holding), holding + share * (most - holding)
-        direction = _direction(request, low, high)
-        push, brake = (high, low) if direction > 0.0 else (low, high)
-        with contextlib.suppress(RefusedError):
-            found = _attempt(replace(elastic, delivery=replace(
-                request.delivery, lag=0.0, resolution=0.0)), holding, low, high)
-            found = found and push_brake_push(elastic, found[0], push, brake)
-            found = in_order(_carried(request, found, 3))
-            if found is not None and request.keeps(found[0]):
-                return Move(Code.MINIMUM_TIME, *found, reason)
-    return three_levels(request, Code.MINIMUM_TIME, reason)
-
-
-def _attempt(
-        request: Request, holding: float, least: float,
-        most: float) -> Attempt:
+def _attempt(request: Request, push: float, brake: float) -> Attempt:
     """Push and brake with given loads; None if no command comes of it."""
-    direction = _direction(request, least, most)
-    push, brake = (most, least) if direction > 0.0 else (least, most)
     elastic = replace(request, material=request.material.elastic)
-    pushing, braking = _durations(elastic, direction, push, brake)
-    if request.delivery.period > 0.0:
-        return _on_grid(request, holding, (push, pushing), (brake, braking))
-    delivery = request.delivery
-    up = delivery.ramp(push - request.load)
-    down = delivery.ramp(push - brake)
-    levels = (Level(0.0, push), Level(max(pushing, up), brake),
-              Level(max(pushing, up) + max(braking, down), holding))
-    return _carried(request, solve(
-        Template.of(levels, [('time', 1), ('time', 2)]), elastic), 2)
+    try:
+        pushing, braking = _durations(elastic, push, brake)
+    except RefusedError:
+        if request.delivery.lag > 0.0:
+            return None
+        raise
+    delivery, holding = request.delivery, request.holding_load()
+    if delivery.period > 0.0:
+        return first_kept((_on_grid(
+            request, (push, pushing), (brake, braking), *x) for x in _MORE_PERIODS), request)
+    up, down = delivery.ramp(push - request.load), delivery.ramp(push - brake)
+    turn = max(pushing, up)
+    found = solve(
+        Template.of((Level(0.0, push), Level(turn, brake), Level(
+            turn + max(braking, down), holding)), [('time', 1), ('time', 2)]), elastic,
+        replace(delivery, lag=0.0))
+    if found is not None and (request.material.creep or delivery.lag > 0.0):
+        found = _carried(request, found[0])
+    return on_time(found, unknowns(request), request)
 
 
-def _carried(request: Request, found: Attempt, switches: int) -> Attempt:
-    """Have the switches of levels be those with branches, at times that commands can carry."""
-    if found is not None and request.material.creep:
-        found = with_branches(
-            request, found[0], [('time', 1 + i) for i in range(switches)])
-    return on_time(found, switches, request)
+def _carried(request: Request, plain: tuple[Level, ...]) -> Attempt:
+    """
+    Solve for the times of push, brake and, behind a lag, push again.
+
+    What branches hold and the lag grow where they are too much at once.
+    """
+    material, delivery, creep = request.material, request.delivery, request.material.creep.held
+    push, brake, holding = (x.load for x in plain)
+    # The second push ends when the field, at the brake's level before, is at the holding load.
+    length = math.log1p((holding - brake) / (push - holding))
+    # How much of a branch a motion as fast as this feels.
+    speeds = paces(material, request.behind(request.target)) / request.frequency
+    felt = 1.0 / (1.0 + speeds ** 2)
+
+    def grown(share: float) -> tuple[float, ...]:
+        return tuple((1.0 + ratio) ** share - 1.0 for ratio in creep.ratios)
+
+    def closer(levels: tuple[Level, ...], share: float, aim: float) -> Attempt:
+        faster = math.sqrt((1.0 + felt @ grown(aim)) / (1.0 + felt @ grown(share)))
+        lag, times = aim * delivery.lag, [x.time / faster for x in levels]
+        guess = [Level(0.0, push), Level(times[1], brake), Level(times[2], holding)]
+        if lag > 0.0:
+            guess[2:] = Level(times[2], push), Level(
+                times[2] + delivery.ramp(push - brake) + lag * length
+                + delivery.ramp(push - holding), holding)
+        found = solve(
+            Template.of(guess, [('time', 1 + i) for i in range(len(guess) - 1)]),
+            replace(request, material=replace(material, creep=replace(creep, ratios=grown(aim)))),
+            replace(delivery, lag=lag))
+        return found if found is None or aim == 1.0 else (found[0][:len(guess)], found[1])
+
+    found = approach(plain, closer, _SHORTEST_STRIDE)
+    ordered = found and all(x.time < y.time for x, y in pairwise(found[0]))
+    return found if ordered else None
 
 
 def _on_grid(
-        request: Request, holding: float, push: tuple[float, float],
-        brake: tuple[float, float]) -> Attempt:
-    """Place push and brake, (load, duration) each, on the grid; their heights are free then."""
-    period = request.delivery.period
-    for more_first, more_second in _MORE_PERIODS:
-        first = max(1, math.ceil(push[1] / period)) + more_first
-        second = max(1, math.ceil(brake[1] / period)) + more_second
-        levels = (
-            Level(0.0, holding + (push[0] - holding) * push[1] / (first * period)),
-            Level(first * period,
-                  holding + (brake[0] - holding) * brake[1] / (second * period)),
-            Level((first + second) * period, holding))
-        found = solve(
-            Template.of(levels, [('load', 0), ('load', 1)]), request)
+        request: Request, push: tuple[float, float], brake: tuple[float, float], more: int,
+        longer: int) -> Template:
+    """Return a guess of push and brake, (load, duration) each, on the grid; heights are free."""
+    period, holding = request.delivery.period, request.holding_load()
+    first = max(1, math.ceil(push[1] / period)) + more
+    second = max(1, math.ceil(brake[1] / period)) + longer
+    return heights((
+        Level(0.0, holding + (push[0] - holding) * push[1] / (first * period)),
+        Level(first * period, holding + (brake[0] - holding) * brake[1] / (second * period)),
+        Level((first + second) * period, holding)))
+
+
+def _fastest_on_grid(request: Request, least: float, most: float) -> Attempt:
+    """Return the shortest three levels on the grid that keep the limits, if there are any."""
+    period, lag, holding = request.delivery.period, request.delivery.lag, request.holding_load()
+    longest = math.ceil((2.0 * math.pi / request.frequency + 3.0 * lag) / period) + 6
+
+    def guess(count: int) -> Template:
+        last = max(1, min(count // 3, math.ceil(_PUSH * lag / period)))
+        return heights((
+            Level(0.0, 0.5 * (least + holding)),
+            Level(max(1, (count - last) // 2) * period, holding),
+            Level((count - last) * period, holding), Level(count * period, holding)))
+
+    # On a fine grid long ones in strides, and then what the last stride has left out.
+    shortest = count = 3
+    while count < longest:
+        found = first_kept([guess(count)], request)
         if found is not None:
-            return found
+            return first_kept(map(guess, range(shortest, count)), request) or found
+        shortest, count = count + 1, count + max(1, count // _STRIDES)
     return None
 
 
@@ -171,83 +201,39 @@ def _direction(request: Request, least: float, most: float) -> float:
     return 1.0 if request.target > stop else -1.0
 
 
-def _durations(
-        request: Request, direction: float, push: float,
-        brake: float) -> tuple[float, float]:
-    """Find how long to push so that braking turns at the target, and how long that brakes."""
-    state, material, target = request.state, request.material, request.target
-    packed = material.packed
-    begins, loads, slopes = np.array([[0.0], [push], [0.0]])
+def _durations(request: Request, push: float, brake: float) -> tuple[float, float]:
+    """Return about how long to push so that braking turns at the target, and how long to brake."""
+    material, target = request.material, request.target
+    packed, direction = material.packed, math.copysign(1.0, push - brake)
+    pushed, stride = (Level(0.0, push),), _STRIDE / (request.frequency + material.zeta)
 
-    def follow(start: State, time: float) -> State:
-        stretch, rate, *_ = sampled(
-            begins, loads, slopes, np.array([float(time)]), start, material, _RTOL)[:, 0].tolist()
-        return State(stretch, rate)
-
-    def turn(start: State) -> tuple[float, float]:
-        if direction * start.rate <= 0.0:
+    def turn(start: State, way: float, load: float) -> tuple[float, float]:
+        if way * start.rate <= 0.0:
             return 0.0, start.stretch
         status, time, stretch, _, _ = motion.turning_point(
-            start.stretch, start.rate, direction, brake, 1.0, packed, _RTOL)
+            start.stretch, start.rate, way, load, 1.0, packed, _RTOL)
         if status != motion.DONE:
             # Too hard against a limiting stretch to be followed: far beyond the target.
-            return 0.0, float(packed[law.UPPER if direction > 0.0 else law.LOWER])
+            return 0.0, float(packed[law.UPPER if way > 0.0 else law.LOWER])
         return time, stretch
 
-    begin = 0.0
-    here = state
-    if direction * state.rate < 0.0:
-        # Moving away: the push first has to bring it to a stop.
-        status, begin, stretch, _, _ = motion.turning_point(
-            state.stretch, state.rate, -direction, push, 1.0, packed, _RTOL)
-        if status == motion.DONE:
-            here = State(stretch, 0.0)
-    stride = 0.02 / (request.frequency + material.zeta)
-    low = 0.0
-    high = stride
-    ahead = follow(here, high)
+    # Moving away, the push first has to bring it to a stop.
+    begin, stretch = turn(request.state, -direction, push)
+    here = request.state if begin == 0.0 else State(stretch, 0.0)
+    pushing, before = 0.0, -math.inf
     for _ in range(_MOST_STEPS):
-        if direction * (ahead.stretch - target) >= 0.0:
+        braking, stop = turn(here, direction, brake)
+        beyond = direction * (stop - target)
+        if beyond >= 0.0 or (pushing > 0.0 and direction * here.rate <= 0.0):
             break
-        low = high
-        high += stride
-        ahead = follow(ahead, stride)
-        if direction * ahead.rate <= 0.0:
-            break
-    if direction * (ahead.stretch - target) < 0.0:
+        before = beyond
+        stretch, rate, *_ = sampled(
+            pushed, here, np.array([stride]), material, rtol=_RTOL)[:, 0].tolist()
+        here, pushing = State(stretch, rate), pushing + stride
+    if beyond < 0.0:
         raise RefusedError(
             Code.FLUX_LIMIT,
             f'{request.named_target} is not reached under {request.units.load_text(push)}: '
             'expected wider flux density limits')
-
-    def excess(time: float) -> float:
-        return direction * (turn(follow(here, time))[1] - target)
-
-    if excess(0.0) >= 0.0:
-        low = high = 0.0
-    elif excess(low) > 0.0:
-        low = 0.0
-    pushing = high if low == high else _zero(excess, low, high)
-    return begin + pushing, turn(follow(here, pushing))[0]
-
-
-def _zero(function: Callable[[float], float], low: float, high: float) -> float:
-    """
-    Return where a function changes its sign (Anderson and Bjorck, BIT 13, 1973).
-
-    SciPy's solvers are as fast, but loading them takes half of the time in which a planner starts.
-    """
-    other, value = function(low), function(high)
-    for _ in range(_MOST_STEPS):
-        step = value * (high - low) / (other - value)
-        if abs(step) <= _ZERO_TOLERANCE * max(abs(high), 0.1):
-            return high + step
-        new = function(high + step)
-        if (new > 0.0) == (value > 0.0):
-            # The same end moves again: the other one has less weight from now on.
-            share = 1.0 - new / value
-            other *= share if share > 0.0 else 0.5
-        else:
-            low, other = high, value
-        high, value = high + step, new
-    return high
+    # What the last stride went too far.
+    return begin + pushing - stride * beyond / (beyond - before), braking

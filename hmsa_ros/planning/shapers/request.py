@@ -1,8 +1,9 @@
 """What a shaper gets, and the checks that all shapers share."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import math
+from typing import Any
 
 import numpy as np
 
@@ -67,6 +68,14 @@ class Request:
     pace: Pace = PACE  #: of smooth; the rate per unit of nondimensional time
     work: Work = field(default_factory=Work, compare=False)
 
+    @classmethod
+    def of(
+            cls, material: NondimensionalParameters, start: State | None = None,
+            **more: Any) -> 'Request':
+        """Return a request to stay, from rest without a field unless a start is given."""
+        state = start or State(material.rest)
+        return cls(state, state.stretch, material, **more)
+
     @property
     def named_target(self) -> str:
         """The target in a message, as in ``'stretch 1.4'``."""
@@ -89,6 +98,11 @@ class Request:
         if math.isfinite(self.state.load):
             return self.state.load
         return float(law.elastic_force(self.state.stretch, self.material.packed))
+
+    @property
+    def start(self) -> State:
+        """The state with the load in force, where that is the one that holds it."""
+        return replace(self.state, load=self.field)
 
     @property
     def frequency(self) -> float:

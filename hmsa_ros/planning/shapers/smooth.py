@@ -20,15 +20,12 @@ from hmsa_ros.model import law
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.moves import Level, Move
 from hmsa_ros.model.simulation import (
-    follow,
     followed_by,
-    RTOL,
     sampled,
-    simulate,
     with_followed,
 )
 from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.shapers.lagged import at_rest
+from hmsa_ros.planning.shapers.free import at_rest
 from hmsa_ros.planning.shapers.pace import MOST_PERIODS
 from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.shooting import Attempt, solve, Template
@@ -46,10 +43,6 @@ _CURVED = 420.0 * (_SHARES * _LEFT) ** 2 * (_LEFT - _SHARES)
 _LONGER, _HALVINGS = 1.25, 5
 # How much longer a command may get that cannot be solved for, and how often.
 _RETRY, _RETRIES = 1.08, 5
-# Passes of a solution by differences, their change as a share of the loads and at least, and
-# what they may miss, as a share of the move and at least.
-_PASSES, _CHANGE, _LEAST_CHANGE = 8, 1e-5, 1e-6
-_AT_REST, _ROUNDING = 1e-10, 1e-12
 # Share of the slew limit that the path may use, and of the limits that corrections may need.
 _SLEW_SHARE, _SLACK = 0.95, 0.01
 
@@ -162,27 +155,17 @@ def _free(
     material, state = request.material, request.state
     load, field = request.load, request.field
     followed = followed_by(state, material)
-    lag = request.delivery.lag
-    loads: Array = np.full(_POINTS, load)
-    start = np.zeros(1)
-    if lag > 0.0:
-        loads += (field - load) * np.exp(-times / lag)
-    pull = loads
-    if material.creep:
-        rows = sampled(
-            start, np.array([load]), start, times, replace(state, load=field), material, RTOL,
-            lag)
-        stretch, rate = rows[0].copy(), rows[1].copy()
-        force = np.array([law.elastic_force(x, material.packed) for x in stretch.tolist()])
-        pull = loads - material.branches[:, motion.RATIO] @ (force - rows[3:])
-    elif state.rate == 0.0 and field == load == law.elastic_force(
+    if not material.creep and state.rate == 0.0 and field == load == law.elastic_force(
             state.stretch, material.packed):
         nothing = np.zeros(_POINTS)
-        return np.full(_POINTS, state.stretch), nothing, nothing, loads, followed
-    else:
-        stretch, rate = simulate(
-            start, [load], times, material, stretch=state.stretch, rate=state.rate, lag=lag,
-            field=field)
+        return np.full(_POINTS, state.stretch), nothing, nothing, nothing + load, followed
+    stretch, rate, loads, *rows = sampled(
+        (Level(0.0, load),), request.start, times, material, replace(
+            request.delivery, slew=math.inf))
+    stretch, rate, pull = stretch.copy(), rate.copy(), loads
+    if material.creep:
+        force = np.array([law.elastic_force(x, material.packed) for x in stretch.tolist()])
+        pull = loads - material.branches[:, motion.RATIO] @ (force - np.array(rows))
     change = np.empty(_POINTS)
     law.accelerations(stretch, rate, pull, material.packed, change)
     return stretch, rate, change, loads, followed
@@ -228,48 +211,9 @@ def _delivered(request: Request, path: _Path, holding: float, period: float) -> 
     d_loads[:-1] = np.array(changes).T
     rounded = np.array([delivery.rounded(x) for x in times.tolist()])
     loads = np.append(loads, path.loads[-1] if request.material.creep else holding)
-    found = solve(
+    return solve(
         Template(rounded, loads, np.zeros_like(d_loads), d_loads), request,
         wait=delivery.rounded(0.5 * each))
-    return found or _settled(request, rounded, loads, d_loads)
-
-
-def _settled(request: Request, times: Array, loads: Array, d_loads: Array) -> Attempt:
-    """
-    Solve for rest with differences.
-
-    For moves so small that rounding counts.
-    """
-    packed = request.material.packed
-    state = replace(request.state, load=request.field)
-    frequency = request.frequency
-    stiffness = law.elastic_stiffness(request.target, packed)
-    move = abs(request.target - state.stretch) + abs(state.rate) / frequency
-    change = max(_CHANGE * float(np.ptp(loads)), _LEAST_CHANGE)
-
-    def levels(factors: Array) -> tuple[Level, ...]:
-        return tuple(Level(t, x) for t, x in zip(
-            times.tolist(), (loads + d_loads @ factors).tolist(), strict=True))
-
-    def miss(factors: Array) -> Array:
-        end = follow(
-            levels(factors)[:-1], state, float(times[-1]), request.material, request.delivery)
-        misses = [end.stretch - request.target, end.rate / frequency,
-                  (end.load - request.balance(followed_by(end, request.material))) / stiffness]
-        return np.array(misses[:len(factors)])
-
-    factors: Array = np.zeros(d_loads.shape[1])
-    try:
-        for _ in range(_PASSES):
-            missed = miss(factors)
-            if np.max(np.abs(missed)) <= max(_AT_REST * move, _ROUNDING):
-                return levels(factors), float(times[-1])
-            slopes = np.column_stack([
-                (miss(factors + change * x) - missed) / change for x in np.eye(len(factors))])
-            factors = factors - np.linalg.solve(slopes, missed)
-    except (HmsaError, np.linalg.LinAlgError):
-        pass
-    return None
 
 
 def _refusal(request: Request) -> tuple[Code, str]:

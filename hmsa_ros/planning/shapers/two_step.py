@@ -1,6 +1,6 @@
 """The two-step command, on ideal and on real hardware."""
 
-import contextlib
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product, starmap
 import math
@@ -8,15 +8,20 @@ import math
 import numpy as np
 
 from hmsa_ros import motion
-from hmsa_ros.model.moves import Level, Limits, Move
+from hmsa_ros.model.moves import Level, Move
 from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.shapers.creeping import free_levels, two_levels
-from hmsa_ros.planning.shapers.lagged import at_rest, settle, three_levels
+from hmsa_ros.planning.shapers.free import at_rest, free_heights, free_levels, no_single
 from hmsa_ros.planning.shapers.push_brake import push_brake
 from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.planning.shooting import approach, Attempt, first_kept, solve, Template
+from hmsa_ros.planning.shooting import approach, Attempt, first_kept, heights, solve, Template
 from hmsa_ros.planning.two_step import CODES, HOLD_TOLERANCE, plan_two_step, RTOL
 
+# Of the push that settles a lagging field, in time constants: it passes the holding level by as
+# much as the level before falls short of it; others on a grid are longer.
+_PUSH = math.log(2.0)
+# Periods of the grid beyond the least number; behind a lag with factors on the push, too.
+_MORE = (0, 1, 2, 3)
+_BEHIND_LAG = (*_MORE, 4, 6, 9), (1, 2, 3)
 # Where a search begins: shares of the way between the least and the largest level, and the longest
 # hold in eighths of a period.
 _HEIGHTS = (0.5, 0.3, 0.7, 0.1, 0.9)
@@ -24,63 +29,80 @@ _LONGEST_HOLD = 18
 # Ramps slower than this are refused without a search, which would take seconds.
 _MOST_HALF_PERIODS = 80
 _SHORTEST_STRIDE = 0.05
+# Half periods and lags from which on levels of free heights may be sooner there.
+_SLOW = 3.0
 # Codes of plans in whose place something else is done at once.
 _WITHOUT = (Code.HOLD, Code.TOO_DAMPED, Code.INDISTINGUISHABLE)
-# Ramps to begin the search for two swings with, in quarters of a period.
-_SWINGS = (0.3, 0.1, 0.7, 0.03, 1.2)
 
 
 def two_step(request: Request) -> Move:
     """
     Apply beta_p for tau_p, then beta_1 (Eq. 13): at rest at the target, nothing left to ring.
 
-    On a grid, the second last period gets a level of its own and both levels are solved for;
-    through ramps, beta_p and its duration are. From a moving start for which no single level
-    leads to rest within the limits, two are used. Where the response is too damped to cross
+    Where branches hold, wherever they arrive: what they hold then is followed afterwards. Where
+    the field lags, a short push more settles it. On a grid the heights are solved for, of one
+    level more, and through ramps beta_p and its duration. Where no single level leads to rest
+    within the limits, levels of free heights do. Where the response is too damped to cross
     the target there is no such command; the unshaped step, which does not overshoot there, takes
-    its place. Both say so in the move's reason.
+    its place. All say so in the move's reason.
     """
-    delivery, creep = request.delivery, request.material.creep
-    if delivery.lag > 0.0 or creep:
-        # The rest is for what one search does not lead to.
-        move = _at_once(request) if delivery.period == 0.0 and delivery.slew == math.inf else None
-        return move or (_late if delivery.lag > 0.0 else _creeping)(request)
     holding = request.holding_load()
-    state, material, target = request.state, request.material, request.target
+    delivery, creeps = request.delivery, bool(request.material.creep)
+    lags, at_once = delivery.lag > 0.0, delivery.period == 0.0 and delivery.slew == math.inf
+    if lags and at_rest(request):
+        return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
+    # On a grid and through ramps commands begin without the lag, whose push is a level more.
+    code, levels = _late(request, delivery.lag if at_once else 0.0) \
+        if lags or creeps else _plain(request)
+    if code in _WITHOUT and not (lags and code is Code.HOLD):
+        return _without(request, code, holding)
+    found: Attempt = None
+    if code is Code.TWO_STEP:
+        found = (levels, levels[-1].time) if at_once else _delivered(request, levels)
+        if found is not None and request.keeps(found[0]):
+            if (lags or creeps) and found[1] > _SLOW * (
+                    math.pi / request.frequency + delivery.lag):
+                sooner = free_heights(request)
+                if sooner is not None and sooner[1] < found[1]:
+                    return Move(Code.MINIMUM_TIME, *sooner, no_single(request))
+            return Move(Code.TWO_STEP, *found)
+    if request.state.rate == 0.0 and not lags and (code is Code.TWO_STEP or not creeps):
+        request.check(levels)
+    if at_once and not lags and not creeps:
+        return push_brake(request, no_single(request))
+    try:
+        return free_levels(request)
+    except RefusedError:
+        found = first_kept(_held(request), request)
+        if found is None:
+            raise
+        return Move(Code.TWO_STEP, *found)
+
+
+def _plain(request: Request) -> tuple[Code, tuple[Level, ...]]:
+    """Return code and levels of ideal hardware without branches."""
+    state, limits = request.state, request.limits
     plan = plan_two_step(
-        state.stretch, target, material, rate=state.rate,
-        load_limits=(request.limits.minimum, request.limits.maximum))
-    if plan.code in _WITHOUT:
-        return _without(request, plan.code, holding)
-    inside = request.limits.minimum <= plan.beta_p <= request.limits.maximum
-    if plan.code is not Code.TWO_STEP or not inside:
-        if state.rate == 0.0:
-            request.check([Level(0.0, plan.beta_p)])
-        return _two_levels(request, holding)
-    ideal = (Level(0.0, plan.beta_p), Level(plan.tau_p, holding))
-    if request.delivery.ideal:
-        return Move(Code.TWO_STEP, ideal, plan.tau_p)
-    if request.delivery.period > 0.0:
-        return _sampled(request, *ideal)
-    return _ramped(request, *ideal)
+        state.stretch, request.target, request.material, rate=state.rate,
+        load_limits=(limits.minimum, limits.maximum))
+    return plan.code, (Level(0.0, plan.beta_p), Level(plan.tau_p, request.holding_load()))
 
 
-def _at_once(request: Request) -> Move | None:
-    """Return the move with branches or behind a lag, at any time and in steps; None if none."""
-    state, material, limits, lag = (
-        request.state, request.material, request.limits, request.delivery.lag)
-    least, most = limits.minimum, limits.maximum
-    found, beta_p, tau_p, beta_1, push, until = motion.two_step_late(
-        state.stretch, state.rate, request.target, least, most, RTOL, HOLD_TOLERANCE,
-        material.packed, material.branches, state.followed, request.field, request.load, lag)
-    if CODES[found] is not Code.TWO_STEP or not (
-            least <= beta_p <= most and least <= beta_1 <= most and least <= push <= most):
-        return None
+def _late(request: Request, lag: float) -> tuple[Code, tuple[Level, ...]]:
+    """Return code and levels with branches or behind a lag, at any time and in steps."""
+    state, material, limits = request.state, request.material, request.limits
+    status, beta_p, tau_p, beta_1, push, until = motion.two_step_late(
+        state.stretch, state.rate, request.target, limits.minimum, limits.maximum, RTOL,
+        HOLD_TOLERANCE, material.packed, material.branches, state.followed, request.field,
+        request.load, lag)
+    code = CODES[status]
+    if code is not Code.TWO_STEP:
+        # What there is to say of it is that of the elastic motion.
+        elastic = _plain(replace(request, material=material.elastic))[0]
+        return elastic if elastic in _WITHOUT else Code.NO_TWO_STEP, ()
     levels = Level(0.0, beta_p), Level(tau_p, beta_1)
-    if lag == 0.0:
-        return Move(Code.TWO_STEP, levels, tau_p)
-    return Move(
-        Code.TWO_STEP, (levels[0], Level(tau_p, push), Level(until, beta_1)), until)
+    return code, levels if lag == 0.0 else (
+        levels[0], Level(tau_p, push), Level(until, beta_1))
 
 
 def _without(request: Request, code: Code, holding: float) -> Move:
@@ -100,113 +122,48 @@ def _without(request: Request, code: Code, holding: float) -> Move:
         'equals beta_1 to rounding: the unshaped step is used')
 
 
-def _elastic(request: Request, holding: float) -> Move | None:
-    """Return a move of ideal hardware without branches and limits, None if there is none."""
-    state = request.state
-    plan = plan_two_step(state.stretch, request.target, request.material.elastic, rate=state.rate)
-    if plan.code in _WITHOUT:
-        return _without(request, plan.code, holding)
-    if plan.code is not Code.TWO_STEP:
-        return None
-    return Move(
-        plan.code, (Level(0.0, plan.beta_p), Level(plan.tau_p, holding)), plan.tau_p)
+def _delivered(request: Request, levels: tuple[Level, ...]) -> Attempt:
+    """Return the command that a grid or ramps make of one at any time and in steps, if any."""
+    if request.delivery.period > 0.0:
+        return first_kept(_on_grid(request, *levels), request)
+    found = _ramped(request, levels)
+    if (found is None or not request.keeps(found[0])) and request.state.rate == 0.0:
+        return first_kept(_held(request), request)
+    return found
 
 
-def _creeping(request: Request) -> Move:
-    """Have branches arrive wherever they do: what they hold then is followed afterwards."""
-    holding = request.holding_load()
-    move = _elastic(request, holding)
-    if move is not None and (move.code is Code.HOLD or math.isinf(move.duration)):
-        return move
-    found = None if move is None else two_levels(request, move)
-    if found is not None and request.delivery.ideal:
-        if request.keeps(found[0]):
-            return Move(Code.TWO_STEP, *found)
-    elif found is not None:
-        with contextlib.suppress(RefusedError):
-            return (_sampled if request.delivery.period > 0.0 else _ramped)(request, *found[0])
-    if found is not None and request.state.rate == 0.0:
-        request.check(found[0])
-    return free_levels(request)
-
-
-def _late(request: Request) -> Move:
-    """Have the field arrive with the stretch, by a level more."""
-    holding = request.holding_load()
-    if at_rest(request):
-        return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
-    move = None
-    if request.material.creep or request.delivery.slew < math.inf:
-        with contextlib.suppress(RefusedError):
-            move = two_step(replace(
-                request, delivery=replace(request.delivery, lag=0.0, period=0.0),
-                limits=Limits()))
-    else:
-        move = _elastic(request, holding)
-    if move is not None and math.isinf(move.duration):
-        return move
-    if move is not None and move.code is Code.TWO_STEP:
-        found = settle(request, move)
-        if found is not None:
-            return found
-    return three_levels(request, Code.MINIMUM_TIME, (
-        'no single intermediate flux density and a push that settles the field lead within the '
-        f'limits to rest at {request.target:g}: three are used'))
-
-
-def _sampled(request: Request, first: Level, last: Level) -> Move:
+def _on_grid(request: Request, first: Level, last: Level) -> Iterator[Template]:
     """
-    Place the command on the grid: one level, and another for its last period.
+    Yield guesses on the grid: one level, another for a period, and one that settles the field.
 
-    The share of the last period that the ideal command spends at beta_1 gives the first guess.
-    Where that is too far off, the solution is followed from the grid that the ideal command
-    fits exactly.
+    The share of that period that the ideal command spends at the last level gives its height. The
+    push is long enough not to ask for much more than the limits.
     """
-    period = request.delivery.period
-    tau_p = last.time
-    least = max(2, math.ceil(tau_p / period - 1e-9))
-    # Ramps may need a longer move than steps.
-    for count in range(least, least + 4):
-        fitting = tau_p / count
-
-        def stretched(
-                levels: tuple[Level, ...], share: float, aim: float, *, count: int = count,
-                fitting: float = fitting) -> Attempt:
-            each = fitting + aim * (period - fitting)
-            late = min(count - tau_p / each, 1.0)
-            between = levels[1].load
-            if share == 0.0:
-                between = first.load + late * (last.load - first.load)
-            guess = (levels[0], Level((count - 1) * each, between),
-                     Level(count * each, last.load))
-            return solve(
-                Template.of(guess, [('load', 0), ('load', 1)]), request)
-
-        exact = (first, Level((count - 1) * fitting, first.load), last)
-        found = approach(exact, stretched, _SHORTEST_STRIDE)
-        if found is not None and request.keeps(found[0]):
-            return Move(Code.TWO_STEP, *found)
-    raise RefusedError(
-        Code.NO_TWO_STEP,
-        f'no command on a grid of {request.units.time_text(period)} within the limits brings '
-        f'{request.named_target} to rest, which takes {request.units.time_text(tau_p)} without')
+    delivery = request.delivery
+    period, lag = delivery.period, delivery.lag
+    shortest = math.ceil(_PUSH * lag / period)
+    late = lag + delivery.ramp(last.load - request.load) if lag > 0.0 else 0.0
+    for periods, longer in product(*(_BEHIND_LAG if lag > 0.0 else (_MORE, (1,)))):
+        push = longer * shortest
+        count = max(push + 2, math.ceil((last.time + late) / period - 1e-9)) + periods
+        before = count - push
+        share = min(max(before - last.time / period, 0.0), 1.0)
+        levels = [first, Level((before - 1) * period, first.load + share * (
+            last.load - first.load)), Level(before * period, last.load)]
+        yield heights(levels + [Level(count * period, last.load)] * bool(push))
 
 
-def _ramped(request: Request, first: Level, last: Level) -> Move:
+def _ramped(request: Request, ideal: tuple[Level, ...]) -> Attempt:
     """
-    Solve for the level between two ramps and for how long it holds.
+    Solve for the level between two ramps and for how long it holds, and the push if one settles.
 
     A linear oscillator comes to rest where ramps and hold together span an odd number of half
-    periods. The solution for the first that fits is followed from fast ramps to the real ones;
-    where that fails, levels and holds in between are tried.
+    periods. The solution for the first that fits is followed from fast ramps to the real ones,
+    and then from no lag to the lag.
     """
-    slew = request.delivery.slew
-    start, change = request.load, last.load - request.load
-    decay = 1.0
-    if first.load != start:
-        decay = min(1.0, abs((last.load - first.load) / (first.load - start)))
-    half_periods = 1 + 2 * max(
-        0, math.ceil(0.5 * (abs(change) / slew / (2.0 * last.time) - 1.0)))
+    first, last = ideal
+    delivery, start = replace(request.delivery, lag=0.0), request.load
+    slew, lag, change = delivery.slew, request.delivery.lag, last.load - start
 
     def slower(levels: tuple[Level, ...], share: float, aim: float) -> Attempt:
         # The ramps lengthen about their middles, so that the second one begins earlier.
@@ -215,34 +172,47 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
         guess = (levels[0], Level(levels[1].time + shift, levels[1].load))
         return solve(
             Template.of(guess, [('load', 0), ('time', 1)]), request,
-            replace(request.delivery, slew=slew / aim))
+            replace(delivery, slew=slew / aim))
 
-    between = first.load
+    def later(levels: tuple[Level, ...], share: float, aim: float) -> Attempt:
+        # The push undoes what the field has not settled of the first level, as far as ramps reach.
+        missing = levels[-1].load - levels[0].load
+        push = math.copysign(
+            min(abs(missing), slew * aim * lag * math.log1p(math.exp(-_PUSH))), missing)
+        return solve(_pushed(levels[0], Level(
+            levels[1].time + (aim - share) * _PUSH * lag, levels[-1].load + push),
+            levels[-1].load, slew, aim * lag), request, replace(delivery, lag=aim * lag))
+
+    decay = 1.0
+    if first.load != start:
+        decay = min(1.0, abs((last.load - first.load) / (first.load - start)))
+    half_periods = 1 + 2 * max(
+        0, math.ceil(0.5 * (abs(change) / slew / (2.0 * last.time) - 1.0)))
     if half_periods > 1:
-        between = start + change / (1.0 + decay ** half_periods)
-    ideal = (Level(0.0, between), Level(half_periods * last.time, last.load))
+        ideal = (Level(0.0, start + change / (1.0 + decay ** half_periods)),
+                 Level(half_periods * last.time, last.load))
     found = approach(ideal, slower, _SHORTEST_STRIDE)
-    if found is not None and request.keeps(found[0]):
-        return Move(Code.TWO_STEP, *found)
-    if request.state.rate == 0.0:
-        found = _searched(request, last.load)
-        if found is not None:
-            return Move(Code.TWO_STEP, *found)
-    else:
-        with contextlib.suppress(RefusedError):
-            return _two_levels(request, last.load)
-    raise RefusedError(
-        Code.SLEW_LIMIT,
-        f'no command through ramps of {request.units.slew_text(slew)} brings '
-        f'{request.named_target} to rest')
+    return approach(found[0], later, _SHORTEST_STRIDE) if found and lag > 0.0 else found
 
 
-def _searched(request: Request, holding: float) -> Attempt:
-    """Solve for a level and its hold from many guesses, those that hold shortest first."""
-    slew, start = request.delivery.slew, request.load
-    eighth = 0.25 * math.pi / request.frequency
-    if abs(holding - start) > _MOST_HALF_PERIODS * 4.0 * eighth * slew:
-        return None
+def _pushed(first: Level, push: Level, last: float, slew: float, lag: float) -> Template:
+    """Return a level and a push before the last load, with both heights and the time free."""
+    change = push.load - first.load
+    template = Template.of(
+        (first, push, Level(push.time + abs(change) / slew + _PUSH * lag, last)),
+        [('load', 0), ('load', 1), ('time', 1)])
+    d_times = template.d_times.copy()
+    d_times[2, :2] = math.copysign(1.0 / slew, change) * np.array([-1.0, 1.0])
+    return replace(template, d_times=d_times)
+
+
+def _held(request: Request) -> Iterator[Template]:
+    """Yield guesses of a level between ramps and its hold, those that hold shortest first."""
+    delivery, start, holding = request.delivery, request.load, request.holding_load()
+    slew, eighth = delivery.slew, 0.25 * math.pi / request.frequency
+    if delivery.lag > 0.0 or delivery.period > 0.0 or math.isinf(slew) or abs(
+            holding - start) > _MOST_HALF_PERIODS * 4.0 * eighth * slew:
+        return
     reach = 8.0 * eighth * slew
     low = max(request.limits.minimum, min(start, holding) - reach)
     high = min(request.limits.maximum, max(start, holding) + reach)
@@ -253,54 +223,4 @@ def _searched(request: Request, holding: float) -> Attempt:
             (Level(0.0, level), Level(abs(level - start) / slew + hold * eighth, holding)),
             [('load', 0), ('time', 1)])
 
-    return first_kept(starmap(guess, product(range(_LONGEST_HOLD), _HEIGHTS)), request)
-
-
-def _no_single(request: Request) -> str:
-    return ('no single intermediate flux density within the limits leads from '
-            f'{request.named_state} to rest at {request.target:g}: two are used')
-
-
-def _two_levels(request: Request, holding: float) -> Move:
-    """Use two levels where one does not do, or one that is held for longer."""
-    if request.material.creep:
-        return free_levels(request)
-    if request.delivery.period == 0.0 and math.isfinite(request.delivery.slew):
-        # Sooner there than by waiting.
-        found = _swings(request, holding)
-        if found is not None:
-            return Move(Code.MINIMUM_TIME, *found, _no_single(request))
-        found = _searched(request, holding)
-        if found is not None:
-            return Move(Code.TWO_STEP, *found)
-    return push_brake(request, _no_single(request))
-
-
-def _swings(request: Request, holding: float) -> Attempt:
-    """
-    Solve for two levels that ramps only just reach, the fastest way where no level is held.
-
-    Bounded in its rate of change, the fastest load ramps without a pause and turns twice.
-    """
-    slew, start = request.delivery.slew, request.load
-    longest = 0.5 * math.pi / request.frequency
-    for share, rest, sign in product(_SWINGS, _SWINGS, (1.0, -1.0)):
-        high = start + sign * slew * share * longest
-        low = holding - sign * slew * rest * longest
-        if sign * (high - low) <= 0.0:
-            continue
-        turn = share * longest
-        guess = Template(
-            np.array([0.0, turn, turn + abs(high - low) / slew]), np.array([high, low, holding]),
-            sign / slew * np.array([[0.0, 0.0], [1.0, 0.0], [2.0, -1.0]]),
-            np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]))
-        found = solve(guess, request)
-        if found is not None and request.delivery.resolution > 0.0:
-            # Once more for the heights, at times that commands can carry and ramps can keep.
-            later = [Level(request.delivery.rounded(x.time) + i * request.delivery.resolution,
-                           x.load) for i, x in enumerate(found[0])]
-            found = solve(
-                Template.of(later, [('load', 0), ('load', 1)]), request) or found
-        if found is not None and request.keeps(found[0]):
-            return found
-    return None
+    yield from starmap(guess, product(range(_LONGEST_HOLD), _HEIGHTS))

@@ -1,0 +1,126 @@
+"""
+Levels of free heights: what leads to rest where a single intermediate level does not.
+
+As many heights are free as there are conditions: two for stretch and rate, and a third one where
+the field lags, which has to arrive with them. Levels are equally long, the shortest first, on
+whatever grid and through whatever ramps; where nothing but ramps bounds the command, the fastest
+one ramps without a pause and turns twice.
+"""
+
+from collections.abc import Iterator
+from itertools import chain, product
+import math
+
+import numpy as np
+
+from hmsa_ros.model import law
+from hmsa_ros.model.moves import Level, Move
+from hmsa_ros.model.simulation import followed_by
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.planning.shapers.request import Request
+from hmsa_ros.planning.shooting import Attempt, first_kept, heights, on_time, Template
+
+# Lengths of all levels together, in half periods at the target.
+_LENGTHS = (0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0)
+# Ramps to begin the search for two swings with, in quarters of a period.
+_SWINGS = (0.3, 0.1, 0.7, 0.03, 1.2)
+_AT_REST = 1e-9
+_NUMBERS = {2: 'two', 3: 'three'}
+
+
+def at_rest(request: Request) -> bool:
+    """Return whether stretch, rate and, where that lags, field are those of the target."""
+    state, packed = request.state, request.material.packed
+    if not (abs(state.stretch - request.target) <= _AT_REST
+            and abs(state.rate) <= _AT_REST * request.frequency):
+        return False
+    delivery, holding = request.delivery, request.balance(followed_by(state, request.material))
+    stiffness = float(law.elastic_stiffness(request.target, packed))
+    return delivery.lag == 0.0 or max(abs(request.field - holding), abs(
+        request.load - holding) * (not math.isinf(delivery.slew))) <= _AT_REST * stiffness
+
+
+def unknowns(request: Request) -> int:
+    """Return how many numbers of a command are free."""
+    return 2 + (request.delivery.lag > 0.0)
+
+
+def free_heights(request: Request) -> Attempt:
+    """Return the shortest levels of free heights that keep the limits, if there are any."""
+    delivery = request.delivery
+    quick = request.state.rate != 0.0 and delivery.period == delivery.lag == 0.0 \
+        and math.isfinite(delivery.slew)
+    found = first_kept(chain(_swings(request) if quick else (), _equal(request)), request)
+    return on_time(found, 2, request) if quick else found
+
+
+def free_levels(request: Request) -> Move:
+    """Come to rest by levels of free heights: `RefusedError` if the limits have none."""
+    found = free_heights(request)
+    if found is None:
+        raise RefusedError(*_refusal(request))
+    return Move(Code.MINIMUM_TIME, *found, no_single(request))
+
+
+def no_single(request: Request) -> str:
+    """Word why levels of free heights are used."""
+    settled = ' and a push that settles the field' if request.delivery.lag > 0.0 else ''
+    return (f'no single intermediate flux density{settled} within the limits leads as soon from '
+            f'{request.named_state} to rest at {request.target:g}: '
+            f'{_NUMBERS[unknowns(request)]} are used')
+
+
+def _equal(request: Request) -> Iterator[Template]:
+    """Yield guesses of levels that are all as long."""
+    delivery, holding, count = request.delivery, request.holding_load(), unknowns(request)
+    half, before = math.pi / request.frequency, 0.0
+    for share in _LENGTHS:
+        each = (share * half + delivery.lag + delivery.ramp(holding - request.load)) / count
+        if delivery.period > 0.0:
+            each = math.ceil(each / delivery.period) * delivery.period
+        each = delivery.rounded(each)
+        if each > before:
+            before = each
+            yield heights([
+                Level(0.0, 0.5 * (request.load + holding)),
+                *(Level((1 + i) * each, holding) for i in range(count))])
+
+
+def _swings(request: Request) -> Iterator[Template]:
+    """Yield guesses of two levels that ramps only just reach."""
+    slew, start, holding = request.delivery.slew, request.load, request.holding_load()
+    longest = 0.5 * math.pi / request.frequency
+    for share, rest, sign in product(_SWINGS, _SWINGS, (1.0, -1.0)):
+        turn = share * longest
+        high, low = start + sign * slew * turn, holding - sign * slew * rest * longest
+        if sign * (high - low) > 0.0:
+            yield Template(
+                np.array([0.0, turn, turn + abs(high - low) / slew]),
+                np.array([high, low, holding]),
+                sign / slew * np.array([[0.0, 0.0], [1.0, 0.0], [2.0, -1.0]]),
+                np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]))
+
+
+def _refusal(request: Request) -> tuple[Code, str]:
+    units, delivery, limits = request.units, request.delivery, request.limits
+    within = (f'flux densities of {units.load_text(limits.minimum)} to '
+              f'{units.load_text(limits.maximum)}')
+    if delivery.lag > 0.0:
+        text = (f'no command for a coil time constant of {units.time_text(delivery.lag)} brings '
+                f'{request.named_target} and the field to rest together within ')
+        if not math.isinf(delivery.slew):
+            return Code.SLEW_LIMIT, (
+                f'{text}ramps of {units.slew_text(delivery.slew)} and {within}')
+        return Code.FLUX_LIMIT, text + within
+    if request.material.creep:
+        return Code.NO_TWO_STEP, (
+            f'no two flux densities within the limits bring {request.named_target} of this '
+            'creeping elastomer to rest: expected wider limits, a smaller move or several '
+            'setpoints')
+    if delivery.period > 0.0:
+        return Code.NO_TWO_STEP, (
+            f'no command on a grid of {units.time_text(delivery.period)} within the limits '
+            f'brings {request.named_target} to rest')
+    return Code.SLEW_LIMIT, (
+        f'no command through ramps of {units.slew_text(delivery.slew)} brings '
+        f'{request.named_target} to rest')
