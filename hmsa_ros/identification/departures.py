@@ -152,7 +152,7 @@ def departures(
                 signatures[-1].found):
             seconds = _DEVIATIONS * spread / norm
             late = seconds, seconds * way
-        # An offset of the stamps is the commonest, and hides best; a gain that nobody gave is next.
+        # An offset of the stamps is the commonest, and hides best, as a gain that nobody gave.
         late_or_off = 'latency' in one.name and not _DELAYS.intersection(fit.free) or (
             one.remedy == GAIN and GAIN not in given)
         least = 0.0 if late_or_off else _HINT
