@@ -58,8 +58,7 @@ class Sequence:
 
 def _package(sequence: Sequence) -> Simulation:
     def run(rtol: float) -> np.ndarray:
-        levels = [Level(*x) for x in zip(
-            sequence.switches.tolist(), sequence.loads.tolist(), strict=True)]
+        levels = list(map(Level, sequence.switches, sequence.loads))
         return sampled(levels, State(1.0), sequence.times, MATERIAL, rtol=rtol)[0]
     return run
 

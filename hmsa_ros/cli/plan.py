@@ -10,7 +10,6 @@ from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import setpoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
-from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.table import Column
 
 if TYPE_CHECKING:
@@ -213,7 +212,7 @@ def _nondimensional(
     from hmsa_ros.planning.sequence import plan_sequence
     from hmsa_ros.planning.setpoint import impossible, Setpoint
     from hmsa_ros.planning.shapers.pace import Pace
-    from hmsa_ros.planning.shapers.request import as_errors, ERRORS
+    from hmsa_ros.planning.shapers.request import as_errors, ERRORS, Request
 
     for stretch, _ in arguments.setpoints:
         if reason := impossible(stretch, group.rest):

@@ -19,8 +19,8 @@ from hmsa_ros.planning.history import agree
 from hmsa_ros.planning.sequence import Segment, segments
 from hmsa_ros.planning.setpoint import impossible, Setpoint
 from hmsa_ros.planning.shapers import get_shaper
+from hmsa_ros.planning.shapers.free import through
 from hmsa_ros.planning.shapers.request import Request, Shaper
-from hmsa_ros.planning.shapers.through import through
 from hmsa_ros.planning.stopping import brake, holdable
 from hmsa_ros.planning.timeline import Draft, Model, Plan, PlannedLevel, PlannedSegment
 

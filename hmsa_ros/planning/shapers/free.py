@@ -62,6 +62,26 @@ def free_levels(request: Request) -> Move:
     return Move(Code.MINIMUM_TIME, *found, no_single(request))
 
 
+def through(request: Request, duration: float) -> Move:
+    """
+    Come to rest after a given time by levels that are all as long.
+
+    Where the limits have no such move: `RefusedError`.
+    """
+    count, period, holding = unknowns(request), request.delivery.period, request.holding_load()
+    edges = duration / count * np.arange(count + 1)
+    if period > 0.0:
+        edges = period * np.round(edges / period)
+    found = first_kept([heights([Level(x, holding) for x in edges.tolist()])] if np.all(
+        np.diff(edges) > 0.0) else (), request)
+    if found is None:
+        raise RefusedError(
+            Code.NOT_CONVERGED,
+            f'no {count} levels of equal duration lead to {request.named_target} in '
+            f'{request.units.time_text(duration)}: expected more time')
+    return Move(Code.MINIMUM_TIME, *found)
+
+
 def no_single(request: Request) -> str:
     """Word why levels of free heights are used."""
     settled = ' and a push that settles the field' if request.delivery.lag > 0.0 else ''
