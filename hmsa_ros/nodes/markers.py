@@ -51,12 +51,14 @@ BESIDE = 2.0
 # Along a beam.
 _STATIONS = 17
 
-# Okabe and Ito's palette: orange, blue, vermilion, grey. What is seen through is the material.
-_BLOCK_COLOUR = (0.90, 0.62, 0.00, 0.55)
-_MAGNETISATION_COLOUR = (0.00, 0.45, 0.70, 1.0)
-_FIELD_COLOUR = (0.84, 0.37, 0.00, 1.0)
-_LABEL_COLOUR = (0.75, 0.75, 0.75, 1.0)
-_TARGET_COLOUR = (0.34, 0.71, 0.91, 0.25)
+# By number the shape and its colour, of Okabe and Ito's palette: orange, blue, vermilion, grey,
+# sky blue. What is seen through is the material.
+_LOOKS = {
+    BLOCK: (Marker.CUBE, (0.90, 0.62, 0.00, 0.55)),
+    MAGNETISATION: (Marker.ARROW, (0.00, 0.45, 0.70, 1.0)),
+    FIELD: (Marker.ARROW, (0.84, 0.37, 0.00, 1.0)),
+    LABEL: (Marker.TEXT_VIEW_FACING, (0.75, 0.75, 0.75, 1.0)),
+    TARGET: (Marker.CUBE, (0.34, 0.71, 0.91, 0.25))}
 
 
 @dataclass(frozen=True)
@@ -154,111 +156,102 @@ class Scene:
 
     def states(self, stamp: int, states: Sequence[State]) -> MarkerArray:
         """Return for each joint block, arrows and label; an unknown field's arrow is deleted."""
-        markers: list[Marker] = []
-        for block, place, state in zip(self.blocks, self.places(), states, strict=True):
-            markers += self._state(stamp, block, place, state)
-        return MarkerArray(markers=markers)
+        return MarkerArray(markers=[
+            marker for drawing, state in zip(self._drawings(stamp), states, strict=True)
+            for marker in drawing.state(state)])
 
     def targets(self, stamp: int, stretches: Sequence[float | None]) -> MarkerArray:
         """Return see-through blocks at their targets; None deletes a joint's marker."""
-        markers = []
-        for block, place, stretch in zip(self.blocks, self.places(), stretches, strict=True):
-            if stretch is None:
-                markers.append(self._marker(stamp, block, TARGET, Marker.CUBE, None))
-            else:
-                markers.append(self._body(
-                    stamp, block, TARGET, place, stretch, _TARGET_COLOUR))
-        return MarkerArray(markers=markers)
+        return MarkerArray(markers=[
+            drawing.deleted(TARGET) if stretch is None else drawing.body(TARGET, stretch)
+            for drawing, stretch in zip(self._drawings(stamp), stretches, strict=True)])
 
-    def _state(
-            self, stamp: int, block: Block, place: tuple[float, float],
-            state: State) -> Iterable[Marker]:
+    def _drawings(self, stamp: int) -> Iterable['_Drawing']:
+        return (_Drawing(self, stamp, block, place) for block, place in zip(
+            self.blocks, self.places(), strict=True))
+
+
+@dataclass(frozen=True)
+class _Drawing:
+    """Markers of one joint of a scene at a stamp in ns; x and y of its middle in m."""
+
+    scene: Scene
+    stamp: int
+    block: Block
+    place: tuple[float, float]
+
+    def state(self, state: State) -> Iterable[Marker]:
+        """Yield block, arrows and label."""
+        block = self.block
         unit = block.per_tesla or block.half_thickness / block.remanence
-        beside = (place[0] + BESIDE * block.half_length, place[1])
-        yield self._body(stamp, block, BLOCK, place, state.stretch, _BLOCK_COLOUR)
+        yield self.body(BLOCK, state.stretch)
         if block.width:
             height = block.half_length
-            yield self._along(stamp, block, place, state.stretch)
+            yield self._along(state.stretch)
         else:
             height = block.half_thickness * state.stretch
-            yield self._arrow(
-                stamp, block, MAGNETISATION, place, unit * block.remanence * state.stretch,
-                _MAGNETISATION_COLOUR)
-        yield self._arrow(
-            stamp, block, FIELD, beside, unit * state.flux_density, _FIELD_COLOUR)
-        label = self._marker(stamp, block, LABEL, Marker.TEXT_VIEW_FACING, _LABEL_COLOUR)
-        label.pose = self._pose(place, height + 0.8 * block.half_thickness)
-        label.scale = Vector3(z=0.4 * block.half_length * self.scale)
-        label.text = f'{block.joint} {state.stretch:.4f}'
-        yield label
+            yield self._arrow(MAGNETISATION, unit * block.remanence * state.stretch)
+        yield self._arrow(FIELD, unit * state.flux_density, BESIDE * block.half_length)
+        yield self._marker(
+            LABEL, pose=self._pose(height + 0.8 * block.half_thickness),
+            scale=Vector3(z=0.4 * block.half_length * self.scene.scale),
+            text=f'{block.joint} {state.stretch:.4f}')
 
-    def _body(
-            self, stamp: int, block: Block, number: int, place: tuple[float, float],
-            stretch: float, colour: tuple[float, float, float, float]) -> Marker:
+    def body(self, number: int, stretch: float) -> Marker:
         """Return a block at a stretch, or a beam at a deflection."""
-        if block.width:
-            marker = self._marker(stamp, block, number, Marker.TRIANGLE_LIST, colour)
-            marker.scale = Vector3(x=1.0, y=1.0, z=1.0)
-            marker.points = [self._point(*corner) for corner in block.bent(stretch)]
-        else:
-            marker = self._marker(stamp, block, number, Marker.CUBE, colour)
-            size = self._point(*block.size(stretch))
-            marker.scale = Vector3(x=size.x, y=size.y, z=size.z)
-        marker.pose = self._pose(place, 0.0)
-        return marker
+        if self.block.width:
+            return self._marker(
+                number, type=Marker.TRIANGLE_LIST, pose=self._pose(0.0),
+                scale=Vector3(x=1.0, y=1.0, z=1.0),
+                points=[self._point(*corner) for corner in self.block.bent(stretch)])
+        size = self._point(*self.block.size(stretch))
+        return self._marker(
+            number, pose=self._pose(0.0), scale=Vector3(x=size.x, y=size.y, z=size.z))
 
-    def _along(
-            self, stamp: int, block: Block, place: tuple[float, float],
-            deflection: float) -> Marker:
+    def deleted(self, number: int) -> Marker:
+        """Return what deletes a marker."""
+        return self._marker(number, action=Marker.DELETE)
+
+    def _along(self, deflection: float) -> Marker:
         """Return the arrow of a beam's magnetisation, along its middle."""
-        marker = self._arrow(
-            stamp, block, MAGNETISATION, place, block.half_length, _MAGNETISATION_COLOUR)
+        marker = self._arrow(MAGNETISATION, self.block.half_length)
         angle = float(tangent(deflection, 0.5))
         x, z = math.cos(angle), math.sin(angle)
         along, across = centreline(deflection, 3)
         marker.points = [self._point(
-            place[0] + (2.0 * along[1] - 1.0 + share * x) * block.half_length, place[1],
-            (2.0 * across[1] + share * z) * block.half_length) for share in (-0.5, 0.5)]
+            self.place[0] + (2.0 * along[1] - 1.0 + share * x) * self.block.half_length,
+            self.place[1], (2.0 * across[1] + share * z) * self.block.half_length)
+            for share in (-0.5, 0.5)]
         return marker
 
-    def _arrow(
-            self, stamp: int, block: Block, number: int, place: tuple[float, float],
-            length: float, colour: tuple[float, float, float, float]) -> Marker:
+    def _arrow(self, number: int, length: float, beside: float = 0.0) -> Marker:
         """Return an arrow along z about the block's middle, downwards for a negative length."""
         if length == 0.0:
             # An arrow of no length has no direction, which viewers complain of.
-            return self._marker(stamp, block, number, Marker.ARROW, None)
-        marker = self._marker(stamp, block, number, Marker.ARROW, colour)
-        marker.pose = Pose(orientation=Quaternion(w=1.0))
-        marker.points = [self._point(*place, z) for z in (-length / 2, length / 2)]
+            return self.deleted(number)
         # Diameters of shaft and head, and the head's length, no longer than half the arrow.
-        thickness = 0.12 * block.half_length * self.scale
-        marker.scale = Vector3(
-            x=thickness, y=2.5 * thickness,
-            z=min(3.0 * thickness, abs(length) / 2 * self.scale))
-        return marker
+        thickness = 0.12 * self.block.half_length * self.scene.scale
+        return self._marker(
+            number, pose=Pose(orientation=Quaternion(w=1.0)),
+            points=[self._point(self.place[0] + beside, self.place[1], z)
+                    for z in (-length / 2, length / 2)],
+            scale=Vector3(x=thickness, y=2.5 * thickness, z=min(
+                3.0 * thickness, abs(length) / 2 * self.scene.scale)))
 
-    def _marker(
-            self, stamp: int, block: Block, number: int, kind: int,
-            colour: tuple[float, float, float, float] | None) -> Marker:
-        """Return a marker without a place; without a colour it deletes the one before."""
-        marker = Marker(
-            header=Header(stamp=to_time(stamp), frame_id=self.frame), ns=block.joint, id=number,
-            type=kind)
-        if colour is None:
-            marker.action = Marker.DELETE
-            return marker
-        marker.action = Marker.ADD
-        red, green, blue, alpha = colour
-        marker.color = ColorRGBA(r=red, g=green, b=blue, a=alpha)
-        marker.lifetime = to_duration(round(self.lifetime * NANOSECONDS))
-        return marker
+    def _marker(self, number: int, **fields: Any) -> Marker:
+        kind, (red, green, blue, alpha) = _LOOKS[number]
+        return Marker(**{
+            'header': Header(stamp=to_time(self.stamp), frame_id=self.scene.frame),
+            'ns': self.block.joint, 'id': number, 'type': kind, 'action': Marker.ADD,
+            'color': ColorRGBA(r=red, g=green, b=blue, a=alpha),
+            'lifetime': to_duration(round(self.scene.lifetime * NANOSECONDS)), **fields})
 
-    def _pose(self, place: tuple[float, float], height: float) -> Pose:
-        return Pose(position=self._point(*place, height), orientation=Quaternion(w=1.0))
+    def _pose(self, height: float) -> Pose:
+        return Pose(
+            position=self._point(*self.place, height), orientation=Quaternion(w=1.0))
 
     def _point(self, x: float, y: float, z: float) -> Point:
-        return Point(x=x * self.scale, y=y * self.scale, z=z * self.scale)
+        return Point(x=x * self.scene.scale, y=y * self.scene.scale, z=z * self.scene.scale)
 
 
 MARKER_SCALE = ParameterSpec(
