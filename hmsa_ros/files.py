@@ -1,6 +1,6 @@
 """Writing files: complete under their name, or not at all."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 import json
 import math
@@ -46,6 +46,18 @@ def write_text(path: Path, text: str) -> None:
     """Write a text as UTF-8 (replacement characters for names that are not), or change nothing."""
     with replacing(path) as beside:
         beside.write_bytes(text.encode('utf-8', 'replace'))
+
+
+def check_targets(targets: Iterable[Path], sources: Iterable[Path] = ()) -> None:
+    """Refuse by `BadInputError` what cannot be written, or is read, before a command begins."""
+    read = [x.resolve() for x in sources]
+    for target in targets:
+        why = ('it is a folder; expected a file' if target.is_dir() else
+               f'{target.parent} is no folder; expected one that exists'
+               if not target.resolve().parent.is_dir() else
+               'it is read; expected another file' if target.resolve() in read else '')
+        if why:
+            raise BadInputError(f'cannot write {target}: {why}')
 
 
 def make_folder(folder: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any, TYPE_CHECKING
 from hmsa_ros.cli.options import add_options, JSON
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import json_text, write_text
+from hmsa_ros.files import check_targets, json_text, write_text
 
 if TYPE_CHECKING:
     from hmsa_ros.device.conformance import Conformance
@@ -52,8 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.device.conformance import Trial
 
     out: Path | None = arguments.report
-    if out is not None and not out.resolve().parent.is_dir():
-        raise BadInputError(f'cannot write {out}: expected a file in a folder that exists')
+    check_targets(filter(None, [out]))
     settings = dict(setting(x) for x in arguments.set)
     with progress() as update:
         found = Trial(

@@ -11,7 +11,7 @@ from hmsa_ros.cli.options import add_options, JSON
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.quantities import number_of
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import json_text, write_text
+from hmsa_ros.files import check_targets, json_text, write_text
 
 if TYPE_CHECKING:
     from hmsa_ros.identification import Recording
@@ -71,8 +71,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     """
     check_targets(
-        [x for x in (arguments.out, arguments.report) if x is not None],
-        [x for x in (arguments.recording, arguments.commands) if x is not None])
+        filter(None, (arguments.out, arguments.report)),
+        filter(None, (arguments.recording, arguments.commands)))
 
     from hmsa_ros.identification.files import file_text, read_belief
     from hmsa_ros.identification.identify import identify
@@ -151,15 +151,6 @@ def known_of(text: str) -> tuple[dict[str, float], dict[str, float]]:
         elif std:
             deviations[name] = number_of(std, unit, name)
     return values, deviations
-
-
-def check_targets(targets: Sequence[Path], sources: Sequence[Path] = ()) -> None:
-    """Refuse what cannot be written, with `BadInputError`, before anything is read or moved."""
-    for target in targets:
-        if target.is_dir() or target.resolve() in [x.resolve() for x in sources] or not (
-                target.resolve().parent.is_dir()):
-            raise BadInputError(
-                f'cannot write {target}: expected a file of its own in a folder that exists')
 
 
 def _read(

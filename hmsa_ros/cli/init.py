@@ -20,7 +20,7 @@ from hmsa_ros.cli.quantities import (
     Quantity,
 )
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import json_text, write_text, yaml_text
+from hmsa_ros.files import check_targets, json_text, write_text, yaml_text
 from hmsa_ros.interfaces.parameters import LAW, LAW_NAME, PUBLISH_RATE
 
 if TYPE_CHECKING:
@@ -95,9 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     path: Path = arguments.out
     if not arguments.force and path.exists():
         raise BadInputError(f'{path} exists: name another file with --out, or add --force')
-    if not path.resolve().parent.is_dir():
-        raise BadInputError(
-            f'cannot write {path}: {path.parent} is no folder; expected one that exists (--out)')
+    check_targets([path])
     asked = _asked(arguments)
     given = _given(arguments, asked)
     joints = joint_names(arguments.joint)
