@@ -108,7 +108,7 @@ class Drawn:
                     watching = x.watching
                     verdicts.append(Verdict(
                         self.now, LEVELS[x.verdict.severity], x.verdict.code, x.verdict.message,
-                        math.nan, x.plan))
+                        x.plan))
                     # Of several in one tick the newest is told, and the worst of all.
                     self.online |= {
                         y.setpoint.number: str(y.verdict) for y in (

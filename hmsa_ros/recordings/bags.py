@@ -7,7 +7,6 @@ bag may come from this package's recorder, from rosbag2, from a simulated plant 
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-import math
 from pathlib import Path
 from typing import Any
 
@@ -162,22 +161,6 @@ class _Trajectory:
             for x in message.points), message.header.frame_id)
 
 
-@dataclass(frozen=True)
-class _Status:
-    """What the planner said, as it was received."""
-
-    sent: int
-    level: int
-    message: str
-    values: dict[str, str]
-
-    @classmethod
-    def of(cls, sent: int, message: Any) -> '_Status':
-        """Take it from a message."""
-        level = message.level[0] if isinstance(message.level, bytes) else int(message.level)
-        return cls(sent, level, message.message, {x.key: x.value for x in message.values})
-
-
 @dataclass
 class _Collected:
     """What has been read of the actuators of one namespace so far."""
@@ -191,7 +174,7 @@ class _Collected:
     plans: list[_Trajectory] = field(default_factory=list)
     trajectories: list[_Trajectory] = field(default_factory=list)
     setpoints: dict[str, list[RecordedRequest]] = field(default_factory=dict)
-    statuses: list[_Status] = field(default_factory=list)
+    verdicts: list[Verdict] = field(default_factory=list)
     # With the joint that each is of.
     sensors: list[tuple[str, LearntSensor]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -245,7 +228,11 @@ class _Collected:
                 (x.hardware_id, LearntSensor(sent, Sensor.of({y.key: y.value for y in x.values})))
                 for x in content.status)
         else:
-            self.statuses.append(_Status.of(sent, content))
+            level = content.level[0] if isinstance(content.level, bytes) else int(content.level)
+            values = {x.key: x.value for x in content.values}
+            self.verdicts.append(Verdict(
+                sent, _LEVELS[min(level, 2)], values.get('code', ''), content.message,
+                whole(values.get('plan')), values.get('request', '')))
 
     def _plans(self, joint: str) -> Iterable[tuple[Level, ...]]:
         """Return the plans of a joint, or of the one that they are of."""
@@ -280,23 +267,13 @@ class _Collected:
 
         A recorder may receive it after that status, and latched news of an earlier one after it.
         """
-        own = [x.values.get('request') == asked.name for x in self.statuses]
+        own = [x.request == asked.name for x in self.verdicts]
         if not asked.name or True not in own:
             return asked.sent
         place = own.index(True)
-        answered = self.statuses[place].sent
-        before = self.statuses[place - 1].sent + 1 if place else min(asked.sent, answered)
+        answered = self.verdicts[place].sent
+        before = self.verdicts[place - 1].sent + 1 if place else min(asked.sent, answered)
         return asked.sent if before <= asked.sent <= answered else min(before, answered)
-
-    def _verdicts(self, joint: str, joints: Sequence[str]) -> Iterable[Verdict]:
-        """Return what the planner said, with the target of a joint."""
-        for status in self.statuses:
-            # Of several joints each has its own.
-            target = status.values.get(f'{joint}.stretch') if joint in joints and len(joints) > 1 \
-                else status.values.get('stretch')
-            yield Verdict(
-                status.sent, _LEVELS[min(status.level, 2)], status.values.get('code', ''),
-                status.message, _number(target), whole(status.values.get('plan')))
 
     def finish(
             self, label: str, reader: BagReader, summary: BagSummary, topics: Mapping[str, str],
@@ -330,7 +307,7 @@ class _Collected:
             _begun(self.applied.get(key, ()), int(samples.time[0])),
             tuple(self.forces.get(key, ())), tuple(self._plans(joint)),
             tuple(self._requests(joint, key)),
-            tuple(self._verdicts(joint, list(dict.fromkeys(planned)))),
+            tuple(self.verdicts),
             tuple(x for of, x in self.sensors if of == joint or len(
                 {y for y, _ in self.sensors}) == 1), {**parameters, **given},
             plant, planner, known, self.left_out + refused + samples.left_out,
@@ -343,14 +320,6 @@ def _begun(levels: Sequence[Level], first: int) -> tuple[Level, ...]:
     return tuple(
         x if x.stamp else replace(x, stamp=min(x.sent, first)) for x in levels
         if x.stamp or not known)
-
-
-def _number(text: str | None) -> float:
-    """Return a number from a status; NaN for what is none."""
-    try:
-        return float(text or 'nan')
-    except ValueError:
-        return math.nan
 
 
 def _place(names: Sequence[str], joint: str) -> int | None:

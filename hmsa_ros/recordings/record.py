@@ -38,8 +38,8 @@ class Verdict:
     level: str  # ``'ok'``, ``'warning'`` or ``'error'``
     code: str
     message: str
-    stretch: float  # target of the setpoint under way; NaN if there is none
     plan: int = 0  # number of the request that is carried out, from 1; 0 where not told
+    request: str = ''  # its name, if it has one
 
 
 @dataclass(frozen=True)
