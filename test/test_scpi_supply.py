@@ -7,8 +7,7 @@ import pytest
 
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.protocol import Kind
-from hmsa_ros.device.scpi_supply import ScpiSupply, Supply, SupplyError
-from hmsa_ros.device.simulated_supply import SimulatedSupply
+from hmsa_ros.device.scpi_supply import ScpiSupply, SimulatedSupply, Supply, SupplyError
 from hmsa_ros.device.watchdog import Fallback
 
 START = 10**18

@@ -21,9 +21,8 @@ import pyte
 import pytest
 
 from hmsa_ros.interfaces.status import Verdict
-from hmsa_ros.watch.chart import limits, strip
 from hmsa_ros.watch.scene import History, Joint, Report, Scene
-from hmsa_ros.watch.screen import as_json, line, Screen
+from hmsa_ros.watch.screen import as_json, limits, line, Screen, strip
 
 WAIT_SECONDS = 60.0
 COLOUR = re.compile(rb'\x1b\[(?:\d+;)*(?:3[0-7]|4[0-7]|9[0-7]|38|48)[;m]')

@@ -34,7 +34,7 @@ _PHASE, _LEAD, _BEAT, _SILENCE, _END = 0.6, 0.1, 0.05, 0.5, 3.0
 _TIMED, _APART, _TRIES = 30, 0.03, 4
 # Limits: of a call in s, of the lateness of the median level in s, of the age of a sample in s, of
 # the error of a clock in s, of samples that repeat the one before.
-_CALL, _LATE, _AGE, _CLOCK, _REPEATED = 0.02, 2e-3, 0.5, 1e-3, 0.6
+_CALL, _LATE, _CLOCK, _REPEATED = 0.02, 2e-3, 1e-3, 0.6
 # The share of calls that must keep their limit, and how often in s events are looked at.
 _MOST, _LOOK = 0.95, 2e-3
 # How many deviations of its mean a response must be to be seen.

@@ -1,10 +1,12 @@
 """Lines to instruments: the ports of pyserial, and simulated ones."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import import_module
+import sys
 from typing import Any
 
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.errors import BadInputError, HmsaError
 
 #: The port that is a simulated instrument; what follows a colon is given to it.
 SIMULATED = 'sim'
@@ -53,6 +55,43 @@ def open_line(
             f'pyserial), or use the port {SIMULATED} for a simulated instrument') from error
     return serial.serial_for_url(
         port, baud, timeout=timeout, write_timeout=patience, exclusive=True)
+
+
+class OnLine:
+    """
+    What speaks over a line that is opened when it is used, and again once it was lost.
+
+    A class has the ``error`` that tells of a lost line, the longest time in s of a read and of a
+    write as ``times``, and ``simulate``, which makes a simulated instrument as of `open_line`.
+    """
+
+    error: type[HmsaError]
+    times: tuple[float, float]
+    simulate: Callable[[str], Any]
+    _line: Any = None
+
+    def __init__(self, port: Any, baud: int) -> None:
+        self._port, self._baud = port, int(baud)
+
+    def _use(self, act: Callable[[], Any]) -> Any:
+        """Do something with the line; return None if it takes nothing in time."""
+        try:
+            if self._line is None:
+                self._line = open_line(
+                    self._port, self._baud, *self.times, simulate=self.simulate)
+            return act()
+        except HmsaError:
+            raise
+        except Exception as error:  # whatever a port that is gone raises
+            if isinstance(error, getattr(
+                    sys.modules.get('serial'), 'SerialTimeoutException', ())):
+                return None
+            line, self._line = self._line, None
+            with suppress(Exception):
+                line.close()
+            raise self.error(
+                f'the line {self._port} failed ({error}): check hardware.port, its cable, and '
+                'that no other program uses it') from error
 
 
 class SimulatedLine:

@@ -1,14 +1,79 @@
-"""A bench supply as a source of current, by SCPI on a serial line or raw TCP."""
+"""A bench supply as a source of current, by SCPI on a serial line or raw TCP, and its twin."""
 
+from collections import deque
 import math
 import re
 from time import monotonic, monotonic_ns
 from typing import Any
 
 from hmsa_ros.device.assembly import Assembly, parts, require
-from hmsa_ros.device.line import open_line
+from hmsa_ros.device.line import OnLine, SimulatedLine
 from hmsa_ros.device.protocol import StateLostError
 from hmsa_ros.errors import HmsaError
+
+
+class SimulatedSupply(SimulatedLine):
+    """A bipolar supply of 10 A and its line."""
+
+    limit, step = 10.0, 10.0 / 2**15
+
+    def __init__(self, rest: str = '') -> None:
+        super().__init__()
+        self.restart()
+        self._text = ''
+
+    def restart(self) -> None:
+        """Switch it on: as a source of voltage, with its output off."""
+        self.current, self.on, self.mode = 0.0, False, 'VOLT'
+        self._errors: deque[str] = deque()
+
+    def _obey(self, command: str) -> str | None:
+        """Carry a command out; return its answer, if it has one."""
+        verb, _, value = command.strip().lstrip(':').upper().partition(' ')
+        if verb == '*IDN?':
+            return 'hmsa_ros, simulated supply, 0, 1'
+        if verb == 'CURR?':
+            return f'{self.limit if value == "MAX" else self.current:.6g}'
+        if verb == 'OUTP?':
+            return str(int(self.on))
+        if verb == 'SYST:ERR?':
+            return self._errors.popleft() if self._errors else '0,"No error"'
+        if verb == '*CLS':
+            self._errors.clear()
+        elif verb == 'OUTP':
+            self.on = value in ('ON', '1')
+        elif verb == 'FUNC:MODE' and value in ('CURR', 'VOLT'):
+            self.mode = value
+        elif verb in ('CURR', 'VOLT'):
+            self._set(verb, value)
+        else:
+            self._errors.append('-113,"Undefined header"')
+        return None
+
+    def _set(self, verb: str, value: str) -> None:
+        try:
+            number = float(value)
+        except ValueError:
+            self._errors.append('-104,"Data type error"')
+            return
+        if verb == 'CURR' and not abs(number) <= self.limit:
+            self._errors.append('-222,"Data out of range"')
+        elif verb == 'CURR':
+            self.current = round(number / self.step) * self.step
+
+    # -- the port ------------------------------------------------------------------------------
+
+    def write(self, text: bytes) -> None:
+        """Take bytes from the host."""
+        *lines, self._text = (self._text + text.decode('ascii', 'replace')).split('\n')
+        for line in lines:
+            answers = [x for x in map(self._obey, line.split(';')) if x is not None]
+            if answers:
+                self._answer += f'{";".join(answers)}\n'.encode()
+
+    def close(self) -> None:
+        """Leave the line."""
+
 
 # In s: an attempt, and a request.
 _ATTEMPT, _PATIENCE = 0.2, 0.5
@@ -23,7 +88,7 @@ class SupplyError(HmsaError):
     """A supply that does not answer, or reports an error."""
 
 
-class Supply:
+class Supply(OnLine):
     """
     The supply as the source of a current in A.
 
@@ -50,14 +115,16 @@ class Supply:
 
     """
 
+    error, times, simulate = SupplyError, (_ATTEMPT, _PATIENCE), SimulatedSupply
+
     def __init__(
             self, port: Any, baud: int = 9600, voltage: float = math.inf,
             resolution: float | None = None) -> None:
         require('baud', baud, positive=True)
         require('voltage', voltage, positive=True)
         require('resolution', 1.0 if resolution is None else resolution, positive=True)
-        self._port, self._baud, self._voltage = port, int(baud), voltage
-        self._line: Any = None
+        super().__init__(port, baud)
+        self._voltage = voltage
         self.open()
         self.resolution = self.limit / _STEPS if resolution is None else resolution
 
@@ -110,22 +177,7 @@ class Supply:
         """Return the parts of an answer; ask again where it is not as expected."""
         until, answer = monotonic() + _PATIENCE, ''
         while True:
-            try:
-                if self._line is None:
-                    from hmsa_ros.device.simulated_supply import SimulatedSupply
-
-                    self._line = open_line(
-                        self._port, self._baud, _ATTEMPT, _PATIENCE, SimulatedSupply)
-                self._line.reset_input_buffer()
-                self._line.write(f'{text}\n'.encode())
-                answer = self._read()
-            except HmsaError:
-                raise
-            except Exception as error:  # whatever a port that is gone raises
-                self._line = None
-                raise SupplyError(
-                    f'the line {self._port} failed ({error}): check hardware.port, its cable, '
-                    'and that no other program uses it') from error
+            answer = self._use(lambda: self._attempt(text)) or answer
             if found := expected.fullmatch(answer):
                 return found.groups()
             if monotonic() > until:
@@ -133,7 +185,9 @@ class Supply:
                     f'the supply on {self._port} answers {answer!r} to {text}: expected a supply '
                     'that speaks SCPI, at the same baud')
 
-    def _read(self) -> str:
+    def _attempt(self, request: str) -> str:
+        self._line.reset_input_buffer()
+        self._line.write(f'{request}\n'.encode())
         text, until = b'', monotonic() + _ATTEMPT
         while not text.endswith(b'\n') and monotonic() < until:
             text += self._line.read(max(self._line.in_waiting, 1))

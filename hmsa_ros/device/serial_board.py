@@ -9,12 +9,11 @@ from binascii import crc_hqx
 from collections.abc import Sequence
 import math
 from secrets import randbelow
-import sys
 from time import monotonic
 from typing import Any, NamedTuple
 
 from hmsa_ros.device.assembly import Assembly, parts, require
-from hmsa_ros.device.line import open_line
+from hmsa_ros.device.line import OnLine
 from hmsa_ros.device.protocol import StateLostError
 from hmsa_ros.errors import HmsaError
 
@@ -44,7 +43,7 @@ def framed(text: str) -> bytes:
     return f'{text}*{crc_hqx(text.encode(), 0xFFFF):04X}\n'.encode()
 
 
-class Board:
+class Board(OnLine):
     """
     The board as the source of a current (or voltage) in A, and as a sensor.
 
@@ -66,11 +65,20 @@ class Board:
 
     """
 
+    error, times = BoardError, (_ATTEMPT, _PATIENCE)
+
+    @staticmethod
+    def simulate(rest: str) -> Any:
+        """Return a simulated board (see `open_line`)."""
+        from hmsa_ros.device.simulated_board import SimulatedBoard  # others need no simulation
+
+        return SimulatedBoard(rest)
+
     def __init__(self, port: Any, baud: int = 1_000_000, watchdog: float = 0.5) -> None:
         require('baud', baud, positive=True)
         require('watchdog', watchdog, positive=True)
-        self._port, self._baud, self._watchdog = port, int(baud), round(watchdog * _MILLION)
-        self._line: Any = None
+        super().__init__(port, baud)
+        self._watchdog = round(watchdog * _MILLION)
         self._number = self._session = 0
         self._lost = False
         self._begin(_BOOT)
@@ -112,29 +120,15 @@ class Board:
             self, verb: str, *values: int, patience: float = _PATIENCE,
             count: int = 0) -> list[int]:
         """Return at least so many values that the board answers; ask again where it does not."""
-        until, answer = monotonic() + patience, None
+        until = monotonic() + patience
+        answer: _Answer | None = None
         while True:
             if self._lost and verb != 'H':
                 self._lost = False
                 raise StateLostError(
                     f'the board on {self._port} has restarted, or was out of reach for '
                     f'{self._watchdog / _MILLION:g} s (watchdog)')
-            try:
-                if self._line is None:
-                    from hmsa_ros.device.simulated_board import SimulatedBoard
-
-                    self._line = open_line(
-                        self._port, self._baud, _ATTEMPT, _PATIENCE, SimulatedBoard)
-                answer = self._attempt(verb, values) or answer
-            except HmsaError:
-                raise
-            except Exception as error:  # whatever a port that is gone raises
-                if not isinstance(error, getattr(
-                        sys.modules.get('serial'), 'SerialTimeoutException', ())):
-                    self.close()
-                    raise BoardError(
-                        f'the line {self._port} failed ({error}): check hardware.port, its cable, '
-                        'and that no other program uses it') from error
+            answer = self._use(lambda: self._attempt(verb, values)) or answer
             if answer is not None and answer.verb == verb and len(answer.values) >= count:
                 return answer.values
             if answer is not None and answer.verb == 'L':

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
-from hmsa_ros.device.sensor import Sensor, SensorErrors
-from hmsa_ros.device.transport import Transport
+from hmsa_ros.device.sensor import Sensor, SensorErrors, Transport
 from hmsa_ros.device.watchdog import Device, Fallback
 from hmsa_ros.model.actuators import Actuators, Setup
 from hmsa_ros.model.equations import Array
