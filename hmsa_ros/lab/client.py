@@ -9,7 +9,6 @@ from uuid import uuid4
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.srv import GetState
 import numpy as np
-from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
@@ -26,9 +25,8 @@ from hmsa_ros.nodes.capture import decode
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
 from hmsa_ros.nodes.presence import LATELY_SECONDS, Presence
 from hmsa_ros.nodes.service_call import ServiceCall
-from hmsa_ros.nodes.visitor import leave, visit
+from hmsa_ros.nodes.visitor import SLICE_SECONDS, Visitor
 
-_SLICE_SECONDS = 0.05
 # How long a planner whose node is there may take to listen: it configures itself in a fraction of
 # a second, which a machine that is busy with much else stretches.
 _LISTENS_SECONDS = 60.0
@@ -46,7 +44,7 @@ _UNHEARD_SECONDS = 3.0
 _SILENCE = Verdict(0, 'no reply from the planner yet', '', '', '', 0, 0)
 
 
-class PlannerClient:
+class PlannerClient(Visitor):
     """
     Talks to one planner; a context manager.
 
@@ -64,52 +62,18 @@ class PlannerClient:
     def __init__(
             self, *, namespace: str = '', joints: Sequence[str] = ('actuator',),
             timeout: float = 10.0) -> None:
-        self._timeout, self._begin = timeout, monotonic()
+        super().__init__('client', namespace, timeout)
+        self._begin = monotonic()
         self._joints = tuple(joints)
         self._namespace = namespace
-        self.node = visit('client', namespace)
-        self._executor = EventsExecutor(context=self.node.context)
-        self._executor.add_node(self.node)
         self._verdict: Verdict = _SILENCE
         self._requested = ''
         endpoints.subscribe(self.node, topics.STATUS, self._on_status, topics.PLANNER)
         self._publisher = endpoints.publisher(
             self.node, topics.JOINT_TRAJECTORY, topics.PLANNER)
 
-    def __enter__(self) -> 'PlannerClient':
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._executor.shutdown()
-        leave(self.node)
-
     def _on_status(self, message: DiagnosticStatus) -> None:
         self._verdict = Verdict.read(message)
-
-    def spin_until(
-            self, condition: Callable[[], bool], failure: str,
-            each: Callable[[], None] | None = None, timeout: float | None = None,
-            time: Callable[[], float] = monotonic) -> None:
-        """
-        Serve callbacks, and call ``each`` about 20 times a second, until a condition holds.
-
-        Raises
-        ------
-        HmsaError
-            If it does not come true within a timeout in s, by default the client's, of ``time``.
-        KeyboardInterrupt
-            If a signal that was noted asks for the end.
-
-        """
-        timeout = self._timeout if timeout is None else timeout
-        deadline = time() + timeout
-        while not condition():
-            if time() > deadline:
-                raise HmsaError(f'waited {timeout:g} s: {failure}')
-            ENDING.check()
-            self._executor.spin_once(timeout_sec=_SLICE_SECONDS)
-            if each is not None:
-                each()
 
     def find_planner(self, each: Callable[[], None] | None = None) -> None:
         """Wait until a planner listens and its status has arrived, and call ``each`` meanwhile."""
@@ -168,7 +132,7 @@ class PlannerClient:
                 presence.look()
                 if found := presence.planners(topics.PLANNER) or presence.devices(self._joints):
                     raise HmsaError(found)
-                self.pass_time(_SLICE_SECONDS)
+                self.pass_time(SLICE_SECONDS)
         finally:
             presence.close()
 
@@ -177,7 +141,7 @@ class PlannerClient:
         end = monotonic() + seconds
         while monotonic() < end:
             ENDING.check()
-            self._executor.spin_once(timeout_sec=_SLICE_SECONDS)
+            self._executor.spin_once(timeout_sec=SLICE_SECONDS)
 
     def find_recorder(self) -> None:
         """Wait until somebody who records subscribes to what is sent, and with it to all else."""
@@ -264,8 +228,8 @@ class PlannerClient:
             # A planner that has just started may not have heard the time yet.
             if self._verdict.code != 'no_time' or monotonic() > deadline:
                 raise BadInputError(f'the planner refused: {self._verdict.message}')
-            self._executor.spin_once(timeout_sec=_SLICE_SECONDS)
-            sleep(_SLICE_SECONDS)
+            self._executor.spin_once(timeout_sec=SLICE_SECONDS)
+            sleep(SLICE_SECONDS)
 
     def follow(
             self, verdict: Verdict, *, each: Callable[[Verdict], None] | None = None,
@@ -332,7 +296,7 @@ class PlannerClient:
         begin = monotonic()
         answer = None
         while monotonic() - begin < _STOP_SECONDS:
-            self._executor.spin_once(timeout_sec=_SLICE_SECONDS)
+            self._executor.spin_once(timeout_sec=SLICE_SECONDS)
             # What was sent last may be on its way: the stop must come after it.
             patient = monotonic() - begin < _GONE_SECONDS
             if answer is None and (self._verdict.request == self._requested or not patient):

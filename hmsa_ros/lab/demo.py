@@ -18,7 +18,7 @@ from hmsa_ros.lab.processes import NodeProcess
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.recordings.bags import read_runs
 from hmsa_ros.recordings.levels import without_repeats
-from hmsa_ros.report.evaluation import evaluate, MoveResult
+from hmsa_ros.report.evaluation import MoveResult
 from hmsa_ros.report.outcome import findings_of
 
 #: The paper's first expansion sequence, (stretch, span) in nondimensional time (Figs. 4, 5).
@@ -90,19 +90,18 @@ def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
     from hmsa_ros.report.arrivals import Part
     from hmsa_ros.report.paper import SCREEN
     from hmsa_ros.report.picture import draw
-    from hmsa_ros.report.timing import timing
 
     run, = read_runs(bag)
     levels = without_repeats(run.commands)[0]
-    evaluation = evaluate(run)
-    if len(evaluation.results) != len(SEQUENCE) or len(levels) != 2 * len(SEQUENCE):
+    part = Part.of(run)
+    if len(part.evaluation.results) != len(SEQUENCE) or len(levels) != 2 * len(SEQUENCE):
         raise HmsaError(
-            f'{len(evaluation.results)} of {len(SEQUENCE)} setpoints were carried out, with '
+            f'{len(part.evaluation.results)} of {len(SEQUENCE)} setpoints were carried out, with '
             f'{len(levels)} commands: expected all, with {2 * len(SEQUENCE)}; on a machine so '
             'busy that commands come late try again')
     found = findings_of(run, Tolerances(LARGEST_RESIDUAL, LARGEST_RESIDUAL, 0.0))
     results = tuple(
         SetpointResult(**asdict(x), finding=found[x.place].to_dict())
-        for x in evaluation.results)
-    draw(picture, [Part(run, evaluation, timing(run))], SCREEN)
+        for x in part.evaluation.results)
+    draw(picture, [part], SCREEN)
     return results

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from itertools import pairwise
+import math
 from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING
@@ -16,8 +17,13 @@ from typing import TYPE_CHECKING
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces import topics
+from hmsa_ros.interfaces.actuator import actuator_from
+from hmsa_ros.interfaces.parameters import BLOCK
 from hmsa_ros.interfaces.status import Verdict
+from hmsa_ros.interfaces.topics import PLANNER, PLANT
 from hmsa_ros.lab.processes import NodeProcess, Session
+from hmsa_ros.model.equations import natural_frequency
+from hmsa_ros.recordings.parameters import values_of
 
 if TYPE_CHECKING:
     from hmsa_ros.lab.watch import Watch
@@ -233,3 +239,37 @@ def _carry_out(experiment: Experiment, watch: 'Watch', progress: Tell) -> Verdic
     watch.client.spin_until(
         lambda: watch.now - begin > total, 'time does not advance', report, float('inf'))
     return verdict
+
+
+# Samples a period of the actuator, and samples that plant and recorder pass on in a second of
+# ours: where there are more of them, simulated time runs slower.
+_SAMPLES_A_PERIOD = 50.0
+_SAMPLES_A_SECOND = 4000.0
+
+
+def simulated_nodes(
+        settings: Mapping[str, object], params_file: str,
+        namespace: str) -> tuple[NodeProcess]:
+    """
+    Return a planner and a paused plant that leads its time.
+
+    They are one process: time waits for the planner, however busy the machine is.
+    """
+    # What the parameter file sets goes before what is chosen here.
+    block = actuator_from(values_of(settings, PLANT, BLOCK))
+    period = 2.0 * math.pi * block.time_unit / float(
+        natural_frequency(block.rest, block.nondimensional))
+    rate = _number(settings, 'publish_rate', max(1000.0, _SAMPLES_A_PERIOD / period))
+    factor = _number(settings, 'real_time_factor', min(1.0, _SAMPLES_A_SECOND / rate))
+    return NodeProcess('controller', {
+        f'{PLANT}:publish_clock': True, f'{PLANT}:use_sim_time': False,
+        f'{PLANT}:start_paused': True, f'{PLANT}:publish_rate': rate,
+        f'{PLANT}:real_time_factor': factor, f'{PLANNER}:use_sim_time': True,
+        f'{PLANNER}:feedback': settings.get(f'{PLANNER}.feedback', 'off')},
+        namespace, params_file),
+
+
+def _number(settings: Mapping[str, object], name: str, default: float) -> float:
+    """Return what the file sets for the plant, as the node reads a number."""
+    value = settings.get(f'{PLANT}.{name}')
+    return float(value) if isinstance(value, (int, float)) else default

@@ -3,25 +3,22 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from difflib import get_close_matches
-from time import monotonic
 from typing import Any
 
 from rcl_interfaces.msg import Parameter, ParameterType
 from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
 from rclpy.exceptions import InvalidTopicNameException
-from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.parameter import get_parameter_value, parameter_value_to_python
 from rclpy.validate_topic_name import validate_topic_name
 
-from hmsa_ros.ending import ENDING
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes.service_call import ServiceCall
-from hmsa_ros.nodes.visitor import leave, visit
+from hmsa_ros.nodes.visitor import Visitor
 
 _SLICE_SECONDS = 0.05
 
 
-class RemoteNode:
+class RemoteNode(Visitor):
     """
     The parameters of one node; a context manager.
 
@@ -48,34 +45,14 @@ class RemoteNode:
             raise BadInputError(
                 f'node is {name!r}: expected the name of a node before that of a parameter, as '
                 'in planner law.name') from error
-        self._name, self._where, self._timeout = name, namespace, timeout
-        self._node = visit('parameters', namespace)
-        self._executor = EventsExecutor(context=self._node.context)
-        self._executor.add_node(self._node)
-
-    def __enter__(self) -> 'RemoteNode':
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._executor.shutdown()
-        leave(self._node)
+        super().__init__('parameters', namespace, timeout)
+        self._name, self._where = name, namespace
 
     def _ask(self, kind: Any, service: str, **request: Any) -> Any:
-        call = ServiceCall(
-            self._node, kind, f'{self._name}/{service}', kind.Request(**request))
-        deadline = monotonic() + self._timeout
-        try:
-            while (answer := call.answer()) is None:
-                if monotonic() > deadline:
-                    raise HmsaError(
-                        f'waited {self._timeout:g} s: no node {self._name} in namespace '
-                        f'{self._where or "/"} replies; start it (hmsa {self._name}) with the '
-                        'same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here')
-                ENDING.check()
-                self._executor.spin_once(timeout_sec=_SLICE_SECONDS)
-        finally:
-            call.close()
-        return answer
+        return self.ask(
+            ServiceCall(self.node, kind, f'{self._name}/{service}', kind.Request(**request)),
+            f'no node {self._name} in namespace {self._where or "/"} replies; start it (hmsa '
+            f'{self._name}) with the same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here')
 
     def _values(self, names: Sequence[str]) -> dict[str, Any]:
         """Return the messages of some parameters, by name."""

@@ -20,7 +20,7 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.capture import decode
 from hmsa_ros.nodes.conversions import from_time
-from hmsa_ros.nodes.remote_parameters import RemoteParameters
+from hmsa_ros.nodes.service_call import RemoteParameters
 
 # How long the end of a sequence may keep us waiting after its time is over.
 _GRACE_SECONDS = 20.0
