@@ -46,10 +46,8 @@ from hmsa_ros.recordings.levels import Level  # noqa: E402
 from hmsa_ros.recordings.record import RecordedRequest, Run  # noqa: E402
 from hmsa_ros.report import looks, style  # noqa: E402
 from hmsa_ros.report.arrivals import Part  # noqa: E402
-from hmsa_ros.report.evaluation import evaluate  # noqa: E402
 from hmsa_ros.report.paper import SCREEN  # noqa: E402
 from hmsa_ros.report.picture import draw  # noqa: E402
-from hmsa_ros.report.timing import timing  # noqa: E402
 from hmsa_studies.__main__ import PICTURES as STUDIES  # noqa: E402
 from hmsa_studies.paper import draw_figure, FIGURES  # noqa: E402
 
@@ -298,7 +296,7 @@ def demo(path: Path) -> None:
     """Draw the run of `hmsa demo`."""
     run = simulated(*(
         (x, span * paper_actuator().time_unit) for x, span in SEQUENCE), rate=20_000.0)
-    draw(path, [Part(run, evaluate(run), timing(run))], SCREEN)
+    draw(path, [Part.of(run)], SCREEN)
 
 
 def adapting(path: Path) -> None:

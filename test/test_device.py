@@ -10,9 +10,8 @@ import pytest
 
 from hmsa_ros.device.health import enough_samples, judge_commands, too_few_samples
 from hmsa_ros.device.protocol import Kind, Sample
-from hmsa_ros.device.sensor import Sensor, SensorErrors
+from hmsa_ros.device.sensor import Sensor, SensorErrors, Transport
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.device.transport import Transport
 from hmsa_ros.device.watchdog import Fallback, Watchdog
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.actuators import Setup

@@ -18,8 +18,8 @@ from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.model.simulation import ActuatorSimulation
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import from_time, to_clock, to_command, to_time
+from hmsa_ros.nodes.device_node import Allegiance
 from hmsa_ros.nodes.endpoints import interface_class
-from hmsa_ros.nodes.guard import Allegiance
 from hmsa_ros.nodes.plant import PlantNode
 
 pytestmark = pytest.mark.ros

@@ -10,7 +10,7 @@ from rclpy.parameter import Parameter
 from hmsa_ros.bag.experiment import parameter_key
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.lab.remote import RemoteNode
-from hmsa_ros.nodes.remote_parameters import RemoteParameters
+from hmsa_ros.nodes.service_call import RemoteParameters
 
 pytestmark = pytest.mark.ros
 

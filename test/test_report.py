@@ -44,7 +44,7 @@ from hmsa_ros.recordings.topics import (
     TYPES,
 )
 from hmsa_ros.recordings.verify import verify
-from hmsa_ros.report.arrivals import Part
+from hmsa_ros.report.arrivals import Part, timing
 from hmsa_ros.report.charts import MOST_PANELS
 from hmsa_ros.report.curves import BUCKETS, decimate
 from hmsa_ros.report.evaluation import evaluate, period_of, plan_points
@@ -52,7 +52,6 @@ from hmsa_ros.report.looks import RUNS
 from hmsa_ros.report.outcome import level_results
 from hmsa_ros.report.page import page
 from hmsa_ros.report.picture import draw
-from hmsa_ros.report.timing import timing
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 ACTUATOR = paper_actuator()

@@ -9,10 +9,9 @@ from test_report import ACTUATOR, applied, parameters, parts_of, simulated, writ
 
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.bags import read_runs
-from hmsa_ros.report.arrivals import Part
+from hmsa_ros.report.arrivals import Part, timing
 from hmsa_ros.report.evaluation import evaluate
 from hmsa_ros.report.page import page
-from hmsa_ros.report.timing import timing
 
 pytestmark = pytest.mark.skipif(
     find_browser() is None,

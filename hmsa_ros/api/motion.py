@@ -138,10 +138,8 @@ class Motion:
 
     def _part(self, colour: str = '') -> 'Part':
         from hmsa_ros.report.arrivals import Part
-        from hmsa_ros.report.evaluation import evaluate
-        from hmsa_ros.report.timing import timing
 
-        return Part(self.run, evaluate(self.run), timing(self.run), colour)
+        return Part.of(self.run, colour)
 
     def save(self, path: str | Path) -> list[Path]:
         """

@@ -1,18 +1,23 @@
 """
-Message definitions and type hashes of installed interface packages.
+Message definitions: of installed interface packages, with their hashes, and those of bags.
 
 A bag holds the text of each message type with all it depends on, so that a reader needs no
 ROS. The text is taken from the ``share`` folders of the environment, without rclpy.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+import contextlib
 from functools import cache
+import io
 import json
 import os
 from pathlib import Path
 import re
 import sys
+from typing import Any
 
+from hmsa_ros.bag import limits
+from hmsa_ros.bag.topics import Topic
 from hmsa_ros.errors import BagError
 
 # Types that are part of the language of .msg files and have no file of their own.
@@ -106,3 +111,47 @@ def type_hash(type_name: str) -> str:
                      if '/'.join(_split(entry['type_name'])) == '/'.join(_split(type_name))), '')
     except (ValueError, KeyError, TypeError):
         return ''
+
+
+# A field that is an array of messages.
+_NESTED = re.compile(r'^\s*(?:[A-Z]\w*|\w+/[\w/]+)\s*\[', re.MULTILINE)
+
+
+def make_decoder(info: Topic) -> Callable[[bytes], Any]:
+    """Return what decodes a topic's payloads; both raise `BagError` where it cannot be done."""
+    from mcap.records import Schema
+    from mcap_ros2.decoder import DecoderFactory
+    # A decoder of its own: the library keeps decoders by schema number, which differs between
+    # the files of a bag.
+    try:
+        # Its parser prints before it raises.
+        with contextlib.redirect_stderr(io.StringIO()), \
+                contextlib.redirect_stdout(io.StringIO()):
+            decode = DecoderFactory().decoder_for(info.encoding, Schema(
+                id=1, name=info.type, encoding=info.definition_encoding,
+                data=info.definition.encode()))
+    except Exception as error:  # the parser raises errors of many unrelated classes
+        raise BagError(f'the definition of {info.type} in the bag cannot be read: '
+                       f'{error}') from error
+    if decode is None:
+        raise BagError(
+            f'messages of topic {info.name} ({info.type or "unknown type"}) cannot be decoded: '
+            f'expected CDR with a ros2msg definition, got {info.encoding!r} with '
+            f'{info.definition_encoding or "no definition"!r}')
+
+    # Arrays of primitive values take what they say of their length; those of messages may take
+    # a hundred times as much.
+    most = limits.DECODED_SIZE if _NESTED.search(info.definition) else limits.CHUNK_SIZE
+
+    def checked(data: bytes) -> Any:
+        if len(data) > most:
+            raise BagError(
+                f'a message of topic {info.name} has {len(data)} bytes: expected at most {most} '
+                f'of a message of type {info.type} to be decoded')
+        try:
+            return decode(data)
+        except Exception as error:
+            raise BagError(f'a message of topic {info.name} does not decode as {info.type}: '
+                           f'{str(error) or type(error).__name__}') from error
+
+    return checked

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from hmsa_ros.bag import limits, metadata
-from hmsa_ros.bag.decode import make_decoder
+from hmsa_ros.bag.definitions import make_decoder
 from hmsa_ros.bag.folder import Folder
 from hmsa_ros.bag.intake import Intake, Problems, ScannedFile
 from hmsa_ros.bag.merge import Cursor, merge, Message

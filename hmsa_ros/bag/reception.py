@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import time
 from typing import Any
 
-from hmsa_ros.bag.framing import Entry
+from hmsa_ros.bag.output import Entry
 from hmsa_ros.bag.qos import Qos
 from hmsa_ros.bag.recording import Status
 

@@ -12,7 +12,7 @@ import threading
 import time
 from typing import NamedTuple
 
-from hmsa_ros.bag.framing import Entry
+from hmsa_ros.bag.output import Entry
 from hmsa_ros.bag.sink import Limits, Sink
 from hmsa_ros.bag.topics import number_of, Topic
 from hmsa_ros.bag.writer import BagWriter

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import os
 
 from hmsa_ros.bag import limits
-from hmsa_ros.bag.framing import Entry
+from hmsa_ros.bag.output import Entry
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.bag.writer import BagWriter
 from hmsa_ros.errors import BagError

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 import time
 
-from hmsa_ros.bag.framing import Entry
+from hmsa_ros.bag.output import Entry
 from hmsa_ros.bag.writer import BagWriter, MIN_FILE_SIZE
 from hmsa_ros.errors import BadInputError, BagError
 

@@ -18,8 +18,7 @@ import re
 
 from hmsa_ros import __version__
 from hmsa_ros.bag import metadata, qos
-from hmsa_ros.bag.framing import Entry
-from hmsa_ros.bag.output import OutputFile, PRESETS, RESERVE_STEP
+from hmsa_ros.bag.output import Entry, OutputFile, PRESETS, RESERVE_STEP
 from hmsa_ros.bag.records import MESSAGE_HEAD
 from hmsa_ros.bag.topics import number_of, Topic
 from hmsa_ros.errors import BadInputError, BagError

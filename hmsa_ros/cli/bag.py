@@ -76,7 +76,7 @@ def _info(arguments: argparse.Namespace) -> int:
     """Print what is in a bag."""
     from hmsa_ros.bag.info import summarize, to_json, to_text
     from hmsa_ros.bag.reader import BagReader
-    from hmsa_ros.recordings.answers import unanswered
+    from hmsa_ros.recordings.topics import unanswered
 
     with progress('reading'):
         summary = summarize(arguments.bag, max_chunk_size=arguments.max_chunk_size)

@@ -8,7 +8,7 @@ from hmsa_ros.cli.options import add_options
 from hmsa_ros.cli.pictures import add_picture_options, paper_of
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import json_text, write_text
+from hmsa_ros.files import check_targets, json_text, write_text
 
 if TYPE_CHECKING:
     from hmsa_ros.recordings.record import Run
@@ -54,10 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.recordings.parameters import read_parameter_file
     from hmsa_ros.report.arrivals import Part
     from hmsa_ros.report.comparison import labelled
-    from hmsa_ros.report.evaluation import evaluate
     from hmsa_ros.report.looks import RUNS
     from hmsa_ros.report.page import page
-    from hmsa_ros.report.timing import timing
 
     joints = [x for x in arguments.joint.split(',') if x]
     parameters = None if arguments.params is None else read_parameter_file(arguments.params)
@@ -69,9 +67,8 @@ def run(arguments: argparse.Namespace) -> int:
         parts = []
         for i, each in enumerate(labelled(runs)):
             update('evaluating', i / len(runs))
-            parts.append(Part(
-                each, evaluate(each), timing(each),
-                RUNS[i % len(RUNS)] if len(runs) > 1 else ''))
+            parts.append(Part.of(
+                each, RUNS[i % len(RUNS)] if len(runs) > 1 else ''))
         update('writing', None)
         write_text(out, page(parts))
         if pictures:
@@ -95,14 +92,8 @@ def _check_targets(targets: list[Path], bags: list[Path]) -> None:
         raise BadInputError(
             'two of --out and --picture name the same file: expected different files')
     for target in targets:
-        if target.is_dir():
-            raise BadInputError(f'cannot write {target}: it is a folder; expected a file')
-        if target.suffix in ('.mcap', '.yaml') or any(
-                target.resolve() == bag.resolve() for bag in bags):
+        if target.suffix in ('.mcap', '.yaml'):
             raise BadInputError(
                 f'cannot write {target}: it may be part of a bag; expected a name such as '
                 'report.html')
-        if not target.resolve().parent.is_dir():
-            raise BadInputError(
-                f'cannot write {target}: {target.parent} is no folder; expected one that '
-                'exists')
+    check_targets(targets, bags)

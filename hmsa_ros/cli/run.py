@@ -117,8 +117,7 @@ def _tolerances(arguments: argparse.Namespace) -> 'Tolerances | None':
 
 
 def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
-    from hmsa_ros.lab.experiment import Experiment
-    from hmsa_ros.lab.simulated import simulated_nodes
+    from hmsa_ros.lab.experiment import Experiment, simulated_nodes
     from hmsa_ros.recordings.parameters import read_parameter_file
 
     expected = {} if arguments.params_file is None else dict(read_parameter_file(
@@ -137,10 +136,8 @@ def _measure(experiment: 'Experiment', tolerances: 'Tolerances | None') -> 'list
     """Read the bag and judge the setpoints of each joint."""
     from hmsa_ros.recordings.bags import read_runs
     from hmsa_ros.report.arrivals import Part
-    from hmsa_ros.report.evaluation import evaluate
-    from hmsa_ros.report.timing import timing
 
-    return [Part(x, evaluate(x, tolerances), timing(x)) for x in read_runs(
+    return [Part.of(x, tolerances=tolerances) for x in read_runs(
         experiment.bag, joints=experiment.joints if len(experiment.joints) > 1 else ())]
 
 

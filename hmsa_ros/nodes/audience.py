@@ -1,6 +1,7 @@
 """Who is to receive what is sent, and whether they are all there."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -12,6 +13,9 @@ from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.parameter import parameter_value_to_python
 
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces import topics
+from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes.cdr import stamp_of
 from hmsa_ros.nodes.selection import Selection
 from hmsa_ros.nodes.senders import listed
 from hmsa_ros.nodes.service_call import ServiceCall
@@ -110,3 +114,34 @@ class Audience:
 def _name(endpoint: Any) -> str:
     """Return the full name of the node that has an endpoint."""
     return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
+
+
+class Followers:
+    """
+    How far samples on topics (full names) have come.
+
+    They are looked at only when somebody asks, so that they take no time from whoever plays.
+    """
+
+    def __init__(self, node: Node, names: Sequence[str]) -> None:
+        self._subscriptions = {
+            name: endpoints.listen(node, replace(topics.JOINT_STATES, name=name))
+            for name in names}
+        # Stamps in ns of the last two samples.
+        self._stamps = dict.fromkeys(names, (0, 0))
+
+    def behind(self, end: int) -> dict[str, int]:
+        """Return by topic how many ns its samples still lack to a time, of those that do."""
+        for name, subscription in self._subscriptions.items():
+            while taken := subscription.take():
+                for x in taken[-2:]:
+                    self._stamps[name] = self._stamps[name][1], stamp_of(x.data)
+        # The next sample may be due after the end only.
+        return {name: end - last for name, (before, last) in self._stamps.items()
+                if not before or 2 * last - before <= end}
+
+    @staticmethod
+    def in_words(behind: Mapping[str, int]) -> str:
+        """Say what `behind` returned."""
+        return ', '.join(f'those of {name} end {lack * 1e-9:.3f} s too early'
+                         for name, lack in behind.items())

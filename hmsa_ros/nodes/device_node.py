@@ -6,6 +6,7 @@ from time import monotonic_ns
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.node import Node
 from sensor_msgs.msg import MagneticField
 
 from hmsa_ros.control.seldom import Seldom
@@ -14,14 +15,128 @@ from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.device.watchdog import Fallback, SAFE_FLUX
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.parameters import ParameterSpec
+from hmsa_ros.interfaces.parameters import JOINT, ParameterSpec
 from hmsa_ros.nodes import conversions, endpoints
-from hmsa_ros.nodes.guard import COMMAND_SOURCES, CommandInput
+from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.outlet import Outlet
-from hmsa_ros.nodes.parameters import JointParameters
+from hmsa_ros.nodes.parameters import JointParameters, JOINTS
 from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.samples import SamplePublisher
+
+#: Obey every publisher, or only the one that was seen first, until it is gone.
+COMMAND_SOURCES = ('any', 'first')
+
+
+class Allegiance:
+    """
+    Decides by identifiers which publisher is obeyed.
+
+    ``source`` is whom it obeys, None before the first command; ``refused`` counts others'
+    commands.
+    """
+
+    def __init__(self) -> None:
+        self.source: bytes | None = None
+        self.refused = 0
+
+    def accepts(self, publisher: bytes, present: Callable[[], Iterable[bytes]]) -> bool:
+        """Return whether to obey a publisher, of those that are present."""
+        if self.source in (None, publisher) or self.source not in present():
+            self.source = publisher
+            return True
+        self.refused += 1
+        return False
+
+
+class CommandInput:
+    """
+    Commands for one actuator from ``'any'`` or only the ``'first'`` publisher.
+
+    ``take`` gets each message that is obeyed; ``unreadable`` counts those that cannot be decoded.
+    What a ``companion`` publishes, a node of that name in the same namespace, is passed over:
+    its commands come directly, and first.
+    """
+
+    def __init__(
+            self, node: Node, topic: topics.Topic, take: Callable[[MagneticField], None],
+            source: str, companion: str = '') -> None:
+        self._companion = companion
+        self._companions: dict[bytes, bool] = {}
+        self.unreadable = 0
+        self._node = node
+        self._topic = topic
+        self._take = take
+        self._allegiance: Allegiance | None = None
+        self._raw: RawSubscription | None = None
+        if source == 'first':
+            self._allegiance = Allegiance()
+        if source == 'first' or companion:
+            self._raw = endpoints.listen(node, topic)
+        self._subscription = None if self._raw is not None else endpoints.subscribe(
+            node, topic, take)
+
+    @property
+    def refused(self) -> int:
+        """Number of commands of publishers that are not obeyed."""
+        return self._allegiance.refused if self._allegiance is not None else 0
+
+    def count(self) -> int:
+        """Return how many publishers the topic has."""
+        return int(self._node.count_publishers(self._topic.name))
+
+    def _publishers(self) -> dict[bytes, tuple[str, str]]:
+        """Return name and namespace of the topic's publishers by identifier, as in the graph."""
+        name = self._node.resolve_topic_name(self._topic.name)
+        return {bytes(x.endpoint_gid): (x.node_name, x.node_namespace)
+                for x in self._node.get_publishers_info_by_topic(name)}
+
+    def poll(self) -> None:
+        """Take what has arrived, where the node's executor does not."""
+        if self._raw is None:
+            return
+        for taken in self._raw.take():
+            if self._companion and self._is_companion(taken.publisher):
+                continue
+            if self._allegiance is None or self._allegiance.accepts(
+                    taken.publisher, self._publishers):
+                self._obey(taken.data)
+            else:
+                self._node.get_logger().warning(
+                    f'command on {self._topic.name} refused: it comes from a publisher other '
+                    'than the one obeyed; stop one of them, or set command_source to any',
+                    throttle_duration_sec=60.0)
+
+    def _is_companion(self, publisher: bytes) -> bool:
+        """Return whether a publisher is the companion; looked up in the graph once."""
+        if publisher not in self._companions:
+            own = self._companion, self._node.get_namespace()
+            found = {x: node == own for x, node in self._publishers().items()}
+            if self._allegiance is not None:
+                self._allegiance.source = next((x for x in found if found[x]), None)
+            self._companions = found
+        return self._companions.get(publisher, False)
+
+    def _obey(self, data: bytes) -> None:
+        try:
+            message = decode(data, MagneticField)
+        except BadInputError as error:
+            self.unreadable += 1
+            self._node.get_logger().error(
+                f'message on {self._topic.name} ignored: {error}',
+                throttle_duration_sec=60.0)
+            return
+        self._take(message)
+
+    def close(self) -> None:
+        """Receive no more."""
+        if self._raw is not None:
+            self._raw.destroy()
+            self._raw = None
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+            self._subscription = None
+
 
 #: What a joint does when nobody commands it; each may have values of its own.
 FALLBACK = (
@@ -49,6 +164,8 @@ PUBLISH_SCALARS = ParameterSpec(
     'Whether to publish stretch and stretch_rate besides joint_states; auto: only for a '
     'single joint.', choices=('auto', 'always', 'never'))
 
+#: What all devices have besides.
+COMMON = (JOINT, JOINTS, COMMAND_SOURCE, PUBLISH_SCALARS)
 #: How often the time is looked at.
 TICK_SECONDS = 0.001
 # Receipts of a joint, in ns: apart at least where commands come, and at most where none do.

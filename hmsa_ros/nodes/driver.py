@@ -16,19 +16,12 @@ from hmsa_ros.device.worker import HardwareWorker
 from hmsa_ros.ending import Deadline, ENDING
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.parameters import JOINT, ParameterSpec, PUBLISH_RATE
+from hmsa_ros.interfaces.parameters import ParameterSpec, PUBLISH_RATE
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions
-from hmsa_ros.nodes.device_node import (
-    COMMAND_SOURCE,
-    DeviceJoint,
-    DeviceNode,
-    FALLBACK,
-    fallback_from,
-    PUBLISH_SCALARS,
-)
+from hmsa_ros.nodes.device_node import COMMON, DeviceJoint, DeviceNode, FALLBACK, fallback_from
 from hmsa_ros.nodes.managed import AUTOSTART
-from hmsa_ros.nodes.parameters import declare_joints, JointParameters, JOINTS
+from hmsa_ros.nodes.parameters import declare_joints, JointParameters
 from hmsa_ros.nodes.runner import run
 
 # How long hardware may take to start before that is said, in s.
@@ -65,13 +58,10 @@ PARAMETERS = (
     HARDWARE,
     TIMEOUT,
     *OWN,
-    JOINT,
-    JOINTS,
-    COMMAND_SOURCE,
+    *COMMON,
     replace(
         PUBLISH_RATE, minimum=0.0,
         description='Rate at which the hardware is read; 0 where there is no sensor.'),
-    PUBLISH_SCALARS,
 )
 
 
@@ -86,8 +76,7 @@ class DriverNode(DeviceNode):
         if SHORT in given:
             # A name that is a value and a namespace breaks ``ros2 param dump``.
             given.setdefault(HARDWARE.name, given.pop(SHORT))
-        self.values = declare_joints(
-            self, [x for x in PARAMETERS if x is not AUTOSTART], OWN)
+        self.values = declare_joints(self, PARAMETERS, OWN)
         self._settings = {x: self._settings_of(x) for x in self.values.names}
         self.failure: HmsaError | None = None
         self.autostart()

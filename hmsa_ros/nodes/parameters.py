@@ -54,7 +54,7 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
 
 def declare(node: Node, specs: Iterable[ParameterSpec]) -> Mapping[str, Any]:
     """
-    Declare parameters on a node and return their values by name.
+    Declare parameters on a node, unless they are, and return their values by name.
 
     Raises
     ------
@@ -65,6 +65,8 @@ def declare(node: Node, specs: Iterable[ParameterSpec]) -> Mapping[str, Any]:
     values: dict[str, Any] = {}
     filled: Mapping[str, Any] | None = None
     for spec in specs:
+        if node.has_parameter(spec.name):
+            continue
         if filled is None and spec.name in FIXED:
             filled = from_files(node, values)
         values[spec.name] = spec.taken(

@@ -27,7 +27,7 @@ from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.cdr import read_trajectory, stamp_of
 from hmsa_ros.nodes.channel import JointChannel
-from hmsa_ros.nodes.managed import AUTOSTART, ManagedNode
+from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.markers import TargetMarkers
 from hmsa_ros.nodes.newest_clock import NewestClock
 from hmsa_ros.nodes.parameters import check_names, declare_joints
@@ -58,8 +58,7 @@ class PlannerNode(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__(topics.PLANNER)
-        self._settings = declare_joints(
-            self, [x for x in PARAMETERS if x is not AUTOSTART], OWN)
+        self._settings = declare_joints(self, PARAMETERS, OWN)
         self._clock_reader = NewestClock(self)
         self._steps = StepWatch()
         self._runtime = self._new_runtime()

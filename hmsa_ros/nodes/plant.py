@@ -24,17 +24,10 @@ from hmsa_ros.model.actuators import check_stretch, Setup, unheld
 from hmsa_ros.model.pacer import Pacer
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
-from hmsa_ros.nodes.device_node import (
-    COMMAND_SOURCE,
-    DeviceJoint,
-    DeviceNode,
-    FALLBACK,
-    fallback_from,
-    PUBLISH_SCALARS,
-)
+from hmsa_ros.nodes.device_node import COMMON, DeviceJoint, DeviceNode, FALLBACK, fallback_from
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.markers import MARKER_FRAME, MARKER_RATE, MARKER_SCALE, State, StateMarkers
-from hmsa_ros.nodes.parameters import declare_joints, JointParameters, JOINTS
+from hmsa_ros.nodes.parameters import declare_joints, JointParameters
 from hmsa_ros.nodes.runner import run
 
 #: Parameters that each joint may have values of its own for.
@@ -122,9 +115,7 @@ def _from_wrench(message: WrenchStamped) -> tuple[int, float]:
 PARAMETERS = (
     AUTOSTART,
     *OWN,
-    shared.JOINT,
-    JOINTS,
-    COMMAND_SOURCE,
+    *COMMON,
     ParameterSpec(
         'command_delay', 0.0,
         'Simulated transport delay of commands.', 's', 0.0, 1e3),
@@ -136,7 +127,6 @@ PARAMETERS = (
     ParameterSpec(
         'seed', 0, 'Seed of the noise; the same seed gives the same run.', '', 0, 2**31 - 1),
     shared.PUBLISH_RATE,
-    PUBLISH_SCALARS,
     ParameterSpec(
         'publish_clock', False,
         'Whether the plant publishes /clock as the source of simulated time; leave its own '
@@ -170,8 +160,7 @@ class PlantNode(DeviceNode):
 
     def __init__(self) -> None:
         super().__init__(topics.PLANT)
-        self.values = declare_joints(
-            self, [x for x in PARAMETERS if x is not AUTOSTART], OWN)
+        self.values = declare_joints(self, PARAMETERS, OWN)
         self.on_change(self._take_parameters)
         self._pacer = Pacer(0, 1.0)
         self._clock_seen = 0

@@ -32,9 +32,8 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.parameters import duration_from, duration_specs, ParameterSpec
 from hmsa_ros.nodes import endpoints
-from hmsa_ros.nodes.audience import Audience
+from hmsa_ros.nodes.audience import Audience, Followers
 from hmsa_ros.nodes.conversions import to_clock, to_status
-from hmsa_ros.nodes.followers import Followers
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare
 from hmsa_ros.nodes.runner import run

@@ -37,9 +37,9 @@ from hmsa_ros.nodes.capture import Capture, decode, SimulatedTime, Taken
 from hmsa_ros.nodes.conversions import from_time, to_status
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare
-from hmsa_ros.nodes.remote_parameters import RemoteParameters
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.selection import Selection
+from hmsa_ros.nodes.service_call import RemoteParameters
 from hmsa_ros.nodes.subscribing import Subscriptions
 
 PARAMETERS = (
