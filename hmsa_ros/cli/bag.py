@@ -1,4 +1,10 @@
-"""``hmsa bag``: what is in a recording, and how to save one that was cut off."""
+"""
+Inspect, verify and recover bags.
+
+Inspect, verify and recover recordings (MCAP bags as rosbag2 writes them).
+
+example: hmsa bag info hmsa_demo/run
+"""
 
 import argparse
 from dataclasses import asdict
@@ -8,7 +14,7 @@ import sys
 from typing import Any
 
 from hmsa_ros.bag.limits import CHUNK_SIZE, MEBIBYTE
-from hmsa_ros.cli.options import add_options, JSON
+from hmsa_ros.cli.options import add_command, add_options, JSON
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError, printable
 from hmsa_ros.files import json_text
@@ -18,27 +24,8 @@ _LARGEST_CHUNK = 65536
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'bag', help='inspect, verify and recover bags',
-        description='Inspect, verify and recover recordings (MCAP bags as rosbag2 writes them).',
-        epilog='example: hmsa bag info hmsa_demo/run')
+    parser = add_command(subparsers, __name__, __doc__)
     actions = parser.add_subparsers(metavar='ACTION', required=True)
-    info = actions.add_parser(
-        'info', help='list the contents of a bag',
-        description='Print topics, counts, rates, losses and duration of a bag, and with '
-                    '--parameters the parameters of the nodes.',
-        epilog='example: hmsa bag info hmsa_demo/run --json')
-    recover = actions.add_parser(
-        'recover', help='copy the readable messages of a damaged bag to a new bag',
-        description='Copy everything readable in a bag to a new bag.',
-        epilog='example: hmsa bag recover cut_off_run --out saved_run')
-    verify = actions.add_parser(
-        'verify', help='simulate the recorded commands and compare with the recorded motion',
-        description='Simulate the recorded commands with the recorded parameters and print the '
-                    'maximum difference from the recorded motion. The exit status is 1 if it '
-                    'exceeds the tolerance, if the bag is damaged, or if a command was not '
-                    'applied.',
-        epilog='example: hmsa bag verify hmsa_demo/run --tolerance 1e-6')
     tolerance = (
         '--tolerance', 'D', float,
         'maximum difference in stretch, or in the deflection of a beam (default %(default)g)',
@@ -51,11 +38,10 @@ def add_parser(subparsers: Any) -> None:
         '--max-chunk', 'MIB', float,
         'largest chunk or message to read, in MiB (default %(default)g)',
         {'default': CHUNK_SIZE / MEBIBYTE})
-    for action, function, options in (
-            (info, _info, [
-                ('--parameters', 'also print the parameters of the recorded nodes'), JSON]),
-            (recover, _recover, [out]),
-            (verify, _verify, [tolerance, params_file, JSON])):
+    for function, options in (
+            (_info, [('--parameters', 'also print the parameters of the recorded nodes'), JSON]),
+            (_recover, [out]), (_verify, [tolerance, params_file, JSON])):
+        action = add_command(actions, function.__name__.strip('_'), function.__doc__)
         action.add_argument('bag', metavar='BAG', help='folder of a bag, or an .mcap file')
         add_options(action, *options, max_chunk)
         action.set_defaults(action=function)
@@ -73,7 +59,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _info(arguments: argparse.Namespace) -> int:
-    """Print what is in a bag."""
+    """
+    List the contents of a bag.
+
+    Print topics, counts, rates, losses and duration of a bag, and with --parameters the parameters
+    of the nodes.
+
+    example: hmsa bag info hmsa_demo/run --json
+    """
     from hmsa_ros.bag.info import summarize, to_json, to_text
     from hmsa_ros.bag.reader import BagReader
     from hmsa_ros.recordings.topics import unanswered
@@ -88,7 +81,15 @@ def _info(arguments: argparse.Namespace) -> int:
 
 
 def _verify(arguments: argparse.Namespace) -> int:
-    """Compare recorded and integrated motion; 1 if they differ or something is missing."""
+    """
+    Simulate the recorded commands and compare with the recorded motion.
+
+    Simulate the recorded commands with the recorded parameters and print the maximum difference
+    from the recorded motion. The exit status is 1 if it exceeds the tolerance, if the bag is
+    damaged, or if a command was not applied.
+
+    example: hmsa bag verify hmsa_demo/run --tolerance 1e-6
+    """
     from hmsa_ros.recordings.bags import read_runs
     from hmsa_ros.recordings.parameters import read_parameter_file
     from hmsa_ros.recordings.verify import verify_run
@@ -123,7 +124,13 @@ def _verify(arguments: argparse.Namespace) -> int:
 
 
 def _recover(arguments: argparse.Namespace) -> int:
-    """Write a new bag."""
+    """
+    Copy the readable messages of a damaged bag to a new bag.
+
+    Copy everything readable in a bag to a new bag.
+
+    example: hmsa bag recover cut_off_run --out saved_run
+    """
     from hmsa_ros.bag.recover import recover
     with progress('recovering'):
         result = recover(

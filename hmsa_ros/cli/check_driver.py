@@ -1,11 +1,19 @@
-"""``hmsa check-driver``: whether a class of hardware does what a driver needs."""
+"""
+Test a hardware class at small levels.
+
+Test a hardware class as hmsa driver uses it, without ROS, with flux densities up to --limit:
+levels, their timing, samples, polarity, and whether the coil is off after a silence, close, an
+exception and SIGTERM. Takes about ten seconds. The exit status is 0 if all checks pass.
+
+example: hmsa check-driver my_lab:Coil --set port=/dev/ttyACM0
+"""
 
 import argparse
 from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_options, JSON
+from hmsa_ros.cli.options import add_command, add_options, JSON
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import check_targets, json_text, write_text
@@ -16,13 +24,7 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'check-driver', help='test a hardware class at small levels',
-        description='Test a hardware class as hmsa driver uses it, without ROS, with flux '
-                    'densities up to --limit: levels, their timing, samples, polarity, and '
-                    'whether the coil is off after a silence, close, an exception and SIGTERM. '
-                    'Takes about ten seconds. The exit status is 0 if all checks pass.',
-        epilog='example: hmsa check-driver my_lab:Coil --set port=/dev/ttyACM0')
+    parser = add_command(subparsers, __name__, __doc__)
     parser.add_argument(
         'hardware', metavar='MODULE:NAME',
         help='as in the parameter hardware of hmsa driver, or serial_board')

@@ -1,10 +1,17 @@
-"""``hmsa compare``: several runs in numbers."""
+"""
+Compare runs in numbers, and in a picture.
+
+Print move time, offset and residual vibration of each setpoint for several runs, and how far each
+curve is from that of the first run.
+
+example: hmsa compare run_zv run_two_step --picture both.pdf --width 85
+"""
 
 import argparse
 from pathlib import Path
 from typing import Any
 
-from hmsa_ros.cli.options import add_options, JSON
+from hmsa_ros.cli.options import add_command, add_options, JSON
 from hmsa_ros.cli.pictures import add_picture_options, paper_of
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
@@ -13,11 +20,7 @@ from hmsa_ros.files import json_text
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'compare', help='compare runs in numbers, and in a picture',
-        description='Print move time, offset and residual vibration of each setpoint for several '
-                    'runs, and how far each curve is from that of the first run.',
-        epilog='example: hmsa compare run_zv run_two_step --picture both.pdf --width 85')
+    parser = add_command(subparsers, __name__, __doc__)
     parser.add_argument(
         'runs', nargs='+', type=Path, metavar='BAG', help='folder of a bag, or an .mcap file')
     add_options(

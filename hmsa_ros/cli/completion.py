@@ -1,7 +1,11 @@
 """
-``hmsa completion``: scripts by which a shell completes commands and options.
+Print a shell completion script.
 
-They hold everything that they need, so that no key press starts Python.
+Print a script that lets the shell complete commands, options and files. In ~/.bashrc or ~/.zshrc:
+eval "$(hmsa completion bash)", or zsh. For fish: hmsa completion fish >
+~/.config/fish/completions/hmsa.fish
+
+example: hmsa completion bash
 """
 
 import argparse
@@ -10,6 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 import re
 from typing import Any
+
+from hmsa_ros.cli.options import add_command
 
 # Options whose values are checked later than by the parser, those of a shaper.
 _OF_SHAPERS = ('--shaper', '--shapers')
@@ -46,12 +52,7 @@ class Command:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'completion', help='print a shell completion script',
-        description='Print a script that lets the shell complete commands, options and files. '
-                    'In ~/.bashrc or ~/.zshrc: eval "$(hmsa completion bash)", or zsh. For '
-                    'fish: hmsa completion fish > ~/.config/fish/completions/hmsa.fish',
-        epilog='example: hmsa completion bash')
+    parser = add_command(subparsers, __name__, __doc__)
     parser.add_argument('shell', choices=('bash', 'zsh', 'fish'), help='the shell')
 
 

@@ -1,4 +1,12 @@
-"""``hmsa demo``: the paper's sequence on real ROS 2 processes."""
+"""
+Run the paper's sequence on real ROS 2 processes.
+
+Start planner, plant and recorder, send the paper's sequence, and print the residual vibration.
+Then move a block that is 20 % stiffer than the planner's model, in open loop and with feedback.
+Writes a bag, two figures and the logs.
+
+example: hmsa demo --out my_first_run
+"""
 
 import argparse
 from datetime import datetime
@@ -6,7 +14,7 @@ import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_options
+from hmsa_ros.cli.options import add_command, add_options
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.ending import ENDING
 from hmsa_ros.files import json_text
@@ -18,13 +26,7 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'demo', help="run the paper's sequence on real ROS 2 processes",
-        description="Start planner, plant and recorder, send the paper's sequence, and print "
-                    'the residual vibration. Then move a block that is 20 % stiffer than the '
-                    "planner's model, in open loop and with feedback. Writes a bag, two figures "
-                    'and the logs.',
-        epilog='example: hmsa demo --out my_first_run')
+    parser = add_command(subparsers, __name__, __doc__)
     add_options(
         parser,
         ('--out', 'DIR', Path, 'output folder (default hmsa_demo/ plus date and time)'),

@@ -1,11 +1,19 @@
-"""``hmsa excite``: the sequence of levels to record for identification."""
+"""
+Design the sequence to record for hmsa identify.
+
+Design the sequence of levels that identifies the actuator best. It respects the limits of coil and
+stretch and ends at rest. The table compares it with unshaped steps and with the paper's sequence,
+repeated for the same duration.
+
+example: hmsa excite --params-file actuator.yaml --duration 2 --out levels.csv
+"""
 
 import argparse
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_options, JSON
+from hmsa_ros.cli.options import add_command, add_options, JSON
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.files import json_text, write_text
 
@@ -16,13 +24,7 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'excite', help='design the sequence to record for hmsa identify',
-        description='Design the sequence of levels that identifies the actuator best. It respects '
-                    'the limits of coil and stretch and ends at rest. The table compares it with '
-                    "unshaped steps and with the paper's sequence, repeated for the same "
-                    'duration.',
-        epilog='example: hmsa excite --params-file actuator.yaml --duration 2 --out levels.csv')
+    parser = add_command(subparsers, __name__, __doc__)
     add_options(
         parser,
         ('--params-file', 'YAML', Path,

@@ -1,22 +1,24 @@
-"""``hmsa export``: the samples and levels of a run as tables."""
+"""
+Write the samples and levels of a run as CSV, Parquet or Matlab file.
+
+Write the samples of a run (time in s from the first sample, stretch, stretch rate in 1/s, flux
+density in T) to FILE, and its levels (time in s, flux density in T) to a second file whose name
+ends in _levels; a Matlab file contains both.
+
+example: hmsa export hmsa_demo/run --out run.csv
+"""
 
 import argparse
 from pathlib import Path
 from typing import Any
 
-from hmsa_ros.cli.options import add_options
+from hmsa_ros.cli.options import add_command, add_options
 from hmsa_ros.cli.progress import progress
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'export', help='write the samples and levels of a run as CSV, Parquet or Matlab file',
-        description='Write the samples of a run (time in s from the first sample, stretch, '
-                    'stretch rate in 1/s, flux density in T) to FILE, and its levels (time in s, '
-                    'flux density in T) to a second file whose name ends in _levels; a Matlab '
-                    'file contains both.',
-        epilog='example: hmsa export hmsa_demo/run --out run.csv')
+    parser = add_command(subparsers, __name__, __doc__)
     parser.add_argument(
         'run_path', type=Path, metavar='RUN', help='folder of a bag, or an .mcap file')
     add_options(

@@ -1,4 +1,12 @@
-"""``hmsa identify``: the parameters of an actuator out of a recording."""
+"""
+Identify the actuator's parameters from a recording.
+
+Identify the actuator's parameters from a recording of its motion, with 95 % intervals, or report
+why the recording cannot determine them. RUN is a bag, or a CSV with a header and the columns time
+(s), stretch and, without --commands, flux_density (T). No start values are needed.
+
+example: hmsa identify camera.csv --commands levels.csv --out actuator.yaml
+"""
 
 import argparse
 from collections.abc import Sequence
@@ -7,7 +15,7 @@ from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_options, JSON
+from hmsa_ros.cli.options import add_command, add_options, JSON
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.quantities import number_of
 from hmsa_ros.errors import BadInputError
@@ -20,13 +28,7 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'identify', help="identify the actuator's parameters from a recording",
-        description="Identify the actuator's parameters from a recording of its motion, with 95 "
-                    '% intervals, or report why the recording cannot determine them. RUN is a '
-                    'bag, or a CSV with a header and the columns time (s), stretch and, without '
-                    '--commands, flux_density (T). No start values are needed.',
-        epilog='example: hmsa identify camera.csv --commands levels.csv --out actuator.yaml')
+    parser = add_command(subparsers, __name__, __doc__)
     parser.add_argument(
         'recording', type=Path, metavar='RUN', help='a bag, or a CSV of samples')
     add_options(

@@ -1,4 +1,14 @@
-"""``hmsa init``: a parameter file for one's own actuator, with what follows from it."""
+r"""
+Write a parameter file for your own actuator.
+
+Write a parameter file of your own actuator for planner and plant (--params-file), and print the
+resulting times, damping, flux densities and reachable stretches. Asks for each value without an
+option. Numbers are in SI units unless a unit follows: 10mm, "50 kPa".
+
+example: hmsa init --half-length 5mm --half-thickness 5mm --density 1.9g/cm3 \
+    --shear-modulus 30kPa --j-lim 20 --zeta 0.1 --remanence 80mT \
+    --flux-max 200mT --out my_actuator.yaml
+"""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -8,7 +18,7 @@ from pathlib import Path
 import sys
 from typing import Any, cast, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_options, JSON, law_of, LAW_OPTION, Row
+from hmsa_ros.cli.options import add_command, add_options, JSON, law_of, LAW_OPTION, Row
 from hmsa_ros.cli.quantities import (
     BEAM,
     BY_KEY,
@@ -49,15 +59,7 @@ _HARDLY = 0.01
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'init', help='write a parameter file for your own actuator',
-        description='Write a parameter file of your own actuator for planner and plant '
-                    '(--params-file), and print the resulting times, damping, flux densities and '
-                    'reachable stretches. Asks for each value without an option. Numbers are in '
-                    'SI units unless a unit follows: 10mm, "50 kPa".',
-        epilog='example: hmsa init --half-length 5mm --half-thickness 5mm --density 1.9g/cm3 \\\n'
-               '    --shear-modulus 30kPa --j-lim 20 --zeta 0.1 --remanence 80mT \\\n'
-               '    --flux-max 200mT --out my_actuator.yaml')
+    parser = add_command(subparsers, __name__, __doc__)
     add_options(
         parser,
         ('--beam',

@@ -1,6 +1,7 @@
 """Options of commands, as rows of tables."""
 
 import argparse
+import inspect
 from typing import Any
 
 from hmsa_ros.errors import BadInputError, excerpt
@@ -71,6 +72,21 @@ def timeout_of(arguments: argparse.Namespace) -> float:
     if not timeout > 0.0:
         raise BadInputError(f'timeout is {timeout:g}: expected a number of seconds above 0')
     return timeout
+
+
+def add_command(subparsers: Any, name: str, text: str | None) -> Any:
+    """
+    Add a command that a docstring describes, and return its parser.
+
+    The first line of the docstring is the help among other commands, and its last paragraph, which
+    begins with ``example:``, is left as it is written. The end of a module's name will do as name.
+    """
+    what, _, rest = inspect.cleandoc(text or '').partition('\n\n')
+    description, _, example = rest.rpartition('example: ')
+    what = what.rstrip('.')
+    return subparsers.add_parser(
+        name.rpartition('.')[2].replace('_', '-'), help=what[:1].lower() + what[1:],
+        description=description or f'{what}.', epilog=f'example: {example}')
 
 
 def add_options(parser: Any, *rows: Row) -> None:

@@ -1,28 +1,25 @@
-"""``hmsa param``: parameters of running nodes, where there is no ``ros2``."""
+"""
+Read and change parameters of running nodes.
+
+Read and change parameters of running nodes, as ros2 param does.
+
+example: hmsa param set planner shaper robust
+"""
 
 import argparse
 from typing import Any
 
-from hmsa_ros.cli.options import add_options, JSON, NAMESPACE, TIMEOUT, timeout_of
+from hmsa_ros.cli.options import add_command, add_options, JSON, NAMESPACE, TIMEOUT, timeout_of
 from hmsa_ros.ending import ENDING
 from hmsa_ros.files import json_text, yaml_text
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'param', help='read and change parameters of running nodes',
-        description='Read and change parameters of running nodes, as ros2 param does.',
-        epilog='example: hmsa param set planner shaper robust')
+    parser = add_command(subparsers, __name__, __doc__)
     actions = parser.add_subparsers(metavar='ACTION', required=True)
-    get = actions.add_parser(
-        'get', help='print parameters of a node', description='Print parameters of a node.',
-        epilog='example: hmsa param get planner shaper')
-    set_ = actions.add_parser(
-        'set', help='change a parameter of a node',
-        description='Change a parameter of a node, such as shaper of the planner: it holds from '
-                    'the next request on.',
-        epilog='example: hmsa param set planner shaper robust')
+    get = add_command(actions, 'get', _get.__doc__)
+    set_ = add_command(actions, 'set', _set.__doc__)
     for action in (get, set_):
         action.add_argument('node', metavar='NODE', help='name of the node, such as planner')
     get.add_argument('names', nargs='*', metavar='NAME', help='parameters (default all)')
@@ -42,6 +39,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _get(arguments: argparse.Namespace) -> int:
+    """
+    Print parameters of a node.
+
+    example: hmsa param get planner shaper
+    """
     from hmsa_ros.lab.remote import RemoteNode
 
     with RemoteNode(arguments.node, arguments.namespace, arguments.timeout) as node:
@@ -56,6 +58,13 @@ def _get(arguments: argparse.Namespace) -> int:
 
 
 def _set(arguments: argparse.Namespace) -> int:
+    """
+    Change a parameter of a node.
+
+    Change a parameter of a node, such as shaper of the planner: it holds from the next request on.
+
+    example: hmsa param set planner shaper robust
+    """
     from hmsa_ros.lab.remote import RemoteNode
 
     with RemoteNode(arguments.node, arguments.namespace, arguments.timeout) as node:

@@ -1,11 +1,19 @@
-"""``hmsa plan``: plan a sequence without ROS."""
+"""
+Plan a sequence of setpoints without ROS.
+
+Plan a sequence of setpoints, dimensionless as in the paper: each setpoint is a stretch and its
+duration (move plus hold) in units of L sqrt(rho/G). With --params-file times are in seconds and
+flux densities in tesla.
+
+example: hmsa plan 1.10:10 1.20:10 1.40:10 --json
+"""
 
 import argparse
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_options, law_of, LAW_OPTION, MATERIAL, of_unit
+from hmsa_ros.cli.options import add_command, add_options, law_of, LAW_OPTION, MATERIAL, of_unit
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import setpoint
 from hmsa_ros.errors import BadInputError
@@ -30,13 +38,7 @@ _WINDING = ('inductance', 'resistance', 'tesla_per_ampere')
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'plan', help='plan a sequence of setpoints without ROS',
-        description='Plan a sequence of setpoints, dimensionless as in the paper: each '
-                    'setpoint is a stretch and its duration (move plus hold) in units of '
-                    'L sqrt(rho/G). With --params-file times are in seconds and flux densities '
-                    'in tesla.',
-        epilog='example: hmsa plan 1.10:10 1.20:10 1.40:10 --json')
+    parser = add_command(subparsers, __name__, __doc__)
     parser.add_argument(
         'setpoints', nargs='+', type=setpoint, metavar='STRETCH:SPAN',
         help='stretch, or deflection of a beam, to come to rest at, and how long this setpoint '

@@ -1,10 +1,18 @@
-"""``hmsa report``: what happened in a run, as one HTML page or a picture."""
+"""
+Write an HTML report of a run from its bag.
+
+Write a report of a run as one self-contained HTML page: response, command, phase plane, residual
+vibration compared with unshaped steps, plan compared with run, timing and losses. Any bag with
+joint states works, in any namespace; several bags share one page.
+
+example: hmsa report hmsa_demo/run --out run.html --picture run.pdf --width 85
+"""
 
 import argparse
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_options
+from hmsa_ros.cli.options import add_command, add_options
 from hmsa_ros.cli.pictures import add_picture_options, paper_of
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
@@ -16,13 +24,7 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'report', help='write an HTML report of a run from its bag',
-        description='Write a report of a run as one self-contained HTML page: response, '
-                    'command, phase plane, residual vibration compared with unshaped steps, plan '
-                    'compared with run, timing and losses. Any bag with joint states works, in '
-                    'any namespace; several bags share one page.',
-        epilog='example: hmsa report hmsa_demo/run --out run.html --picture run.pdf --width 85')
+    parser = add_command(subparsers, __name__, __doc__)
     parser.add_argument(
         'bags', nargs='+', type=Path, metavar='BAG', help='folder of a bag, or an .mcap file')
     add_options(

@@ -1,4 +1,12 @@
-"""``hmsa run``: a whole experiment with one command."""
+"""
+Execute a whole experiment: check, record, send, measure.
+
+Execute an experiment with the running planner and plant or driver, or with simulated ones: check
+that the nodes run and agree, record, send the sequence, close the bag, and measure whether each
+setpoint was reached. Ctrl-C brings the actuator to rest and closes the bag.
+
+example: hmsa run 1.10:0.2 1.20:0.2 1.00:0.2 --simulate
+"""
 
 import argparse
 from dataclasses import asdict
@@ -8,7 +16,7 @@ import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_options, NAMESPACE
+from hmsa_ros.cli.options import add_command, add_options, NAMESPACE
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import add_sequence, levels_of
 from hmsa_ros.ending import ENDING
@@ -28,13 +36,7 @@ _SLOW = 0.9
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'run', help='execute a whole experiment: check, record, send, measure',
-        description='Execute an experiment with the running planner and plant or driver, or with '
-                    'simulated ones: check that the nodes run and agree, record, send the '
-                    'sequence, close the bag, and measure whether each setpoint was reached. '
-                    'Ctrl-C brings the actuator to rest and closes the bag.',
-        epilog='example: hmsa run 1.10:0.2 1.20:0.2 1.00:0.2 --simulate')
+    parser = add_command(subparsers, __name__, __doc__)
     add_sequence(parser)
     add_options(
         parser,

@@ -1,10 +1,17 @@
-"""``hmsa send``: publish a sequence to the running planner."""
+"""
+Publish a sequence of setpoints to the running planner.
+
+Publish a sequence of setpoints or levels to the running planner, starting now, and print the
+status.
+
+example: hmsa send 1.10:2 1.20:2 --wait
+"""
 
 import argparse
 import sys
 from typing import Any
 
-from hmsa_ros.cli.options import add_options, NAMESPACE, timeout_of
+from hmsa_ros.cli.options import add_command, add_options, NAMESPACE, timeout_of
 from hmsa_ros.cli.setpoints import add_sequence, levels_of
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import HmsaError
@@ -12,11 +19,7 @@ from hmsa_ros.errors import HmsaError
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'send', help='publish a sequence of setpoints to the running planner',
-        description='Publish a sequence of setpoints or levels to the running planner, starting '
-                    'now, and print the status.',
-        epilog='example: hmsa send 1.10:2 1.20:2 --wait')
+    parser = add_command(subparsers, __name__, __doc__)
     add_sequence(parser)
     add_options(
         parser,

@@ -1,10 +1,18 @@
-"""``hmsa simulate``: the response to a command of one's own, without ROS."""
+"""
+Simulate the response to levels of the field without ROS.
+
+Simulate how an actuator responds to levels of the field, without ROS: a CSV with the columns time
+(s) and flux_density (T), each in force from its time on. Print what each level leads to; write
+samples with --out and a picture with --picture.
+
+example: hmsa simulate levels.csv --params-file actuator.yaml --picture run.png
+"""
 
 import argparse
 from pathlib import Path
 from typing import Any
 
-from hmsa_ros.cli.options import add_options, JSON
+from hmsa_ros.cli.options import add_command, add_options, JSON
 from hmsa_ros.cli.pictures import add_picture_options, paper_of
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.files import json_text
@@ -12,13 +20,7 @@ from hmsa_ros.files import json_text
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'simulate', help='simulate the response to levels of the field without ROS',
-        description='Simulate how an actuator responds to levels of the field, without ROS: a CSV '
-                    'with the columns time (s) and flux_density (T), each in force from its time '
-                    'on. Print what each level leads to; write samples with --out and a picture '
-                    'with --picture.',
-        epilog='example: hmsa simulate levels.csv --params-file actuator.yaml --picture run.png')
+    parser = add_command(subparsers, __name__, __doc__)
     parser.add_argument(
         'levels', type=Path, metavar='LEVELS.csv', help='CSV of time, flux_density')
     add_options(

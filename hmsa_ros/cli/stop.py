@@ -1,21 +1,23 @@
-"""``hmsa stop``: bring the actuators of a running planner to rest."""
+"""
+Drop the rest of the sequence and come to rest without vibration.
+
+Have the running planner drop the rest of its sequence and bring the actuators to rest without
+vibration, as its service ~/stop does. It waits until they are at rest.
+
+example: hmsa stop
+"""
 
 import argparse
 from typing import Any
 
-from hmsa_ros.cli.options import add_options, NAMESPACE, TIMEOUT, timeout_of
+from hmsa_ros.cli.options import add_command, add_options, NAMESPACE, TIMEOUT, timeout_of
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import HmsaError
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'stop', help='drop the rest of the sequence and come to rest without vibration',
-        description='Have the running planner drop the rest of its sequence and bring the '
-                    'actuators to rest without vibration, as its service ~/stop does. It waits '
-                    'until they are at rest.',
-        epilog='example: hmsa stop')
+    parser = add_command(subparsers, __name__, __doc__)
     add_options(parser, NAMESPACE, TIMEOUT)
 
 

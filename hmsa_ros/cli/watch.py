@@ -1,4 +1,11 @@
-"""``hmsa watch``: what goes on, live in the terminal."""
+"""
+Show the running nodes live in the terminal.
+
+Show stretch and target, command, progress of the plan, status of the last request, and losses,
+live in the terminal. Quit with q or Ctrl-C. Without a terminal it prints one line per second.
+
+example: hmsa watch --joint actuator --span 5
+"""
 
 import argparse
 from collections.abc import Iterator
@@ -10,7 +17,7 @@ import sys
 from time import monotonic
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_options
+from hmsa_ros.cli.options import add_command, add_options
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
 
@@ -27,12 +34,7 @@ _LOOK_SECONDS = 0.1
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'watch', help='show the running nodes live in the terminal',
-        description='Show stretch and target, command, progress of the plan, status of the last '
-                    'request, and losses, live in the terminal. Quit with q or Ctrl-C. '
-                    'Without a terminal it prints one line per second.',
-        epilog='example: hmsa watch --joint actuator --span 5')
+    parser = add_command(subparsers, __name__, __doc__)
     add_options(
         parser,
         ('--namespace', 'NS', str, 'namespace of planner and plant', {'default': ''}),

@@ -1,9 +1,17 @@
-"""``hmsa figures``: the paper's figures from this package's own computation."""
+"""
+Compute and draw the paper's Figures 2 to 10.
+
+Compute the paper's Figures 2 to 10 and write each as PNG and CSV (figure_02.png, figure_02.csv,
+...). Existing files are replaced.
+
+example: hmsa figures --out figures
+"""
 
 import argparse
 from pathlib import Path
 from typing import Any
 
+from hmsa_ros.cli.options import add_command
 from hmsa_ros.cli.pictures import add_picture_options, formats_of, paper_of
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.files import make_folder
@@ -11,11 +19,7 @@ from hmsa_ros.files import make_folder
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'figures', help="compute and draw the paper's Figures 2 to 10",
-        description="Compute the paper's Figures 2 to 10 and write each as PNG and CSV "
-                    '(figure_02.png, figure_02.csv, ...). Existing files are replaced.',
-        epilog='example: hmsa figures --out figures')
+    parser = add_command(subparsers, __name__, __doc__)
     parser.add_argument(
         '--out', type=Path, default=Path('figures'), metavar='DIR',
         help='output folder, created if missing (default figures)')

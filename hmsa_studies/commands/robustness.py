@@ -1,4 +1,14 @@
-"""``hmsa robustness``: what each shaper leaves of a move when the model is in error."""
+"""
+Compare the shapers under parameter errors.
+
+Plan moves with each shaper and the nominal parameters, simulate them with errors in shear modulus
+G, damping zeta and J_lim, and compare the residual vibration: peak-to-peak stretch after arrival
+as a fraction of the step, without the steady-state error. Minimax plans for these errors. Prints a
+table and writes robustness.csv, a figure of each move, and front.png, the worst residual vibration
+over the move time; replaces existing files.
+
+example: hmsa robustness --move 1.0:1.4 1.2:0.8 --errors 0.05 --order 2 3 4
+"""
 
 import argparse
 from collections.abc import Iterator
@@ -8,7 +18,7 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_options, MATERIAL
+from hmsa_ros.cli.options import add_command, add_options, MATERIAL
 from hmsa_ros.cli.pictures import add_picture_options, formats_of, paper_of
 from hmsa_ros.cli.plan import nominal
 from hmsa_ros.errors import BadInputError
@@ -36,15 +46,7 @@ def _move(text: str) -> tuple[float, float]:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'robustness', help='compare the shapers under parameter errors',
-        description='Plan moves with each shaper and the nominal parameters, simulate them with '
-                    'errors in shear modulus G, damping zeta and J_lim, and compare the residual '
-                    'vibration: peak-to-peak stretch after arrival as a fraction of the step, '
-                    'without the steady-state error. Minimax plans for these errors. Prints a '
-                    'table and writes robustness.csv, a figure of each move, and front.png, the '
-                    'worst residual vibration over the move time; replaces existing files.',
-        epilog='example: hmsa robustness --move 1.0:1.4 1.2:0.8 --errors 0.05 --order 2 3 4')
+    parser = add_command(subparsers, __name__, __doc__)
     add_options(
         parser,
         ('--move', 'START:TARGET', _move,

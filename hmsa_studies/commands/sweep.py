@@ -1,4 +1,14 @@
-"""``hmsa sweep``: plans over grids, tables and samples of parameters."""
+"""
+Plan over ranges, tables and samples of parameters.
+
+Plan a move for all combinations of values, dimensionless as in the paper, or in SI units with
+--params-file. GRID is a value, FIRST:LAST:POINTS or log:FIRST:LAST:POINTS, or several of these
+separated by commas; or sobol:LOW:HIGH or normal:MEAN:STD for random samples. A case that cannot be
+planned contains the reason in its status. The table is identical, byte for byte, for any number of
+workers or shards.
+
+example: hmsa sweep --zeta 0:2:1000 --j-lim log:0.1:100:50 --out sweep.csv
+"""
 
 import argparse
 from collections import Counter
@@ -8,7 +18,7 @@ from pathlib import Path
 import shutil
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_options, MATERIAL
+from hmsa_ros.cli.options import add_command, add_options, MATERIAL
 from hmsa_ros.cli.pictures import add_picture_options, formats_of, paper_of
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.report.paper import kind_of, named, Paper
@@ -35,15 +45,7 @@ _AXES = (
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'sweep', help='plan over ranges, tables and samples of parameters',
-        description='Plan a move for all combinations of values, dimensionless as in the paper, '
-                    'or in SI units with --params-file. GRID is a value, '
-                    'FIRST:LAST:POINTS or log:FIRST:LAST:POINTS, or several of these separated '
-                    'by commas; or sobol:LOW:HIGH or normal:MEAN:STD for random samples. A case '
-                    'that cannot be planned contains the reason in its status. The table is '
-                    'identical, byte for byte, for any number of workers or shards.',
-        epilog='example: hmsa sweep --zeta 0:2:1000 --j-lim log:0.1:100:50 --out sweep.csv')
+    parser = add_command(subparsers, __name__, __doc__)
     add_options(
         parser,
         *((option, 'GRID', str, text) for option, text in _AXES),
