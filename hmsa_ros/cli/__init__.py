@@ -2,8 +2,9 @@
 The ``hmsa`` command.
 
 Each command is a module with ``add_parser(subparsers)`` and ``run(arguments)``, listed in
-`COMMANDS`: of this package or, for studies, of another one. Its docstring is the help. Modules import what is slow (rclpy,
-SciPy, matplotlib) inside ``run``, so that ``hmsa --help`` answers at once.
+`COMMANDS`: of this package or, for studies, of another one. Its docstring is the help. Modules
+import what is slow (rclpy, SciPy, matplotlib) inside ``run``, so that ``hmsa --help`` answers at
+once.
 """
 
 import argparse
