@@ -9,7 +9,6 @@ example: hmsa identify camera.csv --commands levels.csv --out actuator.yaml
 """
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 import sys

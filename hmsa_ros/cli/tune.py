@@ -1,4 +1,13 @@
-"""``hmsa tune``: from the data sheet to moves without vibration, as one guided run."""
+"""
+Measure an actuator, choose a shaper, and show before and after.
+
+Make the moves as they are, record an excitation, identify the actuator from it, compare the
+shapers on what is known then, write the parameters, and make the moves again. Works with the
+running planner and plant or driver, which gets the new parameters, or with simulated ones. Ctrl-C
+brings the actuator to rest.
+
+example: hmsa tune 1.10:0.5 1.00:0.5 --simulate --params-file actuator.yaml
+"""
 
 import argparse
 from dataclasses import asdict, replace
@@ -7,13 +16,13 @@ import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.identify import check_targets, known_of
-from hmsa_ros.cli.options import add_options, NAMESPACE
+from hmsa_ros.cli.identify import known_of
+from hmsa_ros.cli.options import add_command, add_options, NAMESPACE
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import setpoint_of_joints
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import json_text, write_text
+from hmsa_ros.files import check_targets, json_text, write_text
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,14 +34,7 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        'tune', help='measure an actuator, choose a shaper, and show before and after',
-        description='Make the moves as they are, record an excitation, identify the actuator '
-                    'from it, compare the shapers on what is known then, write the parameters, '
-                    'and make the moves again. Works with the running planner and plant or '
-                    'driver, which gets the new parameters, or with simulated ones. Ctrl-C '
-                    'brings the actuator to rest.',
-        epilog='example: hmsa tune 1.10:0.5 1.00:0.5 --simulate --params-file actuator.yaml')
+    parser = add_command(subparsers, __name__, __doc__)
     parser.add_argument(
         'setpoints', nargs='+', type=setpoint_of_joints, metavar='STRETCH:SECONDS',
         help='moves to tune for: target stretch, or deflection of a beam, and duration in s')
@@ -73,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
             'setpoints name several joints: expected one stretch each; tune one joint at a time, '
             'with a planner of its own')
     folder = arguments.folder or Path('hmsa_tune') / datetime.now().strftime('%Y-%m-%d_%H-%M-%S')
-    check_targets([x for x in (arguments.out, arguments.report) if x is not None])
+    check_targets(filter(None, (arguments.out, arguments.report)))
     known, uncertain = known_of(arguments.known)
     if arguments.simulate:
         from hmsa_ros.lab.processes import local_environment
@@ -121,7 +123,7 @@ def _nodes(arguments: argparse.Namespace) -> 'tuple[Entries, Nodes]':
         return (known_to(arguments.namespace) if path is None else entries_of(path)), (
             lambda settings: ())
     from hmsa_ros.interfaces.topics import PLANNER
-    from hmsa_ros.lab.simulated import simulated_nodes
+    from hmsa_ros.lab.experiment import simulated_nodes
 
     expected = {} if path is None else dict(read_parameter_file(path))
     node, = simulated_nodes(expected, str(path or ''), arguments.namespace)

@@ -30,9 +30,7 @@ from hmsa_ros.lab.experiment import conduct, Experiment, prepare, Tell
 from hmsa_ros.recordings.bags import read_run
 from hmsa_ros.recordings.parameters import Entries
 from hmsa_ros.report.arrivals import Part
-from hmsa_ros.report.evaluation import evaluate
 from hmsa_ros.report.looks import RUNS
-from hmsa_ros.report.timing import timing
 
 if TYPE_CHECKING:
     from hmsa_ros.lab.processes import NodeProcess
@@ -217,7 +215,7 @@ def _moves(
         tuning.namespace),
         environment, progress, name)
     run = replace(read_run(bag), label=name)
-    return Part(run, evaluate(run), timing(run))
+    return Part.of(run)
 
 
 def _excitation(
