@@ -9,12 +9,11 @@ import sys
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.check_driver import setting
-from hmsa_ros.cli.identify import check_targets
 from hmsa_ros.cli.options import add_options, JSON
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.quantities import number_of
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.files import json_text, write_text, yaml_text
+from hmsa_ros.files import check_targets, json_text, write_text, yaml_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
