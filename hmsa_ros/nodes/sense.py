@@ -241,8 +241,8 @@ class SenseNode(ManagedNode):
         if self._type:
             self._subscribe()
         self.every(_LOOK_SECONDS, self._look)
-        if values['reorder_time']:
-            self.every(1e-3, self._publish)
+        if wait := values['reorder_time']:
+            self.every(max(wait / 10.0, 1e-3), self._publish)
         self.diagnose(self._report)
 
     def _full(self, name: str) -> str:
