@@ -36,7 +36,8 @@ class ClockMap:
     """
     Times of a host, and of a device whose clock has another beginning and rate.
 
-    ``lost`` counts how often the clock turned out to be another one, as after a reboot.
+    ``lost`` counts how often the clock turned out to be another one, as after a reboot; ``drift``
+    is the rate of the device's clock against the host's, less 1.
     """
 
     def __init__(self) -> None:
@@ -48,19 +49,14 @@ class ClockMap:
         self._answers.clear()
         self._origin = 0, 0
         self._strange = 0
-        # Device time less host time is offset + rate (host - centre), about the centre in ns.
-        self._centre = self._offset = self._rate = 0.0
+        # Device time less host time is offset + drift (host - centre), about the centre in ns.
+        self._centre = self._offset = self.drift = 0.0
         self._offset_std = self._rate_std = math.inf
 
     @property
     def ready(self) -> bool:
         """Whether there are enough answers."""
         return len(self._answers) >= ENOUGH
-
-    @property
-    def drift(self) -> float:
-        """Rate of the device's clock against the host's, less 1."""
-        return self._rate
 
     def add(self, before: int, device: int, after: int) -> bool:
         """
@@ -98,7 +94,7 @@ class ClockMap:
         return True
 
     def _residual(self, x: _Answer) -> float:
-        return x.device - x.host - self._offset - self._rate * (x.host - self._centre)
+        return x.device - x.host - self._offset - self.drift * (x.host - self._centre)
 
     def _error(self, host: float) -> float:
         """Return a bound of the error at a time since the first answer: two deviations."""
@@ -116,7 +112,7 @@ class ClockMap:
         self._offset_std = shortest / math.sqrt(3.0)
         since, apart = host - self._centre, device - host
         precision = float(weights @ since**2) + _RATE_STD**-2
-        self._rate = float(weights @ (since * (apart - np.average(
+        self.drift = float(weights @ (since * (apart - np.average(
             apart, weights=weights)))) / precision
         self._rate_std = precision**-0.5
         self._offset = float(np.average(apart, weights=weights))
@@ -137,11 +133,11 @@ class ClockMap:
         """Return the time of the device in ns at one of the host."""
         begin, clock = self._origin
         since = host - begin
-        return clock + since + round(self._offset + self._rate * (since - self._centre))
+        return clock + since + round(self._offset + self.drift * (since - self._centre))
 
     def to_host(self, device: int) -> int:
         """Return the time of the host in ns at one of the device."""
         begin, clock = self._origin
         since = device - clock
-        apart = (self._offset + self._rate * (since - self._centre)) / (1.0 + self._rate)
+        apart = (self._offset + self.drift * (since - self._centre)) / (1.0 + self.drift)
         return begin + since - round(apart)

@@ -66,14 +66,15 @@ class PlannerClient(Visitor):
         self._begin = monotonic()
         self._joints = tuple(joints)
         self._namespace = namespace
-        self._verdict: Verdict = _SILENCE
+        #: What the planner said last.
+        self.verdict: Verdict = _SILENCE
         self._requested = ''
         endpoints.subscribe(self.node, topics.STATUS, self._on_status, topics.PLANNER)
         self._publisher = endpoints.publisher(
             self.node, topics.JOINT_TRAJECTORY, topics.PLANNER)
 
     def _on_status(self, message: DiagnosticStatus) -> None:
-        self._verdict = Verdict.read(message)
+        self.verdict = Verdict.read(message)
 
     def find_planner(self, each: Callable[[], None] | None = None) -> None:
         """Wait until a planner listens and its status has arrived, and call ``each`` meanwhile."""
@@ -83,7 +84,7 @@ class PlannerClient(Visitor):
             'ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here')
 
         def found() -> bool:
-            return (self._verdict is not _SILENCE
+            return (self.verdict is not _SILENCE
                     and self._publisher.get_subscription_count() > 0)
 
         # One whose node is there but does not listen yet is still starting.
@@ -162,11 +163,6 @@ class PlannerClient(Visitor):
         self.spin_until(
             recorded, f'no recorder of {self._publisher.topic_name}; start one with hmsa recorder')
 
-    @property
-    def verdict(self) -> Verdict:
-        """What the planner said last."""
-        return self._verdict
-
     def find_plant(self) -> None:
         """Wait until the commands reach somebody, for a short time: the planner reports it."""
         with suppress(HmsaError):
@@ -221,13 +217,13 @@ class PlannerClient(Visitor):
             self._publisher.publish(to_trajectory(
                 points, self._joints, frame=request, raw=bool(levels)))
             self.spin_until(
-                lambda request=request: self._verdict.request == request,  # type: ignore[misc]
+                lambda request=request: self.verdict.request == request,  # type: ignore[misc]
                 'the planner did not reply with a verdict')
-            if self._verdict.level < DiagnosticStatus.ERROR[0]:
-                return self._verdict
+            if self.verdict.level < DiagnosticStatus.ERROR[0]:
+                return self.verdict
             # A planner that has just started may not have heard the time yet.
-            if self._verdict.code != 'no_time' or monotonic() > deadline:
-                raise BadInputError(f'the planner refused: {self._verdict.message}')
+            if self.verdict.code != 'no_time' or monotonic() > deadline:
+                raise BadInputError(f'the planner refused: {self.verdict.message}')
             self._executor.spin_once(timeout_sec=SLICE_SECONDS)
             sleep(SLICE_SECONDS)
 
@@ -261,7 +257,7 @@ class PlannerClient(Visitor):
         heard = monotonic()
 
         def done() -> bool:
-            now = self._verdict
+            now = self.verdict
             if now.request != verdict.request:
                 raise HmsaError(
                     'the sequence was not completed: another request replaced it '
@@ -282,13 +278,13 @@ class PlannerClient(Visitor):
         with _slower_time(self.node, self._timeout) as time:
             self.spin_until(
                 done, 'the sequence has not finished',
-                None if each is None else lambda: each(self._verdict), timeout, time)
-        late = self._verdict.late - verdict.late
-        if late > 0 and not self._verdict.failure and self._verdict.measured != Code.ARRIVED:
+                None if each is None else lambda: each(self.verdict), timeout, time)
+        late = self.verdict.late - verdict.late
+        if late > 0 and not self.verdict.failure and self.verdict.measured != Code.ARRIVED:
             raise HmsaError(
                 f'{late} commands came late, and what comes of it is not measured: expected '
                 'commands in time (lead_time), or samples (joint_states)')
-        return self._verdict
+        return self.verdict
 
     def stop(self) -> bool:
         """Have the planner come to rest, signals or not; return whether it says that it rests."""
@@ -299,11 +295,11 @@ class PlannerClient(Visitor):
             self._executor.spin_once(timeout_sec=SLICE_SECONDS)
             # What was sent last may be on its way: the stop must come after it.
             patient = monotonic() - begin < _GONE_SECONDS
-            if answer is None and (self._verdict.request == self._requested or not patient):
+            if answer is None and (self.verdict.request == self._requested or not patient):
                 answer = stop.answer()
                 if answer is None and not patient and not stop.ready:
                     return False
-            if answer is not None and self._verdict.state in ('at_rest', 'settling', 'idle'):
+            if answer is not None and self.verdict.state in ('at_rest', 'settling', 'idle'):
                 return bool(answer.success)
         return False
 
