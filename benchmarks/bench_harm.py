@@ -27,7 +27,7 @@ from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Options, Planner
 
 #: Benches, and the seed of the first.
-RUNS, SEED = 400, 100_000
+RUNS, SEED = 400, 7_000
 #: What a move may leave more than in open loop, as a share of its step, the share of benches in
 #: which one does so, and the median of the second move.
 WORSE, HARMED, SECOND = 0.005, 0.01, 0.003
@@ -52,7 +52,7 @@ class Left:
 
     vibration: float
     offset: float
-    codes: tuple[str, ...]
+    codes: tuple[str, ...]  # of verdicts, and of what was measured until then
     words: str  # the sentence of the estimate at its end
 
     @property
@@ -90,7 +90,9 @@ def run(bench: Bench, way: str) -> list[Left]:
             max(float(np.ptp(seen[early])), float(np.ptp(seen[late]))) / step,
             abs(float(np.mean(seen[late])) - target) / step,
             tuple(dict.fromkeys(
-                str(x.verdict.code) for x in told if isinstance(x, StatusChanged))), words))
+                str(code) for x in told if isinstance(x, StatusChanged)
+                for code in (x.verdict.code, *(y.verdict for y in x.findings.values())))),
+            words))
         start = target
     return found
 

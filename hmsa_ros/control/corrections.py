@@ -10,7 +10,7 @@ from hmsa_ros.control.records import Severity, Verdict
 from hmsa_ros.control.slices import Clock, in_time, Work
 from hmsa_ros.control.trimming import trimmed
 from hmsa_ros.estimation import Estimate
-from hmsa_ros.estimation.correction import caution, Course, expect, worthwhile
+from hmsa_ros.estimation.correction import caution, Course, expect, LITTLE, worthwhile
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.drafting import Steps
@@ -21,6 +21,8 @@ from hmsa_ros.planning.timeline import Draft, Model, Plan
 # A correction gains at least this share of the step, less while a move has time for corrections:
 # what rests is not to be moved for little.
 _GAIN, _LITTLE = 5e-4, 5e-5
+# And this share of the noise of a sample.
+_NOISE = 0.02
 # Units of time before its end from which on a move is not corrected any more.
 _SHORTEST = 0.3
 # Levels that differ by less, in units of load, are the same.
@@ -56,16 +58,19 @@ class Corrections:
         if estimate is None or segment.arrival is None or segment.code is Code.LEVELS:
             return draft
         step = max(abs(segment.stretch - draft.levels[0].stretch), _LEAST_STEP)
-        size = expect(
-            estimate, _drafted(draft), self._group.planners[name].options.slew_limit)
-        self._feedback.planned(name, model, size)
+        course = _drafted(draft, self._group.planners[name].plan)
+        slew = self._group.planners[name].options.slew_limit
+        self._feedback.planned(name, model, expect(estimate, course, slew).size)
+        # What is only suspected is no reason to take longer.
+        size = expect(estimate.sure_of(self._feedback.named), course, slew).size
         if size <= self._feedback.tolerance * step:
             return draft
-        longer = caution(len(estimate.free), estimate.noise / step)
+        longer = caution(self._feedback.named, estimate.noise / step)
         arrival = segment.begin + round(longer * (segment.arrival - segment.begin))
         if rest:
             arrival = max(min(arrival, rest[0].begin), segment.arrival)
         self._arrivals[name] = arrival
+        self._feedback.takes_longer(name, arrival)
         return replace(draft, segments=(replace(segment, arrival=arrival), *rest))
 
     def due(self, now: int) -> Iterator[Work]:
@@ -81,7 +86,8 @@ class Corrections:
             level = trimmed(planner, estimate, self._feedback.trim)
             if level is not None:
                 steps = partial(self._trim, name, level)
-            elif self._worthwhile(estimate, planner, self._arrival(name, now)):
+            elif self._feedback.adapted(name) and self._worthwhile(
+                    estimate, planner, self._arrival(name, now)):
                 steps = partial(self._correct, name)
             else:
                 continue
@@ -120,7 +126,7 @@ class Corrections:
     def _worthwhile(self, estimate: Estimate, planner: Planner, arrival: int) -> bool:
         """Return whether a plan is expected to leave more than it must."""
         course, gain = _course(planner.plan, estimate.time, _LITTLE if arrival else _GAIN)
-        return expect(estimate, course, planner.options.slew_limit) > gain
+        return expect(estimate, course, planner.options.slew_limit).size > gain
 
     def _correct(self, name: str, now: int) -> Steps[Mapping[str, Draft]]:
         """Plan the rest anew, if that is expected to leave less."""
@@ -141,11 +147,14 @@ class Corrections:
         slew = planner.options.slew_limit
         course, gain = _course(planner.plan, draft.begin, _LITTLE if arrival else _GAIN)
         segment = draft.segments[0]
+        step = max(abs(segment.stretch - self._feedback.start(name)), _LEAST_STEP)
         before = expect(estimate, course, slew, segment.arrival or 0)
-        after = expect(estimate, _drafted(draft), slew)
-        if not worthwhile(before, after, estimate.noise, gain):
+        after = expect(estimate, _drafted(draft, planner.plan), slew)
+        if not worthwhile(
+                before, after, max(gain, _NOISE * estimate.noise), little=LITTLE * step,
+                resting=not arrival):
             return {}
-        self._after[name] = after
+        self._after[name] = after.size
         return {name: draft}
 
     def take(self, drafts: Mapping[str, Draft], now: int, request: str) -> Verdict | None:
@@ -159,13 +168,13 @@ class Corrections:
         return None
 
 
-def _drafted(draft: Draft) -> Course:
-    """Return the course of the first setpoint of a draft."""
+def _drafted(draft: Draft, plan: Plan) -> Course:
+    """Return the course of the first setpoint of a draft that takes the place of a plan."""
     segment, *rest = draft.segments
     return Course(
         tuple((x.stamp, x.flux_density) for x in draft.levels
               if not rest or x.stamp < rest[0].begin),
-        segment.arrival or draft.begin, segment.stretch,
+        segment.arrival or draft.begin, segment.stretch, plan.level(draft.begin - 1).flux_density,
         _relaxed(draft.levels[0].model, segment.stretch) if rest else math.nan)
 
 
@@ -184,6 +193,6 @@ def _course(plan: Plan, begin: int, gain: float) -> tuple[Course, float]:
     start = plan.segments[place - 1].stretch if place else levels[0].stretch
     return Course(
         tuple((x.stamp, x.flux_density) for x in kept),
-        segment.arrival or kept[-1].stamp, segment.stretch,
+        segment.arrival or kept[-1].stamp, segment.stretch, levels[max(first - 1, 0)].flux_density,
         math.nan if end is None else _relaxed(kept[-1].model, segment.stretch)), max(
             gain * abs(segment.stretch - start), gain * _LEAST_STEP, segment.vibration)

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from hmsa_ros.control.choice import clearly_better
 from hmsa_ros.control.field import Field
 from hmsa_ros.control.holds import Hold
 from hmsa_ros.control.learnt import alike, differs, learnt_model, save
@@ -31,6 +32,10 @@ MODES = ('off', 'observe', 'adapt')
 # How often samples are taken into account while a joint moves, at least and in units of its time,
 # and while it rests, and how often the estimate is told, in ns.
 _UPDATE, _OFTEN, _RESTING, _TELL = 20_000_000, 0.45, 200_000_000, 200_000_000
+# Units of time from one choice of the parameters to plan with to the next.
+_CHOICE = 3.0
+# How many times as seldom where a joint rings after its last change of level.
+_RINGING = 4
 # How many times as long as the last look took the next one is later, at least.
 _IDLE = 4
 # Samples of a natural period that are looked at, and how many fewer at rest.
@@ -115,8 +120,9 @@ class Feedback:
         return {name: self._learnt(name, model) for name, model in models.items()}
 
     def _prior(self, name: str, model: Model) -> Prior:
-        return Prior.nominal(model.actuator, self._settings.feedback_parameters, others={
-            'coil_time_constant': model.options.coil_time_constant}).informed(
+        return Prior.nominal(
+            model.actuator, self._settings.feedback_parameters, suspects=True, others={
+                'coil_time_constant': model.options.coil_time_constant}).informed(
                 self._settings.known.get(name, Known()))
 
     def _learnt(self, name: str, model: Model) -> Model:
@@ -169,6 +175,11 @@ class Feedback:
         span = round(2.0 * _QUIET * self._nominal[name].units.time * NANOSECONDS)
         return joint.newest > last + span
 
+    def _rings(self, name: str, joint: Joint) -> bool:
+        """Return whether no level has changed for a while."""
+        last = self._group.planners[name].plan.levels[-1].stamp
+        return joint.newest > last + round(3.0 * joint.unit * NANOSECONDS)
+
     def add(
             self, name: str, stamp: int, stretch: float, flux_density: float = math.nan) -> None:
         """Take in stretch and field in T measured at a stamp in ns; samples come in any order."""
@@ -196,23 +207,38 @@ class Feedback:
 
     @property
     def wake(self) -> int | None:
-        """Time in ns at which to look at samples next; None for never."""
+        """Time in ns at which to look at samples next; None for never, 0 for now."""
+        if self.mode == 'adapt' and any(x.choosing or x.news for x in self._joints.values()):
+            return 0
         return min((x.next_update for x in self._joints.values() if x.fresh), default=None)
 
-    def update(self, now: int) -> None:
-        """Take samples into account that have come by a time in ns, and tell what they say."""
+    def update(self, now: int) -> bool:
+        """
+        Take samples into account that have come by a time in ns, and tell what they say.
+
+        Returned is whether that has taken a while.
+        """
+        busy = False
         for name, joint in self._joints.items():
+            if joint.choosing is not None:
+                if next(joint.choosing, joint) is joint:
+                    joint.choosing, joint.chosen, joint.news = None, True, True
+                busy = True
+                continue
             if not joint.fresh or now < joint.next_update:
                 continue
+            busy = True
             begun = self._clock()
             joint.update(self._group.planners[name].plan, now)
             joint.next_update = now + (
                 _RESTING if self._quiet(name, joint) else max(
-                    min(_UPDATE, round(_OFTEN * joint.unit * NANOSECONDS)),
+                    min(_UPDATE, round(_OFTEN * joint.unit * NANOSECONDS)) * (
+                        _RINGING if self._rings(name, joint) else 1),
                     _IDLE * (self._clock() - begun)))
             if now >= joint.next_tell:
                 joint.next_tell = now + _TELL
                 self._tell(name, joint, now)
+        return busy
 
     def _tell(self, name: str, joint: Joint, now: int) -> None:
         found = joint.latest
@@ -233,11 +259,14 @@ class Feedback:
             self, name: str, time: int) -> tuple[float, float, tuple[float, ...]] | None:
         """Return what `hmsa_ros.planning.planner.Planner` is to believe of a time in ns."""
         try:
-            found = self.state(name, time)
+            found = self.state(name, time) if self.adapted(name) else None
         except HmsaError:
             return None
-        return None if found is None else (
-            found.stretch, found.rate, followed(found.values, found.stretch))
+        if found is None:
+            return None
+        # Of a branch that is only suspected plans know nothing.
+        return found.stretch, found.rate, (
+            followed(found.values, found.stretch) if found.actuator.creep else ())
 
     def state(self, name: str, time: int) -> Estimate | None:
         """Return what plans may begin from at a time in ns; None where predictions count."""
@@ -249,9 +278,13 @@ class Feedback:
             return None
         return self._predicted(name, joint, time)
 
+    def adapted(self, name: str) -> bool:
+        """Return whether plans use parameters that were learnt."""
+        return self._group.planners[name].model != self._nominal[name]
+
     def follows(self, name: str) -> bool:
         """Return whether plans for a joint begin from what is estimated."""
-        return self.state(name, self._clock()) is not None
+        return self.adapted(name) and self.state(name, self._clock()) is not None
 
     def _predicted(self, name: str, joint: Joint, time: int) -> Estimate | None:
         """Return what is believed of a time in ns under the plan in force by now."""
@@ -292,7 +325,7 @@ class Feedback:
         plan = self._group.planners[name].plan
         if joint.fresh:
             joint.update(plan, self._clock())
-        if joint.estimator.screening.trouble:
+        if joint.trust.why or joint.estimator.screening.trouble:
             # Of a sensor that fails, nothing follows for the move.
             return ''
         why = joint.ledger.take(
@@ -315,7 +348,7 @@ class Feedback:
         joint = self._joints.get(name)
         if joint is not None:
             joint.moves = Moves(not alike(model, self._nominal[name]), expected)
-            joint.next_update = 0
+            joint.next_update = joint.waits = 0
 
     def corrected(self, name: str, stamp: int, expected: float) -> None:
         """Take in that a plan was corrected from a stamp in ns on."""
@@ -324,6 +357,11 @@ class Feedback:
         if joint is not None:
             joint.moves.corrected.append(stamp)
             joint.moves.expected = expected
+
+    @property
+    def named(self) -> int:
+        """How many parameters are estimated by name."""
+        return len(self._settings.feedback_parameters)
 
     @property
     def trim(self) -> float:
@@ -336,20 +374,56 @@ class Feedback:
         cautious = self.mode == 'adapt' and self._settings.feedback_cautious
         return self._settings.feedback_tolerance if cautious else math.inf
 
+    def _choose(self, name: str, joint: Joint, latest: Estimate) -> Iterator[None]:
+        """Plan with what is learnt, once that is clearly better, or while a move waits for it."""
+        planner = self._group.planners[name]
+        used, segments = joint.used or planner.model, planner.plan.segments
+        model, waits = used, latest.time < joint.waits
+        if differs(used, latest):
+            learnt = self._learnt(name, used)
+            if (yield from clearly_better(
+                    latest, learnt, used, joint.start, segments[-1].stretch,
+                    given=used == self._nominal[name])):
+                model = learnt
+        if not joint.acts:
+            return
+        if not waits:
+            joint.next_choice = latest.time + round(_CHOICE * joint.unit * NANOSECONDS)
+            joint.used = model
+        planner.take_model(model)
+
+    def _may_choose(self, name: str, joint: Joint, latest: Estimate) -> bool:
+        """Return whether the parameters to plan with are to be chosen by an estimate."""
+        return not joint.chosen and bool(self._group.planners[name].plan.segments) and (
+            latest.time < joint.waits or latest.time >= joint.next_choice)
+
+    def start(self, name: str) -> float:
+        """Return the stretch from which the setpoint under way of a joint began, uncorrected."""
+        return self._joints[name].start
+
+    def takes_longer(self, name: str, arrival: int) -> None:
+        """Take in that a move has until an arrival in ns to be corrected in."""
+        joint = self._joints.get(name)
+        if joint is not None:
+            joint.waits = arrival
+
     def news(self) -> Iterator[tuple[str, Planner]]:
         """Plan with what is known best by now, and yield joints with new estimates to act upon."""
         if self.mode != 'adapt':
             return
         for name, joint in self._joints.items():
-            if not joint.news:
+            if not joint.news or joint.choosing is not None:
                 continue
             joint.news = False
             planner = self._group.planners[name]
             if joint.acts and joint.latest is not None:
-                if differs(planner.model, joint.latest):
-                    planner.take_model(self._learnt(name, planner.model))
+                if self._may_choose(name, joint, joint.latest):
+                    joint.choosing = self._choose(name, joint, joint.latest)
+                    continue
+                joint.chosen = False
                 yield name, planner
             else:
                 model = self._learnt(name, self._nominal[name])
+                joint.used = model
                 if not alike(model, planner.model):
                     planner.take_model(model)

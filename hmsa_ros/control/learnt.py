@@ -37,8 +37,7 @@ def differs(model: Model, estimate: Estimate) -> bool:
     """Return whether an estimate is known to be of another actuator than a model."""
     for key in estimate.free:
         value = estimate.values[key]
-        before = model.options.coil_time_constant if key == 'coil_time_constant' else getattr(
-            model.actuator, key, value)
+        before = getattr(model.options, key, getattr(model.actuator, key, value))
         if abs(value - before) > max(_NEWS * abs(value), _SURE * estimate.deviations[key]):
             return True
     return False
@@ -56,12 +55,13 @@ def alike(model: Model, other: Model) -> bool:
 
 def known_of(estimate: Estimate) -> Known:
     """Return how well an estimate knows parameters."""
-    count = len(estimate.free)
-    values = tuple(estimate.values[x] for x in estimate.free)
-    scale = np.array([derivative(x, y) for x, y in zip(estimate.free, values, strict=True)])
+    # A suspect that is none has no deviation.
+    places = [i for i, x in enumerate(estimate.free) if estimate.deviations[x] > 0.0]
+    names = tuple(estimate.free[i] for i in places)
+    values = tuple(estimate.values[x] for x in names)
+    scale = np.array([derivative(x, y) for x, y in zip(names, values, strict=True)])
     return Known(
-        estimate.free, values,
-        np.outer(scale, scale) * estimate.covariance[:count, :count])
+        names, values, np.outer(scale, scale) * estimate.covariance[np.ix_(places, places)])
 
 
 def file_text(estimates: Mapping[str, Estimate], now: datetime) -> str:

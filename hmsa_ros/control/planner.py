@@ -347,9 +347,8 @@ class PlannerRuntime:
         """Do what is due at a time in ns, for some ms at most; return what to pass on."""
         self._begin_anew()
         self._engage()
-        if self._send(now):
-            self.feedback.update(now)
-        self._work_on()
+        if not (self._send(now) and self.feedback.update(now)):
+            self._work_on()
         if self._bulletin.preview_again is not None and now >= self._bulletin.preview_again:
             self._bulletin.show()
         self._bulletin.tell_progress(now)

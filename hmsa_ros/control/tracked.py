@@ -1,5 +1,6 @@
 """One joint that feedback looks at: its estimator, and what the estimate says of the plan."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 import math
 
@@ -10,7 +11,7 @@ from hmsa_ros.estimation import Estimate, Estimator
 from hmsa_ros.estimation.motion import held
 from hmsa_ros.estimation.words import sentence
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.planning.timeline import Plan
+from hmsa_ros.planning.timeline import Model, Plan
 
 # Levels before those of the samples that count: the field of a coil that lags remembers them.
 _BEFORE = 8
@@ -31,6 +32,11 @@ class Joint:
     newest: int = 0  # time of the newest sample
     next_update: int = 0  # when to look at samples
     next_tell: int = 0  # when to tell the estimate
+    next_choice: int = 0  # when to choose the parameters to plan with
+    used: Model | None = None  # what was chosen; None for what the planner has
+    choosing: Iterator[None] | None = None  # pieces of the choice under way
+    chosen: bool = False  # whether that was made since the latest estimate
+    waits: int = 0  # arrival of a move that takes longer, so that it can be corrected
     amplitude: float = 0.0  # largest of the vibration since the last arrival
     setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place of the setpoint under way
     fresh: bool = False  # whether there are samples that have not been looked at

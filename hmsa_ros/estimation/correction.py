@@ -8,20 +8,29 @@ in a move, when little is known, a course that forgives errors so wins against o
 for parameters which are a guess.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
 
 from hmsa_ros.estimation.estimator import Estimate
 from hmsa_ros.estimation.motion import follow, Levels, rest
+from hmsa_ros.model.equations import Array
 from hmsa_ros.model.units import NANOSECONDS
 
 #: A move that is expected to leave more than this share of its step is given more time.
 TOLERANCE = 5e-3
-# A correction leaves at most this share of what the course in force leaves, in squares, and
-# gains at least this, as a share of the noise of a sample.
-_SHARE, _GAIN = 0.8, 0.02
+# A correction leaves at most this share of what the course in force leaves, while there is time
+# for more of them and at rest.
+_SHARE, _AT_REST = 0.9, 0.5
+#: Share of the step up to which what a correction changes is little, and how much of that a course
+#: may be expected to leave for another one to do little harm.
+LITTLE = 4.5e-3
+_HARMLESS = 0.67
+# How long in ns a level has been in force that a field has followed.
+_LONG = 1000 * NANOSECONDS
+# Time constants of a coil after which it has followed.
+_LAGS = 10.0
 # Share of the step up to which noise is little.
 _QUIET = 0.004
 
@@ -45,6 +54,7 @@ class Course:
     levels: tuple[tuple[int, float], ...]
     arrival: int  # time in ns of rest at the target
     target: float  # stretch
+    before: float = math.nan  # level in T until the first one; NaN where that came long before
     relaxed: float = math.nan  # level in T that holds it once branches have relaxed; NaN: the last
 
     @property
@@ -53,27 +63,60 @@ class Course:
         return self.levels[-1][1] if math.isnan(self.relaxed) else self.relaxed
 
 
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a course is expected to leave."""
+
+    misses: Array  # by the most probable motion: of stretch, of rate, and of the target
+    variance: float  # what is not known of these, in sum
+    considered: float  # how much of that is by what is only considered
+
+    @property
+    def sure(self) -> 'Outcome':
+        """The same, were what is only considered known."""
+        return replace(self, variance=self.variance - self.considered, considered=0.0)
+
+    @property
+    def size(self) -> float:
+        """Root of the expected square of vibration and distance from the target together."""
+        return math.sqrt(float(self.misses @ self.misses) + max(self.variance, 0.0))
+
+    def apart(self, other: 'Outcome') -> float:
+        """Return how far what another course leaves is from it."""
+        return float(np.linalg.norm(self.misses - other.misses))
+
+
+#: What a motion leaves that cannot be followed.
+_NOWHERE = Outcome(np.full(3, math.inf), 0.0, 0.0)
+
+
 def expect(
         estimate: Estimate, course: Course, slew_limit: float = math.inf,
-        until: int = 0) -> float:
+        until: int = 0) -> Outcome:
     """
     Return what a course is expected to leave; infinite where the motion cannot be followed.
-
-    It is the root of the expected square of vibration and distance from the target together.
 
     The estimate is of a time from which on the course may still be changed; the course has the
     level in force then. If it ends before `until`, in ns, that counts: vibration decays meanwhile.
     """
     begin = estimate.time
-    end = max(course.arrival, begin, until)
+    # A coil that lags shifts a motion, and leaves nothing once it has arrived too.
+    lag = estimate.values['coil_time_constant'] + 2.0 * estimate.deviations.get(
+        'coil_time_constant', 0.0)
+    end = max(course.arrival, begin, until) + round(_LAGS * lag * NANOSECONDS)
+    levels = course.levels
+    if not math.isnan(course.before):
+        # A level that begins with the course is a step in it.
+        levels = ((min(begin, levels[0][0]) - _LONG, course.before), *(
+            (x + (x == begin), y) for x, y in levels))
     motion = follow(
         estimate.values, estimate.free, (estimate.stretch, estimate.rate),
-        Levels(np.array([(x - begin) / NANOSECONDS for x, _ in course.levels]),
-               np.array([x for _, x in course.levels]), slew_limit),
+        Levels(np.array([(x - begin) / NANOSECONDS for x, _ in levels]),
+               np.array([x for _, x in levels]), slew_limit),
         0.0, np.array([(end - begin) / NANOSECONDS]))
     at = rest(estimate.values, estimate.free, course.holding)
     if motion is None or at is None:
-        return math.inf
+        return _NOWHERE
     stretch, frequency, by = at
     rows = np.zeros((3, len(estimate.covariance)))
     rows[0] = motion.by[0]
@@ -82,10 +125,32 @@ def expect(
     rows[2, :-2] = by
     misses = np.array([
         motion.stretch[0] - stretch, motion.rate[0] / frequency, stretch - course.target])
-    spread = float(np.einsum('ij,jk,ik->', rows, estimate.covariance, rows))
-    return math.sqrt(float(misses @ misses) + max(spread, 0.0))
+    spread = float(np.sum(rows @ estimate.covariance * rows))
+    rows[:, len(estimate.free) - estimate.considered:-2] = 0.0
+    return Outcome(
+        misses, spread, spread - float(np.sum(rows @ estimate.covariance * rows)))
 
 
-def worthwhile(before: float, after: float, noise: float, least: float = 0.0) -> bool:
-    """Return whether a correction leaves enough less: sizes of `expect`, and the least gain."""
-    return after < min(math.sqrt(_SHARE) * before, before - max(_GAIN * noise, least))
+def worthwhile(
+        before: Outcome, after: Outcome, least: float = 0.0, *, little: float,
+        resting: bool = False) -> bool:
+    """
+    Return whether another course leaves enough less, and that by the least gain.
+
+    At rest it has to leave much less. What is only considered blurs all courses alike: one that
+    changes little, in units of stretch, can do little harm, and one that changes much has to be
+    better with that too.
+    """
+    return _less(before.sure, after.sure, least, little, resting=resting) and (
+        before.sure.size < _HARMLESS * little
+        or _less(before, after, least, little, resting=resting))
+
+
+def _less(
+        before: Outcome, after: Outcome, least: float, little: float, *, resting: bool) -> bool:
+    """Return as `worthwhile`; where little changes, what is known of neither does not count."""
+    share = _AT_REST if resting else _SHARE
+    if after.apart(before) < little:
+        share, both = _SHARE, min(before.variance, after.variance)
+        before, after = (replace(x, variance=x.variance - both) for x in (before, after))
+    return after.size < min(share * before.size, before.size - least)

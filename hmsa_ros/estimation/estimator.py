@@ -12,11 +12,12 @@ import numpy as np
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
 from hmsa_ros.estimation.prior import Prior
-from hmsa_ros.estimation.scatter import Scatter
 from hmsa_ros.estimation.screening import Screening
+from hmsa_ros.estimation.suspects import Suspects
 from hmsa_ros.estimation.window import coordinates, Solution, Trial, Window
 from hmsa_ros.identification.fit import robust_scale
-from hmsa_ros.identification.quantities import actuator_of, derivative, QUANTITIES
+from hmsa_ros.identification.quantities import actuator_of, BRANCHES, derivative, QUANTITIES
+from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.units import NANOSECONDS
@@ -31,15 +32,19 @@ _NOISE_GAIN = 0.05
 # Times the prior's spread that an estimate may be off it, and that a parameter may wander in a
 # second.
 _BOUND, _DRIFT = 4.0, 0.003
+# Share of that from which on an estimate is not believed, but for what may well be so far off.
+_STRANGE, _FREELY = 0.98, ('damping_coefficient', 'viscoelastic_time')
 # Share of a variance that keeps a parameter where it is.
 _FIXED = 1e-12
 # Deviation of stretch and, in natural frequencies, of rate of a block at rest, and of one whose
 # state is not known; and the units of time after a change of level from which on it rests.
 _AT_REST, _ANYWHERE, _SETTLED = 2e-6, 0.3, 25.0
-# Units of time after the last change of level from which on samples show how they scatter at rest.
+# Units of time between changes of level from which on the later one begins another move.
 _CALM = 12.0
 # So many windows of samples wait at most for an update.
 _WAITING = 10
+# Deviations from which on a suspected branch of creep is one.
+_CREEPS = 5.0
 # Window, as a share, that is left when it moves on, its longest span in units of time, and the
 # samples from which on that counts.
 _KEPT, _LONGEST, _FEWEST = 0.5, 200.0, 20
@@ -49,7 +54,7 @@ _KEPT, _LONGEST, _FEWEST = 0.5, 200.0, 20
 class Options:
     """How to estimate."""
 
-    window: int = 120  # largest number of samples in the horizon
+    window: int = 600  # largest number of samples in the horizon
     noise: float = 0.0  # standard deviation of a sample of stretch; 0 to estimate it
     learn: bool = True  # estimate parameters from the first sample on; else the state alone
     gate: float = 6.0  # deviations of the innovation from which a sample is rejected
@@ -77,11 +82,25 @@ class Estimate:
     noise: float  # standard deviation of a sample
     trusted: bool  # whether it may be acted upon
     trouble: str  # why not; empty if it may
+    considered: int = 0  # how many of those tracked, from the last on, keep their values
 
     @property
     def actuator(self) -> ActuatorParameters:
-        """The block."""
-        return actuator_of(self.values)
+        """The block; it creeps where that is known of it."""
+        found, (ratio, time) = actuator_of(self.values), BRANCHES[0]
+        value = self.values[ratio]
+        if ratio in self.free and value > _CREEPS * self.deviations[ratio]:
+            return replace(found, creep=Creep((value,), (self.values[time],)))
+        return found
+
+    def sure_of(self, first: int) -> 'Estimate':
+        """Return the estimate, were all that is tracked from the place of a first one on known."""
+        covariance, known = self.covariance, slice(first, -2)
+        cross = covariance[:, known]
+        left = covariance - cross @ np.linalg.pinv(
+            covariance[known, known], hermitian=True) @ cross.T
+        left[known], left[:, known] = 0.0, 0.0
+        return replace(self, covariance=left)
 
     def model(self, options: PlannerOptions) -> Model:
         """Return the model to plan with; the estimated lag takes the place of the options'."""
@@ -97,7 +116,6 @@ class Estimator:
         self.options = options or Options()
         self.noise = self.options.noise or _FIRST_NOISE
         self.screening = Screening(self.options.gate, prior.coordinate)
-        self._scatter = Scatter()
         # Else parameters stay as they are from the next update on.
         self.learning = self.options.learn
         # Covariance of the parameters while they stay as they are.
@@ -109,11 +127,8 @@ class Estimator:
         self._solution: Solution | None = None
 
     def restart(self) -> None:
-        """Begin with nothing learnt; counts, levels, and how samples scatter at rest stay."""
+        """Begin with nothing learnt; counts and levels stay."""
         self.screening.restart()
-        self._scatter.trouble = ''
-        if not (self.options.noise or math.isnan(self._scatter.at_rest)):
-            self.noise = self._scatter.at_rest
         self._pending.clear()
         self._fixed = self._window = self._solution = None
 
@@ -179,8 +194,6 @@ class Estimator:
             return None
         self._solution = found
         self._follow_noise(found)
-        self._scatter.look(found, window.stretch, _LEAST_NOISE, resting=self._unchanged(
-            self._origin + round(window.begin * NANOSECONDS), time, _CALM))
         estimate = self._estimate(time, found, window)
         self._go_along(window, found, until)
         return estimate
@@ -260,9 +273,13 @@ class Estimator:
         covariance[:-2, -2] = covariance[-2, :-2] = known @ by
         covariance[-2, -2] = by @ known @ by + off ** 2
         covariance[-1, -1] = (off * frequency) ** 2
+        first = len(mean) - self.prior.suspects
         return Window(
             dict(prior.values), prior.free, np.append(mean, [stretch, 0.0]), covariance,
-            _bounds(self.prior), 0.0, np.zeros(0), np.zeros(0))
+            _bounds(self.prior), 0.0, np.zeros(0), np.zeros(0), Suspects(
+                prior.free, coordinates(self.prior.values, self.prior.free)[first:],
+                1.0 / np.diag(self.prior.covariance)[first:], prior.considered),
+            self._window.suspected if self._window else ())
 
     def _take(self, window: Window, levels: Levels, until: float) -> Trial | None:
         """
@@ -302,23 +319,35 @@ class Estimator:
     def _estimate(self, time: int, found: Solution, window: Window) -> Estimate:
         state, covariance = found.at_end()
         values = found.values
-        if 'creep' in values:
+        if found.motion.behind:
             values = {**values, 'behind': found.motion.behind}
         if self._fixed is not None:
             covariance[:-2, :-2] = self._fixed
         deviations = {
             name: abs(derivative(name, found.values[name])) * math.sqrt(covariance[i, i])
             for i, name in enumerate(self.prior.free)}
-        trouble = self.screening.trouble or self._scatter.trouble
+        trouble = self.screening.trouble or self._strange(found.z)
         return Estimate(
             time, float(state[-2]), float(state[-1]), values, self.prior.free, deviations,
-            covariance, self.noise, not trouble, trouble)
+            covariance, self.noise, not trouble, trouble, self.prior.considered)
+
+    def _strange(self, z: Array) -> str:
+        """Say what would have to be implausibly far off for samples to fit; empty for nothing."""
+        prior = self.prior
+        off = np.abs(z[:-2] - coordinates(prior.values, prior.free)) / prior.spread
+        names = [x for x, share in zip(prior.free, off.tolist(), strict=True)
+                 if share >= _STRANGE * _BOUND and x not in _FREELY]
+        return f'samples fit only with an implausible {" and ".join(names)}' if names else ''
 
     def _go_along(self, window: Window, found: Solution, until: float) -> None:
         """Let the oldest samples go, or, where none come any more, the time."""
         span = _LONGEST * found.values['time_unit']
         count = len(window.time)
-        if count and until - float(window.time[-1]) > span:
+        # A whole move is fitted at once: early in one the fit is no place to sum it up from.
+        before = int(np.searchsorted(window.time, self._seconds(self._move_begins(until))))
+        if before > 1:
+            place = before - 1
+        elif count and until - float(window.time[-1]) > span:
             place = count
         elif count > self.options.window or (
                 count >= _FEWEST and float(window.time[-1]) - window.begin > span):
@@ -340,7 +369,7 @@ class Estimator:
         seconds = shift / NANOSECONDS
         moved = window.move_on(place, time, found, self.noise, drift)
         self._fix(moved, found)
-        if 'creep' in found.values:
+        if found.motion.behind:
             until_then = self._follow(found, window, time)
             if until_then is not None:
                 found = replace(found, values={**found.values, 'behind': until_then.behind})
@@ -386,6 +415,15 @@ class Estimator:
         before = begin - round(units * self.prior.values['time_unit'] * NANOSECONDS)
         return all(
             x[1] == y[1] or not before < y[0] <= end for x, y in itertools.pairwise(self._levels))
+
+    def _move_begins(self, until: float) -> int:
+        """Return when in ns, until a time in s, a level changed last that was long in force."""
+        calm = round(_CALM * self.prior.values['time_unit'] * NANOSECONDS)
+        changes = [y[0] for x, y in itertools.pairwise(self._levels) if x[1] != y[1]
+                   and self._seconds(y[0]) <= until]
+        return max((
+            y for x, y in itertools.pairwise([-10**19, *changes]) if y - x > calm),
+            default=self._origin)
 
     def _as_levels(self) -> Levels:
         return Levels(

@@ -65,7 +65,7 @@ def follow(
         values: Mapping[str, Any], free: Sequence[str], state: tuple[float, float],
         levels: Levels, begin: float, times: Array) -> Motion | None:
     """
-    Simulate a motion from stretch and rate (1/s) at a begin in s to times not before it.
+    Simulate a motion from stretch and rate (1/s) at a begin in s, uniform before it, to times.
 
     Where ``creep`` is among the values, ``behind`` says how far what its branches have followed is
     from the elastic force at the begin, in units of G; without it they have relaxed. Levels before
@@ -100,7 +100,8 @@ def follow(
 
 def followed(values: Mapping[str, Any], stretch: float) -> tuple[float, ...]:
     """Return what branches have followed at a stretch, in units of G; empty if they relaxed."""
-    if not any(values.get('behind', ())):
+    holds = 'creep' in values or values['viscoelastic_ratio'] > 0.0
+    if not (holds and any(values.get('behind', ()))):
         return ()
     force = float(elastic_force(stretch, Setup.of(values, ()).material))
     return tuple(force + x for x in values['behind'])
@@ -113,8 +114,9 @@ def held(
     by = followed(values, stretch)
     if not by:
         return rest(values, (), level)
-    a, k, f = Setup.of(values, ()).theta[[places.STIFFNESS, places.DRIVE, places.FORCE]]
-    ratios = values['creep'].ratios
+    theta = Setup.of(values, ()).theta
+    a, k, f = theta[[places.STIFFNESS, places.DRIVE, places.FORCE]]
+    ratios = theta[places.FIRST_BRANCH::places.BRANCH].tolist()
     pull = k * level + f + a * sum(x * y for x, y in zip(ratios, by, strict=True))
     found = rest(values, (), float((pull / (1.0 + sum(ratios)) - f) / k))
     return found and (found[0], found[1] * math.sqrt(1.0 + sum(ratios)), found[2])

@@ -25,19 +25,28 @@ from hmsa_ros.model.parameters import ActuatorParameters
 #: share of the value.
 DEVIATIONS = {
     'shear_modulus': 0.15, 'density': 0.1, 'remanence': 0.1, 'time_unit': 0.1,
-    'chain_limit': 0.15, 'damping_coefficient': 0.25, 'stretch_bias': 5e-3,
-    'stretch_gain': 0.02, 'sensor_latency': 1e-3, 'coil_time_constant': 5e-4,
-    'constant_force': 0.0, 'viscoelastic_ratio': 0.1, 'viscoelastic_time': 1.0}
+    'chain_limit': 0.1, 'damping_coefficient': 0.25, 'stretch_bias': 5e-3,
+    'stretch_gain': 0.02, 'sensor_latency': 0.05, 'coil_time_constant': 0.05,
+    'constant_force': 0.007, 'viscoelastic_ratio': 0.03, 'viscoelastic_time': 1.0}
 # Where there is none, the deviation is a share of that of a usual block.
 _LEAST_LIMIT, _LEAST_ZETA = 0.02, 0.1
-# A force unknown to this share of the elastic one.
-_FORCE = 0.02
 # The planner has no parameters of these.
 _SENSED = ('stretch_bias', 'stretch_gain', 'sensor_latency', 'constant_force')
+_SCALED = ('constant_force', 'sensor_latency', 'coil_time_constant')
 _NOT_TRACKED = (
     'initial_stretch', 'initial_rate', *(x for x in QUANTITIES if x.startswith('viscoelastic_')))
 #: Tracked unless others are named.
 TRACKED = ('shear_modulus', 'damping_coefficient', 'stretch_bias')
+#: What may be wrong besides, and is tracked with these that no one takes it for an error of them.
+#: The gain of the sensor is none: it looks like another remanence and chain limit.
+SUSPECTS = (
+    'remanence', 'chain_limit', 'coil_time_constant', 'sensor_latency', 'viscoelastic_ratio',
+    'viscoelastic_time')
+#: What is not estimated unless it is named, since it looks like a bias: it keeps its value, and
+#: makes all that depends on it less sure.
+CONSIDERED = ('constant_force',)
+# Relaxation time of a suspected branch in units of time.
+_RELAXATION = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,17 +60,20 @@ class Prior:
     # Deviations of the coordinates of a block that was never identified, shape (p,); they bound
     # how far an estimate may go, and how fast, since a block changes after its identification.
     spread: Array
+    considered: int = 0  # how many of what is tracked, from the last on, keep their values
+    suspects: int = 0  # how many, from the last on, are only suspected, and those among them
 
     @classmethod
     def nominal(
             cls, actuator: ActuatorParameters, free: Sequence[str] = TRACKED, *,
-            others: Mapping[str, float] | None = None,
+            suspects: bool = False, others: Mapping[str, float] | None = None,
             deviations: Mapping[str, float] | None = None) -> 'Prior':
         """
         Return what is known of a block that was never identified.
 
-        Others are values of coil and sensor that are not the defaults, and deviations replace some
-        of `DEVIATIONS`. `BadInputError` says which name is unknown or cannot be tracked.
+        With suspects those of `SUSPECTS` are tracked too. Others are values of coil and sensor
+        that are not the defaults, and deviations replace some of `DEVIATIONS`. `BadInputError`
+        contains the name that is unknown or cannot be tracked.
         """
         free = check_free(free, actuator.law)
         wrong = [x for x in free if x in _NOT_TRACKED]
@@ -69,7 +81,12 @@ class Prior:
             raise BadInputError(
                 f'{", ".join(wrong)} cannot be tracked: expected some of '
                 + ', '.join(x for x in DEVIATIONS if x not in _NOT_TRACKED))
+        considered = [x for x in CONSIDERED if suspects and x not in free]
+        named = len(free)
+        if suspects:
+            free = (*_with_suspects(free, actuator), *considered)
         values: dict[str, Any] = complete(values_of(actuator, others), free)
+        values['viscoelastic_time'] = _RELAXATION * actuator.time_unit
         if actuator.creep:
             values['creep'] = actuator.creep.held
         if 'chain_limit' in free:
@@ -77,9 +94,13 @@ class Prior:
         size = []
         for name in free:
             deviation = (deviations or {}).get(name, DEVIATIONS[name])
-            if name == 'constant_force' and not deviation:
-                deviation = _FORCE / actuator.load_per_newton
-            if name == 'damping_coefficient':
+            if name in (deviations or {}) and name in _SCALED:
+                pass
+            elif name == 'constant_force':
+                deviation /= actuator.load_per_newton
+            elif name in _SCALED:
+                deviation *= actuator.time_unit
+            elif name == 'damping_coefficient':
                 deviation *= max(values[name], _LEAST_ZETA * actuator.damping_unit)
             elif name == 'chain_limit':
                 deviation *= max(1.0 / values[name], _LEAST_LIMIT)
@@ -87,7 +108,9 @@ class Prior:
                 raise BadInputError(
                     f'the deviation of {name} is {deviation:g}: expected a number above 0')
             size.append(deviation)
-        return cls(values, free, np.diag(np.square(size)), np.array(size))
+        return cls(
+            values, free, np.diag(np.square(size)), np.array(size), len(considered),
+            len(free) - named)
 
     @property
     def coordinate(self) -> Coordinate:
@@ -115,3 +138,11 @@ class Prior:
         return replace(
             self, values=values, covariance=covariance,
             spread=np.maximum(self.spread, np.sqrt(np.diag(covariance))))
+
+
+def _with_suspects(free: Sequence[str], actuator: ActuatorParameters) -> tuple[str, ...]:
+    """Return names with those of suspects that a block may have."""
+    return (*free, *(
+        x for x in SUSPECTS if x not in free
+        and not (x == 'chain_limit' and actuator.law is not None)
+        and not (x.startswith('viscoelastic') and any(actuator.creep.ratios))))

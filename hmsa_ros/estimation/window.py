@@ -8,21 +8,27 @@ along with the motion (C. V. Rao, J. B. Rawlings and D. Q. Mayne, IEEE Trans. Au
 (2003) 246).
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hmsa_ros.estimation.motion import follow, Levels, Motion
+from hmsa_ros.estimation.suspects import inverse, Look, optimum, Suspects
 from hmsa_ros.identification.fit import loss, weights_of
 from hmsa_ros.identification.quantities import from_coordinate, QUANTITIES, to_coordinate
 from hmsa_ros.identification.response import clip, complete
 from hmsa_ros.model.equations import Array
 
-# Steps of Gauss and Newton at most, halvings of each, and the step, in deviations, that ends them.
-_PASSES, _HALVINGS, _SMALL = 6, 4, 0.03
+# Steps of Gauss and Newton at most, halvings of each, and the step, in deviations, that is small.
+_PASSES, _HALVINGS, _SMALL = 4, 4, 0.1
+# How many times as many samples as the last time call for another look at what may be wrong.
+_MORE = 1.3
+# How improbable a sample is, at least, in a fit that is poor: half a squared deviation is usual.
+_POOR = 1.0
 # A coordinate sought by its logarithm goes no further than this in one step.
 _STRIDE = 0.3
 
@@ -36,6 +42,24 @@ class Trial(NamedTuple):
     by: Array  # derivatives of what the sensor shows by the coordinates, shape (n, q)
     weights: Array  # how far each sample counts, 0 to 1
     cost: float  # negative logarithm of the probability
+
+    def moved(self, values: dict[str, Any], step: Array) -> 'Trial':
+        """Return what coordinates that are a small step off make of the samples."""
+        motion = replace(
+            self.motion, stretch=self.motion.stretch + self.motion.by @ step,
+            rate=self.motion.rate + self.motion.rate_by @ step)
+        return self._replace(
+            values=values, motion=motion, residual=self.residual - self.by @ step)
+
+
+class Found(NamedTuple):
+    """The most probable coordinates of what is sought."""
+
+    z: Array
+    here: Trial
+    matrix: Array  # of the quadratic that the cost is about there
+    gradient: Array  # downwards
+    loose: NDArray[np.bool_]  # what varies
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +102,11 @@ class Window:
     begin: float  # time of the stretch and rate that are sought
     time: Array  # of the samples, from the begin on
     stretch: Array
+    suspects: Suspects
+    suspected: tuple[int, ...] = ()  # places of suspects that are sought
+    weighed: int = 0  # samples there were when these were chosen
+    # How probable these are, and what others add to the covariance, shape (q, q).
+    spread: tuple[float, Array] = (1.0, np.zeros(()))
 
     def values_at(self, z: Array) -> dict[str, Any]:
         """Return the values of all quantities for coordinates."""
@@ -96,43 +125,101 @@ class Window:
         not before the last sample. What `simulate` says of the coordinates may be given.
         """
         prior: Array = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
+
+        def descend(z: Array, here: Trial | None = None) -> Found | None:
+            return self._descend(z, here, levels, noise, until, prior)
+
+        found = descend(z, here) or descend(self._at_ease(self.mean))
+        if found is None:
+            return None
+        if len(self.time) >= _MORE * self.weighed:
+            found = self._look(found, descend)
+            if loss(found.here.residual, noise, convex=True) > _POOR * len(self.time):
+                # There may be another valley.
+                before = self.suspected, self.spread
+                self.suspected = self.suspects.places
+                other = descend(self._at_ease(self.mean))
+                other = other and self._look(other, descend)
+                if other is not None and other.here.cost < found.here.cost:
+                    found = other
+                else:
+                    self.suspected, self.spread = before
+        covariance = self.suspects.considering(
+            inverse(found.matrix, found.loose), found.matrix, self.covariance)
+        sure, others = self.spread
+        _, motion, residual, by, weights, _ = found.here
+        return Solution(
+            found.z, found.here.values, motion, by, residual, weights,
+            sure * covariance + others)
+
+    def _look(self, found: Found, descend: Callable[[Array], Found | None]) -> Found:
+        """Choose the suspects to be sought, and return the most probable coordinates then."""
+        self.weighed, before = len(self.time), self.suspected
+        self.suspected, self.spread = Look(
+            self.suspects, found.z, found.matrix, found.gradient, *self._room(found.z),
+            self.covariance).choose(before)
+        if self.suspected == before:
+            return found
+        return descend(self._at_ease(found.z)) or found
+
+    def _descend(
+            self, z: Array, here: Trial | None, levels: Levels, noise: float, until: float,
+            prior: Array) -> Found | None:
+        """
+        Seek the most probable coordinates of what is sought.
+
+        The last step, which is small, is not simulated.
+        """
         here = here or self.simulate(z, levels, noise, until, prior)
         if here is None:
-            here = self.simulate(self.mean, levels, noise, until, prior)
-            if here is None:
-                return None
-            z = self.mean
-        for _ in range(_PASSES):
-            residual, by, weights, cost = here[2:]
-            weighted = weights[:, None] * by / noise ** 2
-            matrix = prior + by.T @ weighted
-            step: Array = np.asarray(np.linalg.solve(
-                matrix, weighted.T @ residual + prior @ (self.mean - z)), dtype=np.float64)
-            size = math.sqrt(max(float(step @ matrix @ step), 0.0))
-            if size < _SMALL:
+            return None
+        for number in range(_PASSES + 1):
+            weighted = here.weights[:, None] * here.by / noise ** 2
+            matrix = prior + here.by.T @ weighted
+            gradient = weighted.T @ here.residual + prior @ (self.mean - z)
+            step, loose = self._step(z, matrix, gradient)
+            if float(step @ matrix @ step) < _SMALL ** 2:
+                z = z + step
+                gradient = gradient - matrix @ step
+                here = here.moved(self.values_at(z), step)
                 break
-            step *= min([1.0] + [
-                _STRIDE / abs(x) for name, x in zip(self.free, step.tolist(), strict=False)
-                if QUANTITIES[name].scale == 'log' and abs(x) > _STRIDE])
-            for _ in range(_HALVINGS):
-                trial = self._bounded(z + step)
-                there = self.simulate(trial, levels, noise, until, prior)
-                if there is not None and there[-1] <= cost:
+            there = None
+            for _ in range(_HALVINGS if number < _PASSES else 0):
+                there = self.simulate(self._bounded(z + step), levels, noise, until, prior)
+                if there is not None and there.cost <= here.cost:
                     break
                 step *= 0.4
-            else:
+                there = None
+            if there is None:
                 break
-            z, here = trial, there
-        values, motion, residual, by, weights, _ = here
-        matrix = prior + by.T @ (weights[:, None] * by) / noise ** 2
-        covariance = np.linalg.inv(matrix)
-        return Solution(
-            z, values, motion, by, residual, weights, 0.5 * (covariance + covariance.T))
+            z, here = self._bounded(z + step), there
+        return Found(z, here, matrix, gradient, loose)
+
+    def _at_ease(self, z: Array) -> Array:
+        """Return coordinates with what is not sought where it is known to be."""
+        return self.suspects.at_ease(z, self.suspected)
+
+    def _room(self, z: Array) -> tuple[Array, Array]:
+        """Return the least and the largest step that coordinates have to their bounds."""
+        low, high = np.full(len(z), -math.inf), np.full(len(z), math.inf)
+        low[:-2], high[:-2] = (self.bounds - z[:-2, None]).T
+        return low, high
 
     def _bounded(self, z: Array) -> Array:
         kept: Array = z.copy()
         kept[:-2] = np.clip(z[:-2], self.bounds[:, 0], self.bounds[:, 1])
         return kept
+
+    def _step(
+            self, z: Array, matrix: Array, gradient: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the step to the optimum, which goes as far as it may, and what varies there."""
+        longest = np.array([
+            _STRIDE if QUANTITIES[x].scale == 'log' else math.inf for x in self.free] + [
+                math.inf] * 2)
+        low, high = self._room(z)
+        return optimum(
+            matrix, gradient, np.zeros(len(z)), self.suspects.sought(len(z), self.suspected),
+            np.maximum(low, -longest), np.minimum(high, longest))
 
     def simulate(
             self, z: Array, levels: Levels, noise: float, until: float, prior: Array | None = None
@@ -143,7 +230,7 @@ class Window:
             prior = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
         motion = follow(
             values, self.free, (float(z[-2]), float(z[-1])), levels, self.begin,
-            np.maximum(times - values['sensor_latency'], self.begin))
+            times - values['sensor_latency'])
         if motion is None:
             return None
         n = len(self.stretch)
@@ -168,15 +255,17 @@ class Window:
         matrix = prior + by.T @ (weights * by) / noise ** 2
         gradient = by.T @ (solution.weights[:count] * solution.residual[:count]) / noise ** 2
         gradient = gradient + prior @ (self.mean - solution.z)
-        covariance = np.linalg.inv(matrix)
+        inner = inverse(matrix, self.suspects.sought(len(self.mean), self.suspects.places))
+        covariance = self.suspects.considering(inner, matrix, self.covariance)
+        step = inner @ gradient
         change = transport(solution.motion, count)
         here = np.append(
             solution.z[:-2], [solution.motion.stretch[count], solution.motion.rate[count]])
         covariance = change @ covariance @ change.T + np.diag(drift)
         return Window(
-            self.values, self.free, here + change @ np.linalg.solve(matrix, gradient),
+            self.values, self.free, here + change @ step,
             0.5 * (covariance + covariance.T), self.bounds, begin,
-            self.time[count:], self.stretch[count:])
+            self.time[count:], self.stretch[count:], self.suspects, self.suspected)
 
 
 def coordinates(values: Mapping[str, float], free: Sequence[str]) -> Array:

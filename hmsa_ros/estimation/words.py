@@ -15,6 +15,8 @@ _OFFSET, _RINGING = 0.01, 0.01
 # A bias and a force that hide each other by this correlation, while where the block rests is known
 # no better than this.
 _PAIR, _HIDDEN, _UNKNOWN = ('stretch_bias', 'constant_force'), 0.9, 1e-3
+# Share of the step that a bias is to be known to.
+_BIASED = 0.01
 # Smaller steps have no percentage.
 _STEP = 0.01
 _NAMES = {
@@ -25,17 +27,26 @@ _NAMES = {
 _ABSOLUTE = {
     'coil_time_constant': ('coil lag', 'ms', 1e3), 'constant_force': ('constant force', 'N', 1.0),
     'sensor_latency': ('latency of the sensor', 'ms', 1e3),
+    'viscoelastic_ratio': ('creep', '%', 1e2),
     'stretch_bias': ('bias of the sensor', '', 1.0)}
 
 
-def confounded(estimate: Estimate) -> bool:
-    """Return whether a tracked bias of the sensor and a constant force look alike as yet."""
+def confounded(estimate: Estimate, least: float = _UNKNOWN) -> bool:
+    """
+    Return whether a tracked bias of the sensor and a constant force look alike as yet.
+
+    It matters where the bias is not known to the least share of stretch.
+    """
     if not set(_PAIR) <= set(estimate.free):
         return False
     i, j = (estimate.free.index(x) for x in _PAIR)
     covariance = estimate.covariance
-    together = covariance[i, j] / math.sqrt(covariance[i, i] * covariance[j, j])
-    return abs(together) > _HIDDEN and estimate.deviations[_PAIR[0]] > _UNKNOWN
+    scale = math.sqrt(covariance[i, i] * covariance[j, j])
+    # Neither is sought, for example, where both are given.
+    if scale == 0.0:
+        return False
+    together = covariance[i, j] / scale
+    return abs(together) > _HIDDEN and estimate.deviations[_PAIR[0]] > least
 
 
 def differences(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
@@ -43,11 +54,11 @@ def differences(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
     found = []
     hidden = _PAIR if confounded(estimate) else ()
     for name in estimate.free:
-        if name in hidden:
+        if name in hidden or name == 'viscoelastic_time':
             continue
         value, before = estimate.values[name], nominal[name]
         change = value - before
-        if abs(change) < _SURE * estimate.deviations[name]:
+        if abs(change) <= _SURE * estimate.deviations[name]:
             continue
         if name in _ABSOLUTE:
             label, unit, factor = _ABSOLUTE[name]
@@ -79,7 +90,7 @@ def sentence(
             wrong.append(f'rings at {at[1] / (2.0 * math.pi):.0f} Hz')
     found = ', '.join(differences(estimate, nominal))
     apart = ('a bias of the sensor and a constant force cannot be told apart until two targets '
-             'were held' if confounded(estimate) else '')
+             'were held' if confounded(estimate, max(_UNKNOWN, _BIASED * abs(step))) else '')
     if not wrong and not found:
         return apart or 'as known'
     words = ' and '.join(wrong)

@@ -153,7 +153,8 @@ class Setup:
         given: Creep | None = values.get('creep')
         branches = len(given.ratios) if given else max((
             i for i, names in enumerate(quantities.BRANCHES, 1)
-            if values[names[0]] > 0.0 or set(names) & set(free)), default=0)
+            if values[names[0]] > 0.0 or set(names) & set(free)
+        ), default=len(values.get('behind', ())))
         theta, chain = _chain(values, branches, free)
         inner = sorted({i for x in chain.values() for i in x})
         rows = {x: i for i, x in enumerate(inner)}
