@@ -47,7 +47,7 @@ def two_step(request: Request) -> Move:
     its place. All say so in the move's reason.
     """
     holding = request.holding_load()
-    delivery, creeps = request.delivery, bool(request.material.creep)
+    delivery, creeps = request.delivery, bool(len(request.material.branches))
     lags, at_once = delivery.lag > 0.0, delivery.period == 0.0 and delivery.slew == math.inf
     if lags and at_rest(request):
         return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
@@ -56,16 +56,11 @@ def two_step(request: Request) -> Move:
         if lags or creeps else _plain(request)
     if code in _WITHOUT and not (lags and code is Code.HOLD):
         return _without(request, code, holding)
-    found: Attempt = None
     if code is Code.TWO_STEP:
         found = (levels, levels[-1].time) if at_once else _delivered(request, levels)
         if found is not None and request.keeps(found[0]):
-            if (lags or creeps) and found[1] > _SLOW * (
-                    math.pi / request.frequency + delivery.lag):
-                sooner = free_heights(request)
-                if sooner is not None and sooner[1] < found[1]:
-                    return Move(Code.MINIMUM_TIME, *sooner, no_single(request))
-            return Move(Code.TWO_STEP, *found)
+            sooner = _sooner(request, found[1]) if lags or creeps else None
+            return sooner or Move(Code.TWO_STEP, *found)
     if request.state.rate == 0.0 and not lags and (code is Code.TWO_STEP or not creeps):
         request.check(levels)
     if at_once and not lags and not creeps:
@@ -79,13 +74,23 @@ def two_step(request: Request) -> Move:
         return Move(Code.TWO_STEP, *found)
 
 
+def _sooner(request: Request, duration: float) -> Move | None:
+    """Return levels of free heights that are at rest before a slow command, None if none are."""
+    if duration <= _SLOW * request.delivery.lag or duration <= _SLOW * (
+            math.pi / request.frequency + request.delivery.lag):
+        return None
+    found = free_heights(request)
+    return Move(Code.MINIMUM_TIME, *found, no_single(request)) \
+        if found is not None and found[1] < duration else None
+
+
 def _plain(request: Request) -> tuple[Code, tuple[Level, ...]]:
     """Return code and levels of ideal hardware without branches."""
     state, limits = request.state, request.limits
     plan = plan_two_step(
         state.stretch, request.target, request.material, rate=state.rate,
         load_limits=(limits.minimum, limits.maximum))
-    return plan.code, (Level(0.0, plan.beta_p), Level(plan.tau_p, request.holding_load()))
+    return plan.code, (Level(0.0, plan.beta_p), Level(plan.tau_p, plan.beta_1))
 
 
 def _late(request: Request, lag: float) -> tuple[Code, tuple[Level, ...]]:
