@@ -27,6 +27,7 @@ COMMANDS = (
         'calibrate')),
     *(f'hmsa_studies.commands.{x}' for x in ('sweep', 'robustness', 'figures')),
     'hmsa_ros.cli.completion')
+_NODE = ('hmsa_ros.cli.node',)
 
 
 class _Help(argparse.HelpFormatter):
@@ -54,8 +55,8 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f'hmsa: error: {message}; see {self.prog} --help\n')
 
 
-def build_parser() -> Parser:
-    """Return the parser of the whole command line, with one subparser a command."""
+def build_parser(commands: Sequence[str] = COMMANDS) -> Parser:
+    """Return the parser of the command line, with one subparser a command."""
     parser = Parser(
         prog='hmsa',
         description='Plan and send magnetic-field commands that take hard-magnetic soft actuators '
@@ -63,7 +64,7 @@ def build_parser() -> Parser:
         epilog='example: hmsa demo')
     parser.add_argument('--version', action='version', version=f'hmsa_ros {__version__}')
     subparsers = parser.add_subparsers(metavar='COMMAND', required=True)
-    for name in COMMANDS:
+    for name in commands:
         module = import_module(name)
         before = set(subparsers.choices)
         module.add_parser(subparsers)
@@ -80,7 +81,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     0 is done, 1 the run failed, 2 bad input, 130 interrupted (SIGINT; 143 SIGTERM, 129 SIGHUP).
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    arguments, unknown = build_parser().parse_known_args(split_ros_args(words))
+    # A node starts without the modules of all other commands.
+    parser = build_parser(_NODE if words and words[0] in NODES else COMMANDS)
+    arguments, unknown = parser.parse_known_args(split_ros_args(words))
     if unknown:
         arguments.parser.error(f'unrecognized arguments: {" ".join(unknown)}')
     arguments.ros_args = words[len(split_ros_args(words)):]

@@ -11,6 +11,8 @@ example: hmsa run 1.10:0.2 1.20:0.2 1.00:0.2 --simulate
 import argparse
 from dataclasses import asdict
 from datetime import datetime
+from functools import partial
+from importlib import import_module
 import math
 import os
 from pathlib import Path
@@ -24,6 +26,8 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from hmsa_ros.judge import Finding, Tolerances
     from hmsa_ros.lab.experiment import Conducted, Experiment
     from hmsa_ros.report.arrivals import Part
@@ -79,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
     console = Console(stderr=True)
     try:
         with progress() as update:
-            done = conduct(experiment, dict(os.environ), update)
+            done = conduct(experiment, dict(os.environ), partial(_tell, update))
             ENDING.check()
             update('evaluating the bag', None)
             parts = _measure(experiment, tolerances) if done.measured else []
@@ -100,6 +104,14 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         _print(experiment, parts, reason, done, report)
     return 0 if verdict in ('arrived', NOT_MEASURED) else 1
+
+
+def _tell(update: 'Callable[[str, float | None], None]', what: str, share: float) -> None:
+    """Show what is going on; while the nodes are busy with the sequence, prepare its end."""
+    update(what, share)
+    if share > 0.0:
+        import_module('hmsa_ros.report.outcome')
+        import_module('hmsa_ros.report.comparison')
 
 
 def _tolerances(arguments: argparse.Namespace) -> 'Tolerances | None':

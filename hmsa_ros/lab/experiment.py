@@ -69,8 +69,6 @@ class Experiment:
             topics.from_outside(x.name, topics.PLANNER)
             for x in (topics.JOINT_TRAJECTORY, topics.PLAN, topics.STATUS,
                       topics.ESTIMATE))]
-        if self.nodes:
-            own += [topics.STRETCH.name, topics.STRETCH_RATE.name]
         space = self.namespace.strip('/')
         return [*(f'/{space}/{x}' if space else f'/{x}' for x in own), '/diagnostics', '/clock']
 
