@@ -20,7 +20,7 @@ TAU = style.axis('time', r'\tau')
 STRETCH = style.axis('stretch', r'\lambda')
 RATE = style.axis('stretch rate', r'\dot{\lambda}')
 FLUX = style.axis('flux density', 'b')
-TAU_P = style.axis('intermediate time', r'\tau_p')
+TAU_P = style.axis('time of first level', r'\tau_p')
 #: Critical damping as the paper quotes it, for 1 -> 1.1.
 PAPER_CRITICAL = 2.14
 _COMMANDS = (('unshaped', style.UNSHAPED), ('shaped', style.SHAPED))
@@ -102,7 +102,7 @@ def _plot_targets(axes: Axes, run: Run) -> None:
     for i, target in enumerate(run.targets):
         axes.plot(
             [i * paper_data.SPAN, (i + 1) * paper_data.SPAN], [target, target],
-            label='desired' if i == 0 else None, **style.TARGET)
+            label='target' if i == 0 else None, **style.TARGET)
 
 
 def _plot_responses(axes: Axes, runs: Sequence[Run]) -> None:
@@ -174,7 +174,7 @@ def _draw_single_move(figure: Figure, runs: tuple[Run, ...]) -> None:
     left.set_ylim(0.0, 0.7)
     style.finish(left, TAU, FLUX, 'a')
 
-    right.axhline(shaped.targets[0], label=r'desired $\lambda_d$', **style.TARGET)
+    right.axhline(shaped.targets[0], label=r'target $\lambda_d$', **style.TARGET)
     right.axvline(tau_p, **style.TARGET)
     right.plot(plain.time, plain.stretch, label='$b_1$ alone (unshaped)', **style.UNSHAPED)
     right.plot(alone.time, alone.stretch, label='$b_p$ alone', **_ALONE)
@@ -263,12 +263,12 @@ def _draw_damping_sweep(figure: Figure, sweep: Sweep) -> None:
     top = math.ceil(float(np.nanmax(sweep.tau_p))) + 0.5
     left.set_xlim(0.0, 1.05 * sweep.critical)
     left.set_ylim(0.0, top)
-    style.finish(left, style.axis('damping coefficient', r'\zeta'), TAU_P, 'a')
+    style.finish(left, style.axis('damping', r'\zeta'), TAU_P, 'a')
     near = 2.0
     right.set_xlim(near, near + 1.12 * (sweep.critical - near))
     right.set_ylim(0.0, top)
     style.finish(
-        right, style.axis('damping coefficient', r'\zeta') + ', close-up',
+        right, style.axis('damping', r'\zeta') + ', close-up',
         TAU_P if _stacked(figure) else '', 'b')
     style.legend_below(figure, left)
 

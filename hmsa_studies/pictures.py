@@ -70,8 +70,8 @@ def draw_robustness(
             axes.set_ylim(100.0 * _FLOOR, 400.0)
             axes.set_xlim(errors[0], errors[-1])
             style.finish(
-                axes, f'error of {_SYMBOLS[name]} alone (%)',
-                style.axis('residual', unit='% of step'), letter)
+                axes, f'error in {_SYMBOLS[name]} alone (%)',
+                style.axis('residual vibration', unit='% of step'), letter)
             axes.yaxis.minorticks_off()
         _bars(panels['box'], case, shown, [x for x, _ in curves], 'abcd'[len(names)])
         linear = [x.candidate.name for x in shown if x.candidate.linear]
@@ -114,8 +114,8 @@ def draw_front(
             panel.set_yscale('log')
             panel.margins(x=0.1, y=0.1)
             style.finish(
-                panel, style.axis('arrival', r'\tau'), style.axis(
-                    'worst residual', unit='% of step') if place % columns == 0 else '',
+                panel, style.axis('move time', r'\tau'), style.axis(
+                    'worst residual vibration', unit='% of step') if place % columns == 0 else '',
                 'abcdefghi'[place] if 1 < len(studies) <= 9 else '')
             panel.yaxis.minorticks_off()
             panel.set_title(
@@ -175,7 +175,7 @@ def _bars(
     axes.set_yticks(places, [x.candidate.name for x in results])
     axes.set_ylim(len(results) - 0.4, -0.6)
     style.finish(
-        axes, rf'worst, all within $\pm${100.0 * case.box:g} % (% of step)', '', letter)
+        axes, rf'worst case within $\pm${100.0 * case.box:g} % (% of step)', '', letter)
     axes.xaxis.minorticks_off()
     axes.yaxis.minorticks_off()
     axes.grid(visible=False, axis='y')
@@ -194,7 +194,7 @@ def draw_sampled(
             [['residual', 'command'], ['residual', 'response']], height_ratios=[1.0, 1.3])
         axes = panels['residual']
         axes.plot(
-            study.periods, 100.0 * study.bound, label='rounded, at worst', color=looks.VERMILION,
+            study.periods, 100.0 * study.bound, label='rounded, worst case', color=looks.VERMILION,
             linewidth=0.8, linestyle=(0, (1, 1)))
         axes.plot(
             study.periods, 100.0 * np.maximum(study.rounded, RESOLVED),
@@ -210,7 +210,7 @@ def draw_sampled(
         axes.set_yscale('log')
         axes.set_ylim(5e-7, 300.0)
         style.finish(axes, style.axis('command period', r'T/\tau_p'),
-                     style.axis('residual', unit='% of step'), 'a')
+                     style.axis('residual vibration', unit='% of step'), 'a')
         ticks = [x for x in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0) if x >= study.periods[0]]
         axes.set_xticks(ticks, [f'{x:g}' for x in ticks])
         axes.xaxis.minorticks_off()
@@ -231,7 +231,7 @@ def draw_sampled(
         axes.set_xlim(-0.1 * study.tau_p, 1.6 * study.tau_p)
         style.finish(
             axes, style.axis('time', r'\tau'), style.axis('load', r'\beta'), 'b')
-        axes.set_title(rf'$T$ = {period:g} $\tau_p$, grid dotted', loc='right', fontsize='small')
+        axes.set_title(rf'$T$ = {period:g} $\tau_p$, grid dashed', loc='right', fontsize='small')
         panels['response'].set_xlim(0.0, end)
         figure.align_ylabels([panels['command'], panels['response']])
         style.legend_below(figure, panels['residual'])
@@ -278,7 +278,7 @@ def draw_damped(
         axes.set_xlim(study.zetas[0], study.zetas[-1])
         axes.set_ylim(0.0, None)
         style.finish(
-            axes, style.axis('damping coefficient', r'\zeta'),
+            axes, style.axis('damping', r'\zeta'),
             rf'time $\tau$ to within {100.0 * SETTLED:g} % of the step', 'a')
 
         moves: list[tuple[Move, dict[str, Any]]] = [

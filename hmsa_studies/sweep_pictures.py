@@ -27,17 +27,17 @@ _STEP = '% of step'
 _NAMES = {
     'start': r'start $\lambda_0$', 'target': r'target $\lambda_d$',
     'zeta': r'$\zeta$', 'j_lim': r'$J_\mathrm{lim}$', 'c1': '$c_1$',
-    'load_min': r'least load $\beta$', 'load_max': r'largest load $\beta$',
-    'period': r'command period $\tau$', 'lag': r'lag of the field $\tau$',
+    'load_min': r'minimum load $\beta$', 'load_max': r'maximum load $\beta$',
+    'period': r'command period $\tau$', 'lag': r'coil lag $\tau$',
     'slew': r'slew limit $\mathrm{d}\beta/\mathrm{d}\tau$',
     'command_period': 'command period (s)',
     'beta_p': r'first load $\beta_p$', 'b_p': 'first level $b_p$',
-    'tau_p': r'duration $\tau_p$', 'beta_1': r'holding load $\beta_1$',
+    'tau_p': r'time of first level $\tau_p$', 'beta_1': r'holding load $\beta_1$',
     'b_1': 'holding level $b_1$', 'flux_density_p': 'first flux density $B_p$ (T)',
-    'residual': f'residual vibration ({_STEP})', 'offset': f'offset at rest ({_STEP})',
-    'error.shear_modulus': 'error of $G$ (%)', 'error.j_lim': r'error of $J_\mathrm{lim}$ (%)',
-    'error.zeta': r'error of $\zeta$ (%)', 'error.remanence': 'error of $B_r$ (%)',
-    'time_p': 'duration $t_p$ (s)', 'flux_density_1': 'holding flux density $B_1$ (T)'}
+    'residual': f'residual vibration ({_STEP})', 'offset': f'steady-state error ({_STEP})',
+    'error.shear_modulus': 'error in $G$ (%)', 'error.j_lim': r'error in $J_\mathrm{lim}$ (%)',
+    'error.zeta': r'error in $\zeta$ (%)', 'error.remanence': 'error in $B_r$ (%)',
+    'time_p': 'time of first level $t_p$ (s)', 'flux_density_1': 'holding flux density $B_1$ (T)'}
 # Shares, drawn in percent.
 _SHARES = ('residual', 'offset', *Nondimensional.actual)
 _UNITS = {x.name: x.unit for x in PLANNED}

@@ -129,8 +129,8 @@ def deliveries(path: Path) -> None:
     period = 0.4
     cases = (
         ('ideal', Delivery()), (f'on a grid of {period:g}', Delivery(period=period)),
-        ('ramped, 0.8 a unit of time', Delivery(slew=0.8)))
-    time = np.linspace(0.0, 3.0, 601)
+        ('ramped, 0.8 per time scale', Delivery(slew=0.8)))
+    time = np.linspace(-0.3, 3.0, 661)
     holding = 0.0
     with style.picture(path, 3.1, SCREEN) as figure:
         rows = figure.subplots(2, 3, sharex=True, sharey='row', height_ratios=[1.0, 1.2])
@@ -139,7 +139,9 @@ def deliveries(path: Path) -> None:
                 [Setpoint(1.4, 20 * period)],
                 Request.of(MATERIAL, State(1.0, 0.0, 0.0), delivery=delivery))
             levels = segment.move.levels
-            switches, loads, slopes = np.array(ramps(levels, holding, 3.0, delivery.slew)[0]).T
+            rest = replace(levels[0], time=float(time[0]), load=holding)
+            switches, loads, slopes = np.array(ramps(
+                [rest, *levels], holding, 3.0, delivery.slew)[0]).T
             stretch, _ = simulate(switches, loads, time, MATERIAL, slopes=slopes)
             command = np.zeros_like(time)
             for at, load, slope in zip(switches, loads, slopes, strict=True):
@@ -224,7 +226,7 @@ def creep(path: Path) -> None:
         rows[2].set_ylim(-18.0, 18.0)
         style.finish(rows[0], '', LOAD, 'a')
         style.finish(rows[1], '', STRETCH, 'b')
-        style.finish(rows[2], TIME, style.axis('off target', unit='% of step'), 'c')
+        style.finish(rows[2], TIME, style.axis('error', unit='% of step'), 'c')
 
 
 def beam(path: Path) -> None:
@@ -265,7 +267,7 @@ def beam(path: Path) -> None:
         style.finish(shapes, 'along / length', 'across / length', 'a')
         style.finish(move, style.axis('time', 't', 'ms'), style.axis('deflection', 'u'), 'b')
         style.finish(
-            left, style.axis('time', 't', 'ms'), style.axis('off target', unit='% of step'), 'c')
+            left, style.axis('time', 't', 'ms'), style.axis('error', unit='% of step'), 'c')
 
 
 def simulated(*setpoints: tuple[float, float], rate: float) -> Run:

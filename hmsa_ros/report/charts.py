@@ -316,7 +316,7 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
             'xaxis': axis(
                 label('time in the move', unit=unit.name),
                 range=numbers([0.0, unit.of(shown)])),
-            'yaxis': axis(label('off target', unit='% of the step'), range=[-height, height]),
+            'yaxis': axis(label('error', unit='% of the step'), range=[-height, height]),
             'shapes': [{
                 'type': 'line', 'x0': x, 'x1': x, 'yref': 'paper', 'y0': 0, 'y1': 1,
                 'line': {'color': GREY, 'width': 1, 'dash': '2px,2px'}} for x in arrivals]})
@@ -349,7 +349,9 @@ def residuals(parts: Sequence[Part]) -> Figure:
         'residuals', 'Residual vibration of each setpoint, recorded and for unshaped steps', 340,
         _grouped(data), {
             'xaxis': numbered,
-            'yaxis': axis(label('residual', unit='% of the step'), type='log', **_decades(data))})
+            'yaxis': axis(
+                label('residual vibration', unit='% of the step'), type='log',
+                **_decades(data))})
 
 
 def _decades(data: Sequence[dict[str, Any]]) -> dict[str, Any]:

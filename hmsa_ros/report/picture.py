@@ -78,7 +78,7 @@ def draw(
             panel.set_xlim(0.0, 1e3 * span(parts, i))
             style.finish(
                 panel, style.axis('time in the move', unit='ms'),
-                style.axis('off target', unit='% of step') if i == shown[0] else '', letter)
+                style.axis('error', unit='% of step') if i == shown[0] else '', letter)
             panel.set_title(_title(parts, i), loc='right', fontsize='small')
         figure.align_ylabels([axes['command'], axes['response']])
         # Where curves are dense they lose their dashes, so that the response comes last.
