@@ -101,7 +101,7 @@ def test_rviz_starts_only_when_asked_for_in_the_namespace_of_the_nodes(started):
 
 def test_recorder_can_be_left_out_and_a_bag_be_called_like_a_number(started):
     assert 'recorder' not in nodes(started(record='false'))
-    assert '-p storage.uri:="2026"' in ' '.join(demo(bag='2026')['recorder'].ros_arguments())
+    assert "-p storage.uri:='2026'" in ' '.join(demo(bag='2026')['recorder'].ros_arguments())
 
 
 def test_time_is_simulated_if_the_plant_is():
