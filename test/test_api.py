@@ -237,8 +237,8 @@ def test_the_plan_names_units_currents_and_amplifiers(files, capsys):
         'plan', '1.1:0.5', '--params-file', 'actuator.yaml', '--amplifier', '--inductance', '5mH',
         '--resistance', '2', '--tesla-per-ampere', '20mT/A']) == 0
     said = capsys.readouterr().out
-    for name in ('span (s)', 'flux_density_p (T)', 'time_p (s)', 'current_1 (A)', 'slew (T/s)',
-                 'bandwidth (Hz)', 'voltage (V)'):
+    for name in ('duration (s)', 'flux_density_p (T)', 'time_p (s)', 'current_1 (A)',
+                 'slew (T/s)', 'bandwidth (Hz)', 'voltage (V)'):
         assert name in said
     # 200 T/s at 0.02 T/A: 10 kA/s through 5 mH, and 6.48 A through 2 ohm.
     row = next(x.split() for x in said.splitlines() if x.split()[:2] == ['200', '∞'])

@@ -105,8 +105,8 @@ def run(arguments: argparse.Namespace) -> int:
                     arguments.setpoints, shaper=arguments.shaper or 'two_step',
                     **_more(arguments), **{x: getattr(arguments, x) for x in _WINDING})
         shown = [
-            Column('span', 's'), Column('flux_density_p', 'T'), Column('time_p', 's'),
-            Column('flux_density_1', 'T')]
+            Column('span', 's', head='duration'), Column('flux_density_p', 'T'),
+            Column('time_p', 's'), Column('flux_density_1', 'T')]
         if arguments.tesla_per_ampere is not None:
             shown += [Column('current_p', 'A'), Column('current_1', 'A')]
         unit, middle = units.time, Column('between', 'T at s')
@@ -124,7 +124,9 @@ def run(arguments: argparse.Namespace) -> int:
         group = _group(arguments)
         segments = _nondimensional(arguments, group)
         rows = [_row(x) for x in segments]
-        shown = [Column('span', _TIME), Column('b_p'), Column('tau_p', _TIME), Column('b_1')]
+        shown = [
+            Column('span', _TIME, head='duration'), Column('b_p'), Column('tau_p', _TIME),
+            Column('b_1')]
         unit, middle = 1.0, Column('between', 'b at tau')
 
         def level(load: float) -> float:
