@@ -21,6 +21,7 @@ from hmsa_ros.estimation import Estimate, Estimator, Options, Prior
 from hmsa_ros.estimation.motion import followed
 from hmsa_ros.estimation.words import differences
 from hmsa_ros.identification.known import Known
+from hmsa_ros.identification.quantities import derivative
 from hmsa_ros.judge import Sensor
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import PlannerGroup
@@ -299,19 +300,26 @@ class Feedback:
         return self._predicted(name, joint, time)
 
     def sensor(self, name: str) -> Sensor:
-        """Return what was found of the sensor of a joint; one as given where nothing was."""
+        """
+        Return what was found of the sensor of a joint; one as given where nothing was.
+
+        A force that is only considered is taken as given: it would hide every bias.
+        """
         found = self.latest(name)
         if found is None:
             return Sensor()
         prior = np.diag(self._joints[name].estimator.prior.covariance)
-        known = [x for i, x in enumerate(found.free) if x in _SENSOR and (
-            found.covariance[i, i] < _FOUND**2 * prior[i])]
+        covariance = found.sure_of(len(found.free) - found.considered).covariance
+        known = {x: i for i, x in enumerate(found.free) if x in _SENSOR and (
+            covariance[i, i] < _FOUND**2 * prior[i])}
         figures = {_SENSOR[x]: found.values[x] for x in known} | {
-            f'{_SENSOR[x]}_std': found.deviations[x] for x in known}
+            f'{_SENSOR[x]}_std': abs(derivative(x, found.values[x])) * math.sqrt(
+                max(covariance[i, i], 0.0))
+            for x, i in known.items()}
         together = 0.0
         if 'stretch_bias' in known and 'stretch_gain' in known:
-            pair = [found.free.index(x) for x in ('stretch_bias', 'stretch_gain')]
-            (one, both), (_, two) = found.covariance[np.ix_(pair, pair)]
+            pair = [known[x] for x in ('stretch_bias', 'stretch_gain')]
+            (one, both), (_, two) = covariance[np.ix_(pair, pair)]
             together = float(both / math.sqrt(one * two))
         return Sensor(**figures, together=together)
 
