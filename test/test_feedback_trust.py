@@ -24,10 +24,12 @@ def low_pass(tau):
     return sense
 
 
+# Each made anew for a test: a low-pass goes on from what it has seen.
 FAULTS = {
-    'low-pass': low_pass(5e-3), 'clipped': lambda time, x: [(time, min(x, 1.25))],
-    'scaled': lambda time, x: [(time, 2.0 * x - 1.0)],
-    'ahead': lambda time, x: [(time + 10 * MS, x)]}
+    'low-pass': lambda: low_pass(5e-3),
+    'clipped': lambda: lambda time, x: [(time, min(x, 1.25))],
+    'scaled': lambda: lambda time, x: [(time, 2.0 * x - 1.0)],
+    'ahead': lambda: lambda time, x: [(time + 10 * MS, x)]}
 
 
 def bench(slow=True, noise=1e-4, plant=None, factors=None, **more):
@@ -47,7 +49,7 @@ def moves(it, targets=MOVES):
 
 def check_unlearnt(fault, slow, noise):
     it = bench(slow, noise)
-    healthy, it.sense = it.sense, FAULTS[fault]
+    healthy, it.sense = it.sense, FAULTS[fault]()
     moves(it, MOVES[:2])
     it.sense = healthy
     # With the parameters given it would leave nothing.

@@ -300,15 +300,16 @@ def test_a_sensor_that_is_out_is_named_and_no_miss(spoil, reason):
     assert loop.status.measuring
 
 
-def test_a_bias_that_feedback_has_found_is_no_offset():
+def test_a_bias_that_feedback_has_found_is_no_offset_but_may_be_a_force():
     loops = [Loop(1.0, 1e-4, feedback=x, heartbeat_period=0) for x in ('adapt', 'off')]
     for loop in loops:
         loop.spoil = lambda samples: [(t, x + 0.01) for t, x in samples]
         truth = loop.run((1.2, HOLD), (1.4, HOLD), (1.2, HOLD), (1.4, HOLD))
         assert abs(truth[-1, 1] - 1.4) < 1e-3
     found, offset = loops[0].status.findings['a'], loops[1].status.findings['a']
-    assert found.arrived
-    assert found.offset_std < 1e-3
+    assert found.verdict in ('arrived', 'undecided')
+    assert abs(found.offset) < 1e-3
+    assert 1e-3 < found.offset_std < 4e-3
     assert (offset.verdict, offset.offset) == ('off_target', pytest.approx(0.01, rel=0.05))
 
 

@@ -21,7 +21,6 @@ from hmsa_ros.estimation import Estimate, Estimator, Options, Prior
 from hmsa_ros.estimation.motion import followed
 from hmsa_ros.estimation.words import differences
 from hmsa_ros.identification.known import Known
-from hmsa_ros.identification.quantities import derivative
 from hmsa_ros.judge import Sensor
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import PlannerGroup
@@ -47,6 +46,8 @@ _QUIET = 12.0
 # below which it has been found.
 _SENSOR = {'stretch_bias': 'bias', 'stretch_gain': 'gain', 'sensor_latency': 'latency'}
 _FOUND = 0.3
+# A bias of fewer deviations does not show.
+_SHOWS = 3.0
 # States further ahead than so many units of time are those of rest.
 _AHEAD = 100.0
 
@@ -303,23 +304,22 @@ class Feedback:
         """
         Return what was found of the sensor of a joint; one as given where nothing was.
 
-        A force that is only considered is taken as given: it would hide every bias.
+        A bias that shows may be a force as well: what that leaves open of it counts.
         """
         found = self.latest(name)
         if found is None:
             return Sensor()
         prior = np.diag(self._joints[name].estimator.prior.covariance)
-        covariance = found.sure_of(len(found.free) - found.considered).covariance
-        known = {x: i for i, x in enumerate(found.free) if x in _SENSOR and (
-            covariance[i, i] < _FOUND**2 * prior[i])}
+        sure = np.diag(found.sure_of(len(found.free) - found.considered).covariance)
+        known = [x for i, x in enumerate(found.free) if x in _SENSOR and (
+            sure[i] < _FOUND**2 * prior[i]) and (
+            x != 'stretch_bias' or abs(found.values[x]) > _SHOWS * math.sqrt(sure[i]))]
         figures = {_SENSOR[x]: found.values[x] for x in known} | {
-            f'{_SENSOR[x]}_std': abs(derivative(x, found.values[x])) * math.sqrt(
-                max(covariance[i, i], 0.0))
-            for x, i in known.items()}
+            f'{_SENSOR[x]}_std': found.deviations[x] for x in known}
         together = 0.0
         if 'stretch_bias' in known and 'stretch_gain' in known:
-            pair = [known[x] for x in ('stretch_bias', 'stretch_gain')]
-            (one, both), (_, two) = covariance[np.ix_(pair, pair)]
+            pair = [found.free.index(x) for x in ('stretch_bias', 'stretch_gain')]
+            (one, both), (_, two) = found.covariance[np.ix_(pair, pair)]
             together = float(both / math.sqrt(one * two))
         return Sensor(**figures, together=together)
 
