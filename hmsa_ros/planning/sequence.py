@@ -210,7 +210,8 @@ def _check_known(
         return
     # The first swing about the last level is the widest.
     swing = 2.0 * math.pi / float(natural_frequency(target, material))
-    times = np.linspace(levels[0].time, min(ends[1], ends[0] + swing), _LOOK)
+    times = np.linspace(
+        levels[0].time, min(ends[1], ends[0] + swing), _LOOK, dtype=np.float64)
     stretch = sampled(levels, state, times, material, delivery, _LOOK_RTOL)[STRETCH]
     for widest, beyond in ((np.min(stretch), -1.0), (np.max(stretch), 1.0)):
         limit = elastic.limits[beyond > 0.0]
