@@ -109,7 +109,7 @@ def test_without_a_sensor_it_says_what_it_could_not_try(lab, capsys):
     (['json:loads', '--rate', 'nan'], 'rate is nan Hz'),
     (['json:loads', '--set', 'port'], '--set port: expected KEY=VALUE'),
     (['json:loads', '--set', 'port=['], 'expected a value as in YAML'),
-    (['json:loads', '--report', '/no/where.html'], 'expected a file in a folder that exists'),
+    (['json:loads', '--report', '/no/where.html'], 'expected one that exists'),
     (['json:loads'], 'does not start'),
 ])
 def test_what_cannot_be_tried_is_refused(capsys, arguments, expected):
