@@ -1,11 +1,8 @@
 """``hmsa calibrate``: what a bench is made of, measured step by step."""
 
 import argparse
-from importlib import import_module
 import math
-import os
 from pathlib import Path
-import sys
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.check_driver import setting
@@ -140,13 +137,10 @@ def _typed(current: float) -> float:
 
 def _probe(name: str) -> 'Callable[[float], float]':
     """Return what reads a probe, some times; `BadInputError` if there is none."""
-    from hmsa_ros.device.hardware import told
+    from hmsa_ros.device.hardware import imported, told
 
-    # The script of a command has its own folder there instead.
-    sys.path.append(os.getcwd())
-    module, _, made = name.partition(':')
     try:
-        probe = getattr(import_module(module), made)()
+        probe = imported(name)()
         probe.read()
     except BaseException as error:  # whatever a laboratory's module raises
         raise BadInputError(

@@ -13,21 +13,18 @@ from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 from hmsa_ros.device.assembly import CoilModel
-from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
-from hmsa_ros.device.hardware import Calls, Hardware, load
-from hmsa_ros.device.watchdog import Fallback
-from hmsa_ros.device.worker import HardwareWorker
+from hmsa_ros.device.hardware import Hardware, load
+from hmsa_ros.device.worker import HardwareWorker, lone_worker
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.equations import Array
-from hmsa_ros.model.units import NANOSECONDS
 
 # Readings that a fit needs at the least.
 _FEWEST = 4
 # Share of the range that a model may miss where scatter does not explain it, and a saturation that
 # the readings do not show, in units of the largest field.
 _MISSES, _FAR = 0.005, 20.0
-# In s: between signs of life for a watchdog, silence that switches off, and waiting for a start.
-_BEAT, _SILENCE, _START = 0.1, 1.0, 10.0
+# In s: between signs of life for a watchdog, and silence that switches off.
+_BEAT, _SILENCE = 0.1, 1.0
 # Rate in Hz at which the hardware is looked after.
 _RATE = 50.0
 # Currents closer than this share of their range are one.
@@ -233,11 +230,10 @@ class HeldCoil:
             raise HmsaError(f'the coil does not hold {level:g} T: {failure}')
         return self.coil.current(level)
 
-    def close(self) -> None:
-        """Switch off, and wait for it."""
+    def release(self) -> None:
+        """Give no more signs of life."""
         self._over.set()
         self._beats.join()
-        self._worker.close()
 
 
 @contextmanager
@@ -268,17 +264,12 @@ def held_coil(
     """
     made: list[Hardware] = []
 
-    def make() -> HardwareDevice:
+    def make() -> Hardware:
         made.append(load(name)(joint, settings))
-        return HardwareDevice(
-            [HardwareJoint(made[0], limit, Fallback(_SILENCE, 'zero'))], time=time_ns(),
-            period=round(NANOSECONDS / _RATE), calls=Calls(1.0))
+        return made[0]
 
-    worker = HardwareWorker(make, time_ns)
+    worker = lone_worker(make, limit, _RATE, _SILENCE)
     try:
-        if not worker.started(_START):
-            raise HmsaError(
-                f'{name} has not started within {_START:g} s: expected a first write that returns')
         coil = getattr(made[0], 'coil', None)
         if not isinstance(coil, CoilModel):
             raise BadInputError(
@@ -289,7 +280,7 @@ def held_coil(
         try:
             yield held
         finally:
-            held.close()
+            held.release()
     finally:
         worker.close()
 

@@ -18,12 +18,10 @@ from typing import Any, cast, IO, NamedTuple
 
 import numpy as np
 
-from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.hardware import Calls, Hardware, Instrument, load
 from hmsa_ros.device.protocol import Change, Sample, StateLostError
-from hmsa_ros.device.watchdog import Fallback
-from hmsa_ros.device.worker import HardwareWorker
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.device.worker import lone_worker
+from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.units import NANOSECONDS
 
@@ -121,19 +119,13 @@ class _Bench:
         self._rate = rate
         #: How late in s the host wakes whoever sleeps.
         self.slept: list[float] = []
-        self.worker = HardwareWorker(lambda: self._device(make, limit), time_ns)
-        if not self.worker.started(10.0):
-            raise HmsaError(
-                'the hardware has not started within 10 s, or its first write not returned: '
-                'expected one that does')
+        self.worker = lone_worker(lambda: self._probed(make), limit, rate, _SILENCE)
         # The newest command, which is repeated as a sign of life, and when next.
         self._newest, self._beat = (0, 0.0), 0.0
 
-    def _device(self, make: Callable[[], Hardware], limit: float) -> HardwareDevice:
+    def _probed(self, make: Callable[[], Hardware]) -> Hardware:
         self.probe = _Probe(make())
-        return HardwareDevice(
-            [HardwareJoint(cast(Hardware, self.probe), limit, Fallback(_SILENCE, 'zero'))],
-            time=time_ns(), period=round(NANOSECONDS / self._rate), calls=Calls(1.0))
+        return cast(Hardware, self.probe)
 
     def run(self, seconds: float, levels: Sequence[float] = (), *, beat: bool = True) -> _Seen:
         """Let time pass; hand over levels in T, spread over it, and repeat the last in between."""

@@ -90,6 +90,15 @@ def told(error: BaseException) -> str:
     return f'{name}: {shown}' if text else name
 
 
+def imported(text: str) -> Any:
+    """Return what ``'MODULE:NAME'`` names; the module may be in the working directory."""
+    if os.getcwd() not in sys.path:
+        # The script of a command has its own folder there instead.
+        sys.path.append(os.getcwd())
+    module, _, name = text.partition(':')
+    return getattr(import_module(module), name)
+
+
 def load(text: str) -> Callable[[str, Mapping[str, Any]], Hardware]:
     """
     Return what makes the hardware of a joint by its name, ``'MODULE:NAME'`` or one of `SHIPPED`.
@@ -102,16 +111,13 @@ def load(text: str) -> Callable[[str, Mapping[str, Any]], Hardware]:
         If there is no such thing; what is returned raises it, too, where it fails.
 
     """
-    module, _, name = SHIPPED.get(text, text).partition(':')
-    if not module or not name:
+    path = SHIPPED.get(text, text)
+    if not all(path.partition(':')[::2]):
         raise BadInputError(
             f'hardware is {text!r}: expected MODULE:NAME of what makes the hardware of a joint, '
             f'as in hardware:=my_lab:Coil, or {", ".join(SHIPPED)}')
-    if os.getcwd() not in sys.path:
-        # The script of a command has its own folder there instead.
-        sys.path.append(os.getcwd())
     try:
-        make = getattr(import_module(module), name)
+        make = imported(path)
     except BaseException as error:  # whatever a laboratory's module raises, sys.exit too
         raise BadInputError(
             f'hardware {text!r} cannot be loaded ({told(error)}): expected a module that Python '

@@ -9,12 +9,13 @@ from collections import deque
 from collections.abc import Callable
 import sys
 from threading import Condition, Event, Thread
-from time import monotonic, monotonic_ns
+from time import monotonic, monotonic_ns, time_ns
 from typing import NamedTuple, TypeVar
 
-from hmsa_ros.device.driven import HardwareDevice
-from hmsa_ros.device.hardware import told
+from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
+from hmsa_ros.device.hardware import Calls, Hardware, told
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
+from hmsa_ros.device.watchdog import Fallback
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.timekeeping import StepWatch
@@ -29,6 +30,8 @@ _PAUSE, _LONGEST_PAUSE, _LAST_ATTEMPTS = 0.05, 1.0, 0.7
 # In s, of an end with a call that does not return: waiting for it, for each call past it, and
 # for all that follows.
 _PATIENCE, _PAST, _HANGING = 0.8, 0.4, 2.5
+# Longest start of a lone coil, in s.
+_START = 10.0
 _MEND = 'mend it, then start the driver again'
 
 
@@ -299,6 +302,24 @@ class HardwareWorker:
                 if len(done) == len(device.instruments) and all(done.values()) else
                 'the coil could NOT be switched off and may be on; cut the power of the '
                 'amplifier'))
+
+
+def lone_worker(
+        make: Callable[[], Hardware], limit: float, rate: float, silence: float) -> HardwareWorker:
+    """
+    Return a started worker of one coil, which is off after a silence in s.
+
+    The limit is in T, and the rate, at which the hardware is looked after, in Hz. Hardware that
+    does not start is a `HmsaError`.
+    """
+    worker = HardwareWorker(lambda: HardwareDevice(
+        [HardwareJoint(make(), limit, Fallback(silence, 'zero'))], time=time_ns(),
+        period=round(NANOSECONDS / rate), calls=Calls(1.0)), time_ns)
+    if not worker.started(_START):
+        raise HmsaError(
+            f'the hardware has not started within {_START:g} s, or its first write not returned: '
+            'expected one that does')
+    return worker
 
 
 def _emptied(queue: deque[T]) -> list[T]:
