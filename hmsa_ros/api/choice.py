@@ -7,14 +7,13 @@ import math
 import numpy as np
 
 from hmsa_ros.api.actuator import Actuator
+from hmsa_ros.api.arguments import DEFAULTS
 from hmsa_ros.api.plan import Plan
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.known import Known
 
 #: Shapers that are compared, the quickest first.
 CANDIDATES = ('two_step', 'zvd', 'robust', 'minimax', 'smooth')
-# What `Actuator.scaled` takes, of what is identified.
-_SCALED = ('shear_modulus', 'damping_coefficient', 'chain_limit', 'remanence', 'density')
 _DRAWS = 24
 # Share of the draws that leave at most the vibration given.
 _MOST = 0.95
@@ -59,7 +58,7 @@ def compare_shapers(
         In the order of `CANDIDATES`.
 
     """
-    places = [i for i, x in enumerate(known.names) if x in _SCALED and known.values]
+    places = [i for i, x in enumerate(known.names) if x in DEFAULTS and known.values]
     drawn = np.random.default_rng(seed).multivariate_normal(
         np.zeros(len(places)), known.covariance[np.ix_(places, places)], _DRAWS)
     truths = [

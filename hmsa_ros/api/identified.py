@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from hmsa_ros.api.actuator import Actuator
 from hmsa_ros.api.arguments import columns_of
 from hmsa_ros.api.motion import Motion
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.files import write_text
-from hmsa_ros.identification.files import Belief, file_text, read_belief
+from hmsa_ros.identification.files import Belief, belief_in, file_text
 from hmsa_ros.identification.identify import identify as find
 from hmsa_ros.identification.known import Known
 from hmsa_ros.identification.quantities import free_of
@@ -183,7 +182,6 @@ def identify(
         result, Belief(result.actuator, others, base.parameters, Known()),
         recording.label, datetime.now().astimezone())
     # The file is the one place that has all of it under the names of the nodes.
-    settings = yaml.safe_load(text)['/**']['ros__parameters']
+    belief = belief_in(text)
     return Identified(result, Actuator.from_parameters(
-        settings, read_belief(None, [('', x, y) for x, y in settings.items()])
-        if result.verdict == 'identified' else None), text)
+        belief.settings, belief if result.verdict == 'identified' else None), text)

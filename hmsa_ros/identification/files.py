@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import yaml_text
@@ -218,6 +219,12 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
     lines += known_lines(Known(
         found.names, tuple(float(found.values[x]) for x in found.names), found.covariance))
     return '\n'.join(lines) + '\n'
+
+
+def belief_in(text: str) -> Belief:
+    """Return what a text of `file_text` says."""
+    settings = yaml.safe_load(text)['/**']['ros__parameters']
+    return read_belief(None, [('', x, y) for x, y in settings.items()])
 
 
 def known_lines(known: Known, joint: str = '') -> list[str]:

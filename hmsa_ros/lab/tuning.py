@@ -11,14 +11,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-import yaml
-
 from hmsa_ros.api.actuator import Actuator
 from hmsa_ros.api.choice import choose, compare_shapers, Expected
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.files import write_text, yaml_text
 from hmsa_ros.identification.excitation import Bounds, excite
-from hmsa_ros.identification.files import Belief, file_text, read_belief
+from hmsa_ros.identification.files import Belief, belief_in, file_text, read_belief
 from hmsa_ros.identification.identify import identify
 from hmsa_ros.identification.known import PREFIX
 from hmsa_ros.identification.quantities import free_of
@@ -131,24 +129,24 @@ def tune(tuning: Tuning, environment: Mapping[str, str], progress: Tell) -> Tune
     before = _moves(tuning, 'before', {}, environment, progress)
     progress('designing the excitation', 0.0)
     levels = _excitation(tuning, belief, before)
-    excited = _conducted(tuning, Experiment(
+    excited = _conducted(Experiment(
         tuning.folder / 'excitation', (), tuning.nodes({}), tuning.namespace, levels=levels),
-        environment, progress, 'excitation')
+        environment, progress)
     progress('identifying', 0.0)
     found = _identified(tuning, belief, excited)
     if found.verdict != 'identified' and not (tuning.accept and found.acceptable):
         return Tuned(before, found)
     progress('comparing shapers', 0.0)
-    settings = _settings(file_text(found, belief, str(excited), datetime.now().astimezone()))
+    now = datetime.now().astimezone()
+    learnt = belief_in(file_text(found, belief, str(excited), now))
     shapers = compare_shapers(
-        Actuator.from_parameters(settings), [(x[0], span) for x, span in tuning.setpoints],
-        read_belief(None, [('', x, y) for x, y in settings.items()]).known)
+        Actuator.from_parameters(learnt.settings),
+        [(x[0], span) for x, span in tuning.setpoints], learnt.known)
     shaper = choose(shapers, _QUIET).shaper
-    text = file_text(
-        found, replace(belief, settings={**belief.settings, 'shaper': shaper}),
-        str(excited), datetime.now().astimezone())
-    write_text(tuning.out, text)
-    settings = _settings(text)
+    settings = {**learnt.settings, 'shaper': shaper}
+    write_text(tuning.out, file_text(
+        found, replace(belief, settings={**belief.settings, 'shaper': shaper}), str(excited),
+        now))
     if not tuning.nodes({}):
         _apply(tuning, settings)
     after = _moves(tuning, 'after', settings, environment, progress)
@@ -157,7 +155,7 @@ def tune(tuning: Tuning, environment: Mapping[str, str], progress: Tell) -> Tune
 
 def known_to(namespace: str) -> Entries:
     """
-    Return what the running planner knows of the one actuator that it has, as in a parameter file.
+    Return the parameters of the only actuator of the running planner, as in a parameter file.
 
     Raises
     ------
@@ -186,17 +184,12 @@ def _of_planner(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {x: y for x, y in settings.items() if x in own}
 
 
-def _settings(text: str) -> dict[str, Any]:
-    found: dict[str, Any] = yaml.safe_load(text)['/**']['ros__parameters']
-    return found
-
-
 def _conducted(
-        tuning: Tuning, experiment: Experiment, environment: Mapping[str, str], progress: Tell,
-        what: str) -> Path:
-    """Carry out an experiment in its folder; return its bag."""
+        experiment: Experiment, environment: Mapping[str, str], progress: Tell) -> Path:
+    """Carry out an experiment in its folder, which names it; return its bag."""
     prepare(experiment.folder)
-    done = conduct(experiment, environment, lambda text, share: progress(f'{what}: {text}', share))
+    done = conduct(experiment, environment, lambda text, share: progress(
+        f'{experiment.folder.name}: {text}', share))
     if not done.measured:
         raise HmsaError(
             'no node publishes joint_states: expected a plant, or a driver with a sensor')
@@ -210,12 +203,10 @@ def _moves(
         tuning: Tuning, name: str, settings: Mapping[str, object],
         environment: Mapping[str, str], progress: Tell) -> Part:
     """Make the moves; return what was measured of them."""
-    bag = _conducted(tuning, Experiment(
+    bag = _conducted(Experiment(
         tuning.folder / name, tuning.setpoints, tuning.nodes(_of_planner(settings)),
-        tuning.namespace),
-        environment, progress, name)
-    run = replace(read_run(bag), label=name)
-    return Part.of(run)
+        tuning.namespace), environment, progress)
+    return Part.of(replace(read_run(bag), label=name))
 
 
 def _excitation(
