@@ -1,4 +1,10 @@
-"""``hmsa calibrate``: what a bench is made of, measured step by step."""
+"""
+Calibrate the coil of a bench.
+
+Calibrate a part of a bench, and write what the driver reads.
+
+example: hmsa calibrate coil readings.csv --out coil.yaml
+"""
 
 import argparse
 import math
@@ -6,7 +12,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.check_driver import setting
-from hmsa_ros.cli.options import add_options, JSON
+from hmsa_ros.cli.options import add_command, add_options, JSON
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.quantities import number_of
 from hmsa_ros.errors import BadInputError, HmsaError
@@ -24,19 +30,9 @@ _READINGS = 20
 
 def add_parser(subparsers: Any) -> None:
     """Add the command and its kinds."""
-    parser = subparsers.add_parser(
-        'calibrate', help='calibrate the coil of a bench',
-        description='Calibrate a part of a bench, and write what the driver reads.',
-        epilog='example: hmsa calibrate coil readings.csv --out coil.yaml')
+    parser = add_command(subparsers, __name__, __doc__)
     kinds = parser.add_subparsers(metavar='PART', required=True)
-    coil = kinds.add_parser(
-        'coil', help='flux density over current, against a field probe',
-        description='Take the coil through a loop of levels, from 0 to --limit, to its negative '
-                    'and back, and read a field probe at each: an object of Python, or a person '
-                    'who types the readings. Or evaluate readings in a CSV. Prints the coil '
-                    'constant with its 95 % interval, saturation and hysteresis, and writes the '
-                    'settings of the driver. The coil is off at the end, and after Ctrl-C.',
-        epilog='example: hmsa calibrate coil my_lab:Coil --limit 0.1 --out coil.yaml')
+    coil = add_command(kinds, 'coil', _coil.__doc__)
     coil.set_defaults(run=_coil, parser=coil)
     coil.add_argument(
         'source', metavar='MODULE:NAME|CSV',
@@ -66,7 +62,16 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _coil(arguments: argparse.Namespace) -> int:
-    """Measure, or read, and evaluate; refuse what cannot be used with `BadInputError`."""
+    """
+    Flux density over current, against a field probe.
+
+    Take the coil through a loop of levels, from 0 to --limit, to its negative and back, and read a
+    field probe at each: an object of Python, or a person who types the readings. Or evaluate
+    readings in a CSV. Prints the coil constant with its 95 % interval, saturation and hysteresis,
+    and writes the settings of the driver. The coil is off at the end, and after Ctrl-C.
+
+    example: hmsa calibrate coil my_lab:Coil --limit 0.1 --out coil.yaml
+    """
     from hmsa_ros.device.calibration import calibrate_coil
 
     check_targets([] if arguments.out is None else [arguments.out])
