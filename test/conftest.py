@@ -364,7 +364,7 @@ class RosSide:
         """
         Return a publisher that already has so many subscribers.
 
-        A node that `Served` runs knows of the publisher then: what it sends from here on arrives.
+        A node that `Served` runs has discovered the publisher then: what it sends arrives.
         """
         message_type, qos = bound(message_type, qos)
         before = {x: x.get_publisher_count() for x in Served.subscriptions()}

@@ -21,7 +21,7 @@ from hmsa_ros.planning.timeline import Model
 
 # Other parameters are to leave less by this share of the step.
 _LEAST = 3e-4
-# Share of the step up to which they change little, unless those in use are the ones given.
+# Share of the step up to which a change is little; none is where the given ones are in use.
 _LITTLE = 0.015
 # Smaller steps are tried as this one.
 _STEP = 0.15

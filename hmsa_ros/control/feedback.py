@@ -216,7 +216,7 @@ class Feedback:
 
     def update(self, now: int) -> bool:
         """
-        Take samples into account that have come by a time in ns, and tell what they say.
+        Process the samples that have come by a time in ns, and publish the estimate.
 
         Returned is whether that has taken a while.
         """
@@ -266,7 +266,7 @@ class Feedback:
             return None
         if found is None:
             return None
-        # Of a branch that is only suspected plans know nothing.
+        # Plans ignore a branch that is only suspected.
         return found.stretch, found.rate, (
             followed(found.values, found.stretch) if found.actuator.creep else ())
 

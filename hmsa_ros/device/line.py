@@ -61,7 +61,7 @@ class OnLine:
     """
     What speaks over a line that is opened when it is used, and again once it was lost.
 
-    A class has the ``error`` that tells of a lost line, the longest time in s of a read and of a
+    A class has the ``error`` that reports a lost line, the longest time in s of a read and of a
     write as ``times``, and ``simulate``, which makes a simulated instrument as of `open_line`.
     """
 
