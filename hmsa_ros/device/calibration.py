@@ -254,6 +254,11 @@ def held_coil(
     joint : str
         Name it is called with.
 
+    Yields
+    ------
+    HeldCoil
+        In force.
+
     Raises
     ------
     BadInputError
