@@ -114,13 +114,15 @@ def test_a_driver_switches_the_coil_off_after_a_silence():
     assert bench.writes[-1] == (START + 5001 * MS, 0.0)
 
 
-def test_a_driver_ramps_down_where_that_is_wanted():
+@pytest.mark.parametrize('late', [0, 300_000])
+def test_a_driver_ramps_down_where_that_is_wanted(late):
     bench, device = driver(fallback=Fallback(0.01, 'ramp', 10.0))
     device.receive(0, 0, 0.05)
     now = START
     device.advance(now)
     while device.due is not None:
-        now = device.due
+        # Its thread wakes up late.
+        now = device.due + late
         device.advance(now)
     assert [x for _, x in bench.writes[1:]] == pytest.approx(
         [0.05, 0.04, 0.03, 0.02, 0.01, 0.0], abs=1e-12)

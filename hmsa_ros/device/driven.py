@@ -90,7 +90,7 @@ class HardwareDevice(Device):
     @property
     def due(self) -> int | None:
         """When to advance it next, in ns; None for not before a command comes."""
-        times = [self.next_level, *(x.due(self._time) for x in self._watchdogs),
+        times = [self.next_level, *(x.due for x in self._watchdogs),
                  *(x.due(self._time) for x in self._coils)]
         if self._period:
             times.append(self._next_sample)

@@ -60,7 +60,9 @@ class Watchdog:
         self._fallback = fallback
         self._timeout = round(fallback.timeout * NANOSECONDS)
         self._last: int | None = None
+        # When it began, from which level, and how many of its levels were given.
         self._ramp: tuple[int, float] | None = None
+        self._steps = 0
         self.tripped = False
         self.trips = 0
 
@@ -89,18 +91,21 @@ class Watchdog:
             if self._fallback.safe_flux == 'zero':
                 yield now, 0.0
             elif self._fallback.safe_flux == 'ramp':
-                self._ramp = now, level
+                self.ramp_down(now, level)
         if self._ramp is None:
             return
         begin, level = self._ramp
-        for step in range(-(-(now - begin) // _RAMP_STEP_NS),
-                          (until - begin) // _RAMP_STEP_NS + 1):
-            passed = step * _RAMP_STEP_NS
+        while (passed := self._steps * _RAMP_STEP_NS) <= until - begin:
+            self._steps += 1
             left = abs(level) - self._fallback.ramp_rate * passed / NANOSECONDS
             yield begin + passed, math.copysign(max(left, 0.0), level)
             if left <= 0.0:
                 self._ramp = None
                 return
+
+    def ramp_down(self, now: int, level: float) -> None:
+        """Begin to ramp a level in T to zero at a time in ns."""
+        self._ramp, self._steps = (now, level), 0
 
     def _trips(self, now: int) -> bool:
         if self._last is None or self.tripped or self._timeout == 0:
@@ -112,10 +117,11 @@ class Watchdog:
         self.trips += 1
         return True
 
-    def due(self, now: int) -> int | None:
-        """Return when to `watch` next, in ns; None if there is nothing to watch."""
+    @property
+    def due(self) -> int | None:
+        """When to `watch` next, in ns; None if there is nothing to watch."""
         if self._ramp is not None:
-            return now + _RAMP_STEP_NS
+            return self._ramp[0] + self._steps * _RAMP_STEP_NS
         if self._last is None or self.tripped or self._timeout == 0:
             return None
         return self._last + self._timeout + 1
