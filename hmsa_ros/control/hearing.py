@@ -1,6 +1,6 @@
 """Whether plant or driver hear the planner, what their clocks say, and coils that were cut off."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 import math
 
 from hmsa_ros.control.following import Following
@@ -24,8 +24,9 @@ class Hearing:
 
     `found` returns whether a joint has a device that reports. ``fresh`` are the joints whose
     device has come after the last level, and has heard none. ``cut`` are those whose device
-    refuses commands of before a cut-off, and ``until`` how long to wait for it to obey, in ns by
-    the steady clock.
+    refuses commands of before a cut-off, ``open`` those whose interlock is, and ``locked`` those
+    that obey nothing but 0 T after that. ``until`` is how long to wait for a device to obey, in
+    ns by the steady clock.
     """
 
     def __init__(
@@ -40,6 +41,8 @@ class Hearing:
         self._reporters: dict[str, frozenset[bytes]] = {}
         self.fresh: set[str] = set()
         self.cut: set[str] = set()
+        self.locked: set[str] = set()
+        self.open: set[str] = set()
         self.until: int | None = None
         self._acknowledged: dict[str, int] = {}
         self._warned = False
@@ -99,24 +102,46 @@ class Hearing:
             'sent: what it has not heard is dropped')
         return verdict if planned else None
 
-    def cut_off(self, joint: str, settings: Settings, *, in_force: bool) -> Verdict | None:
+    def cut_off(
+            self, joint: str, settings: Settings, *, in_force: bool,
+            locked: bool) -> Verdict | None:
         """Take in whether the coil of a joint was cut off; return the verdict on its plan."""
+        known = joint in (self.open if locked else self.cut)
+        self.open.discard(joint)
         if not in_force:
             self.cut.discard(joint)
+            self.locked.discard(joint)
             return None
-        if joint in self.cut or joint not in self._group.planners:
+        if locked:
+            self.open.add(joint)
+            self.locked.add(joint)
+        if known or joint not in self._group.planners:
             return None
         self.cut.add(joint)
         if not self._takeover.engaged:
             return None
-        if settings.after_cut_off == 'resume':
+        if settings.after_cut_off == 'resume' and not locked:
             self._takeover.doubt(joint)
             self._following.astray.add(joint)
             return None
         self._group.planners[joint].abandon(self._clock())
         return self._dropped(
+            joint, Code.INTERLOCK, f'{self.interlock(joint)}: the rest of the sequence is dropped',
+        ) if locked else self._dropped(
             joint, Code.CUT_OFF, f'the coil of joint {joint} was cut off by the plant or driver: '
             'the rest of the sequence is dropped')
+
+    def interlock(self, joint: str) -> RefusedError:
+        """Return why nothing is done with a joint that is locked."""
+        return RefusedError(
+            Code.INTERLOCK, f'the interlock of the driver of joint {joint} is open and its coil '
+            'off; close it (~/interlock of the driver), then send a new request')
+
+    def check_interlock(self, joints: Iterable[str]) -> None:
+        """Raise `RefusedError` if one of some joints is locked."""
+        for joint in joints:
+            if joint in self.open:
+                raise self.interlock(joint)
 
     def _dropped(self, joint: str, code: Code, words: str) -> Verdict:
         """Plan from a sample next, since a plan was dropped; return the verdict."""
@@ -130,7 +155,9 @@ class Hearing:
         """Return whether to tell a device that its cut-off is known: seldom, if it is off."""
         steady = self._steady()
         level = self._following.newest.get(joint)
-        if level is None or level[1] != 0.0 or (
+        off = joint not in self.open if joint in self.locked else (
+            level is not None and level[1] == 0.0)
+        if not off or (
                 steady - self._acknowledged.get(joint, -_AGAIN) < _AGAIN):
             return False
         self._acknowledged[joint] = steady

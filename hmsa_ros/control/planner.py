@@ -26,6 +26,7 @@ from hmsa_ros.control.records import (
     Settings,
     Severity,
     Stop,
+    Target,
     Trajectory,
     Verdict,
 )
@@ -119,14 +120,14 @@ class PlannerRuntime:
             if not isinstance(request, Stop):
                 if self.crowded is not None:
                     raise self.crowded
+                self.hearing.check_interlock(_joints_of(request))
                 self.hearing.check_clocks()
         except RefusedError as error:
             return self.planning.refuse(error, request)
         self._begin_anew()
         self._check(request)
         if not isinstance(request, Stop):
-            self.following.asked(
-                request.joints if isinstance(request, Trajectory) else [request.joint])
+            self.following.asked(_joints_of(request))
         work = self.planning.add(request, engaged=self._takeover.engaged)
         self._engage(begin=True)
         sure = self._work_on()
@@ -143,7 +144,7 @@ class PlannerRuntime:
         self.hearing.until = None
         if isinstance(request, Stop) or not self._takeover.engaged:
             return
-        names = request.joints if isinstance(request, Trajectory) else (request.joint,)
+        names = _joints_of(request)
         later = isinstance(request, Trajectory) and request.stamp is not None
         now = self._clock()
         self._look_at_samples()
@@ -160,19 +161,25 @@ class PlannerRuntime:
         return self._silence.words
 
     def received(
-            self, joint: str, time: int, command: int, *, cut_off: bool) -> None:
+            self, joint: str, time: int, command: int, *, cut_off: bool,
+            locked: bool = False) -> None:
         """
         Take in a receipt: by its time in ns a device has received a command of a stamp.
 
-        A device that was cut off refuses commands of before.
+        A device that was cut off refuses commands of before, and one that is locked by an
+        interlock all.
         """
         self.following.seen(time)
         self._drop(self.hearing.received(joint, time, command, comparable=not self.one_clock()))
-        self.cut_off(joint, in_force=cut_off)
+        self.cut_off(joint, in_force=cut_off or locked, locked=locked)
 
-    def cut_off(self, joint: str, *, in_force: bool) -> None:
-        """Take in whether a joint's device was cut off and refuses commands of before."""
-        self._drop(self.hearing.cut_off(joint, self.settings, in_force=in_force))
+    def cut_off(self, joint: str, *, in_force: bool, locked: bool = False) -> None:
+        """Take in whether a joint's device was cut off, or is locked, and refuses commands."""
+        if locked and joint not in self.hearing.open:
+            self.planning.refuse_all(self.hearing.interlock(joint))
+            self.planning.clear()
+        self._drop(self.hearing.cut_off(
+            joint, self.settings, in_force=in_force, locked=locked))
         if in_force and self.active and self.hearing.may_acknowledge(joint):
             self.sending.acknowledge(joint, self._clock())
 
@@ -482,3 +489,8 @@ class PlannerRuntime:
             'heartbeats': self.sending.heartbeats,
             'largest_lateness_ms': f'{late.largest / 1e6:.3f}',
             'refused': self.planning.refused, 'clock_jumps': self.clock_jumps, **values}
+
+
+def _joints_of(request: Target | Trajectory) -> tuple[str, ...]:
+    """Return which joints a request is for."""
+    return request.joints if isinstance(request, Trajectory) else (request.joint,)

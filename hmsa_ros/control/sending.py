@@ -37,10 +37,10 @@ class Sending:
         self._hearing.receipts.sent(name, stamp, now)
 
     def acknowledge(self, name: str, now: int) -> None:
-        """Send the level in force to a device that refuses others after a cut-off."""
+        """Send that its coil is off to a device that refuses other levels after a cut-off."""
         planner = self._group.planners[name]
         self._hand_out(
-            name, planner.soonest(now), self._following.newest[name][1], now)
+            name, planner.soonest(now), 0.0, now)
 
     def beat(self, now: int) -> None:
         """Send levels in force again: who listens learns that somebody is there."""

@@ -51,6 +51,7 @@ class Coil:
         self.tolerance = self.instrument.tolerance(self.limit)
         self.heard: int | None = None  # when, in ns, since the watchdog was last looked at
         self.repeat = False  # whether a sign of life is to be passed on
+        self.armed = False
         self.asked = self.level = math.nan
         self.saturated = self.lost = 0
         self._history: deque[tuple[int, float]] = deque(maxlen=_REMEMBERED)
@@ -62,6 +63,7 @@ class Coil:
     def clear(self) -> None:
         """Forget what is ahead: the level is to be 0."""
         self.schedule = CommandSchedule(0.0)
+        self.wanted = False  # whether it was to be on since then
         # What the device keeps, and what of it is due and not yet said to be applied.
         self._handed: deque[tuple[int, float]] = deque()
         self._awaited: deque[tuple[int, float]] = deque()
@@ -215,6 +217,20 @@ class Coil:
         self._awaited.clear()
         if self.instrument.keeps_levels:
             self._changed = self.schedule.next_stamp
+
+    def disarm(self) -> None:
+        """
+        Have the device disarmed, if it is armed.
+
+        Raises
+        ------
+        HardwareError
+            If it fails.
+
+        """
+        armed, self.armed = self.armed, False
+        if armed:
+            self.instrument.disarm()
 
     # -- the device's clock --------------------------------------------------------------------
 

@@ -1,6 +1,7 @@
 """Real hardware as a device: levels written at their stamps, a watchdog, and samples."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 import math
 from time import time_ns
@@ -131,7 +132,7 @@ class HardwareDevice(Device):
 
     def check(self, joint: int, stamp: int, level: float) -> None:
         """
-        Refuse a level in T that is beyond the limit, or a stamp in ns of another clock.
+        Refuse a level in T beyond the limit, a stamp in ns of another clock, and any while locked.
 
         Raises
         ------
@@ -142,6 +143,9 @@ class HardwareDevice(Device):
         limit = self._coils[joint].limit
         if not abs(level) <= limit:  # not a number is refused, too
             raise BadInputError(f'flux density is {level:g} T: expected at most {limit:g} T')
+        if self.locked:
+            raise BadInputError(
+                f'the interlock is open ({self.locked}): close it, then send a new request')
         self._check_clock(stamp)
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
@@ -151,7 +155,7 @@ class HardwareDevice(Device):
         Raises
         ------
         BadInputError
-            If the level is beyond the limit, or the stamp of another clock.
+            If the level is beyond the limit, the stamp of another clock, or the interlock open.
 
         """
         self.check(joint, stamp, level)
@@ -159,6 +163,7 @@ class HardwareDevice(Device):
         if self._refuses(joint, stamp, level, coil.schedule.current):
             return
         coil.heard = self._time
+        coil.wanted = coil.wanted or abs(level) > coil.tolerance
         changed = coil.insert(stamp, level)
         coil.repeat = coil.repeat or not changed
         late = self._time - stamp
@@ -214,11 +219,16 @@ class HardwareDevice(Device):
 
     def _obey(self, i: int, coil: Coil) -> None:
         """Write what is due, or have the device keep it; raise StateLostError if it has not."""
+        if coil.wanted and not coil.armed:
+            coil.instrument.arm()
+            coil.armed = True
         level = coil.schedule.apply_until(self._time)
         for when, asked, really in coil.pass_to(self._time):
             self._took_effect(i, when, asked, really)
         if level != coil.asked:
             self._write(i, level)
+        if self.locked and coil.asked == 0.0:
+            coil.disarm()
         coil.hand_over(self._time)
         if coil.repeat and self._has_room(coil):
             if coil.instrument.keeps_levels:
@@ -285,7 +295,7 @@ class HardwareDevice(Device):
             'what was commanded is forgotten, send a new request'))
         self._set(i, self._time, 0.0, 0.0)
         coil.clear()
-        coil.repeat = False
+        coil.repeat = coil.armed = False
         self.cut_off(i, self._time)
         try:
             coil.synchronise()
@@ -294,6 +304,40 @@ class HardwareDevice(Device):
             raise HardwareError(
                 f'{coil.instrument.name} lost its state twice in a row') from again
         self._set(i, when, 0.0, level)
+
+    # -- the interlock -------------------------------------------------------------------------
+
+    def lock(self, why: str, time: int) -> None:
+        """
+        Switch all coils off at a time in ns, or ramp them down, and refuse commands from then on.
+
+        Afterwards a joint obeys 0 T first: what was under way does not go on. An empty reason
+        ends it.
+
+        Raises
+        ------
+        HardwareError
+            If a call fails.
+
+        """
+        begins = bool(why) and not self.locked
+        self.locked = why
+        if not begins:
+            return
+        self._pass_to(time)
+        for i, coil in enumerate(self._coils):
+            left = coil.level if self._watchdogs[i].ramps and math.isfinite(coil.level) else 0.0
+            coil.clear()
+            coil.repeat = False
+            self._watchdogs[i].disarm()
+            self._cut_offs[i].begin(time, zero_first=True)
+            if left:
+                self._watchdogs[i].ramp_down(time, left)
+            # That drops what the device keeps, too.
+            try:
+                self._write(i, left)
+            except StateLostError as error:
+                self._lose(i, error)
 
     def _read(self) -> None:
         """Take what is new; readings of several joints with one stamp are one sample."""
@@ -327,10 +371,13 @@ class HardwareDevice(Device):
                 self._write(i, 0.0)
             except StateLostError as error:
                 self._lose(i, error)
+            if coil.instrument.off(coil.level, coil.limit):
+                coil.disarm()
+                return ''
         except HardwareError as error:
+            with suppress(HardwareError):
+                coil.disarm()
             return str(error)
-        if coil.instrument.off(coil.level, coil.limit):
-            return ''
         return f'{coil.instrument.name}.write says that {coil.level:g} T are left'
 
     def open(self) -> None:

@@ -26,7 +26,7 @@ SHIPPED = {
 # What its methods take; all but the first two are optional.
 _TAKES: dict[str, tuple[str, ...]] = {
     'write': ('level', 'now'), 'read': ('now',), 'open': (), 'close': (),
-    'schedule': ('levels',), 'applied': (), 'clock': ()}
+    'schedule': ('levels',), 'applied': (), 'clock': (), 'arm': (), 'disarm': ()}
 OPTIONAL = tuple(_TAKES)[2:]
 # In ns from now, besides the longest call: what cannot be the time of anything that has happened.
 _ABSURD = 10 * NANOSECONDS
@@ -52,6 +52,9 @@ class Hardware(Protocol):
     # replaces all that it has at or after the first stamp (an empty list is a sign of life), at
     # most `capacity` of them at a time; `write` drops what is ahead. With `applied()`, it returns
     # [(stamp, level), ...] that have taken effect since it was last called.
+    #
+    # `arm()` comes before the first level but 0 T, and `disarm()` once the coil is off at the end,
+    # on deactivation, and while an interlock is open.
     #
     # With `clock()`, its own time in ns, all times that it takes and returns are of that clock.
 
@@ -454,6 +457,35 @@ class Instrument:
                 f'{self._names["clock"]} returned {excerpt(answer)}: expected its time in ns')
         return self.clock_map.add(before, int(answer), after)
 
+    def arm(self) -> None:
+        """
+        Have it made ready for levels, where it can.
+
+        Raises
+        ------
+        HardwareError
+            If it fails.
+        StateLostError
+            If the hardware says so.
+
+        """
+        if self.has('arm'):
+            self._call('arm')
+
+    def disarm(self) -> None:
+        """
+        Undo `arm`, where it can.
+
+        Raises
+        ------
+        HardwareError
+            If it fails.
+
+        """
+        if self.has('disarm'):
+            with suppress(StateLostError):
+                self._call('disarm')
+
     def open(self) -> None:
         """Connect again, where it can; an error is passed over, as the next `write` shows."""
         if self.has('open'):
@@ -480,6 +512,9 @@ class Instrument:
             self._written(self._hardware.write(0.0, self._theirs(now)), 0.0, now)
         except BaseException:
             return False
+        finally:
+            with suppress(BaseException):
+                getattr(self._hardware, 'disarm', lambda: None)()
         return True
 
     def drop(self) -> None:

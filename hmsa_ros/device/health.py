@@ -50,6 +50,11 @@ def judge_hardware(trouble: str, *, saturated: int, state_lost: int) -> tuple[in
     return (_WARN, '; '.join(notes)) if notes else (_OK, 'hardware obeys')
 
 
+def judge_interlock(why: str) -> tuple[int, str]:
+    """Return the verdict on an interlock, of why it is open."""
+    return (_ERROR, f'open: {why}') if why else (_OK, 'closed')
+
+
 def listed(names: Sequence[str]) -> str:
     """Return names for a sentence, the first few of many."""
     return ', '.join(names[:4]) + (f' and {len(names) - 4} more' if len(names) > 4 else '')

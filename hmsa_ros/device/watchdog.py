@@ -72,6 +72,11 @@ class Watchdog:
         return self._fallback.safe_flux != 'hold'
 
     @property
+    def ramps(self) -> bool:
+        """Whether the coil is to be ramped down rather than switched off."""
+        return self._fallback.safe_flux == 'ramp'
+
+    @property
     def alarm(self) -> str:
         """What to log when it trips."""
         return (f'no command and no heartbeat for {self._fallback.timeout:g} s: '
@@ -90,7 +95,7 @@ class Watchdog:
         if self._trips(now):
             if self._fallback.safe_flux == 'zero':
                 yield now, 0.0
-            elif self._fallback.safe_flux == 'ramp':
+            elif self.ramps:
                 self.ramp_down(now, level)
         if self._ramp is None:
             return
@@ -151,16 +156,22 @@ class CutOff:
     def __init__(self) -> None:
         self._before: deque[float] = deque(maxlen=_REMEMBERED)
         self._since: int | None = None
+        self._zero_first = False
 
     @property
     def in_force(self) -> bool:
         """Whether levels are refused."""
         return self._since is not None
 
-    def begin(self, now: int) -> None:
-        """Refuse what was commanded before a time in ns, if anything was."""
-        if self._before:
+    def begin(self, now: int, *, zero_first: bool = False) -> None:
+        """
+        Refuse what was commanded before a time in ns, if anything was.
+
+        If zero comes first, anything but 0 T is refused, whatever was commanded before.
+        """
+        if self._before or zero_first:
             self._since = now
+            self._zero_first = self._zero_first or zero_first
 
     def clock_set(self, by: int) -> None:
         """Take in that the clock was set ahead by some ns."""
@@ -169,7 +180,7 @@ class CutOff:
 
     def end(self) -> None:
         """Forget it, and what was commanded."""
-        self._since = None
+        self._since, self._zero_first = None, False
         self._before.clear()
 
     def refusal(self, stamp: int, level: float, now: int, current: float) -> str:
@@ -177,6 +188,11 @@ class CutOff:
         if self._since is None:
             self._remember(level)
             return ''
+        if self._zero_first and (level or current):
+            return (
+                f'{level:g} T, and the interlock was opened '
+                f'{(now - self._since) / NANOSECONDS:.3f} s ago: expected 0 T first, with the '
+                'coil off')
         off = f'the coil was cut off {(now - self._since) / NANOSECONDS:.3f} s ago'
         if stamp and stamp < max(now, self._since):
             self._remember(level)
@@ -208,6 +224,8 @@ class Device(ABC):
         self._changes: list[Change] = []
         self._samples: list[Sample] = []
         self._notices: list[Notice] = []
+        #: Why no command is obeyed; empty where they are.
+        self.locked = ''
 
     @property
     @abstractmethod

@@ -64,12 +64,13 @@ class HardwareWorker:
         self._ready = Event()
         self._ended = False
         self._saver: Thread | None = None
-        self._commands: deque[_Command | None] = deque()
+        # Levels, reasons of an interlock, and None to switch off.
+        self._commands: deque[_Command | str | None] = deque()
         self._changes: deque[Change] = deque()
         self._samples: deque[Sample] = deque()
         self._notices: deque[Notice] = deque()
         self.failure: HmsaError | None = None
-        self.trouble = ''
+        self.trouble = self._locked = ''
         sys.setswitchinterval(_WATCHED / NANOSECONDS)
         self._thread = Thread(target=self._work, name='hardware', daemon=True)
         self._thread.start()
@@ -131,7 +132,18 @@ class HardwareWorker:
         """Have all coils switched off, with nothing ahead."""
         self._put(None)
 
-    def _put(self, command: _Command | None) -> None:
+    @property
+    def locked(self) -> str:
+        """Why no command is obeyed; empty where they are."""
+        return self._locked
+
+    def lock(self, why: str) -> None:
+        """Have coils off and commands refused while there is a reason; an empty one ends it."""
+        if why != self._locked:
+            self._locked = why
+            self._put(why)
+
+    def _put(self, command: _Command | str | None) -> None:
         self._commands.append(command)
         with self._turn:
             self._turn.notify()
@@ -208,7 +220,9 @@ class HardwareWorker:
         """Take what has come, with the time at which it came: calls may have blocked since."""
         while self._commands:
             command = self._commands.popleft()
-            if command is not None:
+            if isinstance(command, str):
+                self.device.lock(command, self._clock())
+            elif command is not None:
                 try:
                     self.device.hear(*command[:3], self._clock() - self._steady() + command.came)
                 except BadInputError as error:

@@ -113,10 +113,17 @@ FLUX_DENSITY_RECEIVED = Topic(
     'A receipt for a command, and a heartbeat five times a second: `header.stamp` is when the '
     'newest command arrived, or the current time, in the clock of the sender; `time_ref` is the '
     'timestamp of that command (0 before the first), `source` the joint. `frame_id` is `cut_off` '
-    'while commands from before a cut-off of the coil are rejected. The planner uses it to check '
+    'while commands from before a cut-off of the coil are rejected, and `interlock` while the '
+    'interlock is open. The planner uses it to check '
     'that commands arrive, and to measure the offset of the clocks. Optional for a driver of your '
     'own.',
     publishers=(PLANT, DRIVER), subscribers=(PLANNER,))
+INTERLOCK = Topic(
+    '~/interlock', 'std_msgs/msg/Bool', RELIABLE,
+    'An interlock, as of a door or an emergency stop: `true` closes it, `false` opens it. While '
+    'it is open, the coil is off, and all commands and requests are rejected. It is closed once '
+    'all publishers have closed it. Publish it reliably, and repeat it.',
+    subscribers=(DRIVER,))
 DISTURBANCE_FORCE = Topic(
     'disturbance_force', 'geometry_msgs/msg/WrenchStamped', RELIABLE,
     'An unplanned force on the simulated actuator: from its timestamp on (0: immediately) until '

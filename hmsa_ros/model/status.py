@@ -43,6 +43,7 @@ class Code(str, Enum):
     CLOCKS_DIFFER = 'clocks_differ'
     UNSEEN = 'unseen'
     CUT_OFF = 'cut_off'
+    INTERLOCK = 'interlock'
 
     NONE = 'none'
     WAITING = 'waiting'

@@ -81,7 +81,8 @@ class JointChannel:
         self._runtime.received(
             self._joint, conversions.from_time(message.header.stamp),
             conversions.from_time(message.time_ref),
-            cut_off=message.header.frame_id == conversions.CUT_OFF)
+            cut_off=message.header.frame_id == conversions.CUT_OFF,
+            locked=message.header.frame_id == conversions.INTERLOCK)
         if message.header.frame_id:
             self._serve()
 

@@ -79,9 +79,10 @@ class LinkedPlanner(PlannerNode):
         for name, *values in _each(joints, sample):
             self._runtime.observed(name, sample.time, *values)
 
-    def take_cut_off(self, joint: str, *, in_force: bool) -> None:
-        """Take in whether the coil of a joint was cut off."""
-        self._runtime.cut_off(joint, in_force=in_force)
+    def take_refusal(self, joint: str, refuses: str) -> None:
+        """Take in what keeps commands of a joint from being obeyed, as in a receipt."""
+        self._runtime.cut_off(
+            joint, in_force=bool(refuses), locked=refuses == conversions.INTERLOCK)
 
     def _glance(self) -> Iterator[tuple[str, Seen]]:
         if self._seen is not None:
@@ -157,9 +158,8 @@ class Linked(DeviceNode):
         if self._joints:
             self._hear()
             self._publish_news()
-            cut_off = self.device.cut_offs
-            for number, joint in enumerate(self._joints):
-                self._planner.take_cut_off(joint.name, in_force=number in cut_off)
+            for joint in self._joints:
+                self._planner.take_refusal(joint.name, joint.refuses)
         self._planner.serve(lambda: self.cycles.left > _ENOUGH)
         self.cycles.note_rest()
 

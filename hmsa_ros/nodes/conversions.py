@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from hmsa_ros.control.records import StatusChanged
 
 #: What a receipt says while commands of before a cut-off are refused.
-CUT_OFF = 'cut_off'
+CUT_OFF, INTERLOCK = 'cut_off', 'interlock'
 
 
 def to_time(nanoseconds: int) -> Time:
@@ -68,10 +68,14 @@ def from_command(message: MagneticField) -> tuple[int, float]:
     return stamp, float(field.z)
 
 
-def to_receipt(joint: str, time: int, command: int, *, cut_off: bool) -> TimeReference:
-    """Return that the newest command of a joint is one of a stamp, at a time; both in ns."""
+def to_receipt(joint: str, time: int, command: int, refuses: str) -> TimeReference:
+    """
+    Return that the newest command of a joint is one of a stamp, at a time; both in ns.
+
+    It may refuse commands because of `CUT_OFF` or `INTERLOCK`.
+    """
     return TimeReference(
-        header=Header(stamp=to_time(time), frame_id=CUT_OFF if cut_off else ''),
+        header=Header(stamp=to_time(time), frame_id=refuses),
         time_ref=to_time(command), source=joint)
 
 

@@ -49,6 +49,12 @@ class Allegiance:
         return False
 
 
+def publishers_of(node: Node, topic: topics.Topic) -> dict[bytes, tuple[str, str]]:
+    """Return name and namespace of a topic's publishers by identifier, as in the graph."""
+    return {bytes(x.endpoint_gid): (x.node_name, x.node_namespace)
+            for x in node.get_publishers_info_by_topic(node.resolve_topic_name(topic.name))}
+
+
 class CommandInput:
     """
     Commands for one actuator from ``'any'`` or only the ``'first'`` publisher.
@@ -87,9 +93,7 @@ class CommandInput:
 
     def _publishers(self) -> dict[bytes, tuple[str, str]]:
         """Return name and namespace of the topic's publishers by identifier, as in the graph."""
-        name = self._node.resolve_topic_name(self._topic.name)
-        return {bytes(x.endpoint_gid): (x.node_name, x.node_namespace)
-                for x in self._node.get_publishers_info_by_topic(name)}
+        return publishers_of(self._node, self._topic)
 
     def poll(self) -> None:
         """Take what has arrived, where the node's executor does not."""
@@ -168,6 +172,8 @@ PUBLISH_SCALARS = ParameterSpec(
 COMMON = (JOINT, JOINTS, COMMAND_SOURCE, PUBLISH_SCALARS)
 #: How often the time is looked at.
 TICK_SECONDS = 0.001
+# What a refused command leaves in force, and what while an interlock is open.
+_STAYS = ('the previous one stays in force', 'the coil is off')
 # Receipts of a joint, in ns: apart at least where commands come, and at most where none do.
 _RECEIPTS, _SIGNS_OF_LIFE = 20_000_000, 200_000_000
 
@@ -216,8 +222,15 @@ class DeviceJoint:
             return
         self._received.publish(conversions.to_receipt(
             self.name, self._came or self._node.now(), self._newest,
-            cut_off=self._number in self._device.cut_offs))
+            self.refuses))
         self._came, self._told = 0, steady
+
+    @property
+    def refuses(self) -> str:
+        """What keeps commands from being obeyed, as in a receipt."""
+        if self._device.locked:
+            return conversions.INTERLOCK
+        return conversions.CUT_OFF if self._number in self._device.cut_offs else ''
 
     def log(self, notice: Notice) -> None:
         """Count and log what the device has noticed."""
@@ -262,7 +275,7 @@ class DeviceJoint:
         self.refused += 1
         if self._tell_refused():
             self._node.get_logger().error(
-                f'{self._of_me}command refused, the previous one stays in force: {why}')
+                f'{self._of_me}command refused, {_STAYS[bool(self._device.locked)]}: {why}')
 
     def crowded(self) -> bool:
         """Return whether several publishers command this joint, and log it once."""

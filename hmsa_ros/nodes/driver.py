@@ -3,23 +3,33 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
-from time import time_ns
+from time import monotonic_ns, time_ns
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import ParameterDescriptor
+from std_msgs.msg import Bool
 
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.hardware import Calls, load, OPTIONAL
-from hmsa_ros.device.health import judge_hardware, listed
+from hmsa_ros.device.health import judge_hardware, judge_interlock, listed
+from hmsa_ros.device.interlock import Interlock
 from hmsa_ros.device.worker import HardwareWorker
 from hmsa_ros.ending import Deadline, ENDING
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.parameters import ParameterSpec, PUBLISH_RATE
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.nodes import conversions
-from hmsa_ros.nodes.device_node import COMMON, DeviceJoint, DeviceNode, FALLBACK, fallback_from
+from hmsa_ros.nodes import conversions, endpoints
+from hmsa_ros.nodes.capture import decode
+from hmsa_ros.nodes.device_node import (
+    COMMON,
+    DeviceJoint,
+    DeviceNode,
+    FALLBACK,
+    fallback_from,
+    publishers_of,
+)
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.parameters import declare_joints, JointParameters
 from hmsa_ros.nodes.runner import run
@@ -50,6 +60,17 @@ TIMEOUT = ParameterSpec(
     'Longest time that a call of the hardware may take; past it the driver tries to switch off '
     'from another thread, and ends.', 's', 0.01, 1e3)
 
+INTERLOCK = (
+    ParameterSpec(
+        'interlock_required', False,
+        'Whether a publisher must close ~/interlock, and repeat that within interlock_timeout, '
+        'for commands to be obeyed; otherwise only a publisher that opens it counts, while the '
+        'driver runs.'),
+    ParameterSpec(
+        'interlock_timeout', 0.5,
+        'Longest silence of a publisher that closed a required ~/interlock.', 's', 0.01, 1e3),
+)
+
 #: What a start value of `HARDWARE` may be called as well.
 SHORT = 'hardware'
 
@@ -57,6 +78,7 @@ PARAMETERS = (
     AUTOSTART,
     HARDWARE,
     TIMEOUT,
+    *INTERLOCK,
     *OWN,
     *COMMON,
     replace(
@@ -116,6 +138,10 @@ class DriverNode(DeviceNode):
                 self.get_logger().warning(
                     f'waiting for {name}: it has not started yet, or its first write not returned')
         self.get_logger().info(_described(self.device.device, self.values))
+        required, timeout = (self.values[x.name] for x in INTERLOCK)
+        self._interlock = Interlock(required=required, timeout=round(timeout * NANOSECONDS))
+        self._lock = endpoints.listen(self, topics.INTERLOCK)
+        self._mind_interlock()
         self._open(DeviceJoint)
 
     def now(self) -> int:
@@ -131,9 +157,32 @@ class DriverNode(DeviceNode):
         if self._joints:
             self.device.close()
             self.failure = self.device.failure
+            self._lock.destroy()
         super().cleanup()
 
+    def _mind_interlock(self) -> None:
+        """Take in what publishers say of the interlock, and pass on whether it is open."""
+        now = monotonic_ns()
+        for taken in self._lock.take():
+            try:
+                closed = bool(decode(taken.data, Bool).data)
+            except BadInputError:
+                closed = False
+            self._interlock.hear(
+                taken.publisher, now, closed=closed,
+                present=lambda: publishers_of(self, topics.INTERLOCK))
+        before, why = self.device.locked, self._interlock.look(now)
+        self.device.lock(why)
+        if bool(why) != bool(before):
+            if why:
+                self.get_logger().error(f'interlock open, the coil goes off: {why}')
+            else:
+                self.get_logger().info('interlock closed: a new request is obeyed')
+            if self._joints:
+                self._diagnose()
+
     def _go_on(self) -> None:
+        self._mind_interlock()
         self.device.look_after()
         if self.device.trouble != self.trouble:
             self.trouble = self.device.trouble
@@ -147,6 +196,10 @@ class DriverNode(DeviceNode):
 
     def _report(self) -> Iterable[DiagnosticStatus]:
         yield from super()._report()
+        yield conversions.to_status(
+            f'{self.get_name()}: interlock', ', '.join(self.values.names),
+            *judge_interlock(self._interlock.why),
+            {'required': self._interlock.required, 'openings': self._interlock.openings})
         device = self.device.device
         level, message = judge_hardware(self.device.trouble, **device.counts)
         yield conversions.to_status(
