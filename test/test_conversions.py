@@ -135,6 +135,31 @@ def test_point_asks_for_neither_motion_nor_effort(name, values):
         assert caught.value.code is Code.BAD_INPUT
 
 
+def test_points_of_a_path_have_rates_and_perhaps_accelerations():
+    message = conversions.to_trajectory(
+        [((1.1, 1.2), SECOND), ((1.2, 1.3), 2 * SECOND)], ['a', 'b'])
+    assert read(message)[0].path is None
+    for point in message.points:
+        point.velocities = [0.1, 0.2]
+    (first, time), _ = read_trajectory(serialize_message(message)).path
+    assert [x[:2] for x in first] == [(1.1, 0.1), (1.2, 0.2)]
+    assert (time, [math.isnan(x[2]) for x in first]) == (SECOND, [True, True])
+    message.points[1].accelerations = [1.0, 2.0]
+    _, (last, _) = read_trajectory(serialize_message(message)).path
+    assert last == [(1.2, 0.1, 1.0), (1.3, 0.2, 2.0)]
+    for name, values, words in (
+            ('velocities', [0.1], 'point 1 has 1 velocities: expected 2'),
+            ('accelerations', [1.0], 'accelerations of all joints or none'),
+            ('effort', [1.0, 0.0], 'and no effort')):
+        broken = deserialize_message(serialize_message(message), type(message))
+        setattr(broken.points[1], name, values)
+        with pytest.raises(RefusedError, match=words):
+            list(read_trajectory(serialize_message(broken)).path)
+        # At rest, all of it says what would follow it.
+        with pytest.raises(RefusedError, match='trajectory_mode set to path'):
+            read(broken)
+
+
 @given(st.integers(0, 200), st.binary(min_size=1, max_size=8))
 def test_trajectory_that_is_damaged_is_read_or_refused(place, damage):
     data = bytearray(serialize_message(conversions.to_trajectory(

@@ -33,7 +33,7 @@ DECLARED: dict[str, tuple[ParameterSpec, ...]] = {
         import_module(f'hmsa_ros.nodes.{module.name}'), 'PARAMETERS', None))}
 # Numbers that are a ratio or a count.
 DIMENSIONLESS = {
-    'creep_tolerance', 'marker_scale', 'max_points', 'minimax_errors',
+    'creep_tolerance', 'marker_scale', 'max_points', 'minimax_errors', 'path_tolerance',
     'actuator.chain_limit', 'initial_stretch', 'real_time_factor', 'robust_order', 'play.rate',
     'play.read_ahead_queue_size', 'play.realtime_priority', 'record.queue_depth',
     'reset_stretch', 'seed', 'law.alpha', 'law.lambda_m', 'law.stretch', 'step_count',

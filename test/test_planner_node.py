@@ -22,6 +22,7 @@ from hmsa_ros.interfaces import topics
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.nodes.conversions import from_command, from_time, to_time, to_trajectory
 from hmsa_ros.nodes.planner import PlannerNode
+from hmsa_ros.planning.drafting import finish
 from hmsa_ros.planning.planner import Options, Planner
 from hmsa_ros.planning.shapers.pace import Pace
 from hmsa_ros.planning.timeline import PlannedLevel
@@ -271,6 +272,32 @@ def test_past_stamp_with_an_end_ahead_joins_in_the_middle(bench):
     planner.request(*SEQUENCE, stamp=START - MS)
     assert [x.stretch for x in planner.core.plan.segments] == [1.2, 1.4]
     planner.run(END)
+    planner.check()
+
+
+def test_velocities_are_followed_in_mode_path_which_can_be_set_while_it_runs(bench):
+    planner = bench()
+    s = np.linspace(0.0, 1.0, 11)
+    rates = 0.3 / 0.1 * 30.0 * (s * (1.0 - s)) ** 2
+    stretches = 1.0 + 0.3 * s ** 3 * (10.0 - 15.0 * s + 6.0 * s ** 2)
+    times = [round(x * 100) * MS for x in s.tolist()]
+    message = trajectory(*zip(stretches.tolist(), times, strict=True))
+    for point, rate in zip(message.points, rates.tolist(), strict=True):
+        point.velocities = [rate]
+    assert 'trajectory_mode set to path' in planner.send(message, 'bad_input').message
+    results = planner.ros.set_parameters('planner', [Parameter('trajectory_mode', value='path')])
+    assert [(x.successful, x.reason) for x in results] == [(True, '')]
+    points = [((*x, math.nan), y) for *x, y in zip(
+        stretches.tolist(), rates.tolist(), times, strict=True)]
+    planner.core.take(finish(planner.core.draft_path(points, None, planner.now)), planner.now)
+    planner.send(message)
+    planner.take()
+    planner.run(START + LEAD + 150 * MS)
+    assert len(planner.commands) > 300
+    assert planner.core.plan.segments[-1].reason == ''
+    assert planner.values()['setpoints'] == '1'
+    # Without velocities, its points are rests.
+    planner.request((1.2, SPELL), (1.1, 2 * SPELL))
     planner.check()
 
 

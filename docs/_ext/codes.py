@@ -26,6 +26,10 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'plan is an unshaped step.',
         'No action needed; the shaper minimum_time arrives sooner.'),
     Code.LEVELS: ('Raw levels as sent, with rest at the end.', ''),
+    Code.PATH: (
+        'A path with velocities is followed (trajectory_mode: path). As a warning: limits keep '
+        'the actuator from the path, by the largest deviation that the message names.',
+        'Slow the path down, or widen the limit that the message names.'),
     Code.OUT_OF_RANGE: (
         'The stretch is at or beyond a limit of the hyperelastic model: the full extension of the '
         'polymer chains (J_lim), where the force falls, or the end of a table.',

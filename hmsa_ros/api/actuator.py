@@ -468,6 +468,57 @@ class Actuator:
             shaper, short_spell)
         return Plan(self, segments, shaper)
 
+    def follow(
+            self, times: ArrayLike, stretches: ArrayLike, rates: ArrayLike | None = None,
+            accelerations: ArrayLike | None = None, *, tolerance: float = 1e-6,
+            period: float = 0.0) -> 'Plan':
+        """
+        Plan to follow a path from rest to rest.
+
+        Parameters
+        ----------
+        times : array_like, shape (n,)
+            In s, increasing, at least two.
+        stretches : array_like, shape (n,)
+            At these times; at the first, the actuator rests.
+        rates, accelerations : array_like, shape (n,), optional
+            In 1/s and 1/s^2, the last rate 0. The path is a Hermite spline through them, or the
+            smoothest spline through the stretches alone.
+        tolerance : float
+            Deviation that the levels may leave, as a fraction of the range of the path.
+        period : float
+            Of the sampling grid of the command in s; 0 for any time.
+
+        Returns
+        -------
+        Plan
+            Its one segment notes the largest deviation where limits keep the actuator from the
+            path.
+
+        Raises
+        ------
+        BadInputError
+            If an argument is of another type or out of range.
+        RefusedError
+            If the path leaves the stretches that the law has.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from hmsa_ros import Actuator
+        >>> times = np.linspace(0.0, 0.5, 11)
+        >>> plan = Actuator().follow(times, 1.0 + 0.1 * np.sin(np.pi * times / 0.5) ** 2)
+        >>> plan.segments[0].notes()
+        []
+
+        """
+        from hmsa_ros.api.paths import path_of, segments_along
+        from hmsa_ros.api.plan import Plan
+
+        path = path_of(self, (times, stretches, rates, accelerations))
+        ends = float(np.asarray(stretches)[0]), float(np.asarray(stretches)[-1])
+        return Plan(self, segments_along(self, path, ends, tolerance, period), 'path')
+
     def _errors(self, shaper: str) -> Uncertainty:
         """Return for which errors minimax plans unless given."""
         if shaper != 'minimax' or self._belief is None:

@@ -14,6 +14,7 @@ from hmsa_ros.model.equations import Array, elastic_force, natural_frequency
 from hmsa_ros.model.moves import Level as Load
 from hmsa_ros.model.moves import State
 from hmsa_ros.model.simulation import check_stretch, longest_motion, sampled
+from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.levels import Level
 from hmsa_ros.recordings.record import RecordedRequest, Run
@@ -325,9 +326,11 @@ def simulated(
     believed = truth if plan is None else plan.actuator
     if plan is not None:
         ends = np.cumsum(plan.setpoints[:, 1])
+        followed = plan.segments[0].move.code is Code.PATH
         asked = (RecordedRequest(-_AHEAD, 0, tuple(
             (x.setpoint.stretch, round(y * NANOSECONDS) if math.isfinite(y) else None)
-            for x, y in zip(plan.segments, ends.tolist(), strict=True))),)
+            for x, y in zip(plan.segments, ends.tolist(), strict=True)),
+            round(plan.move_times[0] * NANOSECONDS) if followed else None),)
         predicted = response(believed, times, levels, times, begin)
         planned = tuple(
             Level(stamp, level, -_AHEAD, x, y) for stamp, level, x, y in zip(

@@ -22,6 +22,7 @@ from hmsa_ros.table import Column
 
 if TYPE_CHECKING:
     from hmsa_ros.api.actuator import Actuator
+    from hmsa_ros.api.plan import Plan
     from hmsa_ros.model.delivery import Delivery
     from hmsa_ros.model.moves import Limits
     from hmsa_ros.model.parameters import NondimensionalParameters
@@ -40,11 +41,14 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = add_command(subparsers, __name__, __doc__)
     parser.add_argument(
-        'setpoints', nargs='+', type=setpoint, metavar='STRETCH:SPAN',
+        'setpoints', nargs='*', type=setpoint, metavar='STRETCH:SPAN',
         help='stretch, or deflection of a beam, to come to rest at, and how long this setpoint '
              'lasts (move plus hold)')
     add_options(
         parser,
+        ('--path', 'CSV', Path,
+         'instead of setpoints, with --params-file: a path to follow from rest to rest, with the '
+         'columns time (s) and stretch; the smoothest curve through them'),
         ('--start', 'S', float,
          'initial stretch, at rest (default 1; 0 for the deflection of a beam)'),
         *((option, metavar, float, text) for option, metavar, text in MATERIAL), LAW_OPTION,
@@ -84,13 +88,16 @@ def run(arguments: argparse.Namespace) -> int:
     Without one, a file of levels to write is a `BadInputError`.
     """
     si = arguments.params_file is not None
+    if bool(arguments.setpoints) == (arguments.path is not None) or arguments.path and not si:
+        raise BadInputError(
+            'expected setpoints such as 1.10:10, or --path CSV with --params-file')
     from hmsa_ros.api.plan import table_of
     from hmsa_ros.model.equations import signed_root
 
     facts, amplifiers = {}, None
     if si:
         actuator = _actuator(arguments)
-        plan = actuator.plan(
+        plan = _along(actuator, arguments) if arguments.path else actuator.plan(
             arguments.setpoints, arguments.shaper or 'two_step', **_more(arguments))
         segments = plan.segments
         if arguments.out is not None:
@@ -171,6 +178,15 @@ def _actuator(arguments: argparse.Namespace) -> 'Actuator':
             f'both --params-file and {", ".join(fixed)} are given: expected only one of them, '
             'since the file sets these values')
     return Actuator.from_yaml(arguments.params_file)
+
+
+def _along(actuator: 'Actuator', arguments: argparse.Namespace) -> 'Plan':
+    """Plan to follow the path of a file; options of moves beside it are a `BadInputError`."""
+    from hmsa_ros.api.paths import read_path
+
+    if extra := [f'--{x}' for x in ('shaper', 'start', 'amplifier') if getattr(arguments, x)]:
+        raise BadInputError(f'--path and {extra[0]} are given: expected only one of them')
+    return actuator.follow(*read_path(arguments.path))
 
 
 def _more(arguments: argparse.Namespace) -> dict[str, Any]:

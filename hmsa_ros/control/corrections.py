@@ -55,7 +55,8 @@ class Corrections:
         estimate = self._feedback.foreseen(name, draft.begin)
         model = draft.levels[-1].model
         self._feedback.planned(name, model, 0.0)
-        if estimate is None or segment.arrival is None or segment.code is Code.LEVELS:
+        if estimate is None or segment.arrival is None or segment.code in (
+                Code.LEVELS, Code.PATH):
             return draft
         step = max(abs(segment.stretch - draft.levels[0].stretch), _LEAST_STEP)
         course = _drafted(draft, self._group.planners[name].plan)

@@ -124,6 +124,8 @@ class PlannerRuntime:
                 self.hearing.check_clocks()
         except RefusedError as error:
             return self.planning.refuse(error, request)
+        if isinstance(request, Trajectory) and self.settings.trajectory_mode == 'rest':
+            request = replace(request, path=None)
         self._begin_anew()
         self._check(request)
         if not isinstance(request, Stop):

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Any
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation.correction import TOLERANCE
@@ -13,6 +14,8 @@ from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import Progress
 
+#: What a trajectory with velocities is: refused, or a path to follow.
+TRAJECTORY_MODES = ('rest', 'path')
 #: What to do when a coil was cut off: wait for a request, or go on with a shaped move.
 AFTER_CUT_OFF = ('wait', 'resume')
 
@@ -29,6 +32,7 @@ class Settings:
     takeover_max_age: int = NANOSECONDS // 2  # largest age of such a sample
     after_cut_off: str = 'wait'  # one of `AFTER_CUT_OFF`
     max_points: int = 100_000  # setpoints of one request, of all joints together
+    trajectory_mode: str = 'rest'  # one of `TRAJECTORY_MODES`
     allow_partial_joints: bool = False  # whether a trajectory may lack joints
     tolerances: Tolerances = field(default_factory=Tolerances)
     # ``off``; ``observe`` to estimate from samples; ``adapt`` to correct plans too.
@@ -59,15 +63,17 @@ class Trajectory:
     A point has the stretch of each joint, and the time in ns from the start until which it lasts;
     if raw, the flux density in T of each joint, and the time from which it applies. Points are
     read bit by bit, and again where they are planned again; they may raise `RefusedError` where
-    they cannot be read.
+    they cannot be read. Those of a ``path``, if there is one, have stretch, rate (1/s) and
+    acceleration (1/s^2, or NaN) of each joint; it is followed if settings say so.
     """
 
     joints: tuple[str, ...]
-    points: Iterable[tuple[Sequence[float], int]]
+    points: Iterable[tuple[Sequence[Any], int]]
     count: int  # of the points
     stamp: int | None = None  # start in ns; None for now
     name: str = ''  # repeated in the verdict
     raw: bool = False
+    path: Iterable[tuple[Sequence[Any], int]] | None = None
 
 
 @dataclass(frozen=True)

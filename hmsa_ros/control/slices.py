@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import count
+from typing import Any
 
 from hmsa_ros.control.records import Request, Target, Trajectory
 from hmsa_ros.planning.drafting import Steps
@@ -58,14 +59,16 @@ def _trajectory(
         request: Trajectory, group: PlannerGroup,
         clock: Clock) -> Steps[tuple[Mapping[str, Draft], int]]:
     """Read the points, then plan."""
-    points: dict[str, list[tuple[float, int]]] = {name: [] for name in request.joints}
-    for number, (stretches, time) in enumerate(request.points):
+    points: dict[str, list[tuple[Any, int]]] = {name: [] for name in request.joints}
+    for number, (stretches, time) in enumerate(
+            request.points if request.path is None else request.path):
         for name, stretch in zip(request.joints, stretches, strict=True):
             points[name].append((stretch, time))
         if number % _READ == _READ - 1:
             yield
     return (yield from in_time(
-        lambda now: group.draft_request(points, request.stamp, now, raw=request.raw), group,
+        lambda now: group.draft_request(
+            points, request.stamp, now, raw=request.raw, path=request.path is not None), group,
         frozenset(request.joints), clock, request.count * len(request.joints)))
 
 

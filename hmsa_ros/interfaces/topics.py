@@ -76,8 +76,9 @@ JOINT_TRAJECTORY = Topic(
     'A sequence of setpoints. The actuator leaves the previous point at its `time_from_start` and '
     'is at rest at `positions` by that of this point. Timestamp 0 starts now; a future timestamp '
     'keeps the current plan until then; a sequence that began in the past is joined in the '
-    'middle. Points without `positions` and with `effort` are raw levels: the flux density in '
-    'tesla from `time_from_start` on; the planner checks them and ends at rest.',
+    'middle. With `trajectory_mode` path, points with `velocities` are a path that is followed to '
+    'rest at its end. Points without `positions` and with `effort` are raw levels: the flux '
+    'density in tesla from `time_from_start` on; the planner checks them and ends at rest.',
     subscribers=(PLANNER, RECORDER))
 SETPOINT = Topic(
     '~/setpoint', _FLOAT, RELIABLE,

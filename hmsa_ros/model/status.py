@@ -24,6 +24,7 @@ class Code(str, Enum):
     TOO_DAMPED = 'too_damped'
     INDISTINGUISHABLE = 'indistinguishable'
     LEVELS = 'levels'
+    PATH = 'path'
 
     OUT_OF_RANGE = 'out_of_range'
     FLUX_LIMIT = 'flux_limit'

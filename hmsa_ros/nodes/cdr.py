@@ -8,8 +8,10 @@ the points when they are asked for.
 
 from collections.abc import Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+import math
 import struct
+from typing import Any
 
 from hmsa_ros.control.records import Trajectory
 from hmsa_ros.errors import BadInputError, excerpt
@@ -83,6 +85,8 @@ _LEAST_POINT = 24
 # More joints than any planner has.
 _MOST_JOINTS = 1000
 _FIELDS = ('positions', 'velocities', 'accelerations', 'effort')
+# What is read of a point of a path: the first three.
+_PATH = 'path'
 
 
 def read_trajectory(data: bytes) -> Trajectory:
@@ -105,10 +109,12 @@ def read_trajectory(data: bytes) -> Trajectory:
     count = cursor.count()
     if _LEAST_POINT * count > cursor.left + 4:
         raise BadInputError('the message cannot be decoded: it ends too early')
-    raw = bool(count) and _raw(cursor, names)
+    sizes = _sizes(cursor) if count and names else []
+    raw = bool(sizes) and not sizes[0] and sizes[3] == many
+    points = _Points(cursor, names, count, 'effort' if raw else 'positions')
     return Trajectory(
-        names, _Points(cursor, names, count, 'effort' if raw else 'positions'), count,
-        stamp or None, name, raw)
+        names, points, count, stamp or None, name, raw,
+        replace(points, wanted=_PATH) if sizes[:2] == [many, many] else None)
 
 
 @dataclass(frozen=True)
@@ -120,28 +126,46 @@ class _Points:
     count: int
     wanted: str
 
-    def __iter__(self) -> Iterator[tuple[Sequence[float], int]]:
+    def __iter__(self) -> Iterator[tuple[Sequence[Any], int]]:
         return _points(copy(self.cursor), self.names, self.count, self.wanted)
 
 
-def _raw(cursor: Cursor, names: Sequence[str]) -> bool:
-    """Whether the next point has efforts and no positions."""
-    place = cursor.place
+def _sizes(cursor: Cursor) -> list[int]:
+    """Return how many numbers each field of the next point has; nothing if it is cut off."""
     try:
-        sizes = [len(cursor.take('d', cursor.count())) for _ in _FIELDS]
+        ahead = copy(cursor)
+        return [len(ahead.take('d', ahead.count())) for _ in _FIELDS]
     except BadInputError:
-        return False
-    finally:
-        cursor.place = place
-    return bool(names) and sizes == [0, sizes[1], sizes[2], len(names)]
+        return []
 
 
 def _points(
         cursor: Cursor, names: Sequence[str], count: int,
-        wanted: str) -> Iterator[tuple[Sequence[float], int]]:
-    """Yield stretches, or levels in T, and time from the start in ns of each point."""
+        wanted: str) -> Iterator[tuple[Sequence[Any], int]]:
+    """
+    Yield stretches, or levels in T, and time from the start in ns of each point.
+
+    Of a path, each joint has stretch, rate and acceleration, the latter NaN if it is not given.
+    """
     rest = (0.0,) * len(names)
     for number in range(count):
+        if wanted == _PATH:
+            rows = [cursor.take('d', cursor.count()) for _ in _FIELDS]
+            for field, row in zip(_FIELDS[:2], rows, strict=False):
+                if len(row) != len(names):
+                    raise RefusedError(
+                        Code.BAD_INPUT,
+                        f'point {number} has {len(row)} {field}: expected {len(names)}, one for '
+                        'each of joint_names in every point of a path')
+            if len(rows[2]) not in (0, len(names)) or rows[3] not in ((), rest):
+                raise RefusedError(
+                    Code.BAD_INPUT,
+                    f'point {number} has accelerations {excerpt(list(rows[2]))} and effort '
+                    f'{excerpt(list(rows[3]))}: expected accelerations of all joints or none, '
+                    'and no effort')
+            yield list(zip(*rows[:2], rows[2] or (math.nan,) * len(names), strict=True)), (
+                cursor.time())
+            continue
         for field in _FIELDS:
             values = cursor.take('d', cursor.count())
             if field == wanted:
@@ -155,6 +179,7 @@ def _points(
                 raise RefusedError(
                     Code.BAD_INPUT,
                     f'point {number} has {field} {excerpt(list(values))}: expected none, '
-                    + ('the actuator comes to rest at each setpoint' if wanted == 'positions'
-                       else 'the levels of the field are all there is'))
+                    + ('the actuator comes to rest at each setpoint (with the parameter '
+                       'trajectory_mode set to path, it follows velocities)'
+                       if wanted == 'positions' else 'the levels of the field are all there is'))
         yield found, cursor.time()

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from hmsa_ros.control.feedback import MODES
-from hmsa_ros.control.records import AFTER_CUT_OFF, Settings
+from hmsa_ros.control.records import AFTER_CUT_OFF, Settings, TRAJECTORY_MODES
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.files import errors_from
 from hmsa_ros.identification.known import Known
@@ -64,6 +64,11 @@ OWN = (
     replace(shared.COIL_TIME_CONSTANT, read_only=False),
     *shared.VISCOELASTIC,
     replace(shared.CREEP_TOLERANCE, read_only=False),
+    ParameterSpec(
+        'path_tolerance', _OPTIONS.path_tolerance,
+        'Maximum deviation from a path (trajectory_mode path) as a fraction of its range; a '
+        'smaller value needs more levels, in proportion to its cube root.', '', 1e-9, 1.0,
+        read_only=False),
     replace(shared.FLUX_DENSITY_MIN, read_only=False),
     replace(shared.FLUX_DENSITY_MAX, read_only=False),
     *shared.KNOWN,
@@ -100,6 +105,11 @@ SPECS = (
         'max_points', _SETTINGS.max_points,
         'Largest number of setpoints in one trajectory, summed over its joints.', '',
         1, 10_000_000, read_only=False),
+    ParameterSpec(
+        'trajectory_mode', _SETTINGS.trajectory_mode,
+        'What to do with a trajectory that has velocities: refuse it, since the actuator comes to '
+        'rest at each point, or follow it as a path; without velocities, each point is a rest.',
+        choices=TRAJECTORY_MODES, read_only=False),
     ParameterSpec(
         'short_spell', _OPTIONS.short_spell,
         'What to do if a setpoint is too short for its move: refuse the request, or continue to '
@@ -204,6 +214,7 @@ def options_from(values: Mapping[str, Any]) -> Options:
         errors=errors_from(values['minimax_file'], values['minimax_errors']),
         coil_time_constant=values['coil_time_constant'],
         creep_tolerance=values['creep_tolerance'],
+        path_tolerance=values['path_tolerance'],
         pace=Pace(values['smooth_periods'], values['stretch_rate_max'] or math.inf))
 
 
@@ -214,8 +225,8 @@ def _nanoseconds(seconds: float) -> int:
 def settings_from(values: JointParameters) -> Settings:
     """Return how a runtime deals with time, as parameters for all joints say."""
     plain: dict[str, Any] = {x: values[x] for x in (
-        'replan_late', 'after_cut_off', 'max_points', 'allow_partial_joints', 'feedback',
-        'feedback_cautious', 'feedback_tolerance', 'feedback_trim', 'feedback_frozen',
+        'trajectory_mode', 'replan_late', 'after_cut_off', 'max_points', 'allow_partial_joints',
+        'feedback', 'feedback_cautious', 'feedback_tolerance', 'feedback_trim', 'feedback_frozen',
         'feedback_file')}
     times: dict[str, Any] = {x: _nanoseconds(values[x]) for x in (
         'heartbeat_period', 'lateness_tolerance', 'takeover_timeout', 'takeover_max_age')}

@@ -11,11 +11,14 @@ from functools import partial
 import math
 from typing import TypeVar
 
+import numpy as np
+
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.moves import Level, Move, State
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.history import agree
+from hmsa_ros.planning.path import along, ON_PATH, Path
 from hmsa_ros.planning.sequence import Segment, segments
 from hmsa_ros.planning.setpoint import impossible, Setpoint
 from hmsa_ros.planning.shapers import get_shaper
@@ -25,6 +28,8 @@ from hmsa_ros.planning.stopping import brake, holdable
 from hmsa_ros.planning.timeline import Draft, Model, Plan, PlannedLevel, PlannedSegment
 
 T = TypeVar('T')
+#: Stretch, rate in 1/s and acceleration in 1/s^2, the latter NaN where it is not given.
+PathPoint = tuple[float, float, float]
 #: Work that pauses now and then.
 Steps = Generator[None, None, T]
 
@@ -34,9 +39,11 @@ _BRAKE_SHARES = (0.5, 0.1, 0.02, 0.0)
 _PATIENCE = (0.0, 0.15, 0.3, 0.45, 0.6)
 # How far off its stretch a field at rest may be, as a share of the load.
 _SETTLED = 1e-6
+# Rate in 1/s that is rest at the end of a path.
+_STOPPED = 1e-7
 # Codes of plans that do not do what was requested.
 _WARNINGS = (Code.TOO_DAMPED, Code.INDISTINGUISHABLE, Code.SPELL_TOO_SHORT)
-# Setpoints that are checked between two pauses, which takes some 0.1 ms.
+# Setpoints that are checked between two pauses, which takes some 0.1 ms; levels take more.
 _CHECKED = 200
 
 
@@ -89,7 +96,7 @@ def check_points(points: Sequence[tuple[float, int]], rest: float) -> Steps[None
             yield
 
 
-def check_any(points: Sequence[tuple[float, int]]) -> None:
+def check_any(points: Sequence[tuple[float | PathPoint, int]]) -> None:
     """Refuse a request without points with `RefusedError`."""
     if not points:
         raise RefusedError(
@@ -140,6 +147,70 @@ def draft_sequence(
     return (yield from draft_setpoints(outset, setpoints))
 
 
+def check_path(points: Sequence[tuple[PathPoint, int]], rest: float) -> None:
+    """Refuse points and times in ns that are no path to rest: `RefusedError`."""
+    check_any(points)
+    previous, given = -1, math.isnan(points[0][0][2])
+    for number, ((stretch, *more), time) in enumerate(points):
+        check_target(stretch, rest)
+        # Accelerations are of all points or of none.
+        if not (math.isfinite(more[0]) and math.isnan(more[1]) is given
+                and not math.isinf(more[1])):
+            raise RefusedError(
+                Code.BAD_INPUT,
+                f'point {number} has velocity {more[0]:g} and acceleration {more[1]:g}: expected '
+                'finite velocities, and accelerations in all points or in none')
+        if time <= previous:
+            raise RefusedError(
+                Code.NOT_INCREASING,
+                f'time_from_start of point {number} is {time / NANOSECONDS:g} s: expected '
+                + (f'more than {previous / NANOSECONDS:g} s' if number else 'at least 0 s'))
+        previous = time
+    if abs(points[-1][0][1]) > _STOPPED:
+        raise RefusedError(
+            Code.BAD_INPUT,
+            f'the last point has velocity {points[-1][0][1]:g}: expected 0, a path ends at rest')
+
+
+def draft_path(
+        outset: Outset, points: Sequence[tuple[PathPoint, int]], base: int,
+        now: int) -> Steps[Draft]:
+    """
+    Follow a checked path from a start in ns, or join it where it is by now.
+
+    From beside it the actuator goes to its first point, or to the first that is a natural period
+    ahead. What cannot be carried out is a `RefusedError`.
+    """
+    model, state, unit = outset.model, outset.state, outset.model.units.time
+    ended, last = points[-1]
+    if base + last <= outset.begin:
+        raise _over([(ended[0], last)], base, now, model.units.coordinate)
+    times = np.array([model.time(base + x - outset.begin) for _, x in points])
+    rows = np.array([x for x, _ in points]).T * np.array([[1.0], [unit], [unit * unit]])
+    given = None if np.isnan(rows[2, 0]) else rows[2]
+    path = None
+    if times[0] <= 0.0 and len(times) > 1:
+        path = Path.through(times, rows[0], rows[1], given).since(0.0)
+        stretch, rate, _ = (float(x[0]) for x in path.course(np.zeros(1)))
+        frequency = model.frequency(state.stretch)
+        if abs(state.stretch - stretch) > ON_PATH or abs(
+                state.rate - rate) > ON_PATH * frequency:
+            path = None
+    if path is None:
+        soon = 0.0 if times[0] > 0.0 else min(
+            2.0 * math.pi / model.frequency(rows[0, -1]), float(times[-1]) * (1.0 - 1e-9))
+        ahead = times > soon
+        here = np.array([state.stretch, state.rate, model.acceleration(state)])
+        times = np.append(0.0, times[ahead])
+        rows = np.column_stack([here, rows[:, ahead]])
+        path = Path.through(times, rows[0], rows[1], None if given is None else rows[2])
+    frame = replace(_frame(model, state), target=float(rows[0, -1]))
+    yield
+    move = yield from along(frame, path, model.options.path_tolerance)
+    return (yield from draft_moves(
+        outset, [Setpoint(frame.target, math.inf)], first=lambda request: move))
+
+
 def draft_setpoints(outset: Outset, setpoints: Sequence[Setpoint]) -> Steps[Draft | None]:
     """Plan setpoints; None where the plan is on the way to the only one, with nothing between."""
     planned = outset.plan.segments
@@ -166,7 +237,7 @@ def draft_stop(outset: Outset) -> Steps[Draft]:
             + [Level(found.duration, model.holding(found.stretch))]),
             found.duration, 'stopped')
         end = State(found.stretch, 0.0, move.levels[-1].load)
-        levels, placed = _placed(model, outset.begin, Segment(
+        levels, placed = yield from _placed(model, outset.begin, Segment(
             Setpoint(found.stretch, math.inf), 0.0, state, end, move, end.load))
         return Draft(outset.begin, tuple(levels), (placed,))
     ways = [(0.0, 'smooth')] * smooth + [(x, 'two_step') for x in _BRAKE_SHARES]
@@ -235,7 +306,7 @@ def _rejoining(outset: Outset, index: int, arrival: int | None) -> Steps[Draft]:
     placed: list[PlannedSegment] = []
     for segment in _planned(
             outset.model, outset.state, _left(outset, index), first=first):
-        more, one = _placed(outset.model, outset.begin, segment)
+        more, one = yield from _placed(outset.model, outset.begin, segment)
         levels += more
         placed.append(one)
         following = index + len(placed)
@@ -272,16 +343,17 @@ def _meeting(outset: Outset, state: State, following: int) -> int | None:
 
 
 def draft_moves(
-        outset: Outset, setpoints: Iterable[Setpoint], shaper: str = '') -> Steps[Draft]:
+        outset: Outset, setpoints: Iterable[Setpoint], shaper: str = '',
+        first: Shaper | None = None) -> Steps[Draft]:
     """Plan setpoints and place them on the timeline; the shaper is that of the options."""
     levels: list[PlannedLevel] = []
     placed: list[PlannedSegment] = []
     warning: PlannedSegment | None = None
-    for segment in _planned(outset.model, outset.state, setpoints, shaper):
-        more, one = _placed(outset.model, outset.begin, segment)
+    for segment in _planned(outset.model, outset.state, setpoints, shaper, first):
+        more, one = yield from _placed(outset.model, outset.begin, segment)
         levels += more
         placed.append(one)
-        if warning is None and one.code in _WARNINGS:
+        if warning is None and (one.code in _WARNINGS or one.code is Code.PATH and one.reason):
             warning = one
         yield
     return Draft(outset.begin, tuple(levels), tuple(placed), warning=warning)
@@ -290,16 +362,22 @@ def draft_moves(
 def _planned(
         model: Model, state: State, setpoints: Iterable[Setpoint], shaper: str = '',
         first: Shaper | None = None) -> Iterator[Segment]:
+    return segments(
+        _frame(model, state), setpoints, get_shaper(shaper or model.options.shaper),
+        model.options.short_spell, first=first)
+
+
+def _frame(model: Model, state: State) -> Request:
+    """Return the request to stay where a state is."""
     options = model.options
-    frame = Request(
+    return Request(
         state, state.stretch, model.material, model.limits, model.delivery, options.order,
         model.units, options.errors, model.pace)
-    return segments(
-        frame, setpoints, get_shaper(shaper or options.shaper), options.short_spell, first=first)
 
 
 def _placed(
-        model: Model, begin: int, segment: Segment) -> tuple[list[PlannedLevel], PlannedSegment]:
+        model: Model, begin: int,
+        segment: Segment) -> Steps[tuple[list[PlannedLevel], PlannedSegment]]:
     """Place a planned move on the timeline, in SI units."""
     start = begin + model.ns(segment.begin)
     state = segment.start
@@ -316,6 +394,8 @@ def _placed(
         time = level.time
         levels.append(PlannedLevel(
             start + model.ns(time), level.load * model.units.load, state, model))
+        if number % _CHECKED == _CHECKED - 1:
+            yield
     duration = segment.move.duration
     return levels, PlannedSegment(
         segment.setpoint.stretch, start,

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 import math
+from typing import Any
 
 from hmsa_ros.model.status import RefusedError
 from hmsa_ros.planning.drafting import Steps
@@ -65,13 +66,13 @@ class PlannerGroup:
     # -- requests ------------------------------------------------------------------------------
 
     def draft_request(
-            self, points: Mapping[str, Sequence[tuple[float, int]]], stamp: int | None,
-            now: int, *, raw: bool = False) -> Steps[dict[str, Draft]]:
-        """Work out a sequence, or levels if raw, without joints that change nothing."""
-        if raw:
+            self, points: Mapping[str, Sequence[tuple[Any, int]]], stamp: int | None,
+            now: int, *, raw: bool = False, path: bool = False) -> Steps[dict[str, Draft]]:
+        """Work out a sequence, levels if raw, or a path, without joints that change nothing."""
+        if raw or path:
+            draft = Planner.draft_levels if raw else Planner.draft_path
             return (yield from self._each(
-                points, lambda name: self.planners[name].draft_levels(
-                    points[name], stamp, now)))
+                points, lambda name: draft(self.planners[name], points[name], stamp, now)))
         drafts = yield from self._each(
             points, lambda name: self.planners[name].draft_request(points[name], stamp, now))
         if self.simultaneous:

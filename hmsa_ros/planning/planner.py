@@ -16,7 +16,7 @@ from hmsa_ros.model.simulation import check_stretch
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning import drafting
-from hmsa_ros.planning.drafting import Outset, Steps
+from hmsa_ros.planning.drafting import Outset, PathPoint, Steps
 from hmsa_ros.planning.raw import check_levels, draft_levels
 from hmsa_ros.planning.running import RunningPlan
 from hmsa_ros.planning.setpoint import Setpoint
@@ -114,6 +114,21 @@ class Planner(RunningPlan):
                 'ago: expected levels more than lead_time ahead')
         return (yield from draft_levels(self._outset(begin), points))
 
+    def draft_path(
+            self, points: Sequence[tuple[PathPoint, int]], stamp: int | None,
+            now: int) -> Steps[Draft]:
+        """
+        Work out a path: points (stretch, rate in 1/s, acceleration in 1/s^2 or NaN), times in ns.
+
+        ``stamp`` and refusals are as of `draft_request`. A path that limits keep the actuator from
+        is followed as near as they allow: the draft has a warning then.
+        """
+        drafting.check_path(points, self.model.material.rest)
+        soonest = self.soonest(now)
+        base = soonest if stamp is None else stamp
+        outset = self._outset(drafting.on_grid(max(base, soonest), self.model))
+        return (yield from drafting.draft_path(outset, points, base, now))
+
     def draft_setpoint(self, stretch: float, now: int) -> Steps[Draft | None]:
         """Work out a move to one stretch; None where it changes nothing."""
         drafting.check_target(stretch, self.model.material.rest)
@@ -168,7 +183,7 @@ class Planner(RunningPlan):
     def as_sent(self, time: int) -> bool:
         """Whether levels are in force at a time in ns that are to be as somebody sent them."""
         found = self.segment(time)
-        return found is not None and found[1].code is Code.LEVELS and (
+        return found is not None and found[1].code in (Code.LEVELS, Code.PATH) and (
             found[1].arrival is None or time < found[1].arrival)
 
     def soonest(self, now: int) -> int:

@@ -62,7 +62,7 @@ class Segment:
 
 def plan_sequence(
         setpoints: Sequence[Setpoint], frame: Request | NondimensionalParameters,
-        shaper: str = 'two_step', short_spell: str = 'refuse') -> tuple[Segment, ...]:
+        shaper: str | Shaper = 'two_step', short_spell: str = 'refuse') -> tuple[Segment, ...]:
     """
     Plan a sequence of setpoints.
 
@@ -74,8 +74,8 @@ def plan_sequence(
         What all moves share, and the state from which the first one starts; or a material alone,
         to start at rest without a field, on ideal hardware. With a command period, spans must be
         multiples of it. The next move starts from what the rounded command leads to.
-    shaper : str
-        Name of a shaper.
+    shaper : str or Shaper
+        A shaper or its name.
     short_spell : {'refuse', 'continue'}
         For a span that ends before the move: refuse, or plan the next move from the state that
         is really reached; the last move is then finished after its span.
@@ -99,7 +99,8 @@ def plan_sequence(
         raise BadInputError(
             f'short_spell is {short_spell!r}: expected one of {", ".join(SHORT_SPELL)}')
     begin = frame if isinstance(frame, Request) else Request.of(frame)
-    return tuple(segments(begin, setpoints, get_shaper(shaper), short_spell))
+    shape = get_shaper(shaper) if isinstance(shaper, str) else shaper
+    return tuple(segments(begin, setpoints, shape, short_spell))
 
 
 def segments(

@@ -46,6 +46,8 @@ class Options:
     coil_time_constant: float = 0.0  #: in s, of a lag of first order; 0 for at once
     #: Vibration that levels which follow creep may leave, as a share of the move.
     creep_tolerance: float = IDEAL.ripple
+    #: Deviation from a path that levels may leave, as a share of its range.
+    path_tolerance: float = 1e-6
     #: Of G, damping coefficient and J_lim, as shares, for which minimax plans.
     errors: Uncertainty = ERRORS
     pace: Pace = PACE  #: of the shaper smooth; the rate in 1/s
@@ -104,6 +106,14 @@ class Model:
     def frequency(self, stretch: float) -> float:
         """Return the nondimensional natural frequency about a stretch."""
         return float(law.natural_frequency(stretch, self.material.packed))
+
+    def acceleration(self, state: State) -> float:
+        """Return the nondimensional acceleration in a state whose branches have relaxed."""
+        found = np.empty(1)
+        law.accelerations(
+            np.array([state.stretch]), np.array([state.rate]), np.array([state.load]),
+            self.material.packed, found)
+        return float(found[0])
 
     def follow(self, state: State, load: float, duration: float) -> State:
         """Predict the state after a load has been commanded for a nondimensional time."""

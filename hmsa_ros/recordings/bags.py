@@ -256,9 +256,14 @@ class _Collected:
         for asked in self.trajectories:
             place = _place(asked.joints, joint)
             if place is not None:
-                requests.append(RecordedRequest(self._sent(asked), asked.stamp, tuple(
+                points = tuple(
                     (x.positions[place], x.time) for x in asked.points
-                    if len(x.positions) == max(len(asked.joints), 1))))
+                    if len(x.positions) == max(len(asked.joints), 1))
+                moves = len(points) > 0 and any(any(x.velocities) for x in asked.points)
+                requests.append(RecordedRequest(
+                    self._sent(asked), asked.stamp, points, None) if not moves else (
+                        RecordedRequest(self._sent(asked), asked.stamp, (
+                            (points[-1][0], None),), points[-1][1])))
         return sorted(requests, key=lambda x: x.sent)
 
     def _sent(self, asked: _Trajectory) -> int:

@@ -28,6 +28,8 @@ class RecordedRequest:
     # Stretch, and time in ns from the start until which it lasts; None for a setpoint that is held
     # until the next.
     points: tuple[tuple[float, int | None], ...]
+    # End in ns from the start of a path, whose one point is where it ends; None for rests.
+    path: int | None = None
 
 
 @dataclass(frozen=True)

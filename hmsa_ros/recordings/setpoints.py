@@ -195,7 +195,10 @@ def _of(
         setpoint = _described(run, target, start, begin, end)
         setpoint = replace(setpoint, number=number, count=len(points))
         here = replace(setpoint, end=None) if last else setpoint
-        if plans:
+        arrival: int | None
+        if request.path is not None:
+            arrival, moves, left_out = base + request.path, [], False
+        elif plans:
             moves = list(_arrivals(run, plans, sent, here, earliest, last=last))
             arrival, left_out = moves.pop(0)[1] if moves else None, False
         else:

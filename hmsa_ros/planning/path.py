@@ -1,0 +1,461 @@
+"""
+Paths of the stretch that are followed, as a dense trajectory with velocities asks for.
+
+The stretch is a flat output (M. Fliess, J. Lévine, P. Martin, P. Rouchon, Int. J. Control 61,
+1327 (1995)): a path gives the load by the equation of motion. Commands carry a staircase of it, or
+ramps. The double integral of a staircase is a quadratic spline, and the stretch answers to the
+double integral of what the staircase lacks; so the levels are those whose spline comes nearest,
+in the mean square, to the double integral of the load (of the amplifier's output where the field
+lags). They are as long as a tolerance allows. The last ones are corrected to end at rest exactly.
+"""
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, replace
+import math
+from typing import Any
+
+import numpy as np
+
+from hmsa_ros import motion
+from hmsa_ros.model import law
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.moves import Level, Move, State
+from hmsa_ros.model.simulation import follow, followed_by, sampled, with_followed
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.planning.shapers.request import Request
+from hmsa_ros.planning.shapers.two_step import two_step
+from hmsa_ros.planning.shooting import Attempt, solve, Template
+
+#: Stretch, rate and acceleration, shape (n,) each, at times from the start on.
+Course = Callable[[Array], tuple[Array, Array, Array]]
+
+# A staircase of steps a apart, each h long, leaves a h^2/(72 sqrt(3) m) of stretch.
+_RIPPLE = 1.0 / (72.0 * math.sqrt(3.0))
+# Share of the tolerance for it: beside a jump of the load it is larger.
+_SHARE = 0.15
+# Levels of a path at the least and at the most, of a natural period, of a block, by which blocks
+# overlap, and levels at the end that are corrected at the most.
+_FEWEST, _MOST, _OF_EACH, _BLOCK, _OVERLAP, _LAST = 24, 200_000, 6, 200, 12, 240
+# How often ramps are allowed for.
+_RAMPED = 6
+#: How near a path the actuator is on it, stretch.
+ON_PATH = 1e-5
+# Stretch that counts as range at the least.
+_LEAST_RANGE = 1e-3
+# Where limits bind: how much faster than its own the actuator returns to the path.
+_RETURN = 3.0
+# Share of a natural period at the end in which levels are corrected.
+_ENDING = 0.6
+
+# Points of an interval of unit length, and what polynomials through them integrate to: once and
+# twice, up to each point and up to the end; and their value at the end.
+_POINTS, _WEIGHTS = (0.5 * x for x in np.polynomial.legendre.leggauss(6))
+_POINTS = _POINTS + 0.5
+_ORDERS = np.arange(6)
+_INVERSE = np.linalg.inv(_POINTS[:, np.newaxis] ** _ORDERS)
+_AT = np.append(_POINTS, 1.0)[:, np.newaxis]
+_VALUE = (_AT ** _ORDERS) @ _INVERSE
+_ONCE = (_AT ** (_ORDERS + 1) / (_ORDERS + 1)) @ _INVERSE
+_TWICE = (_AT ** (_ORDERS + 2) / ((_ORDERS + 1) * (_ORDERS + 2))) @ _INVERSE
+
+
+@dataclass(frozen=True)
+class Path:
+    """A path of the stretch, without a dimension, from time 0 on."""
+
+    #: Times between which it is smooth, increasing, shape (n,), from 0 to its end.
+    breaks: Array
+    course: Course
+
+    @classmethod
+    def through(
+            cls, times: Array, stretches: Array, rates: Array,
+            accelerations: Array | None = None) -> 'Path':
+        """
+        Return the path through points, shape (n,) each, as joint_trajectory_controller has it.
+
+        It is a cubic Hermite spline, of degree 5 where accelerations are given.
+        """
+        from scipy.interpolate import CubicHermiteSpline, PPoly  # others need not wait for it
+
+        if accelerations is None:
+            spline = CubicHermiteSpline(times, stretches, rates)
+        else:
+            spline = PPoly(_quintic(np.diff(times), stretches, rates, accelerations), times)
+        return cls._of(spline, times)
+
+
+    @classmethod
+    def smooth(cls, times: Array, stretches: Array) -> 'Path':
+        """Return the smoothest path through stretches, shape (n,), from rest to rest."""
+        from scipy.interpolate import make_interp_spline  # others need not wait for it
+
+        ends = [(1, 0.0), (2, 0.0)]
+        return cls._of(make_interp_spline(times, stretches, 5, bc_type=(ends, ends)), times)
+
+    @classmethod
+    def _of(cls, spline: Any, times: Array) -> 'Path':
+        slope, curve = spline.derivative(), spline.derivative(2)
+        return cls(times, lambda t: (spline(t), slope(t), curve(t)))
+
+    def since(self, time: float) -> 'Path':
+        """Return what is left of the path from a time on, as from 0."""
+        begins = np.searchsorted(self.breaks, time, side='right')
+        return Path(
+            np.append(0.0, self.breaks[begins:] - time),
+            lambda t: self.course(t + time))
+
+
+def _quintic(spans: Array, x: Array, v: Array, a: Array) -> Array:
+    """Return the coefficients of polynomials of degree 5 between points, highest first."""
+    move = x[1:] - x[:-1] - spans * (v[:-1] + 0.5 * spans * a[:-1])
+    gain = (v[1:] - v[:-1] - spans * a[:-1]) * spans
+    bend = (a[1:] - a[:-1]) * spans ** 2
+    found: Array = np.array([
+        (6.0 * move - 3.0 * gain + 0.5 * bend) / spans ** 5,
+        (-15.0 * move + 7.0 * gain - bend) / spans ** 4,
+        (10.0 * move - 4.0 * gain + 0.5 * bend) / spans ** 3,
+        0.5 * a[:-1], v[:-1], x[:-1]])
+    return found
+
+
+def along(request: Request, path: Path, tolerance: float) -> Generator[None, None, Move]:
+    """
+    Follow a path to rest at the target, where it ends; pauses after some ms of work each.
+
+    Parameters
+    ----------
+    request : Request
+        The state at the start, the target, the actuator, and what commands reach it by.
+    path : Path
+        Ends at the target at rate 0.
+    tolerance : float
+        Deviation that levels may leave as a share of the range of the path.
+
+    Returns
+    -------
+    Move
+        Its reason names the largest deviation where that is more than the tolerance.
+
+    Raises
+    ------
+    RefusedError
+        If the path leaves the stretches that the law has, or no rest at its end can be had.
+
+    """
+    request.holding_load()
+    follower = _Follower(request, path, tolerance)
+    while follower.done < len(follower.edges) - 1:
+        follower.advance()
+        yield
+    return follower.move()
+
+
+class _Follower:
+    """Works out the levels of a path block by block."""
+
+    def __init__(self, request: Request, path: Path, tolerance: float) -> None:
+        self._request, self._path = request, path
+        self.range, self.edges = _edges(request, path, tolerance)
+        self._allowed = tolerance * self.range
+        self.done = 0  # intervals whose levels are known
+        self._levels: list[Level] = []
+        self._states = [request.start]
+        self._followed = followed_by(request.state, request.material)
+        # What integral and double integral of the command have too much, and the load by now.
+        inertia = law.mass(request.state.stretch, request.material.packed)
+        begin = self._course(np.zeros(1))
+        self._lack = np.array([
+            inertia * (request.state.rate - begin[1][0]),
+            inertia * (request.state.stretch - begin[0][0])])
+        self._reached = request.field
+        self._times: list[Array] = []
+        self._away: list[Array] = []
+        self._limited: set[Code] = set()
+
+    def _course(self, times: Array) -> tuple[Array, Array, Array]:
+        """Return stretch, rate and acceleration of the path, which rests after its end."""
+        end = self._path.breaks[-1]
+        stretch, rate, change = self._path.course(np.minimum(times, end))
+        return stretch, np.where(times > end, 0.0, rate), np.where(times > end, 0.0, change)
+
+    def advance(self) -> None:
+        """Work out the levels of the next block."""
+        first, last = self.done, min(self.done + _BLOCK, len(self.edges) - 1)
+        fitted = min(last + _OVERLAP, len(self.edges) - 1)
+        edges, keep = self.edges[first:fitted + 1], last - first
+        stretch, loads = self._inverse(edges, keep)
+        levels = self._fit(edges, loads, keep)
+        limits = self._request.limits
+        clipped = np.clip(levels, limits.minimum, limits.maximum)
+        state = self._states[-1]
+        away = abs(state.stretch - float(self._course(edges[:1])[0][0]))
+        if np.any(clipped != levels):
+            self._limited.add(Code.FLUX_LIMIT)
+            self._lack = np.zeros(2)
+        if np.any(clipped != levels) or away > 10.0 * self._allowed:
+            clipped = self._returning(edges[:keep + 1], clipped)
+        self._simulate(edges[:keep + 1], clipped, stretch[:keep])
+        self.done = last
+
+    def _inverse(self, edges: Array, keep: int) -> tuple[Array, Array]:
+        """Return stretch and load of the path at the points between edges, (n, 6) each."""
+        material = self._request.material
+        spans = np.diff(edges)
+        times: Array = (edges[:-1, np.newaxis] + spans[:, np.newaxis] * _POINTS).ravel()
+        stretch, rate, wanted = self._course(times)
+        packed = material.packed
+        loads = _loads(stretch, rate, wanted, packed)
+        if material.creep:
+            # With the edges, at each of which branches are where the next block begins.
+            every = np.append(np.column_stack([edges[:-1], times.reshape(-1, 6)]), edges[-1])
+            forces = np.empty_like(every)
+            law.evaluate(law.FORCE, np.ascontiguousarray(self._course(every)[0]), packed, forces)
+            behind = np.empty((len(every), len(self._followed)))
+            motion.trail(every, forces, with_followed(material, self._followed), behind)
+            held = (forces[:, np.newaxis] - behind) @ material.branches[:, motion.RATIO]
+            loads = loads + held[:-1].reshape(-1, 7)[:, 1:].ravel()
+            self._followed = tuple(behind[7 * keep].tolist())
+        return stretch.reshape(-1, 6), loads.reshape(-1, 6)
+
+    def _fit(self, edges: Array, loads: Array, keep: int) -> Array:
+        """Return the levels of a block."""
+        from scipy.interpolate import BSpline  # others need not wait for it
+        from scipy.sparse.linalg import spsolve
+
+        delivery, start = self._request.delivery, self._states[-1].ramps_from
+        lag, slew, inner = delivery.lag, delivery.slew, np.diff(edges)[:, np.newaxis]
+        since: Array = edges[:-1, np.newaxis] - edges[0] + inner * _AT.T
+        # The amplifier also gives what changes the field: the lag times its growth.
+        once, twice, values = _integrals(loads, inner)
+        twice += lag * (once - self._reached * since)
+        once += lag * (values - self._reached)
+        target = twice - self._lack[1] - self._lack[0] * since
+        knots = np.concatenate([[edges[0]] * 2, edges, [edges[-1]] * 2])
+        weights = np.sqrt(inner * _WEIGHTS).ravel()
+        design = BSpline.design_matrix(
+            (edges[:-1, np.newaxis] + inner * _POINTS).ravel(), knots, 2).multiply(
+                weights[:, np.newaxis]).tocsc()
+        # The first two coefficients are value and slope at the start, which are 0; the last two
+        # are those at the end, which are given where the path ends.
+        free = slice(2, -2 if edges[-1] == self.edges[-1] else None)
+        normal = (design[:, free].T @ design[:, free]).tocsc()
+        coefficients = np.zeros(len(edges) + 1)
+        more, gained = np.zeros_like(target), np.zeros(len(loads))
+        for _ in range(1 if math.isinf(slew) else _RAMPED):
+            wanted = target - more
+            if free.stop is not None:
+                # The field is that which holds the end, whatever it is just before.
+                slope = once[-1, -1] - self._lack[0] - gained[-1] + lag * (
+                    self._holding() - values[-1, -1])
+                coefficients[-2:] = wanted[-1, -1] - 0.5 * inner[-1, 0] * slope, wanted[-1, -1]
+            coefficients[free] = 0.0
+            coefficients[free] = spsolve(normal, design[:, free].T @ (
+                weights * wanted[:, :-1].ravel() - design @ coefficients))
+            spline = BSpline(knots, coefficients, 2)
+            levels: Array = spline.derivative(2)(edges[:-1] + 0.5 * inner[:, 0])
+            if math.isfinite(slew):
+                more, gained = _ramped(levels, start, inner, slew)
+        end = keep - 1
+        self._lack = np.array([
+            self._lack[0] + levels[:keep] @ inner[:keep, 0] + gained[end] - once[end, -1],
+            float(spline(edges[keep])) + more[end, -1] - target[end, -1]])
+        self._reached = float(values[end, -1])
+        return levels[:keep]
+
+    def _simulate(self, edges: Array, levels: Array, stretch: Array) -> None:
+        """Take levels between edges, and what they lead to beside the path."""
+        request, start = self._request, self._states[-1]
+        times = np.column_stack([
+            edges[:-1, np.newaxis] + np.diff(edges)[:, np.newaxis] * _POINTS, edges[1:]])
+        commands = tuple(map(Level, edges[:-1].tolist(), levels.tolist()))
+        found = sampled(commands, start, times.ravel(), request.material, request.delivery)
+        motions = found[motion.STRETCH].reshape(times.shape)
+        self._times.append(times[:, :-1])
+        self._away.append(np.abs(motions[:, :-1] - stretch))
+        output = start.ramps_from
+        for level, span, row in zip(
+                levels.tolist(), np.diff(edges).tolist(), found[:, 6::7].T.tolist(), strict=True):
+            most = request.delivery.slew * span
+            if abs(level - output) > most:
+                self._limited.add(Code.SLEW_LIMIT)
+            output += min(max(level - output, -most), most)
+            lags = request.delivery.lag > 0.0
+            self._states.append(State(
+                row[0], row[1], row[2] if lags else output, output if lags else None,
+                tuple(row[3:])))
+        self._levels += commands
+
+    def _returning(self, edges: Array, levels: Array) -> Array:
+        """Return levels within the limits that lead back to the path from a state beside it."""
+        request = self._request
+        limits, delivery, material = request.limits, request.delivery, request.material
+        packed, state, found = material.packed, self._states[-1], levels.copy()
+        stretch, rate, wanted = self._course(edges)
+        field = _loads(stretch, rate, wanted, packed)
+        for i, span in enumerate(np.diff(edges).tolist()):
+            inertia = float(law.mass(state.stretch, packed))
+            quick = _RETURN * float(law.natural_frequency(state.stretch, packed))
+            off, speed = state.stretch - stretch[i], state.rate - rate[i]
+            if delivery.lag > 0.0:
+                more = (state.load - field[i]) / inertia
+                push = more - delivery.lag * quick * (
+                    quick * quick * off + 3.0 * quick * speed + 3.0 * more)
+            else:
+                push = -quick * (quick * off + 2.0 * speed)
+            found[i] = min(max(levels[i] + inertia * push, limits.minimum), limits.maximum)
+            state = follow((Level(0.0, float(found[i])),), state, span, material, delivery)
+        return found
+
+    def move(self) -> Move:
+        """Return the move once all levels are known, the last ones corrected to end at rest."""
+        request, edges = self._request, self.edges
+        end = float(edges[-1])
+        begin = int(np.searchsorted(edges, end - _ENDING * 2.0 * math.pi / request.frequency))
+        begin = max(min(begin, len(edges) - 1 - _FEWEST // 2), len(edges) - 1 - _LAST, 0)
+        rest = replace(request, state=self._states[begin])
+        found = self._ended(rest, begin)
+        if found is None or not request.keeps(found[0]):
+            # Beside the path at its end: a move of its own to rest.
+            begin = len(edges) - 1
+            last = two_step(replace(request, state=self._states[-1]))
+            found = last.levels, last.duration
+        since = float(edges[begin])
+        levels = (*self._levels[:begin], *(Level(since + x.time, x.load) for x in found[0]))
+        times = since + np.linspace(0.0, max(end - since, found[1]), 20 * (1 + len(found[0])))[1:]
+        wanted = np.where(
+            times < end, self._course(np.minimum(times, end))[0], request.target)
+        stretch = sampled(
+            found[0], self._states[begin], times - since, request.material,
+            request.delivery)[motion.STRETCH]
+        times = np.append(np.concatenate(self._times)[:begin], times)
+        away = np.append(np.concatenate(self._away)[:begin], np.abs(stretch - wanted))
+        return Move(Code.PATH, levels, since + found[1], self._words(
+            float(np.max(away)), float(times[np.argmax(away)])))
+
+    def _ended(self, request: Request, begin: int) -> Attempt:
+        """Return the last levels, from the first edge that counts, corrected to end at rest."""
+        edges, delivery = self.edges[begin:] - self.edges[begin], request.delivery
+        levels = np.array([x.load for x in self._levels[begin:]])
+        middle = 0.5 * (edges[:-1] + edges[1:]) / edges[-1]
+        angle = request.frequency * edges[-1] * (1.0 - middle)
+        window = 4.0 * middle * (1.0 - middle) * (
+            (request.limits.minimum < levels) & (levels < request.limits.maximum))
+        changes = [window * np.sin(angle), window * np.cos(angle)]
+        if delivery.lag > 0.0:
+            changes.append(np.exp((middle - 1.0) * edges[-1] / (edges[-1] - edges[-2])))
+        d_loads = np.zeros((len(edges), len(changes)))
+        d_loads[:-1] = np.array(changes).T
+        rounded = np.array([delivery.rounded(x) for x in edges.tolist()])
+        levels = np.append(levels, self._holding())
+        return solve(Template(rounded, levels, np.zeros_like(d_loads), d_loads), request)
+
+    def _holding(self) -> float:
+        """Return the load that keeps the end of the path at rest at first."""
+        request = self._request
+        return request.balance(self._followed) if request.material.creep else (
+            request.holding_load())
+
+    def _words(self, largest: float, when: float) -> str:
+        """Return the largest deviation in words, if it is more than levels may leave."""
+        if largest <= self._allowed:
+            return ''
+        request = self._request
+        units, limits = request.units, request.limits
+        why = [f'flux densities of {units.load_text(limits.minimum)} to '
+               f'{units.load_text(limits.maximum)}'] * (Code.FLUX_LIMIT in self._limited)
+        why += [f'ramps of {units.slew_text(request.delivery.slew)}'] * (
+            Code.SLEW_LIMIT in self._limited)
+        why += [f'a command period of {units.time_text(request.delivery.period)}'] * (
+            not why and request.delivery.period > 0.0)
+        return (
+            f'the {units.coordinate} leaves the path by up to {largest:.3g} '
+            f'({100.0 * largest / self.range:.2g} % of its range), at '
+            f'{units.time_text(when)}' + f'; the limit is {" and ".join(why)}' * bool(why))
+
+
+def _loads(stretch: Array, rate: Array, wanted: Array, packed: Array) -> Array:
+    """Return the loads that give wanted accelerations, which are linear in them, (n,) each."""
+    stretch, rate = np.ascontiguousarray(stretch), np.ascontiguousarray(rate)
+    zero, one = np.empty((2, len(stretch)))
+    law.accelerations(stretch, rate, np.zeros(len(stretch)), packed, zero)
+    law.accelerations(stretch, rate, np.ones(len(stretch)), packed, one)
+    found: Array = (wanted - zero) / (one - zero)
+    return found
+
+
+def _integrals(loads: Array, spans: Array) -> tuple[Array, Array, Array]:
+    """Return integral, double integral and value of a load (n, 6), at points and ends, (n, 7)."""
+    once, twice = spans * (loads @ _ONCE.T), spans ** 2 * (loads @ _TWICE.T)
+    first = np.append(0.0, np.cumsum(once[:, -1]))[:-1, np.newaxis]
+    second = np.append(0.0, np.cumsum(
+        twice[:, -1] + spans[:, 0] * first[:, 0]))[:-1, np.newaxis]
+    return once + first, twice + first * spans * _AT.T + second, loads @ _VALUE.T
+
+
+def _ramped(levels: Array, load: float, spans: Array, slew: float) -> tuple[Array, Array]:
+    """
+    Return what ramps to levels add to the double integral of steps to them, and to the integral.
+
+    The former at points and ends of intervals, (n, 7), the latter at their ends, (n,).
+    """
+    changes = np.empty(len(levels))
+    for i, (level, span) in enumerate(zip(levels.tolist(), spans[:, 0].tolist(), strict=True)):
+        changes[i] = level - load
+        load += min(max(changes[i], -slew * span), slew * span)
+    ramp = np.abs(changes)[:, np.newaxis] / slew
+    times = np.minimum(spans * _AT.T, ramp)
+    share = np.divide(times, ramp, out=np.zeros_like(times), where=ramp > 0.0)
+    once = -changes[:, np.newaxis] * times * (1.0 - 0.5 * share)
+    twice = -changes[:, np.newaxis] * times ** 2 * (0.5 - share / 6.0) + once * (
+        spans * _AT.T - times)
+    first = np.append(0.0, np.cumsum(once[:, -1]))
+    second = np.append(0.0, np.cumsum(twice[:, -1] + spans[:, 0] * first[:-1]))[:-1, np.newaxis]
+    return twice + first[:-1, np.newaxis] * spans * _AT.T + second, first[1:]
+
+
+def _edges(request: Request, path: Path, tolerance: float) -> tuple[float, Array]:
+    """Return the range of a path, and the times at which its levels begin, and its end."""
+    material, delivery, breaks = request.material, request.delivery, path.breaks
+    packed = material.packed
+    spans = np.diff(breaks)[:, np.newaxis]
+    times = (breaks[:-1, np.newaxis] + spans * _POINTS).ravel()
+    stretch, rate, wanted = path.course(times)
+    outside = ~((packed[law.LOWER] < stretch) & (stretch < packed[law.UPPER]))
+    if np.any(outside):
+        raise RefusedError(
+            Code.OUT_OF_RANGE,
+            f'the path goes to {request.units.coordinate} {stretch[outside][0]:.6g} at '
+            f'{request.units.time_text(times[outside][0])}: expected a path between '
+            f'{packed[law.LOWER]:.6g} and {packed[law.UPPER]:.6g}')
+    span = max(float(np.ptp(np.append(stretch, request.target))), _LEAST_RANGE)
+    loads = _loads(stretch, rate, wanted, packed).reshape(-1, 6)
+    gaps = spans * np.diff(_POINTS)
+    slopes = np.diff(loads) / gaps
+    steep = np.max(np.abs(slopes), axis=1)
+    if delivery.lag > 0.0:
+        bends = np.diff(slopes) / (0.5 * (gaps[:, 1:] + gaps[:, :-1]))
+        steep = steep + delivery.lag * np.max(np.abs(bends), axis=1)
+    inertia = law.mass(request.target, packed)
+    # A lag takes most of it away again.
+    cube = _SHARE * tolerance * span * inertia / (_RIPPLE * np.maximum(steep, 1e-12))
+    longest = np.maximum(np.cbrt(cube), (cube * delivery.lag) ** 0.25)
+    longest = np.minimum(longest, min(
+        breaks[-1] / _FEWEST, 2.0 * math.pi / request.frequency / _OF_EACH))
+    if delivery.period > 0.0:
+        longest = np.maximum(longest, delivery.period)
+    each = np.ceil(spans[:, 0] / longest)
+    if not np.sum(each) <= _MOST:
+        raise RefusedError(
+            Code.TOO_LONG,
+            f'the path takes {np.sum(each):.3g} levels: expected at most {_MOST}; send it in '
+            'parts, or allow a larger deviation from it (path_tolerance)')
+    edges = np.append(np.concatenate([
+        begin + length * np.arange(count) / count for begin, length, count in zip(
+            breaks[:-1].tolist(), spans[:, 0].tolist(), each.astype(int).tolist(),
+            strict=True)]), breaks[-1])
+    grid = delivery.period or delivery.resolution
+    if grid > 0.0:
+        edges[-1] = grid * np.ceil(edges[-1] / grid * (1.0 - 1e-12))
+        edges = grid * np.unique(np.round(edges / grid))
+    return span, edges

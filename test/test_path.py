@@ -1,0 +1,253 @@
+"""Paths with velocities, followed, judged by SciPy's integration of the equation of motion."""
+
+from dataclasses import replace
+from itertools import pairwise
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicHermiteSpline
+
+from hmsa_ros import Actuator
+from hmsa_ros.cli import main
+from hmsa_ros.control.planner import PlannerRuntime
+from hmsa_ros.control.records import Settings, Severity, Trajectory
+from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.planning.drafting import finish
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.planner import Options, Planner
+
+SECOND = 1_000_000_000
+# The paper's block: units of time (s) and load (T), damping, shape and chain limit.
+TIME, LOAD = 0.01 * math.sqrt(1900.0 / 1e4), 4e-7 * math.pi * 1e4 / 0.1
+ZETA, C1, J_LIM = 0.2, 2.0, 5.0
+CREEP = ((0.1, 0.02),)
+FOLLOWED = 1e-6
+NAN = math.nan
+
+
+def force(x):
+    """Return psi' of the paper's block."""
+    return (x - x ** -2) / (1.0 - (x * x + 2.0 / x - 3.0) / J_LIM)
+
+
+def moved(levels, times, start=1.0, slew=math.inf, lag=0.0, creep=()):
+    """Return stretches at times (s) under levels (s, T), by ramps and lag, each piece by SciPy."""
+    ratios, speeds = np.array([x for x, _ in creep]), np.array([TIME / x for _, x in creep])
+
+    def motion(t, y, load, slope, begin):
+        x, v, field, held = y[0], y[1], y[2], y[3:]
+        output = load + slope * (t - begin)
+        stiffness = (force(x + 1e-6) - force(x - 1e-6)) / 2e-6
+        pull = (field if lag else output) - force(x) - held.sum()
+        return [v, (pull - 0.5 * ZETA * C1 * v + 0.25 * x ** -4 * v * v) * 6.0 / (x ** -3 + C1),
+                (output - field) * TIME / lag if lag else 0.0,
+                *(ratios * stiffness * v - speeds * held)]
+
+    times, slew = times / TIME, slew * TIME / LOAD
+    y, load = np.array([start, 0.0, force(start), *(0.0 * ratios)]), force(start)
+    found, done = np.empty(len(times)), 0
+    end = max(times[-1], levels[-1][0] / TIME) + 1e-9
+    for (begin, level), (until, _) in pairwise([
+            *((t / TIME, x / LOAD) for t, x in levels), (end, 0.0)]):
+        change = level - load
+        ramp = min(begin + abs(change) / slew, until)
+        reached = level if ramp < until else load + math.copysign(
+            min(slew * (until - begin), abs(change)), change)
+        for first, last, value, slope in (
+                (begin, ramp, load, math.copysign(min(slew, 1e9), change)),
+                (ramp, until, reached, 0.0)):
+            if last > first:
+                here = np.searchsorted(times, last)
+                solution = solve_ivp(
+                    motion, (first, last), y, method='DOP853', rtol=1e-12, atol=1e-12,
+                    t_eval=np.append(times[done:here], last), args=(value, slope, first))
+                found[done:here], y, done = solution.y[0, :here - done], solution.y[:, -1], here
+        load = reached
+    return found
+
+
+def dense(duration=0.1, count=41, goal=1.4, *, accelerations=False):
+    """Return times in s and points of a smooth path as MoveIt sends one, and its knots."""
+    s = np.linspace(0.0, 1.0, count)
+    rows = np.array([
+        1.0 + (goal - 1.0) * (10.0 * s ** 3 - 15.0 * s ** 4 + 6.0 * s ** 5),
+        (goal - 1.0) / duration * (30.0 * s ** 2 - 60.0 * s ** 3 + 30.0 * s ** 4),
+        (goal - 1.0) / duration ** 2 * (60.0 * s - 180.0 * s ** 2 + 120.0 * s ** 3)])
+    if not accelerations:
+        rows[2] = NAN
+    times = np.round(duration * s * SECOND).astype(int).tolist()
+    return list(zip(map(tuple, rows.T.tolist()), times, strict=True))
+
+
+def drafted(points, stamp=None, actuator=None, planner=None, **options):
+    """Return the draft of a path that begins at 1 s, and its planner."""
+    planner = planner or Planner(actuator or paper_actuator(), Options(**{
+        'flux_density_min': -0.5, 'flux_density_max': 0.5, 'lead_time': 0, **options}))
+    return finish(planner.draft_path(points, stamp, SECOND)), planner
+
+
+def sent(draft):
+    """Return the levels (s, T) of a draft, from its begin on."""
+    return [((x.stamp - draft.begin) / SECOND, x.flux_density) for x in draft.levels]
+
+
+def hermite(points):
+    """Return the cubic through points, as a joint_trajectory_controller has it."""
+    return CubicHermiteSpline(
+        [t / SECOND for _, t in points], [x[0] for x, _ in points], [x[1] for x, _ in points])
+
+
+def off(draft, path, end, goal, **coil):
+    """Return how far SciPy's motion is off a path, and off its goal afterwards, at most."""
+    times = np.linspace(0.0, end + 0.05, 4001)
+    away = np.abs(moved(sent(draft), times, **coil) - np.where(
+        times < end, path(np.minimum(times, end)), goal))
+    return away[times <= end].max(), away[times > end + 1e-3].max()
+
+
+@pytest.mark.parametrize(('options', 'coil'), [
+    ({}, {}),
+    ({'slew_limit': 30.0}, {'slew': 30.0}),
+    ({'coil_time_constant': 1e-3}, {'lag': 1e-3}),
+    ({'slew_limit': 30.0, 'coil_time_constant': 1e-3}, {'slew': 30.0, 'lag': 1e-3}),
+    ({'period': 100_000}, {}),
+    ({'slew_limit': 30.0, 'creep_tolerance': 1e-6}, {'slew': 30.0, 'creep': CREEP}),
+], ids=['steps', 'ramps', 'lag', 'ramps and lag', 'grid', 'creep'])
+def test_a_dense_path_is_followed_to_a_millionth_of_its_range(options, coil):
+    block = paper_actuator()
+    if 'creep' in coil:
+        block = replace(block, creep=Creep(*map(tuple, zip(*CREEP, strict=True))))
+    points = dense()
+    draft, _ = drafted(points, actuator=block, **options)
+    segment, = draft.segments
+    assert (segment.code, segment.reason, draft.warning) == (Code.PATH, '', None)
+    along, after = off(draft, hermite(points), 0.1, 1.4, **coil)
+    assert along < FOLLOWED * 0.4
+    assert after < FOLLOWED * 0.4
+    if 'period' in options:
+        assert all((x.stamp - draft.begin) % options['period'] == 0 for x in draft.levels)
+
+
+def test_accelerations_make_it_a_spline_of_degree_five():
+    points = dense(count=4, accelerations=True)
+    draft, _ = drafted(points)
+    s = np.linspace(0.0, 0.1, 500)
+    u = s / 0.1
+    wanted = 1.0 + 0.4 * (10.0 * u ** 3 - 15.0 * u ** 4 + 6.0 * u ** 5)
+    assert np.abs(moved(sent(draft), s) - wanted).max() < FOLLOWED * 0.4
+    # With the cubic through four points it would be another path.
+    assert np.abs(hermite(points)(s) - wanted).max() > 1e-3
+
+
+@pytest.mark.parametrize(('options', 'coil', 'words'), [
+    ({'flux_density_min': 0.0, 'flux_density_max': 0.123}, {}, 'flux densities of 0 T to 0.123 T'),
+    ({'slew_limit': 20.0}, {'slew': 20.0}, 'ramps of 20 T/s'),
+    ({'period': 2_000_000}, {}, 'a command period of 0.002 s')])
+def test_the_verdict_names_the_largest_deviation_where_a_limit_binds(options, coil, words):
+    points = dense(duration=0.005)
+    draft, _ = drafted(points, **options)
+    assert draft.warning is draft.segments[0]
+    assert words in draft.warning.reason
+    named = float(draft.warning.reason.split('up to ')[1].split()[0])
+    arrival = (draft.segments[0].arrival - draft.begin) / SECOND
+    times = np.linspace(0.0, 0.1, 8001)
+    found = moved(sent(draft), times, **coil)
+    away = np.abs(found - np.where(times < 0.005, hermite(points)(np.minimum(times, 0.005)), 1.4))
+    assert named == pytest.approx(away.max(), rel=0.02)
+    assert named > 10.0 * FOLLOWED * 0.4
+    assert np.abs(found[times > arrival] - 1.4).max() < 1e-7
+
+
+def test_a_path_that_began_is_joined_where_it_is():
+    points = dense()
+    draft, planner = drafted(points)
+    planner.take(draft, SECOND)
+    later = SECOND + SECOND // 25
+    again = finish(planner.draft_path(points, SECOND, later))
+    assert again.begin == later
+    times = np.linspace(0.0, 0.15, 3001)
+    levels = [x for x in sent(draft) if x[0] < 0.04] + [(t + 0.04, x) for t, x in sent(again)]
+    wanted = np.where(times < 0.1, hermite(points)(np.minimum(times, 0.1)), 1.4)
+    # Where a staircase begins anew, it ripples a little more.
+    assert np.abs(moved(levels, times) - wanted).max() < 5.0 * FOLLOWED * 0.4
+
+
+def test_from_beside_the_path_the_actuator_goes_to_it_within_a_period():
+    points = dense(goal=1.3)
+    draft, planner = drafted([((1.0, 0.0, NAN), 0), ((1.02, 0.0, NAN), SECOND // 50)])
+    planner.take(draft, SECOND)
+    draft = finish(planner.draft_path(points, None, 2 * SECOND))
+    assert draft.warning is None
+    times = np.linspace(0.0, 0.15, 3001)
+    away = np.abs(moved(sent(draft), times, start=1.02) - np.where(
+        times < 0.1, hermite(points)(np.minimum(times, 0.1)), 1.3))
+    assert away[times > 0.015].max() < FOLLOWED * 0.3
+
+
+P = ((1.0, 0.0, NAN), 0)
+
+
+@pytest.mark.parametrize(('points', 'code', 'words'), [
+    ([], Code.BAD_INPUT, 'no points'),
+    ([P], Code.SPELL_TOO_SHORT, 'time_from_start 0'),
+    ([P, ((1.1, 0.3, NAN), SECOND)], Code.BAD_INPUT, 'the last point has velocity 0.3'),
+    ([P, ((1.1, NAN, NAN), SECOND)], Code.BAD_INPUT, 'velocity nan'),
+    ([P, ((1.1, 0.0, 0.0), SECOND)], Code.BAD_INPUT, 'in all points or in none'),
+    ([P, ((1.1, 0.0, NAN), 0)], Code.NOT_INCREASING, 'time_from_start of point 1'),
+    ([((1.0, 0.0, NAN), -1)], Code.NOT_INCREASING, 'at least 0 s'),
+    ([P, ((math.inf, 0.0, NAN), SECOND)], Code.BAD_INPUT, 'stretch is inf'),
+    ([P, ((3.0, 0.0, NAN), SECOND)], Code.OUT_OF_RANGE, 'stretch is 3'),
+    ([P, ((2.0, 90.0, NAN), SECOND // 2), ((1.0, 0.0, NAN), SECOND)], Code.OUT_OF_RANGE,
+     'the path goes to stretch'),
+    ([P, ((1.6, 0.0, NAN), SECOND)], Code.FLUX_LIMIT, 'needs a flux density'),
+    ([P, ((1.1, 0.0, NAN), 10**6 * SECOND)], Code.TOO_LONG, 'expected at most 200000')])
+def test_what_is_no_path_to_rest_is_refused(points, code, words):
+    with pytest.raises(RefusedError, match=words) as refused:
+        drafted(points, flux_density_max=0.15)
+    assert refused.value.code is code
+
+
+def test_a_planner_follows_velocities_only_in_mode_path():
+    points = dense()
+
+    def rests():
+        raise RefusedError(Code.BAD_INPUT, 'point 1 has velocities')
+        yield
+
+    request = Trajectory(('a',), rests(), len(points), path=[((x,), t) for x, t in points])
+    for mode, severity in (('rest', Severity.ERROR), ('path', Severity.OK)):
+        group = PlannerGroup({'a': Planner(paper_actuator(), Options(
+            flux_density_min=-0.5, flux_density_max=0.5))})
+        runtime = PlannerRuntime(
+            group, Settings(trajectory_mode=mode, takeover_timeout=0), clock=lambda: SECOND,
+            steady=lambda: 0)
+        runtime.active = True
+        assert runtime.request(request).severity in (severity, Severity.OK)
+        while runtime.planning:
+            runtime.tick(SECOND)
+        assert len(group.planners['a'].plan.segments) == (mode == 'path')
+
+
+def test_arrays_and_files_of_a_path_are_followed_too(tmp_path, capsys):
+    times = np.linspace(0.0, 0.2, 21)
+    stretches = 1.1 + 0.1 * np.sin(2.0 * np.pi * (times / 0.2) ** 2 * (3.0 - 2.0 * times / 0.2))
+    block = Actuator()
+    plan = block.follow(times, stretches)
+    here = moved(plan.levels.tolist(), times, start=1.1)
+    assert here == pytest.approx(stretches, abs=FOLLOWED * 0.2)
+    assert plan.simulate().report()['verdict'] == ['arrived']
+    block.to_yaml(tmp_path / 'block.yaml')
+    rows = '\n'.join(f'{x!r},{y!r}' for x, y in zip(
+        times.tolist(), stretches.tolist(), strict=True))
+    (tmp_path / 'path.csv').write_text(f'time,stretch\n{rows}\n')
+    assert main(['plan', '--path', str(tmp_path / 'path.csv'), '--params-file',
+                 str(tmp_path / 'block.yaml'), '--out', str(tmp_path / 'levels.csv')]) == 0
+    written = np.loadtxt(tmp_path / 'levels.csv', delimiter=',', skiprows=1)
+    assert written == pytest.approx(plan.levels, abs=1e-12)
+    capsys.readouterr()
+    assert main(['plan', '--path', str(tmp_path / 'path.csv')]) == 2
+    assert '--path CSV with --params-file' in capsys.readouterr().err
