@@ -66,7 +66,7 @@ def test_too_much_damping_falls_back_to_the_plain_step_and_says_so(capsys):
     (['plan', '1.1:-1'], 'duration is -1'),
     (['plan', '1.1:inf'], 'duration is inf'),
     (['plan', 'nan:1'], 'stretch is nan'),
-    (['plan'], 'required: STRETCH:SPAN'),
+    (['plan'], 'expected STRETCH:SPAN'),
     (['plan', '1.1:1'], 'takes 1.316'),
     (['plan', '1.1:10', '--zeta', '-1'], 'zeta is -1'),
     (['plan', '1.1:10', '--zeta', 'nan'], 'zeta is nan'),

@@ -90,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
     si = arguments.params_file is not None
     if bool(arguments.setpoints) == (arguments.path is not None) or arguments.path and not si:
         raise BadInputError(
-            'expected setpoints such as 1.10:10, or --path CSV with --params-file')
+            'expected STRETCH:SPAN such as 1.10:10, or --path CSV with --params-file')
     from hmsa_ros.api.plan import table_of
     from hmsa_ros.model.equations import signed_root
 

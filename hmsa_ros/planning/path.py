@@ -121,27 +121,11 @@ def _quintic(spans: Array, x: Array, v: Array, a: Array) -> Array:
 
 def along(request: Request, path: Path, tolerance: float) -> Generator[None, None, Move]:
     """
-    Follow a path to rest at the target, where it ends; pauses after some ms of work each.
+    Follow a path to rest at its end, the target of the request; pauses after some ms of work each.
 
-    Parameters
-    ----------
-    request : Request
-        The state at the start, the target, the actuator, and what commands reach it by.
-    path : Path
-        Ends at the target at rate 0.
-    tolerance : float
-        Deviation that levels may leave as a share of the range of the path.
-
-    Returns
-    -------
-    Move
-        Its reason names the largest deviation where that is more than the tolerance.
-
-    Raises
-    ------
-    RefusedError
-        If the path leaves the stretches that the law has, or no rest at its end can be had.
-
+    The tolerance is the deviation that levels may leave, as a share of the range of the path; the
+    reason of the move names the largest one where that is more. A path beyond the stretches of the
+    law, or without rest at its end, is a `RefusedError`.
     """
     request.holding_load()
     follower = _Follower(request, path, tolerance)
