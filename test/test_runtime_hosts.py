@@ -23,6 +23,7 @@ class Bench(Rig):
         self.refused = []
         self.lost = False  # whether the samples show the actuator at rest without a field
         self.samples = True
+        self.hears = True  # whether commands arrive where the link works
         self._newest = 0
         self._next = START
 
@@ -36,6 +37,8 @@ class Bench(Rig):
     def deliver(self):
         if not self.linked:
             return
+        if not self.hears:
+            self.wire = []
         for _, x in self.wire:
             self._newest = x.stamp
         if self.cut:
@@ -202,6 +205,52 @@ def test_after_a_cut_off_the_planner_waits_and_then_starts_from_where_the_actuat
     assert rig.runtime.request(Target('a', 1.4)).code == 'accepted'
     rig.run(rig.now + 500 * MS)
     assert rig.residual(1.4) < 1e-6
+
+
+@pytest.mark.parametrize('deaf', [3000, 15_000])
+def test_after_a_cut_off_a_request_waits_until_the_device_hears(deaf):
+    rig = Bench()
+    rig.runtime.request(trajectory((1.2, 400 * MS), (1.4, 60_000 * MS)))
+    rig.run(START + 1500 * MS)
+    rig.cut_off()
+    rig.run(rig.now + 2000 * MS)
+    # What the device reports arrives again, and commands do not yet.
+    rig.hears = False
+    rig.come_back()
+    rig.run(rig.now + 500 * MS)
+    assert rig.runtime.request(Target('a', 1.3)).code == 'waiting'
+    rig.run(rig.now + deaf * MS)
+    assert rig.status.verdict.code == ('cut_off' if deaf < 10_000 else 'unheard')
+    rig.hears = True
+    rig.run(rig.now + 1000 * MS)
+    if deaf > 10_000:
+        assert 'commands of joint a have not arrived for 10 s' in rig.status.verdict.message
+        assert rig.residual(1.0) < 1e-6
+        rig.runtime.request(Target('a', 1.3))
+        rig.run(rig.now + 1000 * MS)
+    assert rig.residual(1.3) < 1e-6
+    assert rig.refused == []
+
+
+def test_a_device_that_dds_has_lost_and_found_is_not_a_new_one():
+    rig = Bench()
+    rig.runtime.hearing.reporters = lambda joint: frozenset({b'one'} if rig.found else ())
+    rig.runtime.request(trajectory((1.2, 400 * MS), (1.4, 60_000 * MS)))
+    rig.run(START + 1500 * MS)
+    rig.cut_off()
+    rig.runtime.applied('a', rig.plant.time - 1, 0.0)
+    rig.found = False
+    rig.run(rig.now + 25_000 * MS)
+    # What it has reported is not reported again.
+    rig.linked, rig.wire, rig.found = True, [], True
+    rig.run(rig.now + 1000 * MS)
+    assert rig.status.verdict.code == 'cut_off'
+    assert not any('came after the commands were sent' in x for x in rig.notes())
+    assert (rig.cut, rig.refused, rig.status.unheard) == (False, [], '')
+    assert {x.flux_density for t, x in rig.sent if t > rig.now - 800 * MS} == {0.0}
+    rig.runtime.request(Target('a', 1.3))
+    rig.run(rig.now + 1000 * MS)
+    assert rig.residual(1.3) < 1e-6
 
 
 def test_after_a_cut_off_the_planner_may_go_on_by_itself_with_a_shaped_move():

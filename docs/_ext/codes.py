@@ -92,6 +92,11 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'Samples have stopped while joint_states has a publisher: the actuator may not be where '
         'the planner predicts.',
         'Repair the sensor, or stop its publisher; without samples moves start as predicted.'),
+    Code.UNHEARD: (
+        'The plant or driver is heard, but commands do not arrive there, as when a link works in '
+        'one direction only.',
+        'Repair the network from the host of the planner to that of the plant or driver; then '
+        'send the request again.'),
     Code.CUT_OFF: (
         'The watchdog of plant or driver switched the coil off, or the hardware lost its state. '
         'The rest of the sequence was dropped.',

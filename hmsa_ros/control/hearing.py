@@ -14,6 +14,9 @@ from hmsa_ros.planning.group import PlannerGroup
 
 # How often a cut-off is acknowledged, in ns.
 _AGAIN = 100_000_000
+# How long a request waits for a device that is heard and hears nothing, in ns: after an outage
+# DDS connects the two directions one after the other.
+_PATIENCE = 10_000_000_000
 # Share of half a natural period, and of lead_time, from which on an offset of clocks is warned of.
 _SHARE = 0.1
 
@@ -25,7 +28,7 @@ class Hearing:
     `found` returns whether a joint has a device that reports. ``fresh`` are the joints whose
     device has come after the last level, and has heard none. ``cut`` are those whose device
     refuses commands of before a cut-off, ``open`` those whose interlock is, and ``locked`` those
-    that obey nothing but 0 T after that. ``until`` is how long to wait for a device to obey, in
+    that obey nothing but 0 T after that. ``since`` is when a plan began to wait for devices, in
     ns by the steady clock.
     """
 
@@ -43,7 +46,7 @@ class Hearing:
         self.cut: set[str] = set()
         self.locked: set[str] = set()
         self.open: set[str] = set()
-        self.until: int | None = None
+        self.since: int | None = None
         self._acknowledged: dict[str, int] = {}
         self._warned = False
         following.clocks = self._clocks
@@ -73,8 +76,12 @@ class Hearing:
         """Find devices that were not found at the last look; return the verdict on a plan."""
         absent = {x for x in self._group.planners if not self._found(x)}
         come, self._absent = self._absent - absent, absent
-        come |= {x for x in self._group.planners if self._relieved(x)}
-        verdicts = [self._appeared(x) for x in sorted(come)]
+        # One that is known, and there again after an outage, is not new.
+        come -= {x for x, known in self._reporters.items() if known}
+        relieved = {x for x in self._group.planners if self._relieved(x)}
+        for joint in relieved:
+            self._following.newest.pop(joint, None)
+        verdicts = [self._appeared(x) for x in sorted(come | relieved)]
         return next((x for x in verdicts if x is not None), None)
 
     def _relieved(self, joint: str) -> bool:
@@ -88,12 +95,14 @@ class Hearing:
             self, joint: str, time: int, command: int, *, comparable: bool) -> Verdict | None:
         """Take in a receipt as `Receipts.received` does; return the verdict on a plan."""
         anew = self.receipts.received(joint, time, command, self._clock(), comparable=comparable)
-        return self._appeared(joint) if anew and joint in self._group.planners else None
+        if not anew or joint not in self._group.planners:
+            return None
+        self._following.newest.pop(joint, None)
+        return self._appeared(joint)
 
     def _appeared(self, joint: str) -> Verdict | None:
         """Take in that a device has come that has heard nothing of a plan."""
         self.fresh.add(joint)
-        self._following.newest.pop(joint, None)
         planner = self._group.planners[joint]
         planned = bool(planner.plan.segments)
         planner.restart()
@@ -109,8 +118,12 @@ class Hearing:
         known = joint in (self.open if locked else self.cut)
         self.open.discard(joint)
         if not in_force:
+            if joint in self.cut and self._group.planners[joint].last_sent.flux_density == 0.0:
+                # It has heard the level that is to be repeated.
+                self.fresh.discard(joint)
             self.cut.discard(joint)
             self.locked.discard(joint)
+            self._acknowledged.pop(joint, None)
             return None
         if locked:
             self.open.add(joint)
@@ -124,7 +137,7 @@ class Hearing:
             self._takeover.doubt(joint)
             self._following.astray.add(joint)
             return None
-        self._group.planners[joint].abandon(self._clock())
+        self._group.planners[joint].abandon()
         return self._dropped(
             joint, Code.INTERLOCK, f'{self.interlock(joint)}: the rest of the sequence is dropped',
         ) if locked else self._dropped(
@@ -164,16 +177,36 @@ class Hearing:
         return True
 
     def holds(self, settings: Settings) -> bool:
-        """Return whether to plan later, once it is known if a coil was cut off and is obeyed."""
+        """
+        Return whether to plan later: once a device that was cut off obeys, and commands arrive.
+
+        Raises
+        ------
+        RefusedError
+            If commands have not arrived for long at a device that is heard.
+
+        """
         names = self._following.astray
-        if not self.cut and all(
+        lost = [x for x in self._group.planners
+                if self.receipts.lost(x, *((0,) if x in self.cut else ()))]
+        if not lost and not self.cut and all(
                 level[1] != 0.0 or self.receipts.since(name, level[0])
                 for name, level in self._following.newest.items() if name in names):
-            self.until = None
+            self.since = None
             return False
-        if self.until is None:
-            self.until = self._steady() + settings.takeover_timeout
-        return self._steady() <= self.until
+        if self.since is None:
+            self.since = self._steady()
+        passed = self._steady() - self.since
+        if not lost:
+            return passed <= settings.takeover_timeout
+        if passed > _PATIENCE:
+            self.since = None
+            raise RefusedError(
+                Code.UNHEARD,
+                f'commands of joint {lost[0]} have not arrived for {passed / NANOSECONDS:.0f} s, '
+                'though the plant or driver is heard: look at the network in the direction from '
+                'the planner to it, and send the request again')
+        return True
 
     # -- clocks --------------------------------------------------------------------------------
 

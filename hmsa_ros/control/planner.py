@@ -143,7 +143,7 @@ class PlannerRuntime:
 
     def _check(self, request: Request) -> None:
         """Have joints looked at that are to move now; to stop nothing is waited for."""
-        self.hearing.until = None
+        self.hearing.since = None
         if isinstance(request, Stop) or not self._takeover.engaged:
             return
         names = _joints_of(request)
@@ -429,10 +429,10 @@ class PlannerRuntime:
         if not requests and not self.following.astray:
             return True
         if any(not isinstance(x, Stop) for x in requests) or not requests:
-            if self.hearing.holds(self.settings):
-                return False
-            self._look_at_samples()
             try:
+                if self.hearing.holds(self.settings):
+                    return False
+                self._look_at_samples()
                 notes = self._takeover.look(
                     self.settings, self.following.newest, self.feedback.follows,
                     keep=not requests)

@@ -160,17 +160,22 @@ class Receipts:
         self.silent = {x for x, known in self._joints.items() if known.silent}
         return fallen, back
 
+    def lost(self, joint: str, patience: int = _PATIENCE) -> bool:
+        """Return whether what was sent to a joint has not arrived for longer than that, in ns."""
+        known = self._joints.get(joint)
+        return known is not None and known.unanswered is not None and (
+            self._steady() - known.unanswered > patience)
+
     @property
     def words(self) -> str:
         """Why commands do not arrive; empty where they do, or where nobody gives receipts."""
-        steady = self._steady()
         for name, known in self._joints.items():
             if known.silent:
                 return (
                     f'no receipt of joint {name} from the plant or driver for more than '
                     f'{_PATIENCE / NANOSECONDS:g} s: it has ended, or its host cannot be '
                     'reached; no command is sent until it is heard again')
-            if known.unanswered is not None and steady - known.unanswered > _PATIENCE:
+            if self.lost(name):
                 return (
                     f'commands of joint {name} do not arrive: the plant or driver is heard, and '
                     f'has received none for more than {_PATIENCE / NANOSECONDS:g} s')

@@ -241,7 +241,7 @@ def _carry_out(experiment: Experiment, watch: 'Watch', progress: Tell) -> Verdic
 
 # Samples a period of the actuator, and samples that plant and recorder pass on in a second of
 # ours: where there are more of them, simulated time runs slower.
-_SAMPLES_A_PERIOD = 50.0
+_SAMPLES_A_PERIOD = 25.0
 _SAMPLES_A_SECOND = 4000.0
 
 
@@ -262,6 +262,7 @@ def simulated_nodes(
     return NodeProcess('controller', {
         f'{PLANT}:publish_clock': True, f'{PLANT}:use_sim_time': False,
         f'{PLANT}:start_paused': True, f'{PLANT}:publish_rate': rate,
+        f'{PLANT}:publish_scalars': 'never',
         f'{PLANT}:real_time_factor': factor, f'{PLANNER}:use_sim_time': True,
         f'{PLANNER}:feedback': settings.get(f'{PLANNER}.feedback', 'off')},
         namespace, params_file),

@@ -43,6 +43,7 @@ class Code(str, Enum):
     SEVERAL_PLANTS = 'several_plants'
     CLOCKS_DIFFER = 'clocks_differ'
     UNSEEN = 'unseen'
+    UNHEARD = 'unheard'
     CUT_OFF = 'cut_off'
     INTERLOCK = 'interlock'
 

@@ -109,12 +109,11 @@ class RunningPlan:
             math.isfinite(more) and _can_be_followed(PlannedLevel(
                 0, more, State(model.actuator.rest, 0.0, 0.0), model)))
 
-    def abandon(self, now: int) -> None:
-        """Drop what is ahead at a time in ns, sent or not, and the setpoints: nobody obeys."""
-        self._remember(self._history.predicted(self.plan.place(now) + 1))
-        place = self.plan.place(now)
-        self._history = History(
-            self._history.levels[:place + 1], place + 1, min(self._history.known, place))
+    def abandon(self) -> None:
+        """Drop what is not known to have taken effect, and the setpoints: nobody obeys."""
+        place = self._history.known
+        self._remember(self._history.predicted(place + 1))
+        self._history = History(self._history.levels[:place + 1], place + 1, place)
         self.plan = Plan(self.plan.number, self._history.levels, ())
         self.revision += 1
 
