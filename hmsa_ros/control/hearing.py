@@ -74,11 +74,11 @@ class Hearing:
 
     def look_for_newcomers(self) -> Verdict | None:
         """Find devices that were not found at the last look; return the verdict on a plan."""
-        absent = {x for x in self._group.planners if not self._found(x)}
-        come, self._absent = self._absent - absent, absent
+        here = {x for x in self._group.planners if self._found(x)}
         # One that is known, and there again after an outage, is not new.
-        come -= {x for x, known in self._reporters.items() if known}
-        relieved = {x for x in self._group.planners if self._relieved(x)}
+        come = {x for x in here & self._absent if not self._reporters.get(x)}
+        self._absent = self._group.planners.keys() - here
+        relieved = {x for x in here if self._relieved(x)}
         for joint in relieved:
             self._following.newest.pop(joint, None)
         verdicts = [self._appeared(x) for x in sorted(come | relieved)]
