@@ -1,7 +1,7 @@
 """
-Calibrate the coil of a bench.
+Calibrate coil, delays and statics of a bench.
 
-Calibrate a part of a bench, and write what the driver reads.
+Calibrate a part of a bench, and write what driver and planner read.
 
 example: hmsa calibrate coil readings.csv --out coil.yaml
 """
@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.check_driver import setting
-from hmsa_ros.cli.options import add_command, add_options, JSON
+from hmsa_ros.cli.options import add_command, add_options, JSON, Row
+from hmsa_ros.cli.pictures import add_picture_options, paper_of
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.quantities import number_of
 from hmsa_ros.errors import BadInputError, HmsaError
@@ -21,11 +22,21 @@ from hmsa_ros.files import check_targets, json_text, write_text, yaml_text
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from hmsa_ros.device.assembly import SensorScale
     from hmsa_ros.device.calibration import CoilCalibration
+    from hmsa_ros.identification.delays import Interval
+    from hmsa_ros.lab.calibrating import Source
     from hmsa_ros.model.equations import Array
 
 # Readings of a probe that are averaged.
 _READINGS = 20
+_SIMULATED = 'hmsa_ros.device.simulated_bench:'
+# Share of the range by which a stretch may still go at the end of a level.
+_SETTLED = 0.01
+
+_SET: Row = ('--set', 'KEY=VALUE', str, 'a setting of the hardware, as hardware.KEY of hmsa '
+             'driver; may be given several times', {'action': 'append', 'default': []})
+_LIMIT: Row = ('--limit', 'T', float, 'maximum flux density (default 0.01 T)', {'default': 0.01})
 
 
 def add_parser(subparsers: Any) -> None:
@@ -41,9 +52,7 @@ def add_parser(subparsers: Any) -> None:
              'the order taken')
     add_options(
         coil,
-        ('--set', 'KEY=VALUE', str, 'a setting of the hardware, as hardware.KEY of hmsa driver; '
-         'may be given several times', {'action': 'append', 'default': []}),
-        ('--limit', 'T', float, 'maximum flux density (default 0.01 T)', {'default': 0.01}),
+        _SET, _LIMIT,
         ('--steps', 'N', int, 'levels on each quarter of the loop (default 5)', {'default': 5}),
         ('--settle', 'S', float, 'time at each level before it is read (default 1 s)',
          {'default': 1.0}),
@@ -53,6 +62,60 @@ def add_parser(subparsers: Any) -> None:
         ('--out', 'YAML', Path,
          'parameter file of the driver to write; a table is written beside it as CSV'),
         JSON)
+    add_picture_options(coil, named='readings and model to draw')
+    latency = add_command(kinds, 'latency', _latency.__doc__)
+    latency.set_defaults(run=_latency, parser=latency)
+    _add_source(latency)
+    add_options(
+        latency,
+        ('--steps', 'N', int, 'number of levels (default 24)', {'default': 24}),
+        ('--params-file', 'YAML', Path,
+         'parameter file with the sizes of the actuator, and rough values (default: none)'),
+        ('--probe', 'MODULE:NAME', str,
+         'makes a field probe: called without arguments, it returns an object whose read() '
+         'returns a flux density in T, or a list of (flux density, NaN, time in ns)'),
+        ('--lag', 'S', float, 'known time constant of the coil, where there is no probe'),
+        ('--out', 'YAML', Path, 'parameter file of driver and planner to write'),
+        JSON)
+    add_picture_options(latency, named='response of the field to draw, or of the stretch')
+    static = add_command(kinds, 'static', _static.__doc__)
+    static.set_defaults(run=_static, parser=static)
+    _add_source(static)
+    add_options(
+        static,
+        ('--steps', 'N', int, 'levels on each quarter of the staircase (default 5)',
+         {'default': 5}),
+        ('--settle', 'S', float,
+         'time at each level, of which the second half counts (default 2 s)', {'default': 2.0}),
+        ('--gauge', 'MODULE:NAME', str,
+         'makes a gauge of the length of the actuator, in the unit of its rest length: called '
+         'without arguments, it returns an object with read()'),
+        ('--out', 'YAML', Path,
+         'parameter file of driver and planner to write; the table is written beside it as CSV'),
+        JSON)
+    add_picture_options(static, named='staircase to draw')
+
+
+def _add_source(parser: Any) -> None:
+    parser.add_argument(
+        'source', nargs='?', metavar='MODULE:NAME',
+        help='hardware as in the parameter hardware of hmsa driver, with a sensor')
+    add_options(
+        parser, ('--simulate', 'calibrate a simulated bench with delays and noise'), _SET, _LIMIT)
+
+
+def _source(arguments: argparse.Namespace) -> 'Source':
+    """Return what is to be calibrated, of valid options."""
+    from hmsa_ros.lab.calibrating import Source
+
+    check_targets([] if arguments.out is None else [arguments.out])
+    if arguments.simulate is (arguments.source is not None):
+        raise BadInputError('expected either MODULE:NAME of hardware or --simulate')
+    if arguments.steps < 2:
+        raise BadInputError(f'--steps is {arguments.steps}: expected at least 2')
+    return Source(
+        f'{_SIMULATED}SimulatedBench' if arguments.simulate else arguments.source,
+        dict(setting(x) for x in arguments.set), arguments.limit)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -79,8 +142,13 @@ def _coil(arguments: argparse.Namespace) -> int:
         raise BadInputError(
             f'--limit {arguments.limit:g}, --settle {arguments.settle:g} or --steps '
             f'{arguments.steps}: expected a limit above 0 T, at least 0 s and at least 2 steps')
+    paper = paper_of(arguments)
     current, flux = _readings(arguments)
     found = calibrate_coil(current, flux)
+    if arguments.picture:
+        from hmsa_ros.report.calibration import draw_coil
+
+        draw_coil(arguments.picture, current, flux, found, paper)
     table = ''
     if arguments.out is not None:
         table = str(_write(arguments.out, found))
@@ -142,15 +210,9 @@ def _typed(current: float) -> float:
 
 def _probe(name: str) -> 'Callable[[float], float]':
     """Return what reads a probe, some times; `BadInputError` if there is none."""
-    from hmsa_ros.device.hardware import imported, told
+    from hmsa_ros.device.hardware import told
 
-    try:
-        probe = imported(name)()
-        probe.read()
-    except BaseException as error:  # whatever a laboratory's module raises
-        raise BadInputError(
-            f'--probe {name} does not start ({told(error)}): expected MODULE:NAME that, called '
-            'without arguments, returns an object with the method read') from error
+    probe = _made(name, '--probe')
 
     def read(_: float) -> float:
         try:
@@ -162,6 +224,20 @@ def _probe(name: str) -> 'Callable[[float], float]':
     return read
 
 
+def _made(name: str, option: str) -> Any:
+    """Return a probe or gauge that answers; `BadInputError` if there is none."""
+    from hmsa_ros.device.hardware import imported, told
+
+    try:
+        found = imported(name)()
+        found.read()
+    except BaseException as error:  # whatever a laboratory's module raises
+        raise BadInputError(
+            f'{option} {name} does not start ({told(error)}): expected MODULE:NAME that, called '
+            'without arguments, returns an object with the method read') from error
+    return found
+
+
 def _write(out: Path, found: 'CoilCalibration') -> Path:
     """Write the driver's parameters, and a table beside them; return the path of that."""
     table = out.with_suffix('.csv')
@@ -170,10 +246,153 @@ def _write(out: Path, found: 'CoilCalibration') -> Path:
         write_text(table, '\n'.join(
             ['current,flux_density', *(f'{x!r},{y!r}' for x, y in rows)]) + '\n')
     low, high = found.interval
-    write_text(out, '\n'.join([
-        f'# {found.tesla_per_ampere:.6g} T/A, 95 % interval {low:.6g} to {high:.6g}, by hmsa '
-        'calibrate coil',
-        '/**/driver:', '  ros__parameters:',
-        *(f'    {key}: {yaml_text(value)}' for key, value in found.settings(
-            str(table.resolve())).items())]) + '\n')
+    _write_parameters(
+        out, f'{found.tesla_per_ampere:.6g} T/A, 95 % interval {low:.6g} to {high:.6g}, by hmsa '
+        'calibrate coil', {'driver': found.settings(str(table.resolve()))})
     return table
+
+
+def _write_parameters(out: Path, words: str, nodes: 'dict[str, dict[str, Any]]') -> None:
+    """Write parameters by node, below a line of words."""
+    lines = [f'# {words}']
+    for node, values in nodes.items():
+        if values:
+            lines += [f'/**/{node}:', '  ros__parameters:', *(
+                f'    {key}: {yaml_text(value)}' for key, value in values.items())]
+    write_text(out, '\n'.join(lines) + '\n')
+
+
+def _latency(arguments: argparse.Namespace) -> int:
+    """
+    Transport, coil lag and sensor latency.
+
+    Step through levels up to --limit and read samples, and a field probe where there is one.
+    Prints the delay of the field after the timestamp of its command, the time constant of the
+    field, and by how much timestamps of the samples are too late, with 95 % intervals. Without a
+    probe the latency includes delays that the device does not report. The coil is off at the end,
+    and after Ctrl-C.
+
+    example: hmsa calibrate latency my_lab:Bench --probe my_lab:Hall --limit 0.05 --out delays.yaml
+    """
+    paper, source = paper_of(arguments), _source(arguments)
+    if arguments.lag is not None and not 0.0 <= arguments.lag < 1.0:
+        raise BadInputError(f'--lag is {arguments.lag:g} s: expected 0 to 1 s')
+    if arguments.lag is not None and (arguments.probe is not None or arguments.simulate):
+        raise BadInputError('--lag is given with a probe, which measures it: expected one of both')
+    from hmsa_ros.identification.files import read_belief
+    from hmsa_ros.lab.calibrating import measure_delays, steps_of
+
+    actuator = read_belief(arguments.params_file).actuator
+    probe = _made(f'{_SIMULATED}SimulatedProbe', '--simulate') if arguments.simulate else (
+        None if arguments.probe is None else _made(arguments.probe, '--probe'))
+    with progress() as update:
+        found = measure_delays(
+            source, steps_of(actuator, arguments.limit, arguments.steps), probe, actuator,
+            arguments.lag, update)
+    if arguments.picture:
+        from hmsa_ros.report.calibration import draw_delays
+
+        draw_delays(arguments.picture, found, paper)
+    shown = {'transport': found.transport, 'lag': found.lag, 'latency': found.latency}
+    notes, scale = list(found.notes), source.scale
+    if arguments.out is not None:
+        nodes: dict[str, dict[str, Any]] = {'driver': {}, 'planner': {}}
+        if scale is not None:
+            nodes['driver'] = {'hardware.sensor.latency': scale.latency + found.setting.value}
+        else:
+            notes.append(f'{source.name} has no setting sensor.latency: take '
+                         f'{found.setting.value:.6g} s off the timestamps of its samples')
+        if math.isfinite(found.lag.value):
+            nodes['planner'] = {'coil_time_constant': max(found.lag.value, 0.0)}
+        _write_parameters(arguments.out, 'by hmsa calibrate latency; times in s', nodes)
+    if arguments.json:
+        print(json_text({
+            **{x: {'value': y.value, 'low': y.low, 'high': y.high} for x, y in shown.items()},
+            'jitter': found.jitter, 'setting': found.setting.value,
+            'verdict': found.motion.verdict, 'notes': notes,
+            'file': None if arguments.out is None else str(arguments.out)}))
+        return 0
+    for name, value in shown.items():
+        print(f'{name:<16}{_interval(value)}')
+    print(f'{"jitter":<16}{1e3 * found.jitter:.3g} ms, of what the device reports')
+    for line in (*(f'note: {x}' for x in notes),
+                 *([] if arguments.out is None else [f'{arguments.out} written'])):
+        print(line)
+    return 0
+
+
+def _interval(found: 'Interval') -> str:
+    return 'unknown' if math.isnan(found.value) else (
+        f'{1e3 * found.value:.4g} ms, 95 % interval {1e3 * found.low:.4g} to '
+        f'{1e3 * found.high:.4g}')
+
+
+def _static(arguments: argparse.Namespace) -> int:
+    """
+    Stretch at rest over flux density, and the scale of the sensor.
+
+    Hold a slow staircase of levels, from 0 to --limit, to its negative and back. Writes the table
+    of the hyperelastic model ``table`` for the planner, and the scale of the sensor by which the
+    stretch without a field is 1. With --gauge also its gain and offset. The coil is off at the
+    end, and after Ctrl-C.
+
+    example: hmsa calibrate static my_lab:Bench --limit 0.05 --settle 5 --out static.yaml
+    """
+    paper, source = paper_of(arguments), _source(arguments)
+    if not 0.1 <= arguments.settle < math.inf:
+        raise BadInputError(f'--settle is {arguments.settle:g} s: expected at least 0.1 s')
+    from hmsa_ros.device.statics import scale_at_rest, scale_by_gauge, statics
+    from hmsa_ros.lab.calibrating import hold_staircase
+
+    gauge = None if arguments.gauge is None else _made(arguments.gauge, '--gauge')
+    with progress() as update:
+        level, stretch, length, drift = hold_staircase(
+            source, arguments.steps, arguments.settle,
+            None if gauge is None else lambda _: float(gauge.read()), update)
+    found, scale, misses = statics(level, stretch), source.scale, math.nan
+    notes = []
+    if drift > _SETTLED:
+        notes.append(f'the stretch still goes by {100.0 * drift:.2g} % of the range at the end of '
+                     'a level: raise --settle')
+    if scale is None:
+        notes.append(f'{source.name} has no scale of its sensor (an Assembly has): it shows '
+                     f'{found.rest:.6g} without a field, expected 1')
+    elif gauge is not None:
+        scale, misses = scale_by_gauge(scale, level, stretch, length)
+    else:
+        scale = scale_at_rest(scale, found.rest)
+    if arguments.picture:
+        from hmsa_ros.report.calibration import draw_statics
+
+        draw_statics(arguments.picture, level, stretch, found, paper)
+    table = None if arguments.out is None else arguments.out.with_suffix('.csv')
+    if table is not None:
+        write_text(table, '\n'.join(['stretch,flux_density', *(
+            f'{x!r},{y!r}' for x, y in zip(
+                found.stretch.tolist(), found.level.tolist(), strict=True))]) + '\n')
+        _write_parameters(arguments.out, 'by hmsa calibrate static', {
+            'driver': _scale_settings(scale),
+            'planner': {'law.name': 'table', 'law.file': str(table.resolve())}})
+    if arguments.json:
+        print(json_text({
+            'level': found.level.tolist(), 'stretch': found.stretch.tolist(), 'rest': found.rest,
+            'apart': found.apart, 'drift': drift, 'scale': _scale_settings(scale),
+            'misses': misses, 'notes': notes,
+            'file': None if arguments.out is None else str(arguments.out)}))
+        return 0
+    print(f'{"stretch":<16}{found.stretch[0]:.4f} to {found.stretch[-1]:.4f}, '
+          f'{len(found.level)} levels of {found.level[0]:.4g} to {found.level[-1]:.4g} T')
+    print(f'{"branches":<16}apart by {100.0 * found.apart:.2g} % of the range')
+    print(f'{"without a field":<16}{found.rest:.6g} as the sensor shows it')
+    for key, value in _scale_settings(scale).items():
+        print(f'{key.removeprefix("hardware."):<20}{value:.6g}')
+    for line in (*(f'note: {x}' for x in notes),
+                 *([] if table is None else [f'{arguments.out} and {table} written'])):
+        print(line)
+    return 0
+
+
+def _scale_settings(scale: 'SensorScale | None') -> 'dict[str, float]':
+    """Return the settings of a driver for a scale, none without one."""
+    return {} if scale is None else {
+        f'hardware.sensor.{x}': getattr(scale, x) for x in ('gain', 'offset', 'rest_length')}

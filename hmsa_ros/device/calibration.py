@@ -114,7 +114,7 @@ def calibrate_coil(current: Array, flux_density: Array) -> CoilCalibration:
             'the probe and its direction')
     straight = _fit(current, flux_density, saturating=False)
     bent = _fit(current, flux_density, saturating=True)
-    at, mean, hysteresis = _means(current, flux_density)
+    at, mean, hysteresis = branch_means(current, flux_density)
     better = len(current) * math.log(
         max(float(np.sum(straight[2]**2)), 1e-300) / max(float(np.sum(bent[2]**2)), 1e-300))
     saturates = better > 10.0 and abs(bent[0][2]) < _FAR * span
@@ -160,7 +160,7 @@ def _fit(current: Array, flux_density: Array, *, saturating: bool) -> tuple[Arra
     return found.x * scale, float(abs(scale[0]) * math.sqrt(covariance[0, 0])), found.fun
 
 
-def _means(current: Array, flux_density: Array) -> tuple[Array, Array, float]:
+def branch_means(current: Array, flux_density: Array) -> tuple[Array, Array, float]:
     """Return currents, mean readings at each, and the hysteresis as a share of the range."""
     size = float(np.ptp(current))
     places = np.round(current / size / _SAME).astype(np.int64)

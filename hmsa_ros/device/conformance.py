@@ -18,23 +18,22 @@ from typing import Any, cast, IO, NamedTuple
 
 import numpy as np
 
+from hmsa_ros.device.bench import Bench, matched, Seen, SILENCE
 from hmsa_ros.device.hardware import Calls, Hardware, Instrument, load
-from hmsa_ros.device.protocol import Change, Sample, StateLostError
-from hmsa_ros.device.worker import lone_worker
+from hmsa_ros.device.protocol import StateLostError
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.units import NANOSECONDS
 
-# In s: a phase of the trial, how far ahead levels are handed over, between signs of life, silence
-# after which the coil is cut off, and how long an end may take.
-_PHASE, _LEAD, _BEAT, _SILENCE, _END = 0.6, 0.1, 0.05, 0.5, 3.0
+# In s: a phase of the trial, and how long an end may take.
+_PHASE, _END = 0.6, 3.0
 # Levels that are timed, the time between them in s, and how often the host may spoil that.
 _TIMED, _APART, _TRIES = 30, 0.03, 4
 # Limits: of a call in s, of the lateness of the median level in s, of the age of a sample in s, of
 # the error of a clock in s, of samples that repeat the one before.
 _CALL, _LATE, _CLOCK, _REPEATED = 0.02, 2e-3, 1e-3, 0.6
-# The share of calls that must keep their limit, and how often in s events are looked at.
-_MOST, _LOOK = 0.95, 2e-3
+# The share of calls that must keep their limit.
+_MOST = 0.95
 # How many deviations of its mean a response must be to be seen.
 _SEEN = 6.0
 
@@ -94,64 +93,18 @@ class _Probe:
         return call
 
 
-class _Seen(NamedTuple):
-    """What came of a phase."""
-
-    changes: list[Change]
-    samples: list[Sample]
-    asked: list[tuple[int, float]]
-
-    @property
-    def stretch(self) -> Array:
-        """Stretch of the samples that have one."""
-        found = np.array([x.stretch[0] for x in self.samples])
-        finite: Array = found[np.isfinite(found)]
-        return finite
-
-
-class _Bench:
-    """A worker with one joint, and a commander that repeats the last level as a planner does."""
+class _ProbedBench(Bench):
+    """A bench whose hardware notes the duration of each call."""
 
     #: Set by the worker's thread before the worker has started.
     probe: _Probe
 
     def __init__(self, make: Callable[[], Hardware], limit: float, rate: float) -> None:
-        self._rate = rate
-        #: How late in s the host wakes whoever sleeps.
-        self.slept: list[float] = []
-        self.worker = lone_worker(lambda: self._probed(make), limit, rate, _SILENCE)
-        # The newest command, which is repeated as a sign of life, and when next.
-        self._newest, self._beat = (0, 0.0), 0.0
+        super().__init__(lambda: self._probed(make), limit, rate)
 
     def _probed(self, make: Callable[[], Hardware]) -> Hardware:
         self.probe = _Probe(make())
         return cast(Hardware, self.probe)
-
-    def run(self, seconds: float, levels: Sequence[float] = (), *, beat: bool = True) -> _Seen:
-        """Let time pass; hand over levels in T, spread over it, and repeat the last in between."""
-        begin, seen = time_ns() + round(_LEAD * NANOSECONDS), _Seen([], [], [])
-        apart = seconds / max(len(levels), 1)
-        for i, level in enumerate(levels):
-            stamp = begin + round(i * apart * NANOSECONDS)
-            self.worker.receive(0, stamp, level)
-            seen.asked.append((stamp, level))
-            self._newest = stamp, level
-        until = monotonic() + seconds + (_LEAD if levels else 0.0)
-        while monotonic() < until and self.worker.failure is None:
-            if beat and monotonic() > self._beat:
-                self._beat = monotonic() + _BEAT
-                self.worker.receive(0, *self._newest)
-            begun = monotonic()
-            sleep(_LOOK)
-            self.slept.append(monotonic() - begun - _LOOK)
-            self.worker.look_after()
-            self._collect(seen)
-        self._collect(seen)
-        return seen
-
-    def _collect(self, seen: _Seen) -> None:
-        seen.changes.extend(self.worker.changes())
-        seen.samples.extend(self.worker.samples())
 
 
 class Trial:
@@ -217,11 +170,11 @@ class Trial:
 
         """
         progress('levels and samples', 0.0)
-        bench = _Bench(self._make, self._level, self._rate)
+        bench = _ProbedBench(self._make, self._level, self._rate)
         self._tolerance = max(
             bench.worker.device.instruments[0].resolution or 0.0, 1e-3 * self._level)
-        rest = self._guarded(bench, _PHASE, [0.0])
-        up, down = (self._guarded(bench, _PHASE, [x * self._level]) for x in (1.0, -1.0))
+        rest = bench.hold(_PHASE, [0.0])
+        up, down = (bench.hold(_PHASE, [x * self._level]) for x in (1.0, -1.0))
         progress('timing', 0.3)
         timed = self._timed(bench)
         self._check_levels([rest, up, down, timed], timed)
@@ -247,20 +200,14 @@ class Trial:
     def _make(self) -> Hardware:
         return load(self.name)(self._joint, self._settings)
 
-    def _timed(self, bench: _Bench) -> _Seen:
+    def _timed(self, bench: _ProbedBench) -> Seen:
         """Time a series of levels: again, a few times, where the host slept through one."""
         for _ in range(_TRIES):
             bench.slept.clear()
-            seen = self._guarded(bench, _TIMED * _APART, [
+            seen = bench.hold(_TIMED * _APART, [
                 (0.5 if i % 2 else 1.0) * self._level for i in range(_TIMED)])
-            if len(_matched(seen)) == _TIMED or max(bench.slept) < _APART / 2:
+            if len(matched(seen)) == _TIMED or max(bench.slept) < _APART / 2:
                 break
-        return seen
-
-    def _guarded(self, bench: _Bench, seconds: float, levels: Sequence[float]) -> _Seen:
-        seen = bench.run(seconds, levels)
-        if bench.worker.failure is not None:
-            raise bench.worker.failure
         return seen
 
     def _note(
@@ -273,15 +220,15 @@ class Trial:
 
     # -- levels --------------------------------------------------------------------------------
 
-    def _check_levels(self, phases: Sequence[_Seen], timed: _Seen) -> None:
+    def _check_levels(self, phases: Sequence[Seen], timed: Seen) -> None:
         wrong = max((
-            abs(change.level - asked[1]) for x in phases for change, asked in _matched(x)),
+            abs(change.level - asked[1]) for x in phases for change, asked in matched(x)),
             default=math.inf)
         self._note(
             'level_reached', wrong, 'T', self._tolerance,
             f'levels of {self._level:g} T were set to within {wrong:g} T',
             'return the level that was really set, and give resolution (T) if it is coarse')
-        missing = len(timed.asked) - len(_matched(timed))
+        missing = len(timed.asked) - len(matched(timed))
         self._note(
             'levels_applied', float(missing), 'levels', 0.0,
             f'{missing} of {len(timed.asked)} levels, {_APART * 1e3:g} ms apart, did not take '
@@ -296,7 +243,7 @@ class Trial:
 
     # -- samples -------------------------------------------------------------------------------
 
-    def _check_samples(self, phases: Sequence[_Seen], timed: _Seen) -> None:
+    def _check_samples(self, phases: Sequence[Seen], timed: Seen) -> None:
         samples = [y for x in phases for y in x.samples]
         if not any(np.isfinite(x.stretch[0]) for x in samples):
             self._untried.append('samples: read returned none')
@@ -323,7 +270,7 @@ class Trial:
             f'{rate:.3g} samples a second, read at {self._rate:g} Hz',
             'read must return sooner; the sensor may be slower than it is asked')
 
-    def _check_response(self, rest: _Seen, up: _Seen, down: _Seen) -> None:
+    def _check_response(self, rest: Seen, up: Seen, down: Seen) -> None:
         means = [float(np.mean(x)) if len(x) else math.nan for x in (
             y.stretch[len(y.stretch) // 2:] for y in (rest, up, down))]
         spread = float(np.std(rest.stretch)) if len(rest.stretch) else math.nan
@@ -342,14 +289,14 @@ class Trial:
 
     # -- ends ----------------------------------------------------------------------------------
 
-    def _check_silence(self, bench: _Bench) -> None:
-        self._guarded(bench, 0.2, [self._level])
+    def _check_silence(self, bench: _ProbedBench) -> None:
+        bench.hold(0.2, [self._level])
         begun = time_ns()
-        seen = bench.run(_SILENCE + 0.5, beat=False)
+        seen = bench.run(SILENCE + 0.5, beat=False)
         off = [x.stamp for x in seen.changes if abs(x.level) <= self._tolerance]
         after = (off[0] - begun) / NANOSECONDS if off else math.inf
         self._note(
-            'off_after_silence', after, 's', _SILENCE + 0.25,
+            'off_after_silence', after, 's', SILENCE + 0.25,
             f'without commands the coil was off after {after:.3g} s', 'write(0.0) must be obeyed')
 
     def _off(self) -> bool | None:
@@ -383,7 +330,7 @@ class Trial:
             'write(0.0) and close must leave it without a current')
 
     def _check_exception(self) -> None:
-        bench = _Bench(self._make, self._level, self._rate)
+        bench = _ProbedBench(self._make, self._level, self._rate)
         bench.run(0.2, [self._level])
         bench.probe.fails = True
         bench.run(0.5)
@@ -420,7 +367,7 @@ class Trial:
                 f'{name} takes {np.median(found) * 1e3:.3g} ms (at most {found.max() * 1e3:.3g})',
                 'give calls a time limit of their own; nothing else is written meanwhile')
 
-    def _check_clock(self, bench: _Bench) -> None:
+    def _check_clock(self, bench: _ProbedBench) -> None:
         known = bench.worker.device.instruments[0].clock_map
         if known is not None:
             self._note(
@@ -429,28 +376,16 @@ class Trial:
                 f'{known.drift * 1e6:.3g} ppm', 'clock() must answer at once')
 
 
-def _matched(seen: _Seen) -> list[tuple[Change, tuple[int, float]]]:
-    """Return which change belongs to which level asked for: the first one in its time."""
-    found, changes = [], list(seen.changes)
-    for i, (stamp, level) in enumerate(seen.asked):
-        until = seen.asked[i + 1][0] if i + 1 < len(seen.asked) else math.inf
-        near = [x for x in changes if stamp - 5e6 <= x.stamp < until]
-        if near:
-            found.append((near[0], (stamp, level)))
-            changes.remove(near[0])
-    return found
-
-
-def _lateness(seen: _Seen) -> list[float]:
+def _lateness(seen: Seen) -> list[float]:
     """Return how much after their time levels took effect, in s."""
-    return [(x.stamp - stamp) / NANOSECONDS for x, (stamp, _) in _matched(seen)]
+    return [(x.stamp - stamp) / NANOSECONDS for x, (stamp, _) in matched(seen)]
 
 
 def _serve(name: str, joint: str, settings: str, level: str, rate: str) -> int:
     """Keep a level, as a driver does, until SIGTERM comes."""
     ended = Event()
     signal.signal(signal.SIGTERM, lambda *_: ended.set())
-    bench = _Bench(lambda: load(name)(joint, json.loads(settings)), float(level), float(rate))
+    bench = Bench(lambda: load(name)(joint, json.loads(settings)), float(level), float(rate))
     bench.run(0.3, [float(level)])
     print('ready', flush=True)
     while not ended.is_set() and bench.worker.failure is None:

@@ -1,0 +1,74 @@
+"""A simulated coil, actuator, laser and field probe, late as real ones are; for guided runs."""
+
+from collections import deque
+from time import time_ns
+
+from hmsa_ros.device.sensor import SensorErrors
+from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
+from hmsa_ros.model.actuators import Setup
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.model.units import NANOSECONDS
+
+# In ns: between samples, and what a probe remembers of them.
+_PERIOD, _KEPT = 1_000_000, 100_000
+# Fields for `SimulatedProbe`, with their times in ns.
+_FIELDS: deque[tuple[float, float, int]] = deque(maxlen=_KEPT)
+
+
+class SimulatedBench:
+    """
+    Hardware that keeps levels until their times; times in s.
+
+    Parameters
+    ----------
+    joint : str
+        Its name.
+    transport, lag, latency : float
+        Delay and first-order lag of the field, and by how much timestamps of samples are late.
+    noise : float
+        Standard deviation of the stretch of a sample.
+
+    """
+
+    def __init__(
+            self, joint: str, transport: float = 5e-4, lag: float = 5e-4, latency: float = 2e-3,
+            noise: float = 1e-3) -> None:
+        self.description = 'simulated'
+        self._transport, self._latency = (
+            round(x * NANOSECONDS) for x in (transport, latency))
+        self._device = SimulatedDevice(
+            [SimulatedJoint(
+                Setup(paper_actuator(), coil_time_constant=lag),
+                errors=SensorErrors(stretch_noise=noise))], period=_PERIOD, time=time_ns())
+        self._ready: deque[tuple[float, float, int]] = deque()
+        _FIELDS.clear()
+
+    def schedule(self, levels: list[tuple[int, float]]) -> None:
+        """Keep levels."""
+        for stamp, level in levels:
+            self._device.receive(0, stamp + self._transport, level)
+
+    def write(self, level: float, now: int) -> int:
+        """Set a level now."""
+        self._device.receive(0, now + self._transport, level)
+        return now
+
+    def read(self, now: int) -> list[tuple[float, float, int]]:
+        """Return the samples that have arrived."""
+        self._device.advance(now)
+        for x in self._device.samples():
+            self._ready.append((
+                float(x.stretch[0]), float('nan'), x.time + self._latency))
+            _FIELDS.append((float(x.flux_density[0]), float('nan'), x.time))
+        found = []
+        while self._ready and self._ready[0][2] <= now:
+            found.append(self._ready.popleft())
+        return found
+
+
+class SimulatedProbe:
+    """A probe in the coil of the simulated bench."""
+
+    def read(self) -> list[tuple[float, float, int]]:
+        """Return field in T, nothing, and time in ns of what was seen since the last call."""
+        return [_FIELDS.popleft() for _ in range(len(_FIELDS))]

@@ -1,0 +1,223 @@
+"""Guided runs on a bench: how late field and samples are, and what a slow staircase holds."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+import math
+from threading import Event, Thread
+from time import time_ns
+from typing import Any
+
+import numpy as np
+
+from hmsa_ros.device.assembly import SensorScale
+from hmsa_ros.device.bench import Bench, LEAD, matched, Seen
+from hmsa_ros.device.calibration import loop
+from hmsa_ros.device.hardware import Hardware, load, readings, told
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.identification.delays import Delays, delays, field_delays
+from hmsa_ros.identification.recording import Recording
+from hmsa_ros.model.equations import Array, natural_frequency
+from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.model.units import NANOSECONDS
+
+Tell = Callable[[str, float], None]
+# Durations of levels in periods of the actuator, and at least in s.
+_PERIODS, _SHORTEST = (0.8, 1.6), 0.12
+# Levels as shares of the limit: in turn one of the first and one of the second range.
+_HIGH, _LOW = (0.6, 1.0), (-0.4, 0.2)
+# In s, between readings of a probe that does not wait for one itself.
+_PAUSE = 2e-4
+_RATE = 1000.0
+
+
+@dataclass(frozen=True)
+class Source:
+    """Hardware to calibrate."""
+
+    name: str  #: ``MODULE:NAME``, or one that is shipped
+    settings: Mapping[str, Any]
+    limit: float  #: largest flux density in T
+    made: list[Hardware] = field(default_factory=list)  #: since it was opened
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.limit < math.inf:
+            raise BadInputError(f'--limit is {self.limit:g} T: expected a number above 0')
+
+    @contextmanager
+    def opened(self) -> Iterator[Bench]:
+        """Start it; its coil is off at the end, however that comes."""
+        def make() -> Hardware:
+            self.made.append(load(self.name)('actuator', self.settings))
+            return self.made[-1]
+
+        bench = Bench(make, self.limit, _RATE)
+        try:
+            yield bench
+        finally:
+            bench.worker.close()
+
+    @property
+    def scale(self) -> SensorScale | None:
+        """What the readings of its sensor mean; None where it does not say."""
+        found = getattr(self.made[-1], 'scale', None)
+        return found if isinstance(found, SensorScale) else None
+
+
+class _Reader:
+    """Reads a probe all the time, in a thread; times in ns, field in T."""
+
+    def __init__(self, probe: Any) -> None:
+        self._probe, self._over = probe, Event()
+        self.seen: list[tuple[int, float]] = []
+        self.failure = ''
+        self._thread = Thread(target=self._work, name='probe', daemon=True)
+        self._thread.start()
+
+    def _work(self) -> None:
+        while not self._over.wait(_PAUSE):
+            begun = time_ns()
+            try:
+                answer = self._probe.read()
+                middle = (begun + time_ns()) // 2
+                self.seen += [(middle if x.stamp is None else x.stamp, x.stretch)
+                              for x in readings(answer)]
+            except BaseException as error:  # whatever a laboratory's class raises
+                self.failure = f'{type(self._probe).__name__}.read raised {told(error)}'
+                return
+
+    def close(self) -> Array:
+        """Stop; return what was read, shape (n, 2); a probe that failed is an `HmsaError`."""
+        self._over.set()
+        self._thread.join()
+        if self.failure:
+            raise HmsaError(self.failure)
+        found: Array = np.array(self.seen, dtype=np.float64).reshape(-1, 2)
+        return found
+
+
+def steps_of(actuator: ActuatorParameters, limit: float, count: int) -> list[tuple[float, float]]:
+    """Return levels in T and how long each is held in s, so that all phases of samples occur."""
+    random = np.random.default_rng(0)
+    period = 2.0 * math.pi * actuator.time_unit / float(
+        natural_frequency(actuator.rest, actuator.nondimensional))
+    return [(limit * random.uniform(*(_LOW if i % 2 else _HIGH)),
+             max(period * random.uniform(*_PERIODS), _SHORTEST * random.uniform(1.0, 1.5)))
+            for i in range(count)]
+
+
+def measure_delays(
+        source: Source, steps: Sequence[tuple[float, float]], probe: Any,
+        actuator: ActuatorParameters, lag: float | None, progress: Tell) -> Delays:
+    """
+    Step through levels, and tell transport, lag and latency apart.
+
+    Parameters
+    ----------
+    source : Source
+        What is measured.
+    steps : sequence of (float, float)
+        Levels in T, and how long each is held in s.
+    probe : object or None
+        Has ``read``, which returns a field in T, or a list of (field in T, NaN, time in ns).
+    actuator : ActuatorParameters
+        As far as it is known.
+    lag : float or None
+        Known lag of the field in s.
+    progress : callable
+        Called with what is going on and the share that is done.
+
+    Returns
+    -------
+    Delays
+        As far as they can be told apart.
+
+    Raises
+    ------
+    HmsaError
+        If hardware or probe fail, or the recording shows too little.
+
+    """
+    seen = Seen([], [], [])
+    with source.opened() as bench:
+        reader = None if probe is None else _Reader(probe)
+        try:
+            for i, (level, seconds) in enumerate(steps):
+                progress(f'{level:.3g} T', i / len(steps))
+                seen = seen.joined(bench.hold(seconds, [level]))
+        finally:
+            field_seen = np.zeros((0, 2)) if reader is None else reader.close()
+    progress('evaluating', 1.0)
+    pairs = matched(seen)
+    samples = {x.time: float(x.stretch[0]) for x in seen.samples if math.isfinite(x.stretch[0])}
+    if not samples or len(pairs) < len(steps):
+        raise HmsaError(
+            f'{source.name} gave {len(samples)} samples and set {len(pairs)} of {len(steps)} '
+            'levels: expected a sensor, and all levels; see hmsa check-driver')
+    zero = min(*samples, *(x.stamp for x, _ in pairs)) - NANOSECONDS
+
+    def seconds_of(times: Any) -> Array:
+        found: Array = (np.asarray(times, dtype=np.int64) - zero) / NANOSECONDS
+        return found
+
+    begins, levels = seconds_of([x.stamp for x, _ in pairs]), np.array([x.level for x, _ in pairs])
+    times = sorted(samples)
+    return delays(
+        Recording(
+            seconds_of(times), np.array([samples[x] for x in times]), np.append(0.0, begins),
+            np.append(0.0, levels), label=source.name),
+        np.append(math.nan, seconds_of([stamp for _, (stamp, _) in pairs])),
+        None if reader is None else field_delays(
+            seconds_of(field_seen[:, 0]), field_seen[:, 1], begins, levels),
+        actuator, lag=lag)
+
+
+def hold_staircase(
+        source: Source, steps: int, settle: float, gauge: Callable[[float], float] | None,
+        progress: Tell) -> tuple[Array, Array, Array, float]:
+    """
+    Hold a slow staircase of levels up, down and back.
+
+    Parameters
+    ----------
+    source : Source
+        What is measured.
+    steps : int
+        Levels on each quarter.
+    settle : float
+        Time in s at each level, of which the second half counts.
+    gauge : callable or None
+        Called with a level in T; returns the length of the actuator.
+    progress : callable
+        Called with what is going on and the share that is done.
+
+    Returns
+    -------
+    (ndarray, ndarray, ndarray, float)
+        Levels in T, stretches, lengths (NaN without a gauge), and by how much the stretch still
+        went at the end of a level at most, as a share of the range.
+
+    Raises
+    ------
+    HmsaError
+        If the hardware fails or has no sensor.
+
+    """
+    levels, rows = loop(source.limit, steps), []
+    with source.opened() as bench:
+        for i, level in enumerate(levels):
+            progress(f'{level:.3g} T', i / len(levels))
+            seen = bench.hold(settle, [level])
+            begin = seen.asked[0][0]
+            parts = [[float(x.stretch[0]) for x in seen.samples if math.isfinite(x.stretch[0])
+                      and begin + y * settle * NANOSECONDS <= x.time] for y in (0.5, 0.75)]
+            if not parts[1]:
+                raise HmsaError(
+                    f'{source.name} gave no sample at {level:.3g} T: expected a sensor, and a '
+                    f'settle time well above {LEAD:g} s')
+            second, late = (float(np.mean(x)) for x in parts)
+            rows.append((
+                level, second, math.nan if gauge is None else gauge(level), late - second))
+    found = np.array(rows)
+    return found[:, 0], found[:, 1], found[:, 2], float(
+        2.0 * np.max(np.abs(found[:, 3])) / max(float(np.ptp(found[:, 1])), 1e-300))
