@@ -132,7 +132,7 @@ def test_a_request_that_no_planner_took_is_named_by_those_who_read_the_bag(
     assert 'note: 1 request on /planner/joint_trajectory has no verdict' in capsys.readouterr().out
     assert main(['bag', 'info', str(folder), '--json']) == 0
     assert 'the planner was not active' in json.loads(capsys.readouterr().out)['notes'][0]
-    assert main(['report', str(folder), '--json']) == 0
+    assert main(['report', str(folder), '--json', '--out', str(tmp_path / 'x.html')]) == 0
     found = json.loads(capsys.readouterr().out)['runs'][0]['setpoints']
     assert [x['verdict'] for x in found] == ['missed']
 
