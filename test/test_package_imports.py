@@ -166,6 +166,14 @@ def test_nodes_start_without_scipy_which_takes_longer_to_load_than_all_else():
     assert (result.returncode, result.stderr) == (0, '')
 
 
+def test_a_plan_without_a_file_imports_no_reader_of_files():
+    result = run(BLOCKED.format(blocked=('scipy', 'mcap', 'yaml', 'hmsa_ros.bag.reader')) + """
+from hmsa_ros.cli import main
+sys.exit(main(['plan', '1.1:10']))
+""")
+    assert (result.returncode, result.stderr) == (0, '')
+
+
 @pytest.mark.parametrize('arguments', [['--help'], ['--version'], ['demo', '--help']])
 def test_help_imports_nothing_slow(arguments):
     result = run(BLOCKED.format(blocked=SLOW) + f"""

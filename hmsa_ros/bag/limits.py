@@ -10,8 +10,6 @@ import math
 import reprlib
 from typing import Any
 
-import yaml
-
 from hmsa_ros.errors import BagError
 
 MEBIBYTE = 2**20
@@ -48,8 +46,6 @@ YAML_NODES = 300_000
 YAML_DEPTH = 30
 #: Sentences about what cannot be read.
 PROBLEMS = 200
-# The C parser is some ten times faster; not every installation of PyYAML has it.
-_Loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
 def load_json(text: str) -> Any:
@@ -69,11 +65,15 @@ def load_json(text: str) -> Any:
 
 def load_yaml(text: str) -> Any:
     """Return what a YAML text holds; raise `BagError` if it is none, too large, or has anchors."""
+    import yaml  # whoever plans without files need not wait for it
+
+    # The C parser is some ten times faster; not every installation of PyYAML has it.
+    loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
     if len(text) > YAML_SIZE:
         raise BagError(f'it has {len(text)} characters, expected at most {YAML_SIZE}')
     nodes = depth = 0
     try:
-        for event in yaml.parse(text, Loader=_Loader):
+        for event in yaml.parse(text, Loader=loader):
             if isinstance(event, yaml.AliasEvent):
                 # With these a few lines unfold to more than fits into any memory.
                 raise BagError('it uses YAML anchors, expected plain YAML')
@@ -87,7 +87,7 @@ def load_yaml(text: str) -> Any:
                     raise BagError(f'it is nested deeper than {YAML_DEPTH}')
             elif isinstance(event, yaml.CollectionEndEvent):
                 depth -= 1
-        return yaml.load(text, _Loader)
+        return yaml.load(text, loader)
     except BagError:
         raise
     except Exception as error:  # values that do not fit their tags raise errors of any class

@@ -4,17 +4,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa_ros.bag.info import BagSummary
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.judge import Sensor
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.recordings.levels import in_force, Level
 from hmsa_ros.recordings.parameters import number_of, of_joint
+
+if TYPE_CHECKING:
+    from hmsa_ros.bag.info import BagSummary
 
 Times = NDArray[np.int64]
 
@@ -81,7 +84,7 @@ class Run:
     notes: tuple[str, ...] = ()  # what a reader should know, one sentence each
     # Of each role (`hmsa_ros.recordings.topics`)
     topics: Mapping[str, str] = field(default_factory=dict)
-    summary: BagSummary | None = None  # None for a table
+    summary: 'BagSummary | None' = None  # None for a table
     origin: str = 'recorded'  # or simulated
 
     def __post_init__(self) -> None:
