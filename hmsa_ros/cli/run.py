@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 NOT_MEASURED = 'predicted, not measured'
 # What is slower than this share of real time is said to be.
 _SLOW = 0.9
+_MOST_REPEATS = 10_000
 
 
 def add_parser(subparsers: Any) -> None:
@@ -57,6 +58,8 @@ def add_parser(subparsers: Any) -> None:
          'steady-state error and residual vibration that count as arrived, as a fraction of the '
          "step (default: the planner's arrival_tolerance, vibration_tolerance and "
          'stretch_tolerance, which also apply to the end of --levels)'),
+        ('--repeat', 'N', int, 'execute it N times, and print statistics (default 1)',
+         {'default': 1}),
         ('--report', 'also write report.html'),
         ('--out', 'DIR', Path, 'folder for the output (default hmsa_run/ plus date and time)'),
         ('--json', 'print the result as JSON'),
@@ -70,40 +73,105 @@ def run(arguments: argparse.Namespace) -> int:
     from rich.console import Console
 
     tolerances = _tolerances(arguments)
+    if not 1 <= arguments.repeat <= _MOST_REPEATS:
+        raise BadInputError(
+            f'--repeat is {arguments.repeat}: expected 1 to {_MOST_REPEATS}')
     folder = arguments.out or Path('hmsa_run') / datetime.now().strftime('%Y-%m-%d_%H-%M-%S')
     if arguments.simulate:
         from hmsa_ros.lab.processes import local_environment
         # Set before anything of ROS is imported: this process joins the nodes' domain.
         os.environ.update(local_environment())
-    experiment = _experiment(arguments, folder)
-    from hmsa_ros.lab.experiment import conduct, prepare
+    from hmsa_ros.lab.experiment import prepare
 
-    prepare(folder)
+    # Each repeat has a folder of its own.
+    folders = [folder] if arguments.repeat == 1 else [
+        folder / str(i + 1) for i in range(arguments.repeat)]
+    experiments = [_experiment(arguments, x) for x in folders]
+    for x in folders:
+        prepare(x)
     ENDING.note()
     console = Console(stderr=True)
-    try:
-        with progress() as update:
-            done = conduct(experiment, dict(os.environ), partial(_tell, update))
-            ENDING.check()
-            update('evaluating the bag', None)
-            parts = _measure(experiment, tolerances) if done.measured else []
-            report = _report(parts, folder / 'report.html') if arguments.report and parts else None
-    except KeyboardInterrupt:
-        console.print(
-            f'interrupted; the bag so far: {experiment.bag}' if experiment.bag.exists()
-            else 'interrupted', highlight=False, soft_wrap=True)
-        return ENDING.status
-    findings = [] if experiment.levels else [y for x in parts for y in x.evaluation.findings]
-    verdict, reason = _verdict(experiment, findings, done)
-    if arguments.json:
-        print(json_text({
+    records, each, verdicts = [], [], []
+    for experiment in experiments:
+        try:
+            done, parts, report = _carried_out(arguments, experiment, tolerances)
+        except KeyboardInterrupt:
+            console.print(
+                f'interrupted; the bag so far: {experiment.bag}' if experiment.bag.exists()
+                else 'interrupted', highlight=False, soft_wrap=True)
+            return ENDING.status
+        findings = [] if experiment.levels else [y for x in parts for y in x.evaluation.findings]
+        verdict, reason = _verdict(experiment, findings, done)
+        verdicts.append(verdict)
+        each.append(findings)
+        records.append({
             'verdict': verdict, 'reason': reason, 'setpoints': [x.to_dict() for x in findings],
             **({'levels': [asdict(x) for x in _levels(parts)]} if experiment.levels else {}),
             'notes': done.notes, 'exits': done.exits, 'bag': str(experiment.bag),
-            'report': None if report is None else str(report)}))
-    else:
-        _print(experiment, parts, reason, done, report)
-    return 0 if verdict in ('arrived', NOT_MEASURED) else 1
+            'report': None if report is None else str(report)})
+        if not arguments.json:
+            _print(experiment, parts, reason, done, report)
+    if arguments.json:
+        print(json_text(records[0] if arguments.repeat == 1 else {
+            'repeats': records, 'statistics': _statistics(each)}))
+    elif arguments.repeat > 1:
+        _print_statistics(each)
+    return 0 if all(x in ('arrived', NOT_MEASURED) for x in verdicts) else 1
+
+
+def _carried_out(
+        arguments: argparse.Namespace, experiment: 'Experiment', tolerances: 'Tolerances | None'
+) -> 'tuple[Conducted, list[Part], Path | None]':
+    """Conduct an experiment and evaluate its bag."""
+    from hmsa_ros.lab.experiment import conduct
+
+    with progress() as update:
+        done = conduct(experiment, dict(os.environ), partial(_tell, update))
+        ENDING.check()
+        update('evaluating the bag', None)
+        parts = _measure(experiment, tolerances) if done.measured else []
+        report = _report(
+            parts, experiment.folder / 'report.html') if arguments.report and parts else None
+    return done, parts, report
+
+
+def _statistics(each: 'list[list[Finding]]') -> list[dict[str, Any]]:
+    """Return mean, standard deviation and largest size of what repeats left, by setpoint."""
+    import numpy as np
+
+    found = []
+    for group in zip(*each, strict=False):
+        row: dict[str, Any] = {
+            'joint': group[0].setpoint.joint, 'setpoint': group[0].setpoint.number,
+            'target': group[0].setpoint.target, 'repeats': len(group),
+            'arrived': sum(x.arrived for x in group)}
+        for name in ('vibration', 'offset'):
+            values = np.array([x.setpoint.percent(getattr(x, name)) for x in group])
+            values = values[np.isfinite(values)]
+            row[f'{name}_percent'] = {
+                'mean': float(np.mean(values)) if len(values) else None,
+                'std': float(np.std(values, ddof=1)) if len(values) > 1 else None,
+                'largest': float(values[np.argmax(np.abs(values))]) if len(values) else None}
+        found.append(row)
+    return found
+
+
+def _print_statistics(each: 'list[list[Finding]]') -> None:
+    from hmsa_ros.table import Column, Table
+
+    rows = []
+    for x in _statistics(each):
+        figures = [x[f'{y}_percent'][z] for y in ('vibration', 'offset')
+                   for z in ('mean', 'std', 'largest')]
+        rows.append((f'{x["joint"]} {x["setpoint"]}'.strip(), x['target'],
+                     f'{x["arrived"]} of {x["repeats"]}',
+                     *(math.nan if y is None else y for y in figures)))
+    if rows:
+        print(Table(
+            (Column('setpoint'), Column('target'), Column('arrived'), *(
+                Column(f'{y}{z}', '', '.3g') for y in ('vibration', 'offset')
+                for z in ('', ' std', ' max'))), tuple(rows),
+            'over the repeats: mean, standard deviation and largest; in % of the step'))
 
 
 def _tell(update: 'Callable[[str, float | None], None]', what: str, share: float) -> None:

@@ -17,8 +17,9 @@ def add_sequence(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--levels', type=Path, metavar='CSV',
         help='instead of setpoints: CSV with the columns time and flux_density, as hmsa excite '
-             'writes it. The levels are sent unchanged if they respect the limits of coil and '
-             'block; levels that do not end at rest are followed by a shaped move to rest')
+             'writes it, or YAML of hmsa learn. The levels are sent unchanged if they respect the '
+             'limits of coil and block; levels that do not end at rest are followed by a shaped '
+             'move to rest')
 
 
 def levels_of(arguments: argparse.Namespace) -> list[tuple[float, float]]:
@@ -30,6 +31,11 @@ def levels_of(arguments: argparse.Namespace) -> list[tuple[float, float]]:
             + ': expected STRETCH:SECONDS ... or --levels CSV')
     if arguments.levels is None:
         return []
+    if arguments.levels.suffix.lower() in ('.yaml', '.yml'):
+        from hmsa_ros.identification.sequences import levels_in
+
+        rows = levels_in(arguments.levels)
+        return [(x - rows[0][0], y) for x, y in rows]
     from hmsa_ros.identification.tables import read_levels
 
     times, levels, _ = read_levels(arguments.levels)

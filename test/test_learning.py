@@ -1,0 +1,186 @@
+"""Learning from repeats, on benches with hysteresis and a second mode that no model has."""
+
+from dataclasses import replace
+import json
+import math
+
+from bench_oracle import Plant, slow
+import numpy as np
+import pytest
+
+from hmsa_ros import Actuator
+from hmsa_ros.cli import main
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.learning import learn, Target, Trial
+from hmsa_ros.identification.sequences import levels_in
+from hmsa_ros.model.parameters import paper_actuator
+
+NOMINAL = slow(paper_actuator())
+SETPOINTS = ((1.15, 1.2), (1.3, 1.2), (1.05, 1.2))
+TARGETS = [Target(x, 1.2 * i, 1.2 * (i + 1)) for i, (x, _) in enumerate(SETPOINTS)]
+TIME = np.arange(0.0, 3.6, 1e-3)
+NOISE = 3e-4
+
+
+def planned():
+    """Return the levels of the sequence as it is planned."""
+    plan = Actuator(**{x: getattr(NOMINAL, x) for x in (
+        'shear_modulus', 'density', 'half_length', 'half_thickness', 'remanence', 'chain_limit',
+        'damping_coefficient')}).plan(SETPOINTS)
+    return [(float(t), float(b)) for t, b in np.asarray(plan.levels) if t < 3.6 - 1e-9]
+
+
+class Bench:
+    """An actuator behind a coil with 2 % of hysteresis, and a second mode that it rings with."""
+
+    def __init__(self, seed, largest):
+        self.random = random = np.random.default_rng((7, seed))
+        self.block = replace(
+            NOMINAL, shear_modulus=random.uniform(0.97, 1.03) * NOMINAL.shear_modulus)
+        # Plays of Prandtl and Ishlinskii, whose loop is as wide as 2 % of the range at 0 T.
+        self.widths = random.uniform(0.02, 0.7, 8) * largest
+        weights = random.uniform(0.5, 1.5, 8)
+        self.weights = weights * 0.02 * largest / (weights @ self.widths)
+        self.frequency, self.damping = random.uniform(150.0, 400.0), random.uniform(0.005, 0.03)
+        self.gain = random.uniform(0.01, 0.03) / largest
+
+    def repeat(self, levels):
+        """Return the true stretch under levels, from rest."""
+        plant, plays = Plant(self.block), np.zeros(8)
+        seen, field, root = np.zeros(len(TIME)), 0.0, math.sqrt(1.0 - self.damping**2)
+        for time, level in levels:
+            plays = np.clip(plays, level - self.widths, level + self.widths)
+            new = (level + self.weights @ plays) / (1.0 + np.sum(self.weights))
+            plant.levels.append((10**9 + round(time * 1e9), new))
+            phase = np.maximum(TIME - time, 0.0) * self.frequency
+            seen += (new - field) * self.gain * (1.0 - np.exp(-self.damping * phase) * (
+                np.cos(root * phase) + self.damping / root * np.sin(root * phase)))
+            field = new
+        return seen + [plant.advance(10**9 + round(x * 1e9) + 1)[0] for x in TIME]
+
+    def trial(self, true, levels):
+        times, values = np.array(levels).T
+        return Trial(TIME, true + NOISE * self.random.standard_normal(len(TIME)), times, values)
+
+
+def judged(true, levels):
+    """Return vibration and offset in % of the step, from half a move after each move on."""
+    found, before = [], 1.0
+    for i, (target, span) in enumerate(SETPOINTS):
+        own = [t for t, _ in levels if span * i - 1e-9 <= t < span * (i + 1)]
+        begin = own[0] + 1.5 * (own[-1] - own[0])
+        first = true[(begin <= TIME) & (begin + 0.12 > TIME)]
+        rest = true[(begin + 0.4 <= TIME) & (span * (i + 1) > TIME)]
+        step = 100.0 / abs(target - before)
+        found.append((step * np.ptp(first), step * abs(np.mean(rest) - target)))
+        before = target
+    return np.array(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('seed', range(6))
+def test_six_repeats_take_away_what_hysteresis_and_a_second_mode_leave(seed):
+    first = levels = planned()
+    bench, trials = Bench(seed, max(abs(b) for _, b in levels)), []
+    for _ in range(6):
+        true = bench.repeat(levels)
+        trials.append(bench.trial(true, levels))
+        found = learn(trials, TARGETS, NOMINAL, (-0.5, 0.5))
+        levels = list(zip(found.level_times.tolist(), found.levels.tolist(), strict=True))
+    before, after = (judged(bench.repeat(x), first) for x in (first, levels))
+    assert before.max() > 1.0
+    assert after[:, 0].max() <= 0.3
+    assert after[:, 1].max() <= 0.1
+    assert found.frequency == pytest.approx(bench.frequency / (2.0 * math.pi), rel=0.02)
+    # What is said of a repeat is what there was.
+    said = 100.0 * np.array([x.vibration for x in found.left[0]])
+    assert said == pytest.approx(before[:, 0], rel=0.3, abs=0.3)
+
+
+def test_a_repeat_that_left_more_is_taken_back():
+    levels = planned()
+    bench = Bench(0, max(abs(b) for _, b in levels))
+    trials = [bench.trial(bench.repeat(levels), levels)]
+    worse = [(t, 1.05 * b) for t, b in levels]
+    trials.append(bench.trial(bench.repeat(worse), worse))
+    once, found = (learn(trials[:n], TARGETS, NOMINAL) for n in (1, 2))
+    assert found.best == 0
+    most = 0.1 * np.ptp(np.append(trials[0].levels, 0.0))
+    base = trials[0].at(found.level_times + 1e-6)
+    assert np.max(np.abs(found.levels - base)) <= most * (1.0 + 1e-9)
+    limited = learn(trials[:1], TARGETS, NOMINAL, (-0.01, 0.05)).levels
+    assert (limited.min() >= -0.01, limited.max() <= 0.05) == (True, True)
+    assert len(once.levels) == len(found.levels)
+
+
+@pytest.mark.parametrize(('change', 'what'), [
+    (lambda x, t: ([], t), '0 repeats'), (lambda x, t: ([x], []), '0 setpoints'),
+    (lambda x, t: ([x], [Target(1.15, 0.0, 1.2), Target(1.15, 1.2, 2.4)]), 'repeats the one'),
+    (lambda x, t: ([x], [Target(1.15, 0.0, 0.1)]), 'at least a period'),
+    (lambda x, t: ([x], [Target(1.15, 9.0, 12.0)]), 'no level belongs'),
+    (lambda x, t: ([replace(x, time=x.time[:100], stretch=x.stretch[:100])], t), 'samples show')])
+def test_what_cannot_be_learnt_from_is_refused(change, what):
+    levels = planned()
+    trial = Bench(0, 0.1).trial(np.ones(len(TIME)), levels)
+    with pytest.raises(BadInputError, match=what):
+        learn(*change(trial, TARGETS), NOMINAL)
+
+
+@pytest.mark.parametrize(('time', 'stretch'), [
+    ([], []), ([0.0, 0.0], [1.0, 1.0]), ([0.0, 1.0], [1.0, math.nan]), ([0.0], [1.0, 1.0])])
+def test_samples_that_are_none_are_refused(time, stretch):
+    with pytest.raises(BadInputError, match='samples of a repeat'):
+        Trial(np.array(time), np.array(stretch), np.zeros(1), np.zeros(1))
+
+
+@pytest.mark.parametrize('text', [
+    '', 'levels', 'levels: 3', 'levels: []', 'levels: [[0, 1], [0, 2]]', 'levels: [[0, .nan]]',
+    'levels: [[a, b]]', 'levels: [[0, 1, 2]]', '{', 'a: [[0, 1]]'])
+def test_a_file_that_is_no_sequence_is_refused(text, tmp_path):
+    path = tmp_path / 'next.yaml'
+    path.write_text(text)
+    with pytest.raises(BadInputError, match='no learnt sequence'):
+        levels_in(path)
+
+
+LAB = """\
+/**:
+  ros__parameters:
+    actuator.half_length: 0.1
+    actuator.half_thickness: 0.1
+    actuator.damping_coefficient: 40.0
+/**/plant:
+  ros__parameters:
+    mismatch.shear_modulus: 1.03
+    stretch_noise: 1.0e-4
+"""
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+def test_repeats_are_run_and_learnt_from(start, tmp_path, capsys):
+    file, following = tmp_path / 'lab.yaml', tmp_path / 'next.yaml'
+    file.write_text(LAB)
+    words = '--simulate', '--params-file', str(file), '--json'
+    run = start.hmsa('run', '1.10:0.8', '1.00:0.8', *words, '--repeat', '2', '--out', str(
+        tmp_path / 'first'))
+    assert run.wait(300.0) == 1
+    found = json.loads(run.stdout)
+    assert len(found['repeats']) == 2
+    row = found['statistics'][0]
+    assert (row['target'], row['repeats'], row['arrived']) == (1.1, 2, 0)
+    each = [x['setpoints'][0]['offset_percent'] for x in found['repeats']]
+    assert row['offset_percent']['mean'] == pytest.approx(np.mean(each))
+    assert row['offset_percent']['std'] == pytest.approx(np.std(each, ddof=1))
+    first = tmp_path / 'first' / '1' / 'run'
+    assert main(['learn', str(first), '--out', str(following)]) == 0
+    capsys.readouterr()
+    run = start.hmsa(
+        'run', '--levels', str(following), *words, '--out', str(tmp_path / 'second'))
+    run.wait(300.0)
+    assert main(['learn', str(first), str(tmp_path / 'second' / 'run'), '--json']) == 0
+    before, after = (
+        [abs(y['offset']) for y in x['setpoints']] for x in
+        json.loads(capsys.readouterr().out)['runs'])
+    assert before[0] > 0.02
+    assert after[0] < 0.1 * before[0]
