@@ -167,7 +167,7 @@ def test_nodes_start_without_scipy_which_takes_longer_to_load_than_all_else():
 
 
 def test_a_plan_without_a_file_imports_no_reader_of_files():
-    result = run(BLOCKED.format(blocked=('scipy', 'mcap', 'yaml', 'hmsa_ros.bag.reader')) + """
+    result = run(BLOCKED.format(blocked=('scipy', 'mcap', 'yaml')) + """
 from hmsa_ros.cli import main
 sys.exit(main(['plan', '1.1:10']))
 """)
