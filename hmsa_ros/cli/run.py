@@ -69,7 +69,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Carry out the experiment."""
+    """Carry out the experiment as often as asked for; a bad number is a `BadInputError`."""
     from rich.console import Console
 
     tolerances = _tolerances(arguments)
