@@ -32,7 +32,7 @@ from hmsa_ros.interfaces.parameters import (
 )
 from hmsa_ros.interfaces.topics import PLANNER
 from hmsa_ros.model.delivery import IDEAL
-from hmsa_ros.model.equations import critical_zeta, elastic_force, equilibrium_stretch
+from hmsa_ros.model.equations import Array, critical_zeta, elastic_force, equilibrium_stretch
 from hmsa_ros.model.laws import LAWS
 from hmsa_ros.model.mismatch import Uncertainty
 from hmsa_ros.model.moves import State
@@ -518,6 +518,77 @@ class Actuator:
         path = path_of(self, (times, stretches, rates, accelerations))
         ends = float(np.asarray(stretches)[0]), float(np.asarray(stretches)[-1])
         return Plan(self, segments_along(self, path, ends, tolerance, period), 'path')
+
+    def wave(
+            self, shape: Any, frequency: float, amplitude: float, *, offset: float | None = None,
+            cycles: float = 10.0, last: float | None = None, tolerance: float = 1e-4) -> 'Plan':
+        """
+        Plan a periodic motion of the stretch, from rest without a field and back to it.
+
+        Parameters
+        ----------
+        shape : {'sine', 'triangle', 'square'} or pairs, array of shape (n, 2), mapping, DataFrame
+            Of the stretch, not of the field; or one period of it, times and stretches, of which
+            mean and peak become offset and amplitude. A square wave is a sequence of two-step
+            moves.
+        frequency : float
+            In Hz.
+        amplitude : float
+            Of the stretch about the offset.
+        offset : float, optional
+            Mean stretch; default that without a field.
+        cycles : float
+            At full amplitude, besides those in which the wave fades in and out.
+        last : float, optional
+            Frequency in Hz at the end of a sweep; default no sweep.
+        tolerance : float
+            Deviation that the levels may leave, as a fraction of the range.
+
+        Returns
+        -------
+        Plan
+            Levels that end at rest.
+
+        Raises
+        ------
+        BadInputError
+            If an argument is of another type or out of range.
+        RefusedError
+            If the limits of the coil do not allow the frequency; `wave_bands` tells which they do.
+
+        Examples
+        --------
+        >>> from hmsa_ros import Actuator
+        >>> block = Actuator()
+        >>> block.wave_bands('sine', 0.05).round(1).tolist()
+        [[0.1, 451.2]]
+        >>> block.wave('sine', 30.0, 0.05).simulate().report()['verdict']
+        ['arrived']
+
+        """
+        from hmsa_ros.api.paths import along_wave, wave_of
+        from hmsa_ros.api.plan import Plan
+
+        if isinstance(shape, str) and shape == 'square':
+            wave = wave_of(self, 'sine', amplitude, offset)
+            half = 0.5 / number(frequency, 'frequency', 'Hz', above=0.0)
+            count = round(number(cycles, 'cycles', least=1.0, most=1e5))
+            return self.plan([(wave.mean + amplitude, half), (
+                wave.mean - amplitude, half)] * count + [(self.block.rest, half)])
+        return Plan(self, along_wave(
+            self, wave_of(self, shape, amplitude, offset),
+            (frequency, frequency if last is None else last), cycles, tolerance), 'path')
+
+    def wave_bands(self, shape: Any, amplitude: float, offset: float | None = None) -> Array:
+        """
+        Return the bands of frequencies in Hz that the limits of the coil allow, shape (n, 2).
+
+        The arguments are as of `wave`. Within 0.001 to 30 natural frequencies; a square wave is
+        possible from 0 on. What is no wave is a `BadInputError`.
+        """
+        from hmsa_ros.api.paths import bands
+
+        return bands(self, shape, amplitude, offset)
 
     def _errors(self, shaper: str) -> Uncertainty:
         """Return for which errors minimax plans unless given."""

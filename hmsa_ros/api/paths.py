@@ -6,21 +6,29 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from hmsa_ros.api.arguments import number
+from hmsa_ros.api.arguments import columns_of, number
 from hmsa_ros.columns import read_table
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.moves import State
+from hmsa_ros.model.simulation import check_stretch
+from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.drafting import check_path, finish
 from hmsa_ros.planning.path import along, Path
 from hmsa_ros.planning.sequence import plan_sequence
 from hmsa_ros.planning.setpoint import Setpoint
 from hmsa_ros.planning.shapers.request import Request
+from hmsa_ros.planning.waves import sampled_shape, Shape, sine, triangle, Wave
 
 if TYPE_CHECKING:
     from hmsa_ros.api.actuator import Actuator
     from hmsa_ros.planning.sequence import Segment
+
+# Shapes of waves that are followed as paths.
+SHAPES: dict[str, Shape] = {'sine': sine, 'triangle': triangle}
+# Frequencies at which a sweep is held against the limits.
+_SWEPT = 50
 
 
 def read_path(file: File) -> tuple[Array, Array]:
@@ -77,6 +85,77 @@ def _column(values: Any) -> Array:
     return found
 
 
+def wave_of(
+        actuator: 'Actuator', shape: Any, amplitude: float, offset: float | None) -> Wave:
+    """
+    Return a wave by the name of its shape, or by one period of times and stretches.
+
+    What is no wave is a `BadInputError`.
+    """
+    rest = actuator.block.rest
+    mean = number(rest if offset is None else offset, 'offset')
+    size = number(amplitude, 'amplitude', above=0.0)
+    if isinstance(shape, str):
+        if shape not in SHAPES:
+            raise BadInputError(
+                f'shape is {excerpt(shape)}: expected one of square, {", ".join(SHAPES)}, or one '
+                'period of times and stretches')
+        form = SHAPES[shape]
+    else:
+        times, stretches = columns_of(shape, ('time', 'stretch'), 'samples of a wave')
+        form = sampled_shape(times, stretches)
+    for stretch in (mean - size, mean + size):
+        check_stretch(stretch, actuator.model.material, 'an extreme of the wave')
+    return Wave(form, mean, size)
+
+
+def bands(actuator: 'Actuator', shape: Any, amplitude: float, offset: float | None) -> Array:
+    """Return the bands of frequencies in Hz that an actuator's limits allow, shape (n, 2)."""
+    square = isinstance(shape, str) and shape == 'square'
+    wave = wave_of(actuator, 'sine' if square else shape, amplitude, offset)
+    frame = _frame(actuator)
+    if square:
+        high, low, rest = wave.mean + wave.amplitude, wave.mean - wave.amplitude, frame.target
+        try:
+            moves = [float(actuator.plan([(y, 1e9)], start=x).move_times[0])
+                     for x, y in ((rest, high), (high, low), (low, high), (low, rest))]
+        except RefusedError:
+            return np.empty((0, 2))
+        return np.array([[0.0, 0.5 / max(moves)]])
+    found: Array = np.array(wave.reach(frame)).reshape(-1, 2) / actuator.model.units.time
+    return found
+
+
+def along_wave(
+        actuator: 'Actuator', wave: Wave, sweep: tuple[float, float], cycles: float,
+        tolerance: float) -> 'tuple[Segment, ...]':
+    """
+    Plan a wave between two rests without a field, from a frequency in Hz to another.
+
+    Frequencies that limits do not allow are a `RefusedError`, others out of range `BadInputError`.
+    """
+    model, frame = actuator.model, _frame(actuator)
+    unit = model.units.time
+    first, last = (number(x, 'frequency', 'Hz', above=0.0) * unit for x in sweep)
+    cycles = number(cycles, 'cycles', least=1.0, most=1e6)
+    if not all(wave.within(frame, x) for x in np.geomspace(first, last, _SWEPT)):
+        reach = ', '.join(f'{a / unit:.4g} to {b / unit:.4g} Hz' for a, b in wave.reach(frame))
+        raise RefusedError(
+            Code.FLUX_LIMIT,
+            f'an amplitude of {wave.amplitude:g} about {wave.mean:g} needs more than flux density '
+            f'and slew limits allow at {sweep[0]:g}'
+            + (f' to {sweep[1]:g}' if last != first else '') + f' Hz: expected {reach or "less"}')
+    path = wave.path(frame, first, last, cycles)
+    return segments_along(actuator, path, (model.material.rest,) * 2, tolerance, 0.0)
+
+
+def _frame(actuator: 'Actuator') -> Request:
+    """Return the request to stay at rest without a field."""
+    model = actuator.model
+    return Request.of(
+        model.material, limits=model.limits, units=model.units, delivery=model.delivery)
+
+
 def segments_along(
         actuator: 'Actuator', path: Path, ends: tuple[float, float], tolerance: float,
         period: float) -> 'tuple[Segment, ...]':
@@ -85,12 +164,11 @@ def segments_along(
 
     A number out of range is a `BadInputError`, what cannot be followed a `RefusedError`.
     """
-    model = actuator.model
     if not 0.0 < number(tolerance, 'tolerance') <= 1.0:
         raise BadInputError(f'tolerance is {tolerance:g}: expected above 0 to 1')
-    frame = Request.of(
-        model.material, State(ends[0]), limits=model.limits, units=model.units,
-        delivery=replace(model.delivery, period=number(period, 'period', 's', least=0.0)
-                         / model.units.time))
+    frame = replace(_frame(actuator), state=State(ends[0]), target=ends[0])
+    if number(period, 'period', 's', least=0.0):
+        frame = replace(frame, delivery=replace(
+            frame.delivery, period=period / actuator.model.units.time))
     move = finish(along(replace(frame, target=ends[1]), path, tolerance))
     return plan_sequence([Setpoint(ends[1], np.inf)], frame, lambda request: move)

@@ -9,7 +9,7 @@ in the mean square, to the double integral of the load (of the amplifier's outpu
 lags). They are as long as a tolerance allows. The last ones are corrected to end at rest exactly.
 """
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import Any
@@ -36,14 +36,14 @@ _SHARE = 0.15
 # Levels of a path at the least and at the most, of a natural period, of a block, by which blocks
 # overlap, and levels at the end that are corrected at the most.
 _FEWEST, _MOST, _OF_EACH, _BLOCK, _OVERLAP, _LAST = 24, 200_000, 6, 200, 12, 240
-# How often ramps are allowed for.
-_RAMPED = 6
+# How often ramps are allowed for, and the change of a load that is none.
+_RAMPED, _SETTLED = 60, 1e-9
 #: How near a path the actuator is on it, stretch.
 ON_PATH = 1e-5
 # Stretch that counts as range at the least.
 _LEAST_RANGE = 1e-3
-# Where limits bind: how much faster than its own the actuator returns to the path.
-_RETURN = 3.0
+# Where limits bind: how fast the actuator may return to the path, in natural frequencies.
+_RETURN = (3.0, 1.0)
 # Share of a natural period at the end in which levels are corrected.
 _ENDING = 0.6
 
@@ -177,9 +177,10 @@ class _Follower:
         if np.any(clipped != levels):
             self._limited.add(Code.FLUX_LIMIT)
             self._lack = np.zeros(2)
+        ways = [clipped]
         if np.any(clipped != levels) or away > 10.0 * self._allowed:
-            clipped = self._returning(edges[:keep + 1], clipped)
-        self._simulate(edges[:keep + 1], clipped, stretch[:keep])
+            ways += [self._returning(edges[:keep + 1], clipped, x) for x in _RETURN]
+        self._take(edges[:keep + 1], ways, stretch[:keep])
         self.done = last
 
     def _inverse(self, edges: Array, keep: int) -> tuple[Array, Array]:
@@ -189,7 +190,7 @@ class _Follower:
         times: Array = (edges[:-1, np.newaxis] + spans[:, np.newaxis] * _POINTS).ravel()
         stretch, rate, wanted = self._course(times)
         packed = material.packed
-        loads = _loads(stretch, rate, wanted, packed)
+        loads = loads_for(stretch, rate, wanted, packed)
         if material.creep:
             # With the edges, at each of which branches are where the next block begins.
             every = np.append(np.column_stack([edges[:-1], times.reshape(-1, 6)]), edges[-1])
@@ -226,7 +227,9 @@ class _Follower:
         normal = (design[:, free].T @ design[:, free]).tocsc()
         coefficients = np.zeros(len(edges) + 1)
         more, gained = np.zeros_like(target), np.zeros(len(loads))
+        levels = np.full(len(loads), math.inf)
         for _ in range(1 if math.isinf(slew) else _RAMPED):
+            before = levels
             wanted = target - more
             if free.stop is not None:
                 # The field is that which holds the end, whatever it is just before.
@@ -237,9 +240,11 @@ class _Follower:
             coefficients[free] = spsolve(normal, design[:, free].T @ (
                 weights * wanted[:, :-1].ravel() - design @ coefficients))
             spline = BSpline(knots, coefficients, 2)
-            levels: Array = spline.derivative(2)(edges[:-1] + 0.5 * inner[:, 0])
+            levels = spline.derivative(2)(edges[:-1] + 0.5 * inner[:, 0])
             if math.isfinite(slew):
                 more, gained = _ramped(levels, start, inner, slew)
+            if np.max(np.abs(levels - before)) <= _SETTLED:
+                break
         end = keep - 1
         self._lack = np.array([
             self._lack[0] + levels[:keep] @ inner[:keep, 0] + gained[end] - once[end, -1],
@@ -247,16 +252,21 @@ class _Follower:
         self._reached = float(values[end, -1])
         return levels[:keep]
 
-    def _simulate(self, edges: Array, levels: Array, stretch: Array) -> None:
-        """Take levels between edges, and what they lead to beside the path."""
+    def _take(self, edges: Array, ways: Sequence[Array], stretch: Array) -> None:
+        """Take those levels between edges whose motion stays nearest to the path."""
         request, start = self._request, self._states[-1]
         times = np.column_stack([
             edges[:-1, np.newaxis] + np.diff(edges)[:, np.newaxis] * _POINTS, edges[1:]])
-        commands = tuple(map(Level, edges[:-1].tolist(), levels.tolist()))
-        found = sampled(commands, start, times.ravel(), request.material, request.delivery)
-        motions = found[motion.STRETCH].reshape(times.shape)
+        least = math.inf
+        for tried in ways:
+            course = sampled(
+                tuple(map(Level, edges[:-1].tolist(), tried.tolist())), start, times.ravel(),
+                request.material, request.delivery)
+            off = np.abs(course[motion.STRETCH].reshape(times.shape)[:, :-1] - stretch)
+            if not float(np.max(off)) >= least:
+                least, levels, found, away = float(np.max(off)), tried, course, off
         self._times.append(times[:, :-1])
-        self._away.append(np.abs(motions[:, :-1] - stretch))
+        self._away.append(away)
         output = start.ramps_from
         for level, span, row in zip(
                 levels.tolist(), np.diff(edges).tolist(), found[:, 6::7].T.tolist(), strict=True):
@@ -268,25 +278,25 @@ class _Follower:
             self._states.append(State(
                 row[0], row[1], row[2] if lags else output, output if lags else None,
                 tuple(row[3:])))
-        self._levels += commands
+        self._levels += map(Level, edges[:-1].tolist(), levels.tolist())
 
-    def _returning(self, edges: Array, levels: Array) -> Array:
-        """Return levels within the limits that lead back to the path from a state beside it."""
+    def _returning(self, edges: Array, levels: Array, speed: float) -> Array:
+        """Return levels within the limits that lead back to the path at a speed of `_RETURN`."""
         request = self._request
         limits, delivery, material = request.limits, request.delivery, request.material
         packed, state, found = material.packed, self._states[-1], levels.copy()
         stretch, rate, wanted = self._course(edges)
-        field = _loads(stretch, rate, wanted, packed)
+        field = loads_for(stretch, rate, wanted, packed)
         for i, span in enumerate(np.diff(edges).tolist()):
             inertia = float(law.mass(state.stretch, packed))
-            quick = _RETURN * float(law.natural_frequency(state.stretch, packed))
-            off, speed = state.stretch - stretch[i], state.rate - rate[i]
+            quick = speed * float(law.natural_frequency(state.stretch, packed))
+            off, fast = state.stretch - stretch[i], state.rate - rate[i]
             if delivery.lag > 0.0:
                 more = (state.load - field[i]) / inertia
                 push = more - delivery.lag * quick * (
-                    quick * quick * off + 3.0 * quick * speed + 3.0 * more)
+                    quick * quick * off + 3.0 * quick * fast + 3.0 * more)
             else:
-                push = -quick * (quick * off + 2.0 * speed)
+                push = -quick * (quick * off + 2.0 * fast)
             found[i] = min(max(levels[i] + inertia * push, limits.minimum), limits.maximum)
             state = follow((Level(0.0, float(found[i])),), state, span, material, delivery)
         return found
@@ -358,7 +368,7 @@ class _Follower:
             f'{units.time_text(when)}' + f'; the limit is {" and ".join(why)}' * bool(why))
 
 
-def _loads(stretch: Array, rate: Array, wanted: Array, packed: Array) -> Array:
+def loads_for(stretch: Array, rate: Array, wanted: Array, packed: Array) -> Array:
     """Return the loads that give wanted accelerations, which are linear in them, (n,) each."""
     stretch, rate = np.ascontiguousarray(stretch), np.ascontiguousarray(rate)
     zero, one = np.empty((2, len(stretch)))
@@ -413,7 +423,7 @@ def _edges(request: Request, path: Path, tolerance: float) -> tuple[float, Array
             f'{request.units.time_text(times[outside][0])}: expected a path between '
             f'{packed[law.LOWER]:.6g} and {packed[law.UPPER]:.6g}')
     span = max(float(np.ptp(np.append(stretch, request.target))), _LEAST_RANGE)
-    loads = _loads(stretch, rate, wanted, packed).reshape(-1, 6)
+    loads = loads_for(stretch, rate, wanted, packed).reshape(-1, 6)
     gaps = spans * np.diff(_POINTS)
     slopes = np.diff(loads) / gaps
     steep = np.max(np.abs(slopes), axis=1)

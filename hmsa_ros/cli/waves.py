@@ -1,0 +1,83 @@
+"""
+Plan a periodic motion of the stretch without ROS.
+
+Plan levels whose response is a wave of the stretch, from rest without a field and back to it, and
+print the frequencies that the coil allows. SHAPE is sine, triangle, square (two-step moves), sweep
+(a sine from --frequency to --to) or a CSV with one period in the columns time and stretch, of
+which mean and peak become offset and amplitude. hmsa run --levels carries the levels out.
+
+example: hmsa wave sine --frequency 30 --amplitude 0.05 --out wave.csv
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from hmsa_ros.cli.options import add_command, add_options, JSON
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import json_text
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command."""
+    parser = add_command(subparsers, 'wave', __doc__)
+    parser.add_argument(
+        'shape', metavar='SHAPE', help='sine, triangle, square, sweep or CSV')
+    parser.add_argument(
+        '--offset', '--mean', metavar='STRETCH', type=float,
+        help='mean stretch (default: that without a field)')
+    add_options(
+        parser,
+        ('--frequency', 'HZ', float, 'frequency', {'required': True}),
+        ('--amplitude', 'STRETCH', float, 'amplitude of the stretch', {'required': True}),
+        ('--cycles', 'N', float,
+         'cycles at full amplitude, besides those in which the wave fades in and out (default 10)',
+         {'default': 10.0}),
+        ('--to', 'HZ', float, 'last frequency of a sweep'),
+        ('--params-file', 'YAML', Path,
+         'parameter file of the actuator (default: the example block)'),
+        ('--out', 'FILE', Path,
+         'levels to write, ending in .csv, .parquet or .mat; an existing file is replaced'),
+        JSON)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Tell what can be reached, plan, write and print; what is no wave is a `BadInputError`."""
+    from hmsa_ros.api.actuator import Actuator
+    from hmsa_ros.api.paths import read_path
+
+    if (arguments.shape == 'sweep') != (arguments.to is not None):
+        raise BadInputError(
+            f'the shape is {arguments.shape} and --to is {arguments.to}: expected --to HZ with '
+            'sweep, and with no other shape')
+    actuator = Actuator() if arguments.params_file is None else Actuator.from_yaml(
+        arguments.params_file)
+    shape: Any = arguments.shape
+    if shape.lower().endswith('.csv'):
+        times, stretches = read_path(Path(shape))
+        shape = {'time': times, 'stretch': stretches}
+    elif shape == 'sweep':
+        shape = 'sine'
+    bands = actuator.wave_bands(shape, arguments.amplitude, arguments.offset)
+    if not arguments.json:
+        print(f'an amplitude of {arguments.amplitude:g} is possible at '
+              + (', '.join(f'{x:.4g} to {y:.4g} Hz' for x, y in bands) or 'no frequency'))
+    plan = actuator.wave(
+        shape, arguments.frequency, arguments.amplitude, offset=arguments.offset,
+        cycles=arguments.cycles, last=arguments.to)
+    if arguments.out is not None:
+        plan.save(arguments.out)
+    duration = float(sum(x for x in plan.setpoints[:-1, 1]) + plan.move_times[-1])
+    notes = [y for x in plan.segments for y in x.notes()]
+    if arguments.json:
+        print(json_text({
+            'bands': bands.tolist(), 'duration': duration, 'levels': plan.levels.tolist(),
+            'notes': notes}))
+        return 0
+    print(f'{len(plan.levels)} levels of {plan.flux_densities.min():.4g} to '
+          f'{plan.flux_densities.max():.4g} T, at rest after {duration:.4g} s')
+    for note in notes:
+        print(f'note: {note}')
+    if arguments.out is not None:
+        print(f'{arguments.out} written')
+    return 0

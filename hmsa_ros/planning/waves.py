@@ -1,0 +1,172 @@
+"""
+Periodic motions of the stretch: their shapes, the paths that lead through them, and their reach.
+
+A path begins and ends at rest: the wave is faded in and out by a polynomial with three derivatives
+that are zero at either end. All is without a dimension.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model import law
+from hmsa_ros.model.equations import Array
+from hmsa_ros.planning.path import loads_for, Path
+from hmsa_ros.planning.shapers.request import Request
+
+#: Value and two derivatives by the phase, whose period is 1, shape (n,) each.
+Shape = Callable[[Array], tuple[Array, Array, Array]]
+
+# Harmonics of a triangle, whose corners they round.
+_HARMONICS: Array = np.arange(1.0, 11.0, 2.0)
+# Cycles and natural periods that a wave is faded in and out for at the least.
+_FADE_CYCLES, _FADE_PERIODS = 1, 2.0
+# Breaks of a path in a cycle, and phases at which the reach is looked at.
+_BREAKS, _PHASES = 8, 128
+# Share of the slew limit that ramps from level to level may need.
+_SLEW_SHARE = 0.75
+# Frequencies that are looked at, in units of the natural one.
+_LOOK: Array = np.geomspace(1e-3, 30.0, 400).astype(np.float64)
+
+
+def sine(phase: Array) -> tuple[Array, Array, Array]:
+    """Return a sine."""
+    return _series(phase, np.ones(1), np.ones(1))
+
+
+def triangle(phase: Array) -> tuple[Array, Array, Array]:
+    """Return a triangle of five harmonics, weighted after Lanczos, with peaks of 1."""
+    signs = (-1.0) ** (_HARMONICS // 2)
+    weights = np.sinc(_HARMONICS / (_HARMONICS[-1] + 2.0)) / _HARMONICS ** 2
+    return _series(phase, _HARMONICS, signs * weights / weights.sum())
+
+
+def _series(phase: Array, orders: Array, weights: Array) -> tuple[Array, Array, Array]:
+    turns = 2.0 * math.pi * orders
+    angle = phase[:, np.newaxis] * turns
+    return (np.sin(angle) @ weights, np.cos(angle) @ (weights * turns),
+            -np.sin(angle) @ (weights * turns ** 2))
+
+
+def sampled_shape(times: Array, stretches: Array) -> Shape:
+    """
+    Return the shape of one period of samples, shape (n,), about its mean and with peaks of 1.
+
+    Samples that do not end where they began, or are no wave, are a `BadInputError`.
+    """
+    from scipy.interpolate import CubicSpline  # others need not wait for it
+
+    if len(times) < 4 or np.any(np.diff(times) <= 0.0):
+        raise BadInputError(
+            f'a wave of {len(times)} samples: expected one period of at least 4 samples at '
+            'increasing times')
+    size = float(np.ptp(stretches))
+    if not size > 0.0 or abs(stretches[-1] - stretches[0]) > 1e-6 * size:
+        raise BadInputError(
+            f'a wave from {stretches[0]:g} to {stretches[-1]:g}: expected one period, of which '
+            'the last sample repeats the first, and which is not constant')
+    spans = (times - times[0]) / (times[-1] - times[0])
+    values = np.append(stretches[:-1], stretches[0])
+    spline = CubicSpline(spans, values, bc_type='periodic')
+    mean = float(spline.integrate(0.0, 1.0))
+    dense = spline(np.linspace(0.0, 1.0, 2049)) - mean
+    peak = float(np.max(np.abs(dense)))
+    slope, curve = spline.derivative(), spline.derivative(2)
+
+    def shape(phase: Array) -> tuple[Array, Array, Array]:
+        phase = np.mod(phase, 1.0)
+        return (spline(phase) - mean) / peak, slope(phase) / peak, curve(phase) / peak
+
+    return shape
+
+
+@dataclass(frozen=True)
+class Wave:
+    """A periodic motion about a mean."""
+
+    shape: Shape
+    mean: float  #: stretch
+    amplitude: float  #: of the stretch, above 0
+
+    def path(self, request: Request, frequency: float, last: float, cycles: float) -> Path:
+        """Return the path from rest through some cycles back to rest, perhaps a sweep."""
+        start = request.state.stretch
+        period = 2.0 * math.pi / float(
+            law.natural_frequency(self.mean, request.material.packed))
+        fades = [math.ceil(max(_FADE_CYCLES, _FADE_PERIODS * period * x)) / x
+                 for x in (frequency, last)]
+        inner = cycles * math.log(last / frequency) / (
+            last - frequency) if last != frequency else cycles / frequency
+        growth = math.log(last / frequency) / inner
+        edges = np.cumsum([fades[0], inner, fades[1]])
+
+        def phase(t: Array) -> tuple[Array, Array, Array]:
+            """Return the phase, its rate and its growth; the sweep is between the fades."""
+            since = np.clip(t - edges[0], 0.0, inner)
+            rate = frequency * np.exp(growth * since)
+            swept = rate - frequency
+            found = np.minimum(t, edges[0]) * frequency + np.maximum(t - edges[1], 0.0) * last + (
+                swept / growth if growth else since * frequency)
+            return found, rate, np.where((t > edges[0]) & (t < edges[1]), growth * rate, 0.0)
+
+        def course(t: Array) -> tuple[Array, Array, Array]:
+            turned, rate, change = phase(t)
+            value, slope, curve = self.shape(turned)
+            away = self.mean - start + self.amplitude * value
+            speed = self.amplitude * slope * rate
+            pull = self.amplitude * (curve * rate ** 2 + slope * change)
+            rising = t < 0.5 * edges[-1]
+            span, sign = np.where(rising, *fades), np.where(rising, 1.0, -1.0)
+            share = np.clip(np.where(rising, t, edges[-1] - t) / span, 0.0, 1.0)
+            left = 1.0 - share
+            faded = share ** 4 * (35.0 - 84.0 * share + 70.0 * share ** 2 - 20.0 * share ** 3)
+            fading = sign * 140.0 * (share * left) ** 3 / span
+            curved = 420.0 * (share * left) ** 2 * (left - share) / span ** 2
+            return (start + faded * away, fading * away + faded * speed,
+                    curved * away + 2.0 * fading * speed + faded * pull)
+
+        ends = np.append(0.0, edges)
+        rates = (frequency, max(frequency, last), last)
+        breaks = [np.linspace(a, b, 1 + math.ceil(_BREAKS * (b - a) * rate), endpoint=False)
+                  for a, b, rate in zip(ends, edges, rates, strict=False)]
+        return Path(np.append(np.concatenate(breaks), edges[-1]), course)
+
+    def within(self, request: Request, frequency: float) -> bool:
+        """Return whether limits of field and slew rate allow the wave at a frequency."""
+        material, delivery, limits = request.material, request.delivery, request.limits
+        packed = material.packed
+        value, slope, curve = self.shape(np.arange(_PHASES) / _PHASES)
+        stretch = self.mean + self.amplitude * value
+        if not (packed[law.LOWER] < stretch.min() and stretch.max() < packed[law.UPPER]):
+            return False
+        found = loads_for(
+            stretch, self.amplitude * frequency * slope,
+            self.amplitude * frequency ** 2 * curve, packed)
+        if material.creep:
+            # At most: as if branches did not relax during a cycle.
+            forces = np.empty(_PHASES)
+            law.evaluate(law.FORCE, stretch, packed, forces)
+            found = found + material.branches[:, 0].sum() * (forces - forces.mean())
+        step = 1.0 / (_PHASES * frequency)
+        for _ in range(delivery.lag > 0.0):
+            found = found + delivery.lag * _growth(found, step)
+        return bool(limits.minimum <= found.min() and found.max() <= limits.maximum
+                    and np.max(np.abs(_growth(found, step))) <= _SLEW_SHARE * delivery.slew)
+
+    def reach(self, request: Request) -> list[tuple[float, float]]:
+        """Return the bands of frequencies that limits allow, within 0.001 to 30 natural ones."""
+        natural = float(law.natural_frequency(self.mean, request.material.packed))
+        looked = _LOOK * natural / (2.0 * math.pi)
+        held = np.array([self.within(request, x) for x in looked.tolist()], dtype=int)
+        turns = np.diff(np.concatenate([[0], held, [0]]))
+        return [(float(looked[i]), float(looked[j - 1])) for i, j in zip(
+            np.flatnonzero(turns > 0), np.flatnonzero(turns < 0), strict=True)]
+
+
+def _growth(values: Array, step: float) -> Array:
+    """Return the change of periodic values per unit of time."""
+    found: Array = (np.roll(values, -1) - np.roll(values, 1)) / (2.0 * step)
+    return found

@@ -1,0 +1,137 @@
+"""Waves of the stretch, their spectra judged by SciPy's integration of the equation of motion."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from test_path import C1, moved, TIME
+
+from hmsa_ros import Actuator
+from hmsa_ros.cli import main
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.status import RefusedError
+
+AMPLITUDE = 0.1
+# Of small motion about 1, where psi'' is 3.
+NATURAL = math.sqrt(3.0 / ((1.0 + C1) / 6.0)) / (2.0 * math.pi * TIME)
+#: Share of the amplitude that a harmonic may have.
+PURE = 5e-3
+_OF_EACH, _CYCLES = 64, 6
+
+
+def spectrum(plan, frequency, fade, mean=1.0, **coil):
+    """Return the amplitudes at multiples of a frequency and between, and what is left after."""
+    times = fade / frequency + np.arange(_CYCLES * _OF_EACH) / (_OF_EACH * frequency)
+    end = plan.move_times[-1]
+    stretch = moved(plan.levels.tolist(), np.append(
+        times, end + np.linspace(1e-6, 3.0 / NATURAL, 300)), **coil)
+    found = 2.0 * np.abs(np.fft.rfft(stretch[:len(times)] - mean)) / len(times)
+    return found[::_CYCLES], np.delete(found, np.arange(0, len(found), _CYCLES)), (
+        np.abs(stretch[len(times):] - 1.0).max())
+
+
+@pytest.mark.parametrize(('share', 'options', 'coil'), [
+    (1.0 / 3.0, {}, {}), (1.0, {}, {}), (1.7, {}, {}),
+    (1.0 / 3.0, {'slew_limit': 60.0, 'coil_time_constant': 5e-4}, {'slew': 60.0, 'lag': 5e-4})],
+    ids=['a third', 'resonance', 'above', 'ramps and lag'])
+def test_a_sine_of_the_field_is_not_what_a_sine_of_the_stretch_needs(share, options, coil):
+    frequency = share * NATURAL
+    plan = Actuator(**options).wave('sine', frequency, AMPLITUDE)
+    assert plan.segments[0].notes() == []
+    harmonics, between, after = spectrum(plan, frequency, math.ceil(max(1.0, 2.0 * share)), **coil)
+    assert harmonics[1] == pytest.approx(AMPLITUDE, rel=1e-4)
+    assert harmonics[0] < 2.0 * PURE * AMPLITUDE
+    assert harmonics[2:].max() < 0.01 * PURE * AMPLITUDE
+    assert between.max() < 0.01 * PURE * AMPLITUDE
+    assert after < 1e-9
+    if share < 1.0 and not coil:
+        # The same sine of the field would not do.
+        levels = plan.levels.copy()
+        field = np.array([0.0, *plan.levels[:-1, 1]])
+        steady = (plan.times > 1.0 / frequency) & (plan.times < 10.0 / frequency)
+        size = np.ptp(field[steady]) / 2.0
+        levels[:, 1] = size * np.sin(2.0 * np.pi * frequency * plan.times)
+        plain = 2.0 * np.abs(np.fft.rfft(moved(
+            levels.tolist(), 4.0 / frequency + np.arange(384) / (64.0 * frequency)) - 1.0)) / 384
+        assert plain[12::6].max() > PURE * AMPLITUDE
+
+
+def test_a_triangle_and_a_period_of_ones_own_are_followed_about_a_mean():
+    block, frequency = Actuator(), 0.1 * NATURAL
+    plan = block.wave('triangle', frequency, AMPLITUDE, offset=1.2)
+    harmonics, between, after = spectrum(plan, frequency, 1, mean=1.2)
+    # The even ones are missing, the odd ones fall at least as those of a true triangle.
+    assert harmonics[2::2].max() < 0.01 * PURE * AMPLITUDE
+    assert np.all(harmonics[3:10:2] < harmonics[1] / np.arange(3, 10, 2) ** 2)
+    assert (between.max(), after) < (0.01 * PURE * AMPLITUDE, 1e-9)
+    s = np.linspace(0.0, 1.0, 33)
+    own = np.sin(2.0 * np.pi * s) + 0.3 * np.sin(4.0 * np.pi * s)
+    plan = block.wave(np.column_stack([7.0 * s, 3.0 + own]), frequency, AMPLITUDE)
+    harmonics, *_ = spectrum(plan, frequency, 1)
+    assert harmonics[2] / harmonics[1] == pytest.approx(0.3, rel=1e-3)
+
+
+def test_a_sweep_goes_through_the_resonance_at_one_amplitude():
+    plan = Actuator().wave('sine', 20.0, 0.05, last=200.0, cycles=60)
+    times = np.linspace(0.0, plan.move_times[-1] + 0.05, 6000)
+    stretch = moved(plan.levels.tolist(), times)
+    inside = (times > 0.06) & (times < plan.move_times[-1] - 0.03)
+    peaks = np.abs(stretch[1:-1] - 1.0)[
+        inside[1:-1] & ((np.diff(stretch)[1:] * np.diff(stretch)[:-1]) < 0.0)]
+    assert len(peaks) > 100
+    assert peaks == pytest.approx(np.full(len(peaks), 0.05), rel=0.02)
+    assert np.abs(stretch[times > plan.move_times[-1] + 1e-6] - 1.0).max() < 1e-9
+
+
+def test_what_the_limits_allow_is_told_and_holds():
+    block = Actuator(slew_limit=100.0)
+    (_, highest), = block.wave_bands('sine', AMPLITUDE)
+    assert block.wave('sine', 0.93 * highest, AMPLITUDE).segments[0].notes() == []
+    with pytest.raises(RefusedError, match=f'expected .* to {highest:.4g} Hz'):
+        block.wave('sine', 1.05 * highest, AMPLITUDE)
+    (_, highest), = Actuator().wave_bands('square', AMPLITUDE)
+    assert {str(x.move.code) for x in Actuator().wave(
+        'square', 0.99 * highest, AMPLITUDE, cycles=2).segments} == {'two_step'}
+    with pytest.raises(RefusedError, match='at least as long as the move'):
+        Actuator().wave('square', 1.01 * highest, AMPLITUDE, cycles=2)
+    s = np.linspace(0.0, 1.0, 33)
+    assert Actuator().wave_bands(np.column_stack([s, np.sin(2.0 * np.pi * s)]), 0.05) == (
+        pytest.approx(Actuator().wave_bands('sine', 0.05), rel=0.02))
+    assert len(Actuator(flux_density_limits=1e-4).wave_bands('sine', AMPLITUDE)) == 0
+
+
+@pytest.mark.parametrize(('shape', 'values', 'words'), [
+    ('saw', {}, "shape is 'saw': expected one of square, sine"),
+    ('sine', {'frequency': 0.0}, 'frequency is 0 Hz'),
+    ('sine', {'frequency': math.nan}, 'frequency is nan'),
+    ('sine', {'frequency': 1e-6}, 'expected at most 200000'),
+    ('sine', {'amplitude': 0.0}, 'amplitude is 0'),
+    ('square', {'amplitude': 2.0}, 'an extreme of the wave is -1'),
+    ('sine', {'offset': math.inf}, 'an extreme of the wave is inf'),
+    ('sine', {'cycles': 0.5}, 'cycles is 0.5'),
+    ('sine', {'last': -3.0}, 'frequency is -3 Hz'),
+    ([(0.0, 1.0), (1.0, 1.1)], {}, 'at least 4 samples'),
+    ([(x, 1.0) for x in range(5)], {}, 'not constant'),
+    ([(x, 1.0 + x) for x in range(5)], {}, 'the last sample repeats the first')])
+def test_what_is_no_wave_is_refused(shape, values, words):
+    with pytest.raises(BadInputError, match=words):
+        Actuator().wave(shape, **{'frequency': 20.0, 'amplitude': 0.05, **values})
+
+
+def test_the_command_tells_the_reach_first_and_writes_levels(tmp_path, capsys):
+    out = tmp_path / 'wave.csv'
+    wave = ['wave', 'sine', '--frequency', '30', '--amplitude', '0.05']
+    assert main([*wave, '--mean', '1.1', '--out', str(out)]) == 0
+    first, second, _ = capsys.readouterr().out.splitlines()
+    assert first.startswith('an amplitude of 0.05 is possible at 0.')
+    assert second.endswith('T, at rest after 0.4 s')
+    written = np.loadtxt(out, delimiter=',', skiprows=1)
+    assert main([*wave, '--offset', '1.1', '--json']) == 0
+    assert np.allclose(json.loads(capsys.readouterr().out)['levels'], written, atol=1e-12)
+    assert main(['wave', 'sweep', *wave[2:], '--to', '40']) == 0
+    for extra, words in ((['--to', '40'], 'expected --to HZ with sweep'),
+                         (['--amplitude', '3'], 'an extreme of the wave is -2'),
+                         (['--frequency', '900'], 'Hz: expected 0.08')):
+        assert main([*wave, *extra]) == 2
+        assert words in capsys.readouterr().err
