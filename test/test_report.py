@@ -30,6 +30,7 @@ from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa_ros.model.residual import percent, residual_vibration
 from hmsa_ros.model.simulation import ActuatorSimulation, simulate
 from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.drafting import finish
 from hmsa_ros.planning.planner import Options, Planner
 from hmsa_ros.recordings.bags import read_runs
 from hmsa_ros.recordings.levels import in_force, Level, without_repeats
@@ -119,8 +120,8 @@ def parameters(**nodes):
 
 def simulated(
         sequence=SEQUENCE, *, space='', actuator=ACTUATOR, plant=None, period=PERIOD,
-        shaper='two_step', slew=0.0, lag=0.0, noise=0.0, extra=0.0, creep=None):
-    """Return the messages of a run: (log time, topic, type, message)."""
+        shaper='two_step', slew=0.0, lag=0.0, noise=0.0, extra=0.0, creep=None, path=()):
+    """Return the messages of a run: (log time, topic, type, message); a path if one is given."""
     planner = Planner(replace(actuator, creep=creep or Creep()), Options(
         shaper=shaper, lead_time=LEAD, slew_limit=slew or math.inf, coil_time_constant=lag,
         flux_density_min=-0.5,
@@ -131,12 +132,17 @@ def simulated(
     ends = np.cumsum([
         round(span * actuator.time_unit * NANOSECONDS) for _, span in sequence]).tolist()
     points = [(x, end) for (x, _), end in zip(sequence, ends, strict=True)]
-    plan = planner.request(points, None, START)
+    asked = [(end, x) for x, end in points]
+    if path:
+        ends, asked = [path[-1][1]], [(end, x, rate) for (x, rate, _), end in path]
+        plan = planner.take(finish(planner.draft_path(path, None, START)), START)
+    else:
+        plan = planner.request(points, None, START)
     levels = [x for x in plan.levels if x.stamp >= 0]
     random = np.random.default_rng(1)
     messages = [
         (START, f'{space}/planner/joint_trajectory', TYPES[TRAJECTORY],
-         trajectory(0, [(end, x) for x, end in points])),
+         trajectory(0, asked)),
         (START, f'{space}/planner/plan', TYPES[PLAN], trajectory(levels[0].stamp, [
             (x.stamp - levels[0].stamp, x.stretch, x.rate, x.flux_density) for x in levels])),
         (START, f'{space}/planner/status', TYPES[STATUS], status(0, 'accepted', 'accepted'))]
@@ -199,6 +205,20 @@ def one(folder, messages, **custom_data):
     """Write a bag and return its run, evaluated."""
     part, = parts_of(write(folder, messages, **custom_data))
     return part
+
+
+def test_a_path_is_one_setpoint_which_is_judged_from_its_end_on(tmp_path):
+    end = 40_000_000
+    path = [((1.0 + 0.2 * x * x * (3.0 - 2.0 * x), 1.2 * x * (1.0 - x) / 0.04, math.nan),
+             round(x * end)) for x in np.linspace(0.0, 1.0, 9).tolist()]
+    part = one(
+        tmp_path / 'run', simulated(path=path, extra=0.1),
+        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert [(x.points, x.path) for x in part.run.requests] == [(((1.2, None),), end)]
+    finding, = part.evaluation.findings
+    assert (str(finding.verdict), finding.setpoint.target) == ('arrived', 1.2)
+    assert finding.setpoint.arrival == START + LEAD + end
+
 
 
 class Page(HTMLParser):
