@@ -232,6 +232,27 @@ def test_a_planner_follows_velocities_only_in_mode_path():
         assert len(group.planners['a'].plan.segments) == (mode == 'path')
 
 
+def test_a_path_begins_soon_though_planning_takes_time():
+    now = [SECOND]
+
+    def clock():
+        now[0] += 20_000_000
+        return now[0]
+
+    points = dense(duration=0.3, count=301)
+    group = PlannerGroup({'a': Planner(paper_actuator(), Options(
+        flux_density_min=-0.5, flux_density_max=0.5, lead_time=5_000_000))})
+    runtime = PlannerRuntime(
+        group, Settings(trajectory_mode='path', takeover_timeout=0), clock=clock,
+        steady=lambda: 0)
+    runtime.active = True
+    runtime.request(Trajectory(
+        ('a',), [], len(points), path=[((x,), t) for x, t in points]))
+    for _ in range(1000):
+        runtime.tick(now[0])
+    assert group.planners['a'].plan.segments[0].begin < 5 * SECOND
+
+
 def test_arrays_and_files_of_a_path_are_followed_too(tmp_path, capsys):
     times = np.linspace(0.0, 0.2, 21)
     stretches = 1.1 + 0.1 * np.sin(2.0 * np.pi * (times / 0.2) ** 2 * (3.0 - 2.0 * times / 0.2))

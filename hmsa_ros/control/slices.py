@@ -69,7 +69,9 @@ def _trajectory(
     return (yield from in_time(
         lambda now: group.draft_request(
             points, request.stamp, now, raw=request.raw, path=request.path is not None), group,
-        frozenset(request.joints), clock, request.count * len(request.joints)))
+        frozenset(request.joints), clock,
+        # The work of a path is not in proportion to its points.
+        1 if request.path is not None else request.count * len(request.joints)))
 
 
 def in_time(
