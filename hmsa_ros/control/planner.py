@@ -38,6 +38,7 @@ from hmsa_ros.control.takeover import Seen, Takeover
 from hmsa_ros.control.watching import Watch
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning import path
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.timeline import Model
 from hmsa_ros.timekeeping import clock_set_words
@@ -69,6 +70,7 @@ class PlannerRuntime:
             glance: Callable[[], Iterable[tuple[str, Seen]]] = tuple) -> None:
         self.group = group
         self.settings = settings
+        self._prepare()
         self.active = False
         #: Refuses requests, except to stop, while several planners or devices run.
         self.crowded: RefusedError | None = None
@@ -307,9 +309,14 @@ class PlannerRuntime:
         if settings.heartbeat_period != self.settings.heartbeat_period:
             self.sending.next_beat = self._clock() + settings.heartbeat_period
         self.settings = settings
+        self._prepare()
         for name, model in self.feedback.change(settings, models).items():
             self.group.planners[name].take_model(model)
         self.group.simultaneous = simultaneous
+
+    def _prepare(self) -> None:
+        if self.settings.trajectory_mode == 'path':
+            path.prepare()
 
     # -- out -----------------------------------------------------------------------------------
 

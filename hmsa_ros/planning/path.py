@@ -11,6 +11,7 @@ lags). They are as long as a tolerance allows. The last ones are corrected to en
 
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 import math
 from typing import Any
 
@@ -366,6 +367,12 @@ class _Follower:
             f'the {units.coordinate} leaves the path by up to {largest:.3g} '
             f'({100.0 * largest / self.range:.2g} % of its range), at '
             f'{units.time_text(when)}' + f'; the limit is {" and ".join(why)}' * bool(why))
+
+
+def prepare() -> None:
+    """Load what the first path would wait for, for some tenths of a second."""
+    for name in ('interpolate', 'sparse.linalg'):
+        import_module(f'scipy.{name}')
 
 
 def loads_for(stretch: Array, rate: Array, wanted: Array, packed: Array) -> Array:
