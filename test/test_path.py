@@ -188,6 +188,22 @@ def test_from_beside_the_path_the_actuator_goes_to_it_within_a_period():
     assert away[times > 0.015].max() < FOLLOWED * 0.3
 
 
+@pytest.mark.parametrize('make', [
+    lambda planner, now: planner.draft_stop(now),
+    lambda planner, now: planner.draft_setpoint(1.1, now),
+    lambda planner, now: planner.draft_path(dense(goal=1.2), None, now)],
+    ids=['stop', 'setpoint', 'path'])
+def test_what_follows_in_the_middle_of_a_path_ends_at_rest(make):
+    draft, planner = drafted(dense())
+    planner.take(draft, SECOND)
+    after = finish(make(planner, SECOND + SECOND // 25))
+    levels = [x for x in sent(draft) if x[0] < 0.04] + [(t + 0.04, x) for t, x in sent(after)]
+    segment = after.segments[-1]
+    arrival = (segment.arrival - SECOND) / SECOND
+    times = arrival + np.linspace(1e-6, 0.05, 300)
+    assert moved(levels, times) == pytest.approx(segment.stretch, abs=1e-8)
+
+
 P = ((1.0, 0.0, NAN), 0)
 
 
