@@ -174,6 +174,7 @@ def test_a_guided_staircase_writes_a_law_that_the_planner_takes(tmp_path, capsys
     (('latency', 'x:y', '--lag', '-1'), '--lag'),
     (('latency', '--simulate', '--lag', '0'), 'expected one of both'),
     (('static', '--simulate', '--settle', '0'), '--settle'),
+    (('static', '--simulate', '--steps', '2'), '--steps is 2'),
     (('static', '--simulate', '--gauge', 'nothing:here'), '--gauge')])
 def test_what_cannot_be_measured_is_refused(words, what, capsys):
     assert main(['calibrate', *words]) == 2

@@ -3,6 +3,7 @@
 from dataclasses import replace
 import math
 
+from lifecycle_msgs.srv import ChangeState
 import pytest
 from std_msgs.msg import Bool, Float64
 from test_runtime_hosts import BEATING, Bench, MS, START
@@ -298,3 +299,27 @@ def test_a_required_interlock_wins_over_everything(command, start, ros, tmp_path
     log = (tmp_path / 'lab.py.log').read_text().split()
     assert (log[0], log[-2:]) == ('0.000', ['disarm', '0.000'])
     assert log.count('arm') == log.count('disarm') == 2
+
+
+@pytest.mark.ros
+def test_an_interlock_stays_open_while_a_driver_is_configured_anew(start, ros, tmp_path):
+    (tmp_path / 'lab.py').write_text(BENCH)
+    health = ros.collect(topics.DIAGNOSTICS.type, topics.DIAGNOSTICS.name)
+    start.hmsa(
+        'driver', '--ros-args', '-p', 'hardware:=lab:Coil', '-p', 'publish_rate:=0.0',
+        PYTHONPATH=str(tmp_path))
+    door = ros.publisher(topics.INTERLOCK.type, 'driver/interlock', topics.INTERLOCK.qos)
+
+    def shown():
+        return [x.message for y in health[-1:] for x in y.status if x.name == 'driver: interlock']
+
+    ros.spin_until(lambda: door.get_subscription_count() and shown() == ['closed'], 'a driver')
+    door.publish(Bool(data=False))
+    ros.spin_until(lambda: shown() == ['open: a publisher has opened it'], 'an open interlock')
+    for change in ('deactivate', 'cleanup', 'configure', 'activate'):
+        request = ChangeState.Request()
+        request.transition.label = change
+        assert ros.call(ChangeState, 'driver/change_state', request).success
+    health.clear()
+    ros.spin_until(shown, 'a driver that is there again')
+    assert shown() == ['open: a publisher has opened it']

@@ -339,6 +339,9 @@ def _static(arguments: argparse.Namespace) -> int:
     example: hmsa calibrate static my_lab:Bench --limit 0.05 --settle 5 --out static.yaml
     """
     paper, source = paper_of(arguments), _source(arguments)
+    if arguments.steps < 3:
+        raise BadInputError(
+            f'--steps is {arguments.steps}: expected at least 3, since a table needs six levels')
     if not 0.1 <= arguments.settle < math.inf:
         raise BadInputError(f'--settle is {arguments.settle:g} s: expected at least 0.1 s')
     from hmsa_ros.device.statics import scale_at_rest, scale_by_gauge, statics

@@ -101,6 +101,9 @@ class DriverNode(DeviceNode):
         self.values = declare_joints(self, PARAMETERS, OWN)
         self._settings = {x: self._settings_of(x) for x in self.values.names}
         self.failure: HmsaError | None = None
+        required, timeout = (self.values[x.name] for x in INTERLOCK)
+        # An open interlock is also open for a driver that is configured anew.
+        self._interlock = Interlock(required=required, timeout=round(timeout * NANOSECONDS))
         self.autostart()
 
     def _settings_of(self, joint: str) -> dict[str, Any]:
@@ -138,8 +141,6 @@ class DriverNode(DeviceNode):
                 self.get_logger().warning(
                     f'waiting for {name}: it has not started yet, or its first write not returned')
         self.get_logger().info(_described(self.device.device, self.values))
-        required, timeout = (self.values[x.name] for x in INTERLOCK)
-        self._interlock = Interlock(required=required, timeout=round(timeout * NANOSECONDS))
         self._lock = endpoints.listen(self, topics.INTERLOCK)
         self._mind_interlock()
         self._open(DeviceJoint)
