@@ -113,7 +113,7 @@ $(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml constraints.tx
 	@touch $@ $(VENV)/.motion
 
 $(VENV)/.tools: $(VENV)/.installed
-	$(EXTRAS) test studies cluster docs > $(VENV)/extras.txt
+	$(EXTRAS) test studies cluster panel docs > $(VENV)/extras.txt
 	$(INSTALL) -r $(VENV)/extras.txt
 	@touch $@
 

@@ -69,6 +69,10 @@ EXTRAS_REQUIRE = {
         'distributed>=2024.1',
         'pyarrow>=14.0',
     ],
+    # The page that hmsa panel serves.
+    'panel': [
+        'tornado>=6.2',
+    ],
     # Boards on a serial port.
     'serial': [
         'pyserial>=3.5',
@@ -132,6 +136,7 @@ setup(
     package_data={PACKAGE: [
         'fastdds.xml', 'fastdds_localhost.xml', 'motion/_motion.pyi', '_deadline.pyi', 'py.typed',
         'device/_board.pyi', 'device/hmsa_board/board.hpp', 'device/hmsa_board/hmsa_board.ino',
+        'panel/index.html', 'panel/panel.css', 'panel/panel.js',
         'report/page.css', 'report/page.js', 'report/style.mplstyle',
         *(f'report/{x}.html' for x in ('page', 'parts', 'run', 'identified', 'conformance')),
         *(f'cli/completion.{x}' for x in ('bash', 'zsh', 'fish')),

@@ -45,7 +45,8 @@ class Browser:
             [sys.executable, '-c', _LAUNCH, str(theirs_in), str(theirs_out), program,
              '--headless=new', '--no-sandbox', '--disable-gpu', '--disable-dev-shm-usage',
              '--hide-scrollbars', '--no-first-run', '--disable-extensions',
-             '--disable-background-networking', '--host-resolver-rules=MAP * ~NOTFOUND',
+             '--disable-background-networking',
+             '--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1',
              f'--user-data-dir={folder / "profile"}', '--remote-debugging-pipe'],
             pass_fds=(theirs_in, theirs_out), stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -96,9 +97,9 @@ class Browser:
         return received
 
     def open(
-            self, path: Path, *, width: int = 1280, height: int = 900, dark: bool = False,
+            self, path: Path | str, *, width: int = 1280, height: int = 900, dark: bool = False,
             mobile: bool = False) -> Page:
-        """Open a file and wait until it is loaded."""
+        """Open a file or an address of this host and wait until it is loaded."""
         return Page(self, path, width, height, dark, mobile)
 
 
@@ -106,7 +107,7 @@ class Page:
     """A page in a tab of its own."""
 
     def __init__(
-            self, browser: Browser, path: Path, width: int, height: int, dark: bool,
+            self, browser: Browser, path: Path | str, width: int, height: int, dark: bool,
             mobile: bool) -> None:
         self._browser = browser
         target = browser.call('Target.createTarget', url='about:blank')['targetId']
@@ -121,8 +122,12 @@ class Page:
         self.call('Emulation.setEmulatedMedia', features=[
             {'name': 'prefers-color-scheme', 'value': 'dark' if dark else 'light'},
             {'name': 'pointer', 'value': 'coarse' if mobile else 'fine'}])
-        self.call('Page.navigate', url=path.resolve().as_uri())
-        self.wait_for("document.readyState === 'complete'")
+        url = path if isinstance(path, str) else path.resolve().as_uri()
+        # What the page may ask for: of a server, what is there.
+        self._own = ('file:', 'data:', 'blob:', *(
+            [url, url.replace('http:', 'ws:')] if isinstance(path, str) else []))
+        self.call('Page.navigate', url=url)
+        self.wait_for("location.href !== 'about:blank' && document.readyState === 'complete'")
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
         """Call a method of the protocol on this page."""
@@ -169,6 +174,6 @@ class Page:
             elif method == 'Log.entryAdded' and what['entry']['level'] in ('error', 'warning'):
                 found.append(what['entry'])
             elif method == 'Network.requestWillBeSent' and not what['request'][
-                    'url'].startswith(('file:', 'data:', 'blob:')):
+                    'url'].startswith(self._own):
                 found.append(what['request']['url'])
         return found

@@ -32,7 +32,7 @@ WITHOUT_KEY = {'plotly', 'pyte', 'ruff', 'types-PyYAML'}
 # Requirements whose module has another name.
 MODULES = {'PyYAML': 'yaml', 'mcap-ros2-support': 'mcap_ros2'}
 # What only a part of the package needs.
-OPTIONAL = {'dask', 'distributed', 'pyarrow'}
+OPTIONAL = {'dask', 'distributed', 'pyarrow', 'tornado'}
 # What the package asks for in one line where it is missing: the user's choice.
 BESIDE = {'pandas', 'rerun'}
 # Needed to install, or to be launched, not to be imported.
@@ -141,7 +141,7 @@ def test_everything_imported_is_required_and_everything_required_is_imported(set
            if not key.startswith('python3-') and key not in KEYS.values()}
     extras = setup['extras_require']
     assert names(extras['studies']) == {'pyarrow'}
-    assert names(extras['cluster']) == OPTIONAL
+    assert names(extras['cluster']) | names(extras['panel']) == OPTIONAL
     assert imported() == (python | ros | OPTIONAL | BESIDE) - NOT_IMPORTED
 
 

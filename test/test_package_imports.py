@@ -112,7 +112,7 @@ def test_commands_that_need_ros_say_how_to_get_it_where_there_is_none(tmp_path):
     commands = [
         *([x] for x in NODES),
         ['demo'], ['run', '1.1:0.1'], ['run', '1.1:0.1', '--simulate'], ['send', '1.1:0.1'],
-        ['watch', '--once']]
+        ['watch', '--once'], ['panel']]
     result = run(BLOCKED.format(blocked=ROS) + f"""
 import os
 os.chdir({str(tmp_path)!r})
@@ -188,7 +188,7 @@ sys.exit(main())
 def test_every_command_of_the_interface_answers_help():
     commands = (
         'demo', 'plan', 'send', 'run', 'planner', 'plant', 'recorder', 'player', 'bag', 'figures',
-        'report', 'robustness', 'sweep', 'identify', 'excite')
+        'report', 'robustness', 'sweep', 'identify', 'excite', 'panel')
     result = run(f"""
 import os, sys
 from hmsa_ros.cli import main

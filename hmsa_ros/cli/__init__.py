@@ -23,8 +23,8 @@ from hmsa_ros.errors import complain, HmsaError
 COMMANDS = (
     *(f'hmsa_ros.cli.{x}' for x in (
         'demo', 'init', 'excite', 'identify', 'plan', 'waves', 'simulate', 'node', 'send', 'stop',
-        'param', 'run', 'learn', 'tune', 'watch', 'bag', 'report', 'compare', 'export',
-        'check_driver', 'calibrate')),
+        'param', 'run', 'learn', 'tune', 'watch', 'panel', 'bag', 'report', 'compare',
+        'export', 'check_driver', 'calibrate')),
     *(f'hmsa_studies.commands.{x}' for x in ('sweep', 'robustness', 'figures')),
     'hmsa_ros.cli.completion')
 _NODE = ('hmsa_ros.cli.node',)

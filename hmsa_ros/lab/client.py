@@ -142,7 +142,7 @@ class PlannerClient(Visitor):
         end = monotonic() + seconds
         while monotonic() < end:
             ENDING.check()
-            self._executor.spin_once(timeout_sec=SLICE_SECONDS)
+            self._executor.spin_once(timeout_sec=min(SLICE_SECONDS, max(end - monotonic(), 0.0)))
 
     def find_recorder(self) -> None:
         """Wait until somebody who records subscribes to what is sent, and with it to all else."""
@@ -199,6 +199,32 @@ class PlannerClient(Visitor):
             If it does not answer.
 
         """
+        deadline = monotonic() + self._timeout
+        while True:
+            request = self.publish(setpoints, levels)
+            self.spin_until(
+                lambda request=request: self.verdict.request == request,  # type: ignore[misc]
+                'the planner did not reply with a verdict')
+            if self.verdict.level < DiagnosticStatus.ERROR[0]:
+                return self.verdict
+            # A planner that has just started may not have heard the time yet.
+            if self.verdict.code != 'no_time' or monotonic() > deadline:
+                raise BadInputError(f'the planner refused: {self.verdict.message}')
+            self._executor.spin_once(timeout_sec=SLICE_SECONDS)
+            sleep(SLICE_SECONDS)
+
+    def publish(
+            self, setpoints: Sequence[tuple[float | Sequence[float], float]],
+            levels: Sequence[tuple[float, float]] = ()) -> str:
+        """
+        Send a sequence as `send` does, without waiting; return the name of the request.
+
+        Raises
+        ------
+        BadInputError
+            If the stretches are not as many as the joints, or the sequence is too long.
+
+        """
         points: list[tuple[float | Sequence[float], int]] = [
             (level, round(time * NANOSECONDS)) for time, level in levels]
         end = 0.0
@@ -211,21 +237,15 @@ class PlannerClient(Visitor):
             if end >= 2**31:
                 raise BadInputError(f'the sequence lasts {end:g} s: expected less than 2^31 s')
             points.append((stretch, round(end * NANOSECONDS)))
-        deadline = monotonic() + self._timeout
-        while True:
-            request = self._requested = uuid4().hex
-            self._publisher.publish(to_trajectory(
-                points, self._joints, frame=request, raw=bool(levels)))
-            self.spin_until(
-                lambda request=request: self.verdict.request == request,  # type: ignore[misc]
-                'the planner did not reply with a verdict')
-            if self.verdict.level < DiagnosticStatus.ERROR[0]:
-                return self.verdict
-            # A planner that has just started may not have heard the time yet.
-            if self.verdict.code != 'no_time' or monotonic() > deadline:
-                raise BadInputError(f'the planner refused: {self.verdict.message}')
-            self._executor.spin_once(timeout_sec=SLICE_SECONDS)
-            sleep(SLICE_SECONDS)
+        self._requested = uuid4().hex
+        self._publisher.publish(to_trajectory(
+            points, self._joints, frame=self._requested, raw=bool(levels)))
+        return self._requested
+
+    @property
+    def listened(self) -> bool:
+        """Whether somebody subscribes to what is sent."""
+        return bool(self._publisher.get_subscription_count())
 
     def follow(
             self, verdict: Verdict, *, each: Callable[[Verdict], None] | None = None,

@@ -146,7 +146,7 @@ def conduct(
     with Session(experiment.folder, environment) as session:
         progress('starting the nodes' if experiment.nodes else 'looking for the nodes', 0.0)
         if experiment.nodes:
-            for node in (*experiment.nodes, _recorder(experiment, True)):
+            for node in (*experiment.nodes, recorder_of(experiment, True)):
                 ENDING.check()
                 session.start(node)
         return _conduct(experiment, session, progress, times)
@@ -202,7 +202,7 @@ def _begin(experiment: Experiment, session: Session, watch: 'Watch') -> None:
     watch.client.check_alone()
     if not experiment.nodes:
         watch.check()
-        session.start(_recorder(experiment, bool(watch.parameter('planner.use_sim_time'))))
+        session.start(recorder_of(experiment, bool(watch.parameter('planner.use_sim_time'))))
     watch.client.spin_until(
         lambda: watch.recorder_ready,
         f'the recorder is not ready: {session.last_words(topics.RECORDER)}', session.check)
@@ -210,7 +210,8 @@ def _begin(experiment: Experiment, session: Session, watch: 'Watch') -> None:
         watch.unpause()
 
 
-def _recorder(experiment: Experiment, simulated: bool) -> NodeProcess:
+def recorder_of(experiment: Experiment, simulated: bool) -> NodeProcess:
+    """Return the recorder of an experiment, in simulated time if so."""
     return NodeProcess(topics.RECORDER, {
         'use_sim_time': simulated, 'storage.uri': str(experiment.bag),
         'record.topics': experiment.topics()}, experiment.namespace)

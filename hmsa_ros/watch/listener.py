@@ -220,13 +220,16 @@ class Listener:
             joint = self._joints.get(name)
             if joint is None:
                 joint = self._joints[name] = Joint(
-                    name, History(self._span), History(self._span))
+                    name, History(self._span), History(self._span),
+                    fluxes=History(self._span))
             joint.stretch = float(stretches[-1, i])
             joint.rate = newest.velocity[i] if i < len(newest.velocity) else math.nan
             joint.flux_density = newest.effort[i] if i < len(newest.effort) else math.nan
             finite = stretches[np.isfinite(stretches[:, i]), i]
             if len(finite):
                 joint.stretches.put(self._looked, now, finite)
+            fluxes = np.array([x.effort[i] for x in messages if i < len(x.effort)])
+            joint.fluxes.put(self._looked, now, fluxes[np.isfinite(fluxes)])
 
     def _take_commands(self) -> None:
         for name, (source, schedule) in self._commands.items():

@@ -10,6 +10,8 @@ from hmsa_ros.interfaces.status import Verdict
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import POSITION
 
+#: Of a chart.
+SLOTS = 480
 #: What diagnostics and verdicts call their levels.
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 
@@ -17,7 +19,7 @@ LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 class History:
     """The least and largest value in each slot of the last ``span`` seconds; peaks are kept."""
 
-    def __init__(self, span: float, slots: int = 480) -> None:
+    def __init__(self, span: float, slots: int = SLOTS) -> None:
         self._slot = span / slots
         self._low = np.full(slots, np.nan)
         self._high = np.full(slots, np.nan)
@@ -58,7 +60,7 @@ class History:
 @dataclass
 class Joint:
     """
-    One actuator: newest sample, target and command (in SI, NaN if not known), and its chart.
+    One actuator: newest sample, target and command (in SI, NaN if not known), and its charts.
 
     ``coordinate`` is what its position is called, as far as known.
     """
@@ -72,6 +74,7 @@ class Joint:
     target: float = math.nan
     commanded: float = math.nan
     coordinate: str = POSITION
+    fluxes: History = field(default_factory=lambda: History(10.0))
 
 
 @dataclass

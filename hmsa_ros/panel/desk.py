@@ -1,0 +1,273 @@
+"""What the panel does with ROS, in one thread that never waits for an answer."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+import json
+import math
+from pathlib import Path
+from queue import Empty
+from time import monotonic
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+import numpy as np
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.parameter import parameter_value_to_python
+from std_srvs.srv import Trigger
+
+from hmsa_ros.control.feedback import MODES
+from hmsa_ros.ending import ENDING
+from hmsa_ros.errors import BadInputError, HmsaError, printable
+from hmsa_ros.interfaces import topics
+from hmsa_ros.interfaces.status import texts
+from hmsa_ros.lab.client import PlannerClient
+from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes.service_call import ServiceCall
+from hmsa_ros.panel.recording import Recording
+from hmsa_ros.panel.server import Server
+from hmsa_ros.watch.listener import Listener
+from hmsa_ros.watch.scene import History, LEVELS, Scene, SLOTS
+from hmsa_ros.watch.screen import as_json
+
+# Between two frames; of each chart one has the last slots, and all of them while a page is new.
+_PERIOD, _TAIL, _NEW_SECONDS = 0.02, 24, 1.0
+# Until a page that is loaded again is back, and until a planner counts as gone.
+_RELOAD_SECONDS, _GONE_SECONDS = 1.0, 10.0
+_ASK_SECONDS = 1.0
+_RESTING = ('at_rest', 'idle')
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the panel drives, and how."""
+
+    parse: Callable[[str], tuple[Sequence[float], float]]  #: one setpoint from its text
+    out: Path  #: folder of recordings
+    namespace: str = ''
+    joints: tuple[str, ...] = ('actuator',)
+    span: float = 10.0  #: of the charts in s
+    stop_on_close: bool = True  #: come to rest when the last page is closed
+
+
+class Desk:
+    """Carries out what the pages of a server ask for, and tells them what is seen."""
+
+    def __init__(self, server: Server, options: Options) -> None:
+        self._server, self._options = server, options
+        self._client = PlannerClient(namespace=options.namespace, joints=options.joints)
+        self._listener = Listener(
+            namespace=options.namespace, joints=options.joints, span=options.span)
+        node = self._client.node
+        self._stop = endpoints.call(node, topics.STOP, topics.PLANNER, Trigger.Request())
+        self._get = ServiceCall(
+            node, GetParameters, f'{topics.PLANNER}/get_parameters',
+            GetParameters.Request(names=['feedback', 'use_sim_time']))
+        self._set: ServiceCall | None = None
+        endpoints.subscribe(node, topics.ESTIMATE, self._on_estimate, topics.PLANNER)
+        self._recording = Recording(options.out, options.namespace, options.joints)
+        self._estimates: dict[str, dict[str, Any]] = {}
+        self._known: Mapping[str, Any] = {}
+        self._next_ask = 0.0
+        # The request sent last, when, and whether the planner has received it, or never will.
+        self._request, self._sent, self._received = '', -math.inf, True
+        # When stopping began, and whether that request was known to have come before.
+        self._stopping, self._sure = -math.inf, False
+        self._pages, self._news, self._left = 0, -math.inf, math.inf
+        self._note: dict[str, Any] = {'number': 0, 'level': 'OK', 'text': ''}
+
+    def run(self) -> None:
+        """Serve until the process is told to end; the actuator rests then, the bag is closed."""
+        try:
+            while not ENDING.asked:
+                self._client.pass_time(_PERIOD)
+                self._step()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            if self._options.stop_on_close and self._moves:
+                self._client.stop()
+            self._recording.close()
+            self._listener.__exit__()
+            self._client.__exit__()
+
+    def _step(self) -> None:
+        scene, now = self._listener.look(), monotonic()
+        self._received = self._received or self._client.verdict.request == self._request
+        if not self._received and now - self._sent > _GONE_SECONDS:
+            self._received = True
+            self._tell('the planner did not reply to the request: send it again', 2)
+        self._look_at_pages(now)
+        if self._server.stop.is_set():
+            self._server.stop.clear()
+            self._begin_stop(now)
+        self._follow_stop(now)
+        try:
+            while True:
+                self._carry_out(self._server.commands.get_nowait(), now)
+        except Empty:
+            pass
+        self._follow_rest(now)
+        # A page that comes later gets none that is old by then.
+        self._server.frame = json.dumps(
+            self._frame(scene, now), separators=(',', ':')) if self._pages else ''
+
+    def _tell(self, text: str, level: int = 0) -> None:
+        self._note = {
+            'number': self._note['number'] + 1, 'level': LEVELS[level], 'text': printable(text)}
+
+    @property
+    def _moves(self) -> bool:
+        """Whether what the panel sent is under way, as far as known."""
+        verdict = self._client.verdict
+        return not self._received or (
+            verdict.request == self._request != '' and verdict.state not in _RESTING)
+
+    def _look_at_pages(self, now: float) -> None:
+        """Notice new pages, and that the last one is closed."""
+        pages = len(self._server.pages)
+        if pages > self._pages:
+            self._news = now
+        if pages:
+            self._left = math.inf
+        elif self._pages:
+            self._left = now
+        self._pages = pages
+        if now - self._left > _RELOAD_SECONDS:
+            self._left = math.inf
+            if self._options.stop_on_close and self._moves:
+                self._begin_stop(now)
+
+    # -- stop ----------------------------------------------------------------------------------
+
+    def _begin_stop(self, now: float) -> None:
+        self._stopping, self._sure = now, self._received
+        self._tell('stopping', 1)
+
+    def _follow_stop(self, now: float) -> None:
+        """Ask until an answer comes to a call that was made after the last request arrived."""
+        if self._stopping == -math.inf:
+            # So that its server is known when it counts.
+            self._stop.ready  # noqa: B018
+        elif (answer := self._stop.answer()) is not None and self._sure:
+            self._stopping = -math.inf
+            self._tell(answer.message, 0 if answer.success else 2)
+        elif answer is not None:
+            self._sure = self._received
+        elif now - self._stopping > _GONE_SECONDS:
+            self._stopping = -math.inf
+            self._tell('the planner does not answer the stop: look after the coil', 2)
+
+    # -- commands ------------------------------------------------------------------------------
+
+    def _carry_out(self, command: Mapping[str, Any], now: float) -> None:
+        try:
+            match command:
+                case {'do': 'send', 'setpoints': str(words)}:
+                    self._send(words, now)
+                case {'do': 'feedback', 'mode': str(mode)} if mode in MODES:
+                    self._set_feedback(mode)
+                case {'do': 'record', 'on': True}:
+                    self._recording.start(bool(self._known.get('use_sim_time')))
+                    self._tell('recording')
+                case {'do': 'record', 'on': False}:
+                    self._recording.stop()
+                case _:
+                    raise BadInputError(
+                        f'unknown command {str(command.get("do"))[:40]!r}: reload the page')
+        except HmsaError as error:
+            self._tell(str(error), 2)
+
+    def _send(self, words: str, now: float) -> None:
+        if self._stopping > -math.inf:
+            raise HmsaError('not sent, since the actuator is being stopped: send it again')
+        setpoints = [self._options.parse(x) for x in words.split()]
+        if not setpoints:
+            raise BadInputError('no setpoint: expected STRETCH:SECONDS ..., such as 1.10:1 1.00:1')
+        if not self._client.listened:
+            raise HmsaError('no planner listens: start one with hmsa planner')
+        self._request, self._sent, self._received = self._client.publish(setpoints), now, False
+        self._tell(f'sent {" ".join(words.split())}')
+
+    def _set_feedback(self, mode: str) -> None:
+        if self._set is not None:
+            self._set.close()
+        value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=mode)
+        self._set = ServiceCall(
+            self._client.node, SetParameters, f'{topics.PLANNER}/set_parameters',
+            SetParameters.Request(parameters=[Parameter(name='feedback', value=value)]))
+
+    def _follow_rest(self, now: float) -> None:
+        """Take answers of the parameters' services, and look after the recorder."""
+        if self._set is not None and (answer := self._set.answer()) is not None:
+            self._set.close()
+            self._set, self._next_ask = None, 0.0
+            for result in answer.results[:1]:
+                if not result.successful:
+                    self._tell(f'the planner refused: {result.reason}', 2)
+        if not (self._get.ready and self._client.listened):
+            self._known = {}
+        elif now >= self._next_ask and (answer := self._get.answer()) is not None:
+            self._known = dict(zip(('feedback', 'use_sim_time'), map(
+                parameter_value_to_python, answer.values), strict=False))
+            self._next_ask = now + _ASK_SECONDS
+        self._recording.check()
+        if self._recording.trouble:
+            self._tell(self._recording.trouble, 2)
+            self._recording.trouble = ''
+
+    def _on_estimate(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = texts(status)
+            # Of one joint or of several, whose names are known.
+            if status.hardware_id in self._options.joints:
+                self._estimates[status.hardware_id] = {
+                    'joint': status.hardware_id, 'level': LEVELS[min(status.level[0], 3)],
+                    'message': printable(status.message), 'rows': [
+                        [name, *(_known(values.get(f'{name}{end}', ''))
+                                 for end in ('', '.std', '.nominal'))]
+                        for name in values if f'{name}.std' in values]}
+
+    # -- frames --------------------------------------------------------------------------------
+
+    def _frame(self, scene: Scene, now: float) -> dict[str, Any]:
+        """Return what a page shows, for JSON."""
+        recording, feedback = self._recording, self._known.get('feedback', '')
+        reports = self._server.reports
+        if recording.report is not None:
+            reports[recording.report.parent.name] = recording.report
+        tail = SLOTS if now - self._news < _NEW_SECONDS else _TAIL
+        seen = dict(as_json(scene))
+        if scene.request is not None:
+            # What was measured in words; anybody may send figures.
+            seen['request']['finding'] = scene.request.finding
+        return {
+            **seen,
+            'slot': math.floor(scene.now / (self._options.span / SLOTS)),
+            'span': self._options.span, 'slots': SLOTS, 'charts': {
+                x.name: {
+                    'coordinate': x.coordinate, 'stretch': _tail(x.stretches, scene.now, tail),
+                    'target': _tail(x.targets, scene.now, tail),
+                    'flux': _tail(x.fluxes, scene.now, tail)} for x in scene.joints},
+            'feedback': feedback, 'modes': MODES, 'setting': self._set is not None,
+            'estimates': list(self._estimates.values()) if feedback not in ('', 'off') else [],
+            'recording': {
+                'state': recording.state, 'bag': str(recording.bag or ''),
+                'seconds': now - recording.since if recording.state == 'on' else None,
+                'reports': list(reports)},
+            'stopping': self._stopping > -math.inf, 'note': self._note}
+
+
+def _tail(history: History, now: float, count: int) -> list[list[float | None]]:
+    """Return the least and largest values in the last slots of a history."""
+    return [[None if math.isnan(x) else x for x in np.round(side[-count:], 7).tolist()]
+            for side in history.ranges(now, SLOTS)]
+
+
+def _known(text: str) -> float | None:
+    """Return the finite number in a text, else None."""
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
