@@ -2,8 +2,7 @@
 Random laboratories in virtual time: an actuator, a coil and a sensor that a planner does not know.
 
 The motion is Eq. 10 with a coil that lags, a branch that creeps and a constant force, integrated
-by Runge and Kutta's method in plain floating point. Nothing of the package takes part but the
-record of a block's sizes.
+by SciPy. Nothing of the package takes part but the record of a block's sizes.
 """
 
 from collections.abc import Sequence
@@ -13,6 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import mu_0
+from scipy.integrate import OdeSolution, solve_ivp
 
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 
@@ -24,8 +24,8 @@ KINDS = {
     'force': 'constant force'}
 #: All that are drawn, with nothing wrong and with several things wrong.
 GROUPS = {'none': 'nothing', **KINDS, 'several': 'several of these'}
-# Steps of the integration in a unit of time, at least, and samples in one.
-_STEPS, _SAMPLES = 30, (4.4, 25.0)
+# Units of time that are integrated at once, and samples in one.
+_AHEAD, _SAMPLES = 3.0, (4.4, 25.0)
 # Every second bench has several things wrong, each with this probability.
 _LIKELY = 0.5
 _TARGETS = (1.08, 1.45)  # range of stretches, and the least step
@@ -53,6 +53,7 @@ class Bench:
     period: float  # of samples
     dropouts: float  # share of samples that are lost, in bursts
     targets: tuple[float, ...]
+    kinds: tuple[str, ...] = ()  # of `KINDS`: what is wrong
 
     @property
     def unit(self) -> float:
@@ -121,7 +122,7 @@ def drawn(seed: int, targets: int = 3) -> Bench:
         max(delay * unit, late), gain if 'gain' in wrong else 1.0, bias,
         ratio if 'creep' in wrong else 0.0, relaxation * unit,
         force / given.load_per_newton if 'force' in wrong else 0.0, noise, unit / per_unit,
-        dropouts, tuple(stretches))
+        dropouts, tuple(stretches), tuple(x for x in KINDS if x in wrong))
 
 
 class Plant:
@@ -139,17 +140,19 @@ class Plant:
         self._c1 = 2.0 * (block.half_thickness / block.half_length) ** 2
         self._force = bench.force * block.load_per_newton * block.shear_modulus / inertia
         self._lag, self._ratio, self._relaxation = bench.lag, bench.ratio, bench.relaxation
-        self._largest = bench.unit / _STEPS
-        self.time = time
+        self._ahead = round(1e9 * _AHEAD * bench.unit)
+        self.time = self._begin = self._since = self._until = time
         self._levels: list[tuple[int, float]] = []
-        self._level = 0.0
+        # The field decays from the level before to the one in force.
+        self._field = self._level = 0.0
+        self._motion: OdeSolution | None = None  # from `_since` until `_until`
         self.applied: list[tuple[int, float]] = []
         state = 1.0
         # Rest under the force, once branches have relaxed.
         for _ in range(50):
             slope = (self._elastic(state + 1e-6) - self._elastic(state - 1e-6)) / 2e-6
             state -= (self._elastic(state) - self._force / self._stiffness) / slope
-        self.state = (state, 0.0, self._elastic(state), 0.0)
+        self.state = np.array([state, 0.0, self._elastic(state)])  # at `_since`
 
     def command(self, stamp: int, level: float) -> None:
         """Take a level from a stamp on; it takes the place of all at or after it."""
@@ -160,48 +163,49 @@ class Plant:
         """Go on until a time; return the stretch then."""
         while self._levels and self._levels[0][0] <= time:
             stamp, level = self._levels.pop(0)
-            self._integrate(1e-9 * (stamp - self.time))
-            self.time, self._level = stamp, level
+            self._go_on(stamp)
+            self._begin_with(level)
             self.applied.append((stamp, level))
-        self._integrate(1e-9 * (time - self.time))
-        self.time = time
-        return self.state[0]
+        return self._go_on(time)
+
+    def _begin_with(self, level: float) -> None:
+        if self._motion is not None:
+            self.state = self._motion(1e-9 * (self.time - self._since))
+        self._field, self._level = self._field_at(self.time), level
+        self._begin, self._since, self._motion = self.time, self.time, None
+
+    def _field_at(self, time: float) -> float:
+        """Return the field in T at a time in ns while a level is in force."""
+        if not self._lag:
+            return self._level
+        return self._level + (self._field - self._level) * math.exp(
+            -1e-9 * (time - self._begin) / self._lag)
 
     def _elastic(self, stretch: float) -> float:
         """Return psi' of the Gent law."""
         return (stretch - stretch ** -2) / (
             1.0 - (2.0 / stretch + stretch ** 2 - 3.0) / self._limit)
 
-    def _slope(
-            self, stretch: float, rate: float, relaxed: float, field: float
-    ) -> tuple[float, float, float, float]:
-        elastic = self._elastic(stretch)
-        lag, cube = self._lag, stretch ** -3
-        acting = field if lag else self._level
-        total = self._drive * acting + self._force - self._damping * rate - self._stiffness * (
-            elastic + self._ratio * (elastic - relaxed)) + (
-                0.25 * rate * rate * cube / stretch)
-        return (
-            rate, 6.0 * total / (cube + self._c1), (elastic - relaxed) / self._relaxation,
-            (self._level - field) / lag if lag else 0.0)
+    def _slope(self, time: float, state: Array) -> tuple[float, float, float]:
+        stretch, rate, relaxed = state.tolist()
+        elastic, cube = self._elastic(stretch), stretch ** -3
+        total = self._drive * self._field_at(
+            self._since + 1e9 * time) + self._force - self._damping * rate - self._stiffness * (
+            elastic + self._ratio * (elastic - relaxed)) + 0.25 * rate * rate * cube / stretch
+        return rate, 6.0 * total / (cube + self._c1), (elastic - relaxed) / self._relaxation
 
-    def _integrate(self, span: float) -> None:
-        if span <= 0.0:
-            return
-        # A coil that lags little needs short steps.
-        count = math.ceil(span / min(self._largest, self._lag or self._largest))
-        h = span / count
-        for _ in range(count):
-            x, v, w, b = self.state
-            x1, v1, w1, b1 = self._slope(x, v, w, b)
-            g = 0.5 * h
-            x2, v2, w2, b2 = self._slope(x + g * x1, v + g * v1, w + g * w1, b + g * b1)
-            x3, v3, w3, b3 = self._slope(x + g * x2, v + g * v2, w + g * w2, b + g * b2)
-            x4, v4, w4, b4 = self._slope(x + h * x3, v + h * v3, w + h * w3, b + h * b3)
-            g = h / 6.0
-            self.state = (
-                x + g * (x1 + 2.0 * (x2 + x3) + x4), v + g * (v1 + 2.0 * (v2 + v3) + v4),
-                w + g * (w1 + 2.0 * (w2 + w3) + w4), b + g * (b1 + 2.0 * (b2 + b3) + b4))
+    def _go_on(self, time: int) -> float:
+        """Go on under the level in force."""
+        while self._motion is None or time > self._until:
+            if self._motion is not None:
+                self.state = self._motion(1e-9 * (self._until - self._since))
+                self._since = self._until
+            self._until = self._since + self._ahead
+            self._motion = solve_ivp(
+                self._slope, (0.0, 1e-9 * self._ahead), self.state, 'DOP853', rtol=1e-8,
+                atol=1e-9, dense_output=True).sol
+        self.time = time
+        return float(self._motion(1e-9 * (time - self._since))[0])
 
 
 class Device:

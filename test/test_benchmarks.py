@@ -13,7 +13,8 @@ from scipy.integrate import solve_ivp
 
 from benchmarks import __main__ as program
 from benchmarks import bench_defects, bench_harm, bench_judge, bench_plant, contenders
-from benchmarks.laboratory import Device, drawn, Plant
+from benchmarks.bounds import bound
+from benchmarks.laboratory import Device, drawn, KINDS, Plant
 from benchmarks.measure import Contender, loosest, race, Report, Row, text_of_time
 from benchmarks.reference import Actuator, response, two_step
 from benchmarks.sheet import Sheet
@@ -144,7 +145,7 @@ def test_the_plant_of_a_laboratory_moves_as_scipy_says():
     found = [plant.advance(round(1e9 * x)) for x in times]
     expected = simulate(times, switches, levels, bench.block, Extras(
         coil=bench.lag, ratio=bench.ratio, time=bench.relaxation, force=bench.force))
-    assert found == pytest.approx(expected, abs=2e-5)
+    assert found == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_laboratory_is_the_same_for_the_same_seed_and_in_open_loop_leaves_what_is_wrong():
@@ -159,6 +160,16 @@ def test_a_laboratory_is_the_same_for_the_same_seed_and_in_open_loop_leaves_what
     assert bench_harm.harm({'open loop': [exact], 'adapt': [weak]}, 'adapt') == [
         weak.size - exact.size]
     assert Device(bench, 0).next_sample > 0
+
+
+def test_a_laboratory_bounds_what_the_second_move_leaves_by_what_may_be_wrong():
+    bench = replace(drawn(1), noise=1e-4)
+    found = [bound(x, y) for x in (bench, replace(bench, noise=1e-3))
+             for y in ((), ('force',), tuple(KINDS))]
+    # A bias alone leaves nothing, and more noise or more to be known leaves more.
+    assert found[0] == found[3] == 0.0
+    assert found[0] < found[1] < found[2] < found[5]
+    assert 5.0 < found[4] / found[1] < 20.0
 
 
 @pytest.mark.parametrize(('within', 'verdict', 'said'), [
