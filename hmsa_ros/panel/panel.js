@@ -173,15 +173,16 @@ function draw(canvas, lines, scale, least, label) {
     pen.strokeStyle = colour(name);
     pen.setLineDash(dash);
     pen.beginPath();
-    let drawing = false;
+    let before = -Infinity;
     for (let i = 0; i < count; i++) {
       const slot = (frame.slot - count + 1 + i) % count;
       if (lows[slot] === null || lows[slot] === undefined) continue;
       const x = GUTTER + i * across;
-      if (drawing) pen.lineTo(x, place(scale * lows[slot]));
+      // Where nothing came for a while there is a gap.
+      if (i - before < count / 40) pen.lineTo(x, place(scale * lows[slot]));
       else pen.moveTo(x, place(scale * lows[slot]));
       if (highs[slot] !== lows[slot]) pen.lineTo(x, place(scale * highs[slot]));
-      drawing = true;
+      before = i;
     }
     pen.stroke();
   }
