@@ -184,7 +184,7 @@ class _Report(_Guarded):
 class _Socket(_Guarded, WebSocketHandler):
     origin_needed = True
 
-    def open(self, *_: str) -> None:
+    def open(self, *_: str, **__: str) -> None:
         self.server.pages.add(self)
         self._feeding = asyncio.create_task(self._feed())
 

@@ -85,7 +85,6 @@ class Path:
             spline = PPoly(_quintic(np.diff(times), stretches, rates, accelerations), times)
         return cls._of(spline, times)
 
-
     @classmethod
     def smooth(cls, times: Array, stretches: Array) -> 'Path':
         """Return the smoothest path through stretches, shape (n,), from rest to rest."""
@@ -227,7 +226,8 @@ class _Follower:
         free = slice(2, -2 if edges[-1] == self.edges[-1] else None)
         normal = (design[:, free].T @ design[:, free]).tocsc()
         coefficients = np.zeros(len(edges) + 1)
-        more, gained = np.zeros_like(target), np.zeros(len(loads))
+        more: Array = np.zeros_like(target)
+        gained: Array = np.zeros(len(loads))
         levels = np.full(len(loads), math.inf)
         for _ in range(1 if math.isinf(slew) else _RAMPED):
             before = levels
@@ -317,7 +317,8 @@ class _Follower:
             found = last.levels, last.duration
         since = float(edges[begin])
         levels = (*self._levels[:begin], *(Level(since + x.time, x.load) for x in found[0]))
-        times = since + np.linspace(0.0, max(end - since, found[1]), 20 * (1 + len(found[0])))[1:]
+        times = since + np.linspace(
+            0.0, max(end - since, found[1]), 20 * (1 + len(found[0])), dtype=np.float64)[1:]
         wanted = np.where(
             times < end, self._course(np.minimum(times, end))[0], request.target)
         stretch = sampled(

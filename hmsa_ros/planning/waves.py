@@ -21,7 +21,7 @@ from hmsa_ros.planning.shapers.request import Request
 Shape = Callable[[Array], tuple[Array, Array, Array]]
 
 # Harmonics of a triangle, whose corners they round.
-_HARMONICS: Array = np.arange(1.0, 11.0, 2.0)
+_HARMONICS: Array = np.arange(1.0, 11.0, 2.0, dtype=np.float64)
 # Cycles and natural periods that a wave is faded in and out for at the least.
 _FADE_CYCLES, _FADE_PERIODS = 1, 2.0
 # Breaks of a path in a cycle, and phases at which the reach is looked at.
@@ -119,7 +119,7 @@ class Wave:
             speed = self.amplitude * slope * rate
             pull = self.amplitude * (curve * rate ** 2 + slope * change)
             rising = t < 0.5 * edges[-1]
-            span, sign = np.where(rising, *fades), np.where(rising, 1.0, -1.0)
+            span, sign = np.where(rising, fades[0], fades[1]), np.where(rising, 1.0, -1.0)
             share = np.clip(np.where(rising, t, edges[-1] - t) / span, 0.0, 1.0)
             left = 1.0 - share
             faded = share ** 4 * (35.0 - 84.0 * share + 70.0 * share ** 2 - 20.0 * share ** 3)

@@ -49,7 +49,7 @@ def draw_delays(paths: Sequence[Path], found: Delays, paper: Paper) -> None:
               (motion.recording.time, motion.fitted), paper)
         return
     end = max(seen.transport.value + _LAGS * seen.lag.value, _SHORTEST)
-    since, near = np.linspace(0.0, end, _LINE), seen.since <= end
+    since, near = np.linspace(0.0, end, _LINE, dtype=np.float64), seen.since <= end
     _draw(paths, (style.axis('time since the level', unit='ms'), 'fraction of the step'),
           (1e3 * seen.since[near], seen.share[near]),
           (1e3 * since, response(since, seen.transport.value, seen.lag.value)), paper)
