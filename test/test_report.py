@@ -8,6 +8,7 @@ import math
 import re
 import subprocess
 import sys
+from types import MappingProxyType
 
 from beam_oracle import silicone
 import numpy as np
@@ -165,8 +166,14 @@ def payload(message, kind):
     return message if isinstance(message, bytes) else bytes(STORE.serialize_cdr(message, kind))
 
 
-def write(folder, messages, *, chunk_size=2**20, definitions=(), **custom_data):
-    """Write a bag as this package's recorder does, but for some types' definitions."""
+def write(
+        folder, messages, *, chunk_size=2**20, definitions=(), published=MappingProxyType({}),
+        **custom_data):
+    """
+    Write a bag as this package's recorder does, but for some types' definitions.
+
+    Messages were published when they were recorded, or at other times, by those.
+    """
     with BagWriter(folder, custom_data=custom_data, chunk_size=chunk_size) as writer:
         numbers = {}
         for _, topic, kind, _ in messages:
@@ -175,7 +182,7 @@ def write(folder, messages, *, chunk_size=2**20, definitions=(), **custom_data):
                 text = dict(definitions).get(kind, text)
                 numbers[topic] = writer.add_topic(Topic(topic, kind, text, encoding))
         writer.write(
-            (numbers[topic], time, time, i, payload(message, kind))
+            (numbers[topic], time, published.get(time, time), i, payload(message, kind))
             for i, (time, topic, kind, message) in enumerate(
                 sorted(messages, key=lambda x: x[0])))
     return folder
@@ -1112,6 +1119,20 @@ def rounded(messages):
         if topic.endswith('command'):
             x.magnetic_field.z = 2e-6 * round(x.magnetic_field.z / 2e-6)
     return messages
+
+
+def test_a_latched_plan_of_before_that_comes_after_a_request_is_not_the_one_for_it(tmp_path):
+    asked, planned, said, *others = simulated()
+    before = START // 2
+    old = trajectory(before, [(0, 1.0, 0.0, 0.03), (6_000_000, 1.2, 0.0, 0.06)])
+    part = one(
+        tmp_path / 'run', [
+            (START - 1, '/planner/status', TYPES[STATUS], status(0, 'arrived', 'arrived')),
+            asked, (START + 1, '/planner/plan', TYPES[PLAN], old),
+            (START + 2, *planned[1:]), (START + 3, *said[1:]), *others],
+        published={START - 1: before + 1, START + 1: before},
+        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert [str(x.verdict) for x in part.evaluation.findings] == ['arrived'] * 3
 
 
 @pytest.mark.parametrize('missing', [(), ('plan',), ('plan', 'status')])

@@ -129,6 +129,8 @@ def _collect(
                 f'reading {reader.path.name}', (message.log_time - begin) / max(end - begin, 1))
         space, role, joint = found[message.topic]
         collected[space].take(role, joint, message, decoders[message.topic])
+    for one in collected.values():
+        one.order()
     return collected
 
 
@@ -170,11 +172,13 @@ class _Collected:
     applied: dict[str, list[Level]] = field(default_factory=dict)
     forces: dict[str, list[tuple[int, int, float]]] = field(default_factory=dict)
     refused: dict[str, int] = field(default_factory=dict)
-    # Of all joints, as they were received.
+    # Of all joints, as they were received; plans and verdicts are known once they are in order.
     plans: list[_Trajectory] = field(default_factory=list)
     trajectories: list[_Trajectory] = field(default_factory=list)
     setpoints: dict[str, list[RecordedRequest]] = field(default_factory=dict)
     verdicts: list[Verdict] = field(default_factory=list)
+    # Plans and verdicts, and when each was published, by the clock of the planner.
+    published: list[tuple[int, _Trajectory | Verdict]] = field(default_factory=list)
     # With the joint that each is of.
     sensors: list[tuple[str, LearntSensor]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -188,7 +192,7 @@ class _Collected:
             if role == roles.JOINT_STATES:
                 self.samples.take(message.log_time, message.data)
             else:
-                self._take(role, joint, message.log_time, decode(message.data))
+                self._take(role, joint, message, decode(message.data))
         except (AttributeError, TypeError, ValueError, OverflowError) as error:
             # The bag brings the definition along, and may call anything by that name.
             self._leave_out(
@@ -202,7 +206,8 @@ class _Collected:
         if len(self.notes) < _MOST_NOTES:
             self.notes.append(f'{reason}: left out')
 
-    def _take(self, role: str, joint: str, sent: int, content: Any) -> None:
+    def _take(self, role: str, joint: str, message: Message, content: Any) -> None:
+        sent = message.log_time
         if role in (roles.COMMAND, roles.APPLIED):
             vector = content.magnetic_field
             kept = self.commands if role == roles.COMMAND else self.applied
@@ -217,7 +222,7 @@ class _Collected:
                 sent, nanoseconds_of(content.header.stamp) or sent,
                 float(content.wrench.force.z)))
         elif role == roles.PLAN:
-            self.plans.append(_Trajectory.of(sent, content))
+            self.published.append((message.publish_time, _Trajectory.of(sent, content)))
         elif role == roles.TRAJECTORY:
             self.trajectories.append(_Trajectory.of(sent, content))
         elif role == roles.SETPOINT:
@@ -230,9 +235,25 @@ class _Collected:
         else:
             level = content.level[0] if isinstance(content.level, bytes) else int(content.level)
             values = {x.key: x.value for x in content.values}
-            self.verdicts.append(Verdict(
+            self.published.append((message.publish_time, Verdict(
                 sent, _LEVELS[min(level, 2)], values.get('code', ''), content.message,
-                whole(values.get('plan')), values.get('request', '')))
+                whole(values.get('plan')), values.get('request', ''))))
+
+    def order(self) -> None:
+        """
+        Put plans and verdicts in the order in which the planner published them.
+
+        Both are latched: whoever subscribes receives old ones, perhaps after what is new. They
+        count as received no later than what was published after them.
+        """
+        latest = None
+        self.published.sort(key=lambda x: x[0])
+        for _, one in reversed(self.published):
+            latest = one.sent if latest is None else min(latest, one.sent)
+            kept: list[Any] = self.verdicts if isinstance(one, Verdict) else self.plans
+            kept.append(replace(one, sent=latest))
+        self.plans.reverse()
+        self.verdicts.reverse()
 
     def _plans(self, joint: str) -> Iterable[tuple[Level, ...]]:
         """Return the plans of a joint, or of the one that they are of."""
