@@ -40,6 +40,14 @@ class Table:
     lines: Array  # number of each row's line
     notes: tuple[str, ...]  # what was converted
 
+    def check_complete(self, path: Path, because: str = '') -> None:
+        """Raise `BadInputError`, which may say why, unless every cell has a finite number."""
+        bad = ~np.all([np.isfinite(x) for x in self.columns.values()], axis=0)
+        if np.any(bad):
+            raise BadInputError(
+                f'{path} line {self.lines[np.argmax(bad)]} has no number for '
+                f'{" or ".join(self.columns)}: expected both in every line{because}')
+
 
 def _text(path: Path, kind: str) -> str:
     try:
@@ -93,7 +101,7 @@ def read_table(path: Path, wanted: tuple[str, ...], *, kind: str = 'a CSV') -> T
             f'{", ".join(wanted)}; its columns are {excerpt(", ".join(cells))}'
             + ('; stretch is strain plus 1' if 'stretch' in missing
                and any('strain' in x.lower() for x in cells) else ''))
-    columns: dict[str, Array] = {name: np.full(len(rows) - 1, np.nan) for name in places}
+    columns: dict[str, Array] = {name: np.full(len(rows) - 1, np.nan) for name in wanted}
     for i, (line, text) in enumerate(rows[1:]):
         parts = _split(text, separator)
         if any(parts[len(cells):]):

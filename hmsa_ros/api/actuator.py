@@ -554,7 +554,7 @@ class Actuator:
         BadInputError
             If an argument is of another type or out of range.
         RefusedError
-            If the limits of the coil do not allow the frequency; `wave_bands` tells which they do.
+            If the limits of the coil do not allow the frequency; `wave_bands` returns those.
 
         Examples
         --------

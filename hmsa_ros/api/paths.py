@@ -38,11 +38,7 @@ def read_path(file: File) -> tuple[Array, Array]:
     `BadInputError` says why a file cannot be used.
     """
     table = read_table(file, ('time', 'stretch'))
-    bad = ~(np.isfinite(table.columns['time']) & np.isfinite(table.columns['stretch']))
-    if np.any(bad):
-        raise BadInputError(
-            f'{file} line {table.lines[np.argmax(bad)]} has no number for time or stretch: '
-            'expected both in every line')
+    table.check_complete(file)
     return table.columns['time'], table.columns['stretch']
 
 
@@ -138,7 +134,8 @@ def along_wave(
     unit = model.units.time
     first, last = (number(x, 'frequency', 'Hz', above=0.0) * unit for x in sweep)
     cycles = number(cycles, 'cycles', least=1.0, most=1e6)
-    if not all(wave.within(frame, x) for x in np.geomspace(first, last, _SWEPT)):
+    if not all(wave.within(frame, x) for x in np.geomspace(
+            first, last, _SWEPT if last != first else 1)):
         reach = ', '.join(f'{a / unit:.4g} to {b / unit:.4g} Hz' for a, b in wave.reach(frame))
         raise RefusedError(
             Code.FLUX_LIMIT,

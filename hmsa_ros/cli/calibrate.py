@@ -43,8 +43,7 @@ def add_parser(subparsers: Any) -> None:
     """Add the command and its kinds."""
     parser = add_command(subparsers, __name__, __doc__)
     kinds = parser.add_subparsers(metavar='PART', required=True)
-    coil = add_command(kinds, 'coil', _coil.__doc__)
-    coil.set_defaults(run=_coil, parser=coil)
+    coil = _add_kind(kinds, 'coil', _coil)
     coil.add_argument(
         'source', metavar='MODULE:NAME|CSV',
         help='hardware as in the parameter hardware of hmsa driver, with a coil constant that is '
@@ -63,8 +62,7 @@ def add_parser(subparsers: Any) -> None:
          'parameter file of the driver to write; a table is written beside it as CSV'),
         JSON)
     add_picture_options(coil, named='readings and model to draw')
-    latency = add_command(kinds, 'latency', _latency.__doc__)
-    latency.set_defaults(run=_latency, parser=latency)
+    latency = _add_kind(kinds, 'latency', _latency)
     _add_source(latency)
     add_options(
         latency,
@@ -78,8 +76,7 @@ def add_parser(subparsers: Any) -> None:
         ('--out', 'YAML', Path, 'parameter file of driver and planner to write'),
         JSON)
     add_picture_options(latency, named='response of the field to draw, or of the stretch')
-    static = add_command(kinds, 'static', _static.__doc__)
-    static.set_defaults(run=_static, parser=static)
+    static = _add_kind(kinds, 'static', _static)
     _add_source(static)
     add_options(
         static,
@@ -94,6 +91,12 @@ def add_parser(subparsers: Any) -> None:
          'parameter file of driver and planner to write; the table is written beside it as CSV'),
         JSON)
     add_picture_options(static, named='staircase to draw')
+
+
+def _add_kind(kinds: Any, name: str, run: 'Callable[[argparse.Namespace], int]') -> Any:
+    parser = add_command(kinds, name, run.__doc__)
+    parser.set_defaults(run=run, parser=parser)
+    return parser
 
 
 def _add_source(parser: Any) -> None:

@@ -8,10 +8,9 @@ example: hmsa compare run_zv run_two_step --picture both.pdf --width 85
 """
 
 import argparse
-from pathlib import Path
 from typing import Any
 
-from hmsa_ros.cli.options import add_command, add_options, JSON
+from hmsa_ros.cli.options import add_bags, add_command, add_options, JSON
 from hmsa_ros.cli.pictures import add_picture_options, paper_of
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
@@ -21,8 +20,7 @@ from hmsa_ros.files import json_text
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = add_command(subparsers, __name__, __doc__)
-    parser.add_argument(
-        'runs', nargs='+', type=Path, metavar='BAG', help='folder of a bag, or an .mcap file')
+    add_bags(parser, 'runs')
     add_options(
         parser,
         ('--joint', 'NAME', str, 'joint to compare, if the bags have several', {'default': ''}),

@@ -14,7 +14,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from hmsa_ros.cli.options import add_command, add_options, JSON
+from hmsa_ros.cli.options import add_bags, add_command, add_options, JSON
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.files import check_targets, json_text, write_text
 
@@ -22,8 +22,7 @@ from hmsa_ros.files import check_targets, json_text, write_text
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = add_command(subparsers, __name__, __doc__)
-    parser.add_argument(
-        'runs', nargs='+', type=Path, metavar='BAG', help='folder of a bag, or an .mcap file')
+    add_bags(parser, 'runs')
     add_options(
         parser,
         ('--joint', 'NAME', str, 'joint to learn for, if the bags have several', {'default': ''}),

@@ -2,6 +2,7 @@
 
 import argparse
 import inspect
+from pathlib import Path
 from typing import Any
 
 from hmsa_ros.errors import BadInputError, excerpt
@@ -87,6 +88,12 @@ def add_command(subparsers: Any, name: str, text: str | None) -> Any:
     return subparsers.add_parser(
         name.rpartition('.')[2].replace('_', '-'), help=what[:1].lower() + what[1:],
         description=description or f'{what}.', epilog=f'example: {example}')
+
+
+def add_bags(parser: Any, name: str) -> None:
+    """Add one or more bags as arguments of a name."""
+    parser.add_argument(
+        name, nargs='+', type=Path, metavar='BAG', help='folder of a bag, or an .mcap file')
 
 
 def add_options(parser: Any, *rows: Row) -> None:

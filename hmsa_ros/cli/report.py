@@ -12,7 +12,7 @@ import argparse
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, add_options
+from hmsa_ros.cli.options import add_bags, add_command, add_options
 from hmsa_ros.cli.pictures import add_picture_options, paper_of
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = add_command(subparsers, __name__, __doc__)
-    parser.add_argument(
-        'bags', nargs='+', type=Path, metavar='BAG', help='folder of a bag, or an .mcap file')
+    add_bags(parser, 'bags')
     add_options(
         parser,
         ('--out', 'FILE', Path,

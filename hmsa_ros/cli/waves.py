@@ -42,7 +42,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Tell what can be reached, plan, write and print; what is no wave is a `BadInputError`."""
+    """Print what can be reached, plan and write; what is no wave is a `BadInputError`."""
     from hmsa_ros.api.actuator import Actuator
     from hmsa_ros.api.paths import read_path
 

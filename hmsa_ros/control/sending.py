@@ -39,8 +39,7 @@ class Sending:
     def acknowledge(self, name: str, now: int) -> None:
         """Send that its coil is off to a device that refuses other levels after a cut-off."""
         planner = self._group.planners[name]
-        self._hand_out(
-            name, planner.soonest(now), 0.0, now)
+        self._hand_out(name, planner.soonest(now), 0.0, now)
 
     def beat(self, now: int) -> None:
         """Send levels in force again: who listens learns that somebody is there."""

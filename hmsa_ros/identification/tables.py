@@ -41,12 +41,7 @@ def read_levels(path: Path) -> tuple[Array, Array, tuple[str, ...]]:
     if not len(table.lines):
         raise BadInputError(f'{path} has a header and no row: expected levels')
     times, levels = table.columns['time'], table.columns['flux_density']
-    bad = ~(np.isfinite(times) & np.isfinite(levels))
-    if np.any(bad):
-        raise BadInputError(
-            f'{path} line {table.lines[np.argmax(bad)]} has no number for time or '
-            'flux_density: expected both in every line; a level that is left out would be a '
-            'wrong one')
+    table.check_complete(path, '; a level that is left out would be a wrong one')
     back = np.flatnonzero(np.diff(times) < 0.0)
     if len(back):
         raise BadInputError(

@@ -151,7 +151,7 @@ class Wave:
             law.evaluate(law.FORCE, stretch, packed, forces)
             found = found + material.branches[:, 0].sum() * (forces - forces.mean())
         step = 1.0 / (_PHASES * frequency)
-        for _ in range(delivery.lag > 0.0):
+        if delivery.lag > 0.0:
             found = found + delivery.lag * _growth(found, step)
         return bool(limits.minimum <= found.min() and found.max() <= limits.maximum
                     and np.max(np.abs(_growth(found, step))) <= _SLEW_SHARE * delivery.slew)
