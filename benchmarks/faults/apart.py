@@ -90,8 +90,8 @@ def _outage(rig: Rig, seconds: float) -> Seen:
         still = stretches[(back + off) // 2:off]
         peak = float(stretches[off:].max())
     return Seen(
-        f'{"told" if told else "not told"} during the outage; at rest at {still[-1]:.4f} until '
-        f'asked again, then at most {peak:.4f} on the way to 1.2, exit {status}',
+        f'{"reported" if told else "not reported"}; at rest at {still[-1]:.4f}, then at most '
+        f'{peak:.4f}, exit {status}',
         f'{float(np.ptp(still)):.1e}',
         told and status == 0 and 1.199 < peak < 1.202 and float(np.ptp(still)) < 1e-3)
 
@@ -99,10 +99,8 @@ def _outage(rig: Rig, seconds: float) -> Seen:
 for _seconds in (2.0, 25.0):
     FAULTS.fault(
         f'hosts_outage_{_seconds:g}', f'hosts apart for {_seconds:g} s',
-        'planner and plant in network namespaces, link down at 1.35, ARP entries removed; '
-        'safe_flux zero',
-        'the field goes to zero and stays there until asked again; the planner reports the '
-        'outage and the cut-off; the next move is shaped')(
+        'network namespaces; link down at 1.35, safe_flux zero; later a request of 1.2',
+        'no field until the request; outage and cut-off reported; next move shaped')(
             lambda rig, seconds=_seconds: _outage(rig, seconds))
 
 
@@ -123,14 +121,14 @@ def _recorder(rig: Rig, where: str) -> Seen:
         unheard = 'no receipt' in planner.said or 'heartbeat' in plant.said
         jumped = 'clock' in plant.said
     return Seen(
-        f'exit {status}, longest gap between samples {gap:.2f} s, planner and plant '
-        f'{"lost" if unheard else "heard"} each other', '-',
+        f'exit {status}, longest gap {gap:.2f} s, receipts {"lost" if unheard else "received"}',
+        '-',
         status == 0 and gap < 1.0 and not unheard and not jumped)
 
 
 for _where, _name in (('bench', 'one host'), ('desk', 'two hosts')):
     FAULTS.fault(
         f'hosts_recorder_{_where}', f"a subscriber's host goes away, the others on {_name}",
-        'link of the host of a subscriber to joint_states down, ARP entries removed, five moves',
-        'all moves arrive, samples never stop for a second, and planner and plant hear each '
-        'other')(lambda rig, where=_where: _recorder(rig, where))
+        'its link down, five moves',
+        'all moves arrive; no gap of 1 s in the samples; receipts continue')(
+            lambda rig, where=_where: _recorder(rig, where))

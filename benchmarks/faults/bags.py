@@ -11,11 +11,12 @@ _FLIPS = 2000
 
 @FAULTS.fault(
     'bag_flips', 'one bit of a bag changed',
-    f'{_FLIPS} bits of the headers of records, in bags closed and killed, plain and compressed',
-    'each is said, or changes nothing that is read: 0 wrong without a word')
+    f'{_FLIPS} bits of record headers; closed, killed, plain and compressed bags',
+    'reported, or without effect')
 def _flips(rig: Rig) -> Seen:
     results = [result for _, result in samples(_FLIPS, rig.folder)]
     wrong = [place for result in results for place in result.wrong]
     return Seen(
-        f'{sum(x.said for x in results)} said, {sum(x.harmless for x in results)} without effect',
-        f'{len(wrong)} wrong without a word', not wrong)
+        f'{sum(x.said for x in results)} reported, '
+        f'{sum(x.harmless for x in results)} without effect',
+        f'{len(wrong)} unreported', not wrong)

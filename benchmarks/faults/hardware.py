@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import math
+import re
 import signal
 from threading import Event
 from time import monotonic
@@ -27,6 +28,9 @@ _LEAD = 200_000_000
 _TIMEOUT, _CALL, _FIRMWARE = 0.5, 0.5, 0.4
 # What a driver may take that is told to end, and one whose call hangs, in s.
 _PROMPT, _SOON = 3.0, 5.0
+# What stands around what a driver says, in its log and its last words.
+_AROUND = re.compile(
+    r'^(hmsa: error: |\[\w+\] \[[\d.]+\] \[\w+\]: )|; mend it, then start the driver again$')
 
 
 class _Bench:
@@ -81,8 +85,8 @@ class _Bench:
     @property
     def last(self) -> str:
         """What the driver said last."""
-        lines = self.driver.said.strip().splitlines()
-        return lines[-1] if lines else ''
+        last = self.driver.said.strip().rpartition('\n')[2]
+        return _AROUND.sub('', last)
 
 
 @contextmanager
@@ -118,26 +122,22 @@ for _name, _word, _call in (
         ('OSError', 'K', 'write'), ('SystemExit', 'K', 'write'),
         ('KeyboardInterrupt', 'S', 'read'), ('MemoryError', 'S', 'read')):
     FAULTS.fault(
-        f'driver_{_name.lower()}', f'a driver whose {_call} raises {_name}',
-        'a board on a serial line, 20 mT flow',
-        'the coil is off within command_timeout, the call and the error are named, exit 1')(
+        f'driver_{_name.lower()}', f'{_call} raises {_name}', 'a board on a serial line, 20 mT',
+        'off within command_timeout, method and error named, exit 1')(
             lambda rig, name=_name, word=_word, call=_call: _failed(
                 rig, word, f'RAISE {name}',
                 f'SerialCoil.{call} of joint actuator raised {name}', 'the coil is switched off'))
 
 
 FAULTS.fault(
-    'driver_garbage', 'a driver whose board answers garbage',
-    'half a line, then right answers again',
-    'the coil is off within command_timeout, exit 1')(
+    'driver_garbage', 'board answers garbage', 'half a line, then right answers',
+    'off within command_timeout, exit 1')(
         lambda rig: _failed(rig, 'KS', '#*;S 1.', 'SerialCoil'))
 
 
 @FAULTS.fault(
-    'driver_cable', 'cable of a driver out, later in again',
-    'the line is closed while 20 mT flow; the board has no watchdog',
-    'the coil could NOT be switched off: said, ERROR in diagnostics, the level reported is not '
-    'known; off once the cable is in again, exit 1')
+    'driver_cable', 'cable out, later in again', 'at 20 mT; a board without watchdog',
+    'failure to switch off reported, ERROR, level NaN; off once the cable is back, exit 1')
 def _cable(rig: Rig) -> Seen:
     with _bench(rig) as bench:
         bench.switch_on()
@@ -151,15 +151,15 @@ def _cable(rig: Rig) -> Seen:
         status = bench.ends()
         off = bench.board.off_since(begin)
         return Seen(
-            f'{level:g} T flowed, {applied:g} T were reported; exit {status}, "{bench.last}"',
+            f'{level:g} T, {applied:g} T reported; exit {status}, "{bench.last}"',
             f'off after {off:.2f} s of cable',
             level == _LEVEL and math.isnan(applied) and status == 1 and math.isfinite(off)
             and 'switched off at last' in bench.last)
 
 
 @FAULTS.fault(
-    'driver_cable_ended', 'cable of a driver out, and the driver told to end',
-    'SIGTERM after the alarm', 'it ends within 3 s and says that the coil was not switched off')
+    'driver_cable_ended', 'cable out, then SIGTERM', 'after the report',
+    'ends within 3 s, reports that the coil is not off')
 def _cable_ended(rig: Rig) -> Seen:
     with _bench(rig) as bench:
         bench.switch_on()
@@ -179,9 +179,8 @@ def _terminated(bench: _Bench, text: str) -> Seen:
 
 
 @FAULTS.fault(
-    'driver_reboot', 'board of a driver reboots',
-    'its level is gone, its count of boots one higher; the old level goes on being repeated',
-    'said, 0 T reported, the old level refused, another one obeyed; the driver goes on')
+    'driver_reboot', 'board reboots', 'its level is lost; the old level is repeated',
+    'reported, 0 T, old level rejected, another obeyed; driver continues')
 def _reboot(rig: Rig) -> Seen:
     with _bench(rig) as bench:
         bench.switch_on()
@@ -194,13 +193,13 @@ def _reboot(rig: Rig) -> Seen:
             bench.beat_until(condition, what, yields=False)
         again = bench.board.largest_since(begin)
         bench.beat_until(lambda: bench.board.level == 0.01, 'another level', 0.01)
-        return Seen(f'said; another level obeyed, {again:g} T without it', '-',
+        return Seen(f'reported; another level obeyed, {again:g} T before', '-',
                     again == 0.0 and bench.driver.alive)
 
 
 @FAULTS.fault(
-    'driver_saturated', 'amplifier of a driver saturated', '20 mT asked for, 12 mT possible',
-    'the level reported is the one that flows, WARN in diagnostics names saturation')
+    'driver_saturated', 'amplifier saturated', '20 mT requested, 12 mT possible',
+    'actual level reported, WARN names saturation')
 def _saturated(rig: Rig) -> Seen:
     with _bench(rig) as bench:
         bench.board.largest = 0.012
@@ -244,15 +243,14 @@ def _hung(rig: Rig, word: str, method: str) -> Seen:
 
 for _word, _call in (('K', 'write'), ('S', 'read')):
     FAULTS.fault(
-        f'driver_{_call}_blocks', f'a {_call} of a driver that does not return',
-        'the board does what it is told, but does not answer',
-        'alarm after hardware.timeout, off from another thread, exit 1 within 5 s')(
+        f'driver_{_call}_blocks', f'{_call} does not return', 'the board obeys without answer',
+        'off from another thread after hardware.timeout, exit 1 within 5 s')(
             lambda rig, word=_word, call=_call: _hung(rig, word, call))
 
 
 @FAULTS.fault(
-    'driver_blocked_ended', 'a driver told to end while a call does not return',
-    'SIGTERM at once, hardware.timeout 60 s', 'it ends within 3 s, and the coil is off')
+    'driver_blocked_ended', 'SIGTERM while a call does not return', 'hardware.timeout 60 s',
+    'ends within 3 s, coil off')
 def _blocked_ended(rig: Rig) -> Seen:
     with _bench(rig, **{'hardware.timeout': 60.0}) as bench:
         begin = _blocked(bench, 'S')
@@ -263,9 +261,8 @@ def _blocked_ended(rig: Rig) -> Seen:
 
 
 @FAULTS.fault(
-    'driver_gil', 'a call of a driver that lets no Python run',
-    'a C function that keeps the GIL; the firmware has a watchdog',
-    'the process ends within 5 s and names the call; the firmware switches off')
+    'driver_gil', 'a call keeps the GIL', 'a C function; firmware with a watchdog',
+    'ends within 5 s, names the method; the firmware switches off')
 def _held(rig: Rig) -> Seen:
     with _bench(rig, _FIRMWARE) as bench:
         bench.switch_on()
@@ -281,8 +278,8 @@ def _held(rig: Rig) -> Seen:
 
 
 @FAULTS.fault(
-    'driver_constructor', 'a driver told to end while its class does not start',
-    'a constructor that sleeps for 60 s, SIGTERM', 'it ends within 3 s')
+    'driver_constructor', 'SIGTERM while the class starts', 'a constructor that sleeps for 60 s',
+    'ends within 3 s')
 def _constructor(rig: Rig) -> Seen:
     with _bench(rig, **{'hardware.sleep': 60.0}) as bench:
         rig.spin_until(lambda: 'it has not started yet' in bench.driver.said, 'that it is said')
@@ -290,8 +287,8 @@ def _constructor(rig: Rig) -> Seen:
 
 
 @FAULTS.fault(
-    'driver_planner_killed', 'planner of a driver killed', 'kill -9 while it holds 1.1',
-    'the coil is off within command_timeout of its last heartbeat, said by the driver')
+    'driver_planner_killed', 'planner killed', 'while 1.1 is held',
+    'off within command_timeout of the last heartbeat, reported')
 def _planner_killed(rig: Rig) -> Seen:
     with _bench(rig) as bench:
         planner = rig.start('planner')
@@ -304,12 +301,12 @@ def _planner_killed(rig: Rig) -> Seen:
         rig.spin_until(lambda: not bench.board.level, 'the watchdog')
         off = bench.board.off_since(begin)
         rig.spin_until(lambda: 'no heartbeat' in bench.driver.said, 'that it is said')
-        return Seen('said', f'off after {off:.2f} s', off < _TIMEOUT + 0.1)
+        return Seen('reported', f'off after {off:.2f} s', off < _TIMEOUT + 0.1)
 
 
 @FAULTS.fault(
-    'driver_killed', 'a driver killed', 'kill -9; firmware with a watchdog, publish_rate 0',
-    'heartbeats have fed that watchdog before; it switches off after')
+    'driver_killed', 'driver killed', 'firmware with a watchdog, publish_rate 0',
+    'heartbeats feed this watchdog; it switches off')
 def _killed(rig: Rig) -> Seen:
     with _bench(rig, _FIRMWARE, publish_rate=0.0) as bench:
         bench.switch_on()

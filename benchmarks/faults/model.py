@@ -41,7 +41,7 @@ def _mismatch(rig: Rig, name: str) -> Seen:
             plant.end()
             rig.verdicts.clear()
     return Seen(
-        f'as the model says of it, to {worst:.0e}',
+        f'as simulated, to {worst:.0e}',
         ', '.join(f'{x:.2g}' for x in residuals),
         worst < _SAME and all(a < b for a, b in zip(residuals, residuals[1:], strict=False))
         and residuals[0] > LIMIT)
@@ -66,16 +66,13 @@ for _name, _what in (
         ('remanence', 'remanence'), ('shear_modulus', 'modulus'),
         ('damping_coefficient', 'damping')):
     FAULTS.fault(
-        f'mismatch_{_name}', f'{_what} other than the planner knows',
-        'plant with ' + ', '.join(f'{100 * x:g}' for x in _SHARES) + ' % more, 1 -> 1.2',
-        f'the residual of the model with these parameters, to {_SAME:g} of stretch, growing '
-        'with the mismatch')(lambda rig, name=_name: _mismatch(rig, name))
+        f'mismatch_{_name}', f'parameter error in {_what}',
+        ', '.join(f'{100 * x:g}' for x in _SHARES) + ' %, 1 -> 1.2',
+        f'stretch as simulated, to {_SAME:g}')(lambda rig, name=_name: _mismatch(rig, name))
 
 
 @FAULTS.fault(
-    'lag', 'a coil that lags behind',
-    'coil_time_constant 0.2 ms, which the planner does not know; 1 -> 1.2',
-    f'the residual of the model with this lag, to {_SAME:g} of stretch')
+    'lag', 'unknown coil lag', '0.2 ms, 1 -> 1.2', f'stretch as simulated, to {_SAME:g}')
 def _lag(rig: Rig) -> Seen:
     lag = 2e-4
     pair(rig, plant={'coil_time_constant': lag})
@@ -90,14 +87,13 @@ def _lag(rig: Rig) -> Seen:
     late = np.flatnonzero(np.abs(values[:, 2] - values[-1, 2]) > 1e-6)[-1]
     residual = float(np.ptp(values[late + 1:, 0])) / 0.2
     return Seen(
-        f'as the model says of it, to {worst:.0e}', f'{residual:.2g}',
+        f'as simulated, to {worst:.0e}', f'{residual:.2g}',
         worst < _SAME and residual > LIMIT)
 
 
 @FAULTS.fault(
-    'noise', 'noise on what is measured', 'stretch_noise 0.001, rate_noise 1/s; 1 -> 1.2',
-    'the field is not touched, since nothing is fed back: scatter of 0.001 about the target, '
-    'and its mean at the target to a tenth of that')
+    'noise', 'sensor noise', 'stretch_noise 0.001, rate_noise 1/s; 1 -> 1.2',
+    'scatter of 0.001, mean at the target to 1e-4')
 def _noise(rig: Rig) -> Seen:
     pair(rig, plant={'stretch_noise': 1e-3, 'rate_noise': 1.0})
     mark = rig.count()
@@ -113,8 +109,8 @@ def _noise(rig: Rig) -> Seen:
 
 
 @FAULTS.fault(
-    'transport', 'commands that take time in the driver',
-    'command_delay 0.02 s, below lead_time', f'none late, residual below {LIMIT:g}')
+    'transport', 'commands delayed in the driver', 'command_delay 0.02 s, below lead_time',
+    'none late')
 def _transport(rig: Rig) -> Seen:
     pair(rig, plant={'command_delay': 0.02})
     worst = moves(rig)
@@ -124,9 +120,8 @@ def _transport(rig: Rig) -> Seen:
 
 
 @FAULTS.fault(
-    'disturbance', 'a force from outside', '0.05 N on its topic for 0.5 s, while 1.2 is held',
-    'the stretch gives way while it lasts and comes back when it has gone; moves after that are '
-    f'as planned: residual below {LIMIT:g}')
+    'disturbance', 'external force', '0.05 N for 0.5 s, while 1.2 is held',
+    'stretch changes, then returns')
 def _disturbance(rig: Rig) -> Seen:
     pair(rig)
     moves(rig, (1.2,))

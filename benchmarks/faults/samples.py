@@ -42,29 +42,23 @@ def _failing(rig: Rig, fault: str, word: str, counter: str) -> Seen:
     trusted = all(x['trusted'] == 'True' for _, x in told[seen:])
     harmless = fault in ('swap', 'twice')
     return Seen(
-        f'field changed by {moved:.2g} T on its own; '
-        + ('no estimate any more' if silent else f'"{told[-1][0]}"')
+        f'field changed by {moved:.2g} T; '
+        + ('no estimate' if silent else f'"{told[-1][0].split(";")[0]}"')
         + (f'; {count} {counter}' if counter else '') + f'; error {error:.1%}', share(residual),
         said and count > 0 and max(residual, error) < _LEFT
         and (harmless and trusted or moved == 0.0))
 
 
 for _fault, _name, _how, _expected, _word, _counter in (
-        ('nan', 'a sensor that gives no numbers', 'NaN for each sample',
-         'counted as unreadable', '', 'unreadable'),
-        ('freeze', 'a sensor that freezes', 'the last value again and again',
-         'rejected and named once the actuator moves', 'open loop until samples fit again', ''),
-        ('jump', 'a sensor that jumps', '0.05 of stretch more from now on',
-         'rejected and named', 'open loop until samples fit again', 'rejected'),
-        ('swap', 'samples in the wrong order', 'each two swapped',
-         'put in order by their stamps', '', ''),
-        ('twice', 'samples that come twice', 'each sample sent twice',
-         'passed over unread, as all that are denser than the estimate needs', '', ''),
-        ('silence', 'a sensor that falls silent', 'no samples any more', 'open loop', '', '')):
+        ('nan', 'sensor without numbers', 'NaN', 'counted', '', 'unreadable'),
+        ('freeze', 'frozen sensor', 'last value repeated',
+         'rejected once the actuator moves', 'open loop until samples fit again', ''),
+        ('jump', 'sensor that jumps', '0.05 of stretch more',
+         'rejected', 'open loop until samples fit again', 'rejected'),
+        ('swap', 'samples in the wrong order', 'pairs swapped', 'sorted', '', ''),
+        ('twice', 'doubled samples', 'each sent twice', 'skipped', '', ''),
+        ('silence', 'silent sensor', 'no samples', 'open loop', '', '')):
     FAULTS.fault(
-        f'sensor_{_fault}', f'{_name}, feedback adapt',
-        f'{_how}, at rest, after a move with G 10 % higher, noise 1e-3; then 1.2 -> 1.1',
-        f'{_expected}; the field does not change on its own, the next move is planned with what '
-        f'was learnt: residual and error below {_LEFT:g}')(
+        f'sensor_{_fault}', f'{_name}, adapt',        _how, _expected)(
             lambda rig, fault=_fault, word=_word, counter=_counter: _failing(
                 rig, fault, word, counter))

@@ -61,10 +61,10 @@ def inject(fault: Fault, domain: int) -> Outcome:
 
 def markdown(outcomes: Sequence[Outcome]) -> str:
     """Return the table for a page of the documentation."""
-    head = ('fault', 'how it is made', 'expected', 'seen', 'residual or loss', '')
+    head = ('fault', 'how', 'expected', 'seen', 'residual or loss')
     lines = ['| ' + ' | '.join(head) + ' |', '|' + ' --- |' * len(head)]
     for row in outcomes:
-        cells = (row.fault.name, row.fault.how, row.fault.expected, row.seen.text,
-                 row.seen.figure, 'met' if row.seen.met else '**not met**')
+        seen = row.seen.text if row.seen.met else f'**not met**: {row.seen.text}'
+        cells = (row.fault.name, row.fault.how, row.fault.expected, seen, row.seen.figure)
         lines.append('| ' + ' | '.join(x.replace('|', '\\|') for x in cells) + ' |')
     return '\n'.join(lines) + '\n'
