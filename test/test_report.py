@@ -1135,6 +1135,24 @@ def test_a_latched_plan_of_before_that_comes_after_a_request_is_not_the_one_for_
     assert [str(x.verdict) for x in part.evaluation.findings] == ['arrived'] * 3
 
 
+@pytest.mark.parametrize('order', ['before', 'after'])
+def test_a_plan_between_the_same_ticks_as_its_request_is_the_one_for_it(tmp_path, order):
+    asked, planned, said, *others = simulated()
+    asked[-1].header.frame_id = 'mine'
+    said[-1].values.append(
+        STORE.types['diagnostic_msgs/msg/KeyValue'](key='request', value='mine'))
+    # Simulated time as a recorder sees it: until its status nothing has a time of its own, or
+    # the request comes even later.
+    late = {'before': START, 'after': START + 1}[order]
+    part = one(
+        tmp_path / 'run', [
+            (START, '/planner/status', TYPES[STATUS], status(0, 'none', 'none')),
+            (late, *asked[1:]), (START, *planned[1:]), (START + 2, *said[1:]), *others],
+        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert [str(x.verdict) for x in part.evaluation.findings] == ['arrived'] * 3
+    assert len(part.evaluation.results) == 3
+
+
 @pytest.mark.parametrize('missing', [(), ('plan',), ('plan', 'status')])
 def test_levels_that_hardware_rounds_reach_the_setpoints_that_were_requested(tmp_path, missing):
     targets = 1.1, 1.2, 1.21, 1.4, 1.2, 1.1, 1.05, 1.0

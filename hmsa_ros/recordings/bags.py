@@ -27,6 +27,8 @@ from hmsa_ros.recordings.topics import topics_by_joint
 # Between two calls of the progress.
 _PROGRESS_MESSAGES = 20_000
 _MOST_NOTES = 20
+# In ns, between what a planner published and the next, so that a request fits between.
+_APART = 2
 _LEVELS = ('ok', 'warning', 'error')
 
 
@@ -244,16 +246,21 @@ class _Collected:
         Put plans and verdicts in the order in which the planner published them.
 
         Both are latched: whoever subscribes receives old ones, perhaps after what is new. They
-        count as received no later than what was published after them.
+        count as received no later than what was published after them, and no two at one time:
+        between two ticks of a clock everything is recorded at the same.
         """
-        latest = None
         self.published.sort(key=lambda x: x[0])
-        for _, one in reversed(self.published):
-            latest = one.sent if latest is None else min(latest, one.sent)
+        times = [x.sent for _, x in self.published]
+        for i in reversed(range(len(times) - 1)):
+            times[i] = min(times[i], times[i + 1])
+        for i in range(1, len(times)):
+            times[i] = max(times[i], times[i - 1] + _APART)
+        self.published = [
+            (x, replace(one, sent=sent))
+            for (x, one), sent in zip(self.published, times, strict=True)]
+        for _, one in self.published:
             kept: list[Any] = self.verdicts if isinstance(one, Verdict) else self.plans
-            kept.append(replace(one, sent=latest))
-        self.plans.reverse()
-        self.verdicts.reverse()
+            kept.append(one)
 
     def _plans(self, joint: str) -> Iterable[tuple[Level, ...]]:
         """Return the plans of a joint, or of the one that they are of."""
@@ -289,17 +296,19 @@ class _Collected:
 
     def _sent(self, asked: _Trajectory) -> int:
         """
-        Return when a request was recorded, after all that was said before its own status.
+        Return when a request was recorded: before its own plan and status, after all others.
 
-        A recorder may receive it after that status, and latched news of an earlier one after it.
+        A recorder may receive it after them, and latched news of an earlier one after it.
         """
-        own = [x.request == asked.name for x in self.verdicts]
-        if not asked.name or True not in own:
+        said = [x for _, x in self.published]
+        own = next((i for i, x in enumerate(said) if isinstance(x, Verdict)
+                    and asked.name and x.request == asked.name), None)
+        if own is None:
             return asked.sent
-        place = own.index(True)
-        answered = self.verdicts[place].sent
-        before = self.verdicts[place - 1].sent + 1 if place else min(asked.sent, answered)
-        return asked.sent if before <= asked.sent <= answered else min(before, answered)
+        if own and isinstance(said[own - 1], _Trajectory):
+            own -= 1
+        before = said[own - 1].sent + 1 if own else asked.sent
+        return min(max(asked.sent, before), said[own].sent - 1)
 
     def finish(
             self, label: str, reader: BagReader, summary: BagSummary, topics: Mapping[str, str],
