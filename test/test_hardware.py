@@ -412,6 +412,21 @@ def test_a_device_that_keeps_time_gets_levels_ahead_and_says_when_they_took_effe
     assert (board.calls[-1], board.kept) == (('write', -0.1), [])
 
 
+def test_a_device_that_is_slow_to_answer_is_not_given_levels_again_that_are_past():
+    def applied(self):
+        self.run_until(self.host + 45 * MS)
+        return Board.applied(self)
+
+    board, device = board_driver(applied=applied)
+    for k in range(1, 20):
+        device.receive(0, START + 20 * k * MS, 0.01 * k)
+    # Two levels take effect while the first is asked for, and one before it can be said.
+    for k in (2, 21, 22, 83, 84, 100, 180, 300, 500):
+        step(board, device, max(START + k * MS, board.host))
+    assert [x for x, _ in board.calls].count('write') == 1  # the first 0 T
+    assert [x.level for x in device.changes()] == pytest.approx([0.01 * k for k in range(1, 20)])
+
+
 def test_a_level_is_replaced_at_its_own_time_though_the_clock_is_known_better_by_then():
     board, device = board_driver()
     device.receive(0, START + 3000 * MS, 0.1)

@@ -193,15 +193,15 @@ class Coil:
             due.append(self._handed.popleft())
         if not self.instrument.has('applied'):
             return [(stamp, level, level) for stamp, level in due]
-        if due:
-            # What is not said yet is on its way.
-            self.asked = due[-1][1]
         self._awaited.extend(due)
         if not self._awaited:
             return []
         found = []
         for when, level in self.instrument.applied(now):
-            asked = self._awaited.popleft()[1] if self._awaited else level
+            # A device that is slow to answer has gone on meanwhile.
+            queue = self._awaited or self._handed
+            stamp, asked = queue.popleft() if queue else (when, level)
+            self.schedule.apply_until(stamp)
             found.append((when, asked, level))
         if self._awaited and now - self._awaited[0][0] > self._patience:
             stamp, level = self._awaited[0]
@@ -210,6 +210,11 @@ class Coil:
                 f'{(now - stamp) / NANOSECONDS:.3f} s after its time: expected that within '
                 'hardware.timeout')
         return found
+
+    @property
+    def stands(self) -> bool:
+        """Whether the level that is to be in force is so, or on its way."""
+        return self.schedule.current == (self._awaited[-1][1] if self._awaited else self.asked)
 
     def superseded(self) -> None:
         """Take in that a write has dropped what the device kept."""

@@ -222,10 +222,11 @@ class HardwareDevice(Device):
         if coil.wanted and not coil.armed:
             coil.instrument.arm()
             coil.armed = True
-        level = coil.schedule.apply_until(self._time)
+        coil.schedule.apply_until(self._time)
         for when, asked, really in coil.pass_to(self._time):
             self._took_effect(i, when, asked, really)
-        if level != coil.asked:
+        level = coil.schedule.current
+        if not coil.stands:
             self._write(i, level)
         if self.locked and coil.asked == 0.0:
             coil.disarm()

@@ -1,10 +1,11 @@
 """The twin of a serial board: its firmware before a simulated coil, actuator and laser."""
 
+from collections.abc import Callable
 import math
 from pathlib import Path
 from random import Random
 from time import monotonic_ns
-from typing import TextIO
+from typing import Any, TextIO
 
 from hmsa_ros.device import _board
 from hmsa_ros.device.line import SimulatedLine
@@ -16,8 +17,8 @@ from hmsa_ros.model.simulation import ActuatorSimulation
 TESLA_PER_AMPERE, REST_LENGTH = 0.05, 20.0
 # In uA.
 _LIMIT, _RESOLUTION = 10_000_000, 100
-# In us of its clock, which runs fast by so much.
-_PERIOD, _FAST = 1000, 40e-6
+# In us of its clock.
+_PERIOD = 1000
 _NOISE = 1e-3  # in mm
 
 
@@ -31,6 +32,8 @@ class SimulatedBoard(SimulatedLine):
     ----------
     truth : str
         File for the true motion, as a CSV; empty for none.
+    clock : callable
+        Returns the time of the host in ns.
 
     Raises
     ------
@@ -39,10 +42,14 @@ class SimulatedBoard(SimulatedLine):
 
     """
 
-    def __init__(self, truth: str = '') -> None:
+    #: by how much its clock is fast, and the field of the coil
+    fast, tesla_per_ampere = 40e-6, TESLA_PER_AMPERE
+
+    def __init__(self, truth: str = '', clock: Callable[[], int] = monotonic_ns) -> None:
         super().__init__()
-        self._begun = monotonic_ns()
-        self._block = ActuatorSimulation(paper_actuator(), time=0)
+        self._clock = clock
+        self._begun = clock()
+        self._block = self._make_block()
         self._random = Random(1)
         self._level = 0
         self._truth: TextIO | None = None
@@ -56,26 +63,32 @@ class SimulatedBoard(SimulatedLine):
             self._truth.write('time,stretch,rate,flux_density\n')
         self.restart()
 
+    @staticmethod
+    def _make_block() -> Any:
+        return ActuatorSimulation(paper_actuator(), time=0)
+
     def restart(self) -> None:
         """Boot: the coil is off, and its clock begins at 0."""
         self._board = _board.make(_LIMIT, _RESOLUTION)
-        self._booted = monotonic_ns()
-        self._next_sample = 0
+        self._booted = self._clock()
+        self._next_sample = self._now = 0
 
     def _host(self, time: int) -> int:
         """Return the time in ns since the beginning at one in us of its clock."""
-        return self._booted - self._begun + round(1000 * time / (1.0 + _FAST))
+        return self._booted - self._begun + round(1000 * time / (1.0 + self.fast))
 
     def advance(self) -> int:
         """Have it do what is due by now; return the time of its clock in us."""
-        now = math.floor((monotonic_ns() - self._booted) * (1.0 + _FAST) / 1000)
+        now = math.floor((self._clock() - self._booted) * (1.0 + self.fast) / 1000)
         while True:
             due = _board.due(self._board)
-            time = min(self._next_sample, now if due < 0 else due, now)
+            # A level that came late is applied when it has come.
+            time = min(self._next_sample, now if due < 0 else max(due, self._now), now)
+            self._now = time
             level = _board.advance(self._board, time)
             if level != self._level:
                 self._level = level
-                self._block.command(self._host(time), level * 1e-6 * TESLA_PER_AMPERE)
+                self._block.command(self._host(time), level * 1e-6 * self.tesla_per_ampere)
             if time == self._next_sample:
                 self._sample(time)
             elif time == now:
@@ -89,7 +102,7 @@ class SimulatedBoard(SimulatedLine):
         self._next_sample += _PERIOD
         if self._truth is not None:
             self._truth.write(f'{block.time / 1e9:.6f},{block.stretch!r},{block.rate!r},'
-                              f'{self._level * 1e-6 * TESLA_PER_AMPERE:g}\n')
+                              f'{self._level * 1e-6 * self.tesla_per_ampere:g}\n')
 
     # -- the port ------------------------------------------------------------------------------
 
