@@ -1,12 +1,12 @@
 """Parameters of a running node, read and changed while its caller waits."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from difflib import get_close_matches
 from typing import Any
 
 from rcl_interfaces.msg import Parameter, ParameterType
-from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
+from rcl_interfaces.srv import GetParameters, ListParameters, SetParametersAtomically
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.parameter import get_parameter_value, parameter_value_to_python
 from rclpy.validate_topic_name import validate_topic_name
@@ -102,14 +102,32 @@ class RemoteNode(Visitor):
             If it does not reply.
 
         """
-        before = self._values([name])[name]
-        value = _value(text, None if before is None else before.type)
-        result = self._ask(SetParameters, 'set_parameters', parameters=[
-            Parameter(name=name, value=value)]).results[0]
+        before = self.set_all({name: text})[name]
+        return before, self.get([name])[name]
+
+    def set_all(self, texts: Mapping[str, str]) -> dict[str, Any]:
+        """
+        Change parameters together, all or none; return the values before.
+
+        Raises
+        ------
+        BadInputError
+            If the node refuses them, with its reason.
+        HmsaError
+            If it does not reply.
+
+        """
+        if not texts:
+            return {}
+        before = self._values(list(texts))
+        result = self._ask(SetParametersAtomically, 'set_parameters_atomically', parameters=[
+            Parameter(name=name, value=_value(
+                text, None if before[name] is None else before[name].type))
+            for name, text in texts.items()]).result
         if not result.successful:
-            raise BadInputError(f'{self._name} refused {name} {text}: {result.reason}')
-        return (None if before is None else parameter_value_to_python(before)), (
-            self.get([name])[name])
+            given = ', '.join(f'{x} {y}' for x, y in texts.items())
+            raise BadInputError(f'{self._name} refused {given}: {result.reason}')
+        return {x: None if y is None else parameter_value_to_python(y) for x, y in before.items()}
 
 
 def _value(text: str, kind: int | None) -> Any:

@@ -20,11 +20,13 @@ from hmsa_ros.identification.files import Belief, belief_in, file_text, read_bel
 from hmsa_ros.identification.identify import identify
 from hmsa_ros.identification.known import PREFIX
 from hmsa_ros.identification.quantities import free_of
+from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.result import Identification
 from hmsa_ros.identification.runs import recording_of
 from hmsa_ros.interfaces.topics import PLANNER
 from hmsa_ros.judge import worst
 from hmsa_ros.lab.experiment import conduct, Experiment, prepare, Tell
+from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.recordings.bags import read_run
 from hmsa_ros.recordings.parameters import Entries
 from hmsa_ros.report.arrivals import Part
@@ -128,22 +130,20 @@ def tune(tuning: Tuning, environment: Mapping[str, str], progress: Tell) -> Tune
     belief = read_belief(None, tuning.entries)
     before = _moves(tuning, 'before', {}, environment, progress)
     progress('designing the excitation', 0.0)
-    levels = _excitation(tuning, belief, before)
+    time = before.run.time
+    levels = excitation(tuning, belief, 1e9 * (len(time) - 1) / float(time[-1] - time[0]))
     excited = _conducted(Experiment(
         tuning.folder / 'excitation', (), tuning.nodes({}), tuning.namespace, levels=levels),
         environment, progress)
     progress('identifying', 0.0)
-    found = _identified(tuning, belief, excited)
+    recording, block, coil = recording_of(read_run(excited), belief.actuator)
+    found = identified(tuning, belief, recording, block, coil)
     if found.verdict != 'identified' and not (tuning.accept and found.acceptable):
         return Tuned(before, found)
     progress('comparing shapers', 0.0)
     now = datetime.now().astimezone()
-    learnt = belief_in(file_text(found, belief, str(excited), now))
-    shapers = compare_shapers(
-        Actuator.from_parameters(learnt.settings),
-        [(x[0], span) for x, span in tuning.setpoints], learnt.known)
-    shaper = choose(shapers, _QUIET).shaper
-    settings = {**learnt.settings, 'shaper': shaper}
+    shapers, settings = chosen(tuning, belief, found)
+    shaper = settings['shaper']
     write_text(tuning.out, file_text(
         found, replace(belief, settings={**belief.settings, 'shaper': shaper}), str(excited),
         now))
@@ -209,27 +209,26 @@ def _moves(
     return Part.of(replace(read_run(bag), label=name))
 
 
-def _excitation(
-        tuning: Tuning, belief: Belief, before: Part) -> list[tuple[float, float]]:
-    """Return the levels to record, for a sensor as it has been seen."""
+def excitation(tuning: Tuning, belief: Belief, rate: float) -> list[tuple[float, float]]:
+    """Return the levels to record, time in s and T, for a sensor of a rate in Hz."""
     rest = belief.actuator.rest
     stretches = [rest, *(x[0] for x, _ in tuning.setpoints)]
     beyond = _BEYOND * (max(stretches) - min(stretches))
-    time = before.run.time
     found = excite(
         belief.actuator, Bounds(
             belief.number('flux_density_min', -0.5), belief.number('flux_density_max', 0.5),
             belief.number('slew_limit', 0.0) or float('inf'),
             min(stretches) - beyond if tuning.stretch_min is None else tuning.stretch_min,
             max(stretches) + beyond if tuning.stretch_max is None else tuning.stretch_max),
-        duration=tuning.duration, rate=1e9 * (len(time) - 1) / float(time[-1] - time[0]),
+        duration=tuning.duration, rate=rate,
         free=free_of(tuning.free, belief.actuator.law, tuning.known)).best
     return list(zip(found.level_times.tolist(), found.levels.tolist(), strict=True))
 
 
-def _identified(tuning: Tuning, belief: Belief, bag: Path) -> Identification:
-    """Identify, with what residuals name added to what is free."""
-    recording, block, coil = recording_of(read_run(bag), belief.actuator)
+def identified(
+        tuning: Tuning, belief: Belief, recording: Recording, block: ActuatorParameters,
+        coil: Mapping[str, float]) -> Identification:
+    """Identify, with what residuals name added to what is free (see `recording_of`)."""
     known = {**coil, **belief.others, **tuning.known}
 
     def fit(free: tuple[str, ...]) -> Identification:
@@ -263,6 +262,17 @@ def _identified(tuning: Tuning, belief: Belief, bag: Path) -> Identification:
     return found
 
 
+def chosen(
+        tuning: Tuning, belief: Belief, found: Identification
+) -> tuple[list[Expected], dict[str, Any]]:
+    """Return how the shapers compare, and the settings of a planner with what was found."""
+    learnt = belief_in(file_text(found, belief, '', datetime.now().astimezone()))
+    shapers = compare_shapers(
+        Actuator.from_parameters(learnt.settings),
+        [(x[0], span) for x, span in tuning.setpoints], learnt.known)
+    return shapers, {**learnt.settings, 'shaper': choose(shapers, _QUIET).shaper}
+
+
 def _apply(tuning: Tuning, settings: Mapping[str, Any]) -> None:
     """Give the running planner what was found."""
     from hmsa_ros.lab.remote import RemoteNode
@@ -272,8 +282,9 @@ def _apply(tuning: Tuning, settings: Mapping[str, Any]) -> None:
         changed = {x: y for x, y in settings.items() if x in before and before[x] != y
                    and not x.startswith(PREFIX)}
         try:
-            for name, value in changed.items():
-                planner.set(name, value if isinstance(value, str) else yaml_text(value))
+            # Together: branches that creep have a ratio and a time each.
+            planner.set_all({x: y if isinstance(y, str) else yaml_text(y)
+                             for x, y in changed.items()})
         except BadInputError as error:
             raise HmsaError(
                 f'{tuning.out} is written, and the running planner does not take it ({error}): '

@@ -62,7 +62,7 @@ OWN = (
         read_only=False),
     replace(shared.SLEW_LIMIT, read_only=False),
     replace(shared.COIL_TIME_CONSTANT, read_only=False),
-    *shared.VISCOELASTIC,
+    *(replace(x, read_only=False) for x in shared.VISCOELASTIC),
     replace(shared.CREEP_TOLERANCE, read_only=False),
     ParameterSpec(
         'path_tolerance', _OPTIONS.path_tolerance,
