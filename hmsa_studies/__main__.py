@@ -47,7 +47,7 @@ def robustness_table(start: float, target: float) -> Table:
     for candidate in candidates():
         result = study(case, candidate)
         rows.append((
-            candidate.label,
+            candidate.label.partition(' (')[0],
             f'{result.arrival:.3f}' if candidate.shaper != 'step' else 'never',
             percent(result.nominal),
             *(percent(worst.residual) for worst in result.alone.values()),
