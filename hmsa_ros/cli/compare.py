@@ -2,19 +2,25 @@
 Compare runs in numbers, and in a picture.
 
 Print move time, offset and residual vibration of each setpoint for several runs, and how far each
-curve is from that of the first run.
+curve is from that of the first run. Of folders that hmsa run --repeat wrote, print mean, standard
+deviation and largest size over the repeats; their pictures show the mean of each arrival, and the
+standard deviation as a band.
 
 example: hmsa compare run_zv run_two_step --picture both.pdf --width 85
 """
 
 import argparse
-from typing import Any
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_bags, add_command, add_options, JSON
 from hmsa_ros.cli.pictures import add_picture_options, paper_of
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
+
+if TYPE_CHECKING:
+    from hmsa_ros.report.paper import Paper
 
 
 def add_parser(subparsers: Any) -> None:
@@ -35,6 +41,12 @@ def run(arguments: argparse.Namespace) -> int:
         raise BadInputError(
             f'only {arguments.runs[0]} is given: expected two runs or more, such as hmsa compare '
             'first/run second/run')
+    from hmsa_ros.report.repeats import repeats_in
+
+    repeats = [repeats_in(x) for x in arguments.runs]
+    if any(repeats):
+        return _compare_repeats(arguments, [x or [y] for x, y in zip(
+            repeats, arguments.runs, strict=True)], paper)
     from hmsa_ros.api.motion import compare, draw_all, read
 
     with progress('reading'):
@@ -50,4 +62,34 @@ def run(arguments: argparse.Namespace) -> int:
     print(found)
     for picture in arguments.picture:
         print(picture)
+    return 0
+
+
+def _compare_repeats(
+        arguments: argparse.Namespace, groups: 'list[list[Path]]', paper: 'Paper') -> int:
+    """Compare runs that were repeated, or some of which were."""
+    from hmsa_ros.recordings.bags import read_run
+    from hmsa_ros.report.arrivals import Part
+    from hmsa_ros.report.repeats import draw_bands, statistics, statistics_table
+
+    labels = [x.parent.name if x.name == 'run' else x.name for x in map(
+        Path.resolve, arguments.runs)]
+    if len(set(labels)) < len(labels):
+        labels = [f'{x} ({i})' for i, x in enumerate(labels, 1)]
+    with progress('reading'):
+        parts = {label: [Part.of(read_run(x, joint=arguments.joint)) for x in group]
+                 for label, group in zip(labels, groups, strict=True)}
+        found = {label: statistics([x.evaluation.findings for x in group])
+                 for label, group in parts.items()}
+        table = statistics_table(found)
+        if arguments.picture:
+            draw_bands(arguments.picture, parts, paper)
+    if arguments.json:
+        print(json_text({
+            'runs': list(found), 'setpoints': [
+                {'run': label, **x} for label, group in found.items() for x in group],
+            'files': [str(x) for x in arguments.picture]}))
+        return 0
+    for line in (table, *arguments.picture):
+        print(line)
     return 0

@@ -89,6 +89,8 @@ def run(arguments: argparse.Namespace) -> int:
     experiments = [_experiment(arguments, x) for x in folders]
     for x in folders:
         prepare(x)
+    from hmsa_ros.report.repeats import statistics, statistics_table
+
     ENDING.note()
     console = Console(stderr=True)
     records, each, verdicts = [], [], []
@@ -113,9 +115,9 @@ def run(arguments: argparse.Namespace) -> int:
             _print(experiment, parts, reason, done, report)
     if arguments.json:
         print(json_text(records[0] if arguments.repeat == 1 else {
-            'repeats': records, 'statistics': _statistics(each)}))
-    elif arguments.repeat > 1:
-        _print_statistics(each)
+            'repeats': records, 'statistics': statistics(each)}))
+    elif arguments.repeat > 1 and any(each):
+        print(statistics_table({'': statistics(each)}))
     return 0 if all(x in ('arrived', NOT_MEASURED) for x in verdicts) else 1
 
 
@@ -133,45 +135,6 @@ def _carried_out(
         report = _report(
             parts, experiment.folder / 'report.html') if arguments.report and parts else None
     return done, parts, report
-
-
-def _statistics(each: 'list[list[Finding]]') -> list[dict[str, Any]]:
-    """Return mean, standard deviation and largest size of what repeats left, by setpoint."""
-    import numpy as np
-
-    found = []
-    for group in zip(*each, strict=False):
-        row: dict[str, Any] = {
-            'joint': group[0].setpoint.joint, 'setpoint': group[0].setpoint.number,
-            'target': group[0].setpoint.target, 'repeats': len(group),
-            'arrived': sum(x.arrived for x in group)}
-        for name in ('vibration', 'offset'):
-            values = np.array([x.setpoint.percent(getattr(x, name)) for x in group])
-            values = values[np.isfinite(values)]
-            row[f'{name}_percent'] = {
-                'mean': float(np.mean(values)) if len(values) else None,
-                'std': float(np.std(values, ddof=1)) if len(values) > 1 else None,
-                'largest': float(values[np.argmax(np.abs(values))]) if len(values) else None}
-        found.append(row)
-    return found
-
-
-def _print_statistics(each: 'list[list[Finding]]') -> None:
-    from hmsa_ros.table import Column, Table
-
-    rows = []
-    for x in _statistics(each):
-        figures = [x[f'{y}_percent'][z] for y in ('vibration', 'offset')
-                   for z in ('mean', 'std', 'largest')]
-        rows.append((f'{x["joint"]} {x["setpoint"]}'.strip(), x['target'],
-                     f'{x["arrived"]} of {x["repeats"]}',
-                     *(math.nan if y is None else y for y in figures)))
-    if rows:
-        print(Table(
-            (Column('setpoint'), Column('target'), Column('arrived'), *(
-                Column(f'{y}{z}', '', '.3g') for y in ('vibration', 'offset')
-                for z in ('', ' std', ' max'))), tuple(rows),
-            'over the repeats: mean, standard deviation and largest; in % of the step'))
 
 
 def _tell(update: 'Callable[[str, float | None], None]', what: str, share: float) -> None:
