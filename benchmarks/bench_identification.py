@@ -75,14 +75,13 @@ def compare(*, quick: bool = False, runs: int = RUNS) -> Sheet:
         for x in figures.values()), strict=True))
     return Sheet(
         'identification',
-        f'Of each parameter the root mean square error over the Cramer-Rao bound, and how many '
-        f'of the 95 % intervals cover the truth, in %; {runs} runs of 2 s each, start values 30 '
-        f'% off, the gain of the sensor given. All parameters together, {wide} of the '
-        f'{len(rows)} rows cover more than {100.0 * LARGEST_COVERAGE:.0f} % and {narrow} less '
-        f'than {100.0 * LEAST_COVERAGE:.0f} %. By chance a ratio reaches {ratio:.2f} where '
-        f'{LARGEST_RATIO:g} is meant, and a coverage {100.0 * least:.0f} or {100.0 * most:.0f} '
-        f'where {100.0 * LEAST_COVERAGE:.0f} to {100.0 * LARGEST_COVERAGE:.0f} is; what lies '
-        'beyond fails',
+        f'Root mean square error over the Cramer-Rao bound, and coverage of the 95 % intervals in '
+        f'%; {runs} runs of 2 s each, start values with errors of 30 %, sensor gain given. All '
+        f'parameters together, {wide} of the {len(rows)} rows cover more than '
+        f'{100.0 * LARGEST_COVERAGE:.0f} % and {narrow} less than {100.0 * LEAST_COVERAGE:.0f} %. '
+        f'Limits that allow for chance: ratio {ratio:.2f} for {LARGEST_RATIO:g}, coverage '
+        f'{100.0 * least:.0f} and {100.0 * most:.0f} for {100.0 * LEAST_COVERAGE:.0f} and '
+        f'{100.0 * LARGEST_COVERAGE:.0f}',
         ['sequence, noise, rate', 'G', 'c', 'J_lim', 'Br', 'bias', 'all [%]', 'not identified',
          'processor [ms]'], rows, figures, passed)
 
@@ -210,10 +209,9 @@ def robustness(*, quick: bool = False, runs: int = ROBUST_RUNS) -> Sheet:
     return Sheet(
         'identification_robustness',
         f'{runs} runs each of 2 s at 1 kHz, unshaped steps repeated, noise 0.001; bias (of the '
-        'worst '
-        f'parameter; chance alone makes {1.0 / np.sqrt(runs):.2f}) and error in standard '
-        'deviations as they are said; width of the intervals and move of the result beside the '
-        'same run with white noise alone',
+        f'worst parameter; {1.0 / np.sqrt(runs):.2f} by chance) and error in reported standard '
+        'deviations; width of the intervals and change of the result relative to white noise '
+        'alone',
         ['what is bad', 'identified / not identifiable / rejected', 'bias', 'error, rms',
          'covered by 95 % [%]', 'intervals wider by', 'largest move [std]'], rows, figures)
 
@@ -266,7 +264,7 @@ def speed(*, quick: bool = False) -> Sheet:
             figures[rows[-1][0]] = {'seconds': spent, 'apart': apart}
     return Sheet(
         'identification_speed',
-        'Time of 2 s at 1 kHz: here start values, fit, diagnosis and intervals; there the fit '
-        'alone from values 10 % off, by least squares on the simulation of this package'
-        f'{shooting}; how far their result is from ours in our standard deviations',
+        'Time for 2 s at 1 kHz: this package with start values, diagnosis and intervals; SciPy '
+        'for the fit alone, from values with errors of 10 %, on the same simulation'
+        f'{shooting}; difference of the results in standard deviations',
         ['', 'least [ms]', 'median [ms]', 'apart [std]'], rows, figures)

@@ -105,7 +105,7 @@ def test_an_actuator_is_driven_from_the_page(browser, start, tmp_path):
     shows('#message', '9')
     enter(page, 'stretch', 'x')
     press(page, '#move button')
-    shows('#note', 'expected STRETCH:SPAN')
+    shows('#note', 'expected STRETCH:DURATION')
     # Recorded, with feedback.
     press(page, '[data-mode=observe]')
     page.wait_for('document.querySelector("[data-mode=observe][aria-pressed=true]") !== null')

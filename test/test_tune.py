@@ -62,7 +62,8 @@ def test_a_shaper_that_cannot_plan_the_moves_is_not_chosen():
 
 @pytest.mark.parametrize(('words', 'what'), [
     (('1.1,1.2:1',), 'several joints'), (('1.1:1', '--out', '.'), 'cannot write'),
-    (('1.1:1', '--known', 'mass=1'), "--known has 'mass=1'"), (('1.1',), 'expected STRETCH:SPAN')])
+    (('1.1:1', '--known', 'mass=1'), "--known has 'mass=1'"),
+    (('1.1',), 'expected STRETCH:DURATION')])
 def test_what_cannot_be_tuned_is_refused_before_anything_moves(words, what, capsys, tmp_path):
     try:
         status = main(['tune', *words, '--simulate', '--folder', str(tmp_path / 'runs')])

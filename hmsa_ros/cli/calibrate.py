@@ -1,7 +1,7 @@
 """
 Calibrate coil, delays and statics of a bench.
 
-Calibrate a part of a bench, and write what driver and planner read.
+Calibrate a part of a bench, and write its parameters for driver and planner.
 
 example: hmsa calibrate coil readings.csv --out coil.yaml
 """
@@ -56,8 +56,8 @@ def add_parser(subparsers: Any) -> None:
         ('--settle', 'S', float, 'time at each level before it is read (default 1 s)',
          {'default': 1.0}),
         ('--probe', 'MODULE:NAME', str,
-         'makes the field probe: called without arguments, it returns an object whose read() '
-         'returns a flux density in T (default: readings are typed, with or without a unit)'),
+         'class or function without arguments for the field probe, an object whose read() '
+         'returns a flux density in T (default: type the readings, with or without a unit)'),
         ('--out', 'YAML', Path,
          'parameter file of the driver to write; a table is written beside it as CSV'),
         JSON)
@@ -70,7 +70,7 @@ def add_parser(subparsers: Any) -> None:
         ('--params-file', 'YAML', Path,
          'parameter file with the sizes of the actuator, and rough values (default: none)'),
         ('--probe', 'MODULE:NAME', str,
-         'makes a field probe: called without arguments, it returns an object whose read() '
+         'class or function without arguments for a field probe, an object whose read() '
          'returns a flux density in T, or a list of (flux density, NaN, time in ns)'),
         ('--lag', 'S', float, 'known time constant of the coil, where there is no probe'),
         ('--out', 'YAML', Path, 'parameter file of driver and planner to write'),
@@ -85,8 +85,8 @@ def add_parser(subparsers: Any) -> None:
         ('--settle', 'S', float,
          'time at each level, of which the second half counts (default 2 s)', {'default': 2.0}),
         ('--gauge', 'MODULE:NAME', str,
-         'makes a gauge of the length of the actuator, in the unit of its rest length: called '
-         'without arguments, it returns an object with read()'),
+         'class or function without arguments for a gauge, an object whose read() returns the '
+         'length of the actuator in the unit of its rest length'),
         ('--out', 'YAML', Path,
          'parameter file of driver and planner to write; the table is written beside it as CSV'),
         JSON)
@@ -131,10 +131,10 @@ def _coil(arguments: argparse.Namespace) -> int:
     """
     Flux density over current, against a field probe.
 
-    Take the coil through a loop of levels, from 0 to --limit, to its negative and back, and read a
-    field probe at each: an object of Python, or a person who types the readings. Or evaluate
-    readings in a CSV. Prints the coil constant with its 95 % interval, saturation and hysteresis,
-    and writes the settings of the driver. The coil is off at the end, and after Ctrl-C.
+    Set levels in a loop, from 0 to --limit, to its negative and back, and read a field probe at
+    each: by Python, or typed in. Or evaluate readings in a CSV. Prints the coil constant with its
+    95 % interval, saturation and hysteresis, and writes the settings of the driver. The coil is
+    off at the end, and after Ctrl-C.
 
     example: hmsa calibrate coil my_lab:Coil --limit 0.1 --out coil.yaml
     """

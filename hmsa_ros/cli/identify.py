@@ -38,12 +38,12 @@ def add_parser(subparsers: Any) -> None:
          'parameter file with the known values, such as geometry and density'),
         ('--free', 'NAME,...', str,
          'parameters to identify (default shear_modulus, damping_coefficient, chain_limit, '
-         'remanence, stretch_bias); +NAME adds to these, and --free=-NAME takes from them; '
+         'remanence, stretch_bias); +NAME adds to these, and --free=-NAME removes one; '
          'others: density, time_unit, stretch_gain, sensor_latency, '
          'coil_time_constant, constant_force, initial_stretch, initial_rate, '
-         'viscoelastic_ratio, viscoelastic_time and viscoelastic_exponent, for more branches with '
-         '_2 and _3 after them; '
-         'with a law its constants, such as law.c10 and law.c01', {'default': ''}),
+         'viscoelastic_ratio, viscoelastic_time and viscoelastic_exponent (further branches with '
+         '_2 and _3); constants of a hyperelastic model, such as law.c10 and law.c01',
+         {'default': ''}),
         ('--known', 'NAME=VALUE[+-STD],...', str,
          'fixed values, such as sensor_latency=2ms or half_length=5mm+-1%%; the intervals include '
          'the effect of a standard deviation', {'default': ''}),

@@ -1,10 +1,10 @@
 """
-Correct a sequence by what its repeats left.
+Correct the levels of a sequence by the errors of its repeats.
 
-Read the runs of one sequence, in their order, and correct its levels by the residual that was
-measured, for what no model has: hysteresis, a second mode. The first run has the setpoints as they
-were planned; each of the others executed the levels learnt from those before it. Prints what each
-run left, and writes the levels for the next run, which hmsa run --levels takes.
+Read the runs of one sequence, in their order, and correct its levels by the measured errors, such
+as those by hysteresis or a second mode. The first run has the planned setpoints; each of the
+others executed the levels learnt from those before it. Print the error of each run, and write the
+levels for the next run, for hmsa run --levels.
 
 example: hmsa learn planned/run second/run --out next.yaml
 """

@@ -9,10 +9,10 @@ from hmsa_ros.ending import ENDING
 NODES = {
     'planner': 'plan shaped commands for setpoint sequences',
     'plant': 'simulate the actuator',
-    'driver': 'drive real hardware in the place of the plant',
+    'driver': 'operate a physical actuator in place of the plant',
     'recorder': 'record topics to a bag',
     'player': 'replay a bag',
-    'sense': 'publish the stretch that a camera or another sensor sees',
+    'sense': 'publish the stretch that a camera or another sensor measures',
     'controller': 'planner and plant, or driver, in one process and one loop',
 }
 _EXAMPLES = {

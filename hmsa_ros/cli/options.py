@@ -23,8 +23,8 @@ MATERIAL = (
 
 LAW_OPTION: Row = (
     '--law', 'NAME:KEY=VALUE,...', str,
-    'hyperelastic model and its constants (moduli in Pa or with a unit, or in any unit where all '
-    'is nondimensional; values of a list with / between), such as yeoh:c10=15kPa,c20=500 or '
+    'hyperelastic model and its constants (moduli in Pa or with a unit, in dimensionless plans in '
+    'any common unit; values of a list separated by /), such as yeoh:c10=15kPa,c20=500 or '
     'ogden:mu=6e3/100,alpha=1.3/5')
 
 

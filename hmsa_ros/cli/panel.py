@@ -2,9 +2,9 @@
 Drive the running nodes from a page in the browser.
 
 Serve one page on this host: stretch, flux density and status live, setpoints and sequences, stop,
-feedback and its estimate, recordings and their reports. Open the address that it prints; whoever
-has that address can move the actuator. When the last page is closed, and at the end, an actuator
-that the panel moves comes to rest without vibration.
+feedback and its estimate, recordings and their reports. Open the printed address; anyone who has
+it can move the actuator. When the last page is closed, and at the end, an actuator that the panel
+moves comes to rest without vibration.
 
 example: hmsa panel --port 8642 --out my_recordings
 """
@@ -33,8 +33,8 @@ def add_parser(subparsers: Any) -> None:
          {'default': Path('hmsa_panel')}))
     parser.add_argument(
         '--stop-on-close', action=argparse.BooleanOptionalAction, default=True,
-        help='when the last page is closed, come to rest; otherwise a sequence goes on to its '
-             'planned rest')
+        help='when the last page is closed, come to rest; otherwise a sequence continues to '
+             'its planned rest')
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -61,7 +61,7 @@ def _set(arguments: argparse.Namespace) -> int:
     """
     Change a parameter of a node.
 
-    Change a parameter of a node, such as shaper of the planner: it holds from the next request on.
+    Change a parameter of a node. The planner uses it from the next request on.
 
     example: hmsa param set planner shaper robust
     """

@@ -40,14 +40,14 @@ def add_picture_options(
     add_options(
         group,
         ('--width', 'MM', float,
-         'width in mm: 85 for a column, 120, or 183 for two (default %(default)g); panels stand '
-         'below each other where they do not fit beside each other',
+         'width in mm: 85 for a column, 120, or 183 for two (default %(default)g); panels that '
+         'do not fit side by side are stacked',
          {'default': standard.width}),
-        ('--font-size', 'PT', float, 'size of the letters in pt (default %(default)g)',
+        ('--font-size', 'PT', float, 'font size in pt (default %(default)g)',
          {'default': standard.letters}),
-        ('--dpi', 'N', float, 'dots an inch of PNG (default %(default)g)',
+        ('--dpi', 'N', float, 'dots per inch of PNG (default %(default)g)',
          {'default': standard.dpi}),
-        *([('--data', 'write what each picture shows as CSV, too, under the same name')]
+        *([('--data', 'also write the plotted values as CSV, under the same name')]
           if data else []))
 
 

@@ -41,9 +41,8 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = add_command(subparsers, __name__, __doc__)
     parser.add_argument(
-        'setpoints', nargs='*', type=setpoint, metavar='STRETCH:SPAN',
-        help='stretch, or deflection of a beam, to come to rest at, and how long this setpoint '
-             'lasts (move plus hold)')
+        'setpoints', nargs='*', type=setpoint, metavar='STRETCH:DURATION',
+        help='target stretch, or deflection of a beam, and duration (move plus hold)')
     add_options(
         parser,
         ('--path', 'CSV', Path,
@@ -70,9 +69,9 @@ def add_parser(subparsers: Any) -> None:
          'parameter file (YAML) of planner and plant, for a plan in seconds and tesla'),
         of_unit('--tesla-per-ampere', 'T/A', 'field of the coil per current, for levels in A'),
         ('--amplifier',
-         'with --params-file: also print what amplifiers from fast to slow have to give, and the '
-         'time that they lose; with --tesla-per-ampere, --inductance and --resistance also '
-         'current and voltage'),
+         'with --params-file: also compare the move times and flux densities of amplifiers from '
+         'fast to slow; with --tesla-per-ampere, --inductance and --resistance also current and '
+         'voltage'),
         of_unit('--inductance', 'H', 'inductance L of the coil'),
         of_unit('--resistance', 'ohm', 'resistance R of the coil'),
         ('--out', 'FILE', Path,
@@ -90,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
     si = arguments.params_file is not None
     if bool(arguments.setpoints) == (arguments.path is not None) or arguments.path and not si:
         raise BadInputError(
-            'expected STRETCH:SPAN such as 1.10:10, or --path CSV with --params-file')
+            'expected STRETCH:DURATION such as 1.10:10, or --path CSV with --params-file')
     from hmsa_ros.api.plan import table_of
     from hmsa_ros.model.equations import signed_root
 

@@ -34,7 +34,7 @@ def add_parser(subparsers: Any) -> None:
         ('--json', 'print the results of each setpoint, and the files, as JSON'))
     parser.add_argument(
         '--params-file', '--params', dest='params', type=Path, metavar='YAML',
-        help='parameter file (YAML) of the real actuator (default: the parameters in the bag)')
+        help='parameter file (YAML) of the actuator (default: the parameters in the bag)')
     parser.add_argument(
         '--joint', default='', metavar='NAME',
         help='joint to show, or several separated by commas (default: those with commands)')

@@ -68,4 +68,4 @@ def setpoint_of_joints(text: str) -> tuple[tuple[float, ...], float]:
 
 def _no_setpoint(text: str) -> argparse.ArgumentTypeError:
     return argparse.ArgumentTypeError(
-        f'{text!r}: expected STRETCH:SPAN, two numbers such as 1.10:10')
+        f'{text!r}: expected STRETCH:DURATION, two numbers such as 1.10:10')

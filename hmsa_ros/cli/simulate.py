@@ -1,9 +1,9 @@
 """
 Simulate the response to levels of the field without ROS.
 
-Simulate how an actuator responds to levels of the field, without ROS: a CSV with the columns time
-(s) and flux_density (T), each in force from its time on. Print what each level leads to; write
-samples with --out and a picture with --picture.
+Simulate the response of an actuator to levels of the field, without ROS: a CSV with the columns
+time (s) and flux_density (T), each in force from its time on. Print the response to each level;
+write samples with --out and figures with --picture.
 
 example: hmsa simulate levels.csv --params-file actuator.yaml --picture run.png
 """
@@ -28,9 +28,9 @@ def add_parser(subparsers: Any) -> None:
         ('--params-file', 'YAML', Path,
          'parameter file of the actuator (default: the example block)'),
         ('--until', 'S', float, 'end in s (default: when the last level has settled)'),
-        ('--start', 'X', float, 'stretch at rest before (default 1; 0 for a beam)'),
+        ('--start', 'X', float, 'initial stretch, at rest (default 1; 0 for a beam)'),
         ('--rate', 'HZ', float,
-         'samples a second in Hz (default 1000, or 40 a period of the actuator)'),
+         'sample rate in Hz (default 1000, or 40 samples per period of the actuator)'),
         ('--noise', 'X', float, 'standard deviation of the stretch samples (default 0)',
          {'default': 0.0}),
         ('--seed', 'N', int, 'of the noise (default 0)', {'default': 0}),

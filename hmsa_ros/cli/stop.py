@@ -1,8 +1,8 @@
 """
 Drop the rest of the sequence and come to rest without vibration.
 
-Have the running planner drop the rest of its sequence and bring the actuators to rest without
-vibration, as its service ~/stop does. It waits until they are at rest.
+Call the service ~/stop of the running planner: it drops the rest of its sequence and brings the
+actuators to rest without vibration. Return when they are at rest.
 
 example: hmsa stop
 """

@@ -1,10 +1,10 @@
 """
 Measure an actuator, choose a shaper, and show before and after.
 
-Make the moves as they are, record an excitation, identify the actuator from it, compare the
-shapers on what is known then, write the parameters, and make the moves again. Works with the
-running planner and plant or driver, which gets the new parameters, or with simulated ones. Ctrl-C
-brings the actuator to rest.
+Make the moves, record an excitation, identify the actuator from it, compare the shapers for its
+uncertainty, write the parameters, and make the moves again. Works with the running planner, which
+gets the new parameters, and plant or driver, or with simulated ones. Ctrl-C brings the actuator to
+rest.
 
 example: hmsa tune 1.10:0.5 1.00:0.5 --simulate --params-file actuator.yaml
 """
@@ -42,7 +42,7 @@ def add_parser(subparsers: Any) -> None:
         parser,
         ('--simulate', 'start a planner and a plant for each run, in simulated time'),
         ('--params-file', 'YAML', Path,
-         'parameter file with what is known (default: the parameters of the running planner, or '
+         'parameter file with known values (default: the parameters of the running planner, or '
          'the defaults with --simulate)'),
         ('--duration', 'S', float,
          'duration of the excitation in s (default 180 periods of the actuator)'),
@@ -51,7 +51,7 @@ def add_parser(subparsers: Any) -> None:
         ('--stretch-max', 'X', float,
          'maximum stretch of the excitation (default half the range of the moves above it)'),
         ('--free', 'NAME,...', str,
-         'parameters to identify, as in hmsa identify; what the residuals show is added',
+         'parameters to identify, as in hmsa identify; effects in the fit residuals are added',
          {'default': ''}),
         ('--known', 'NAME=VALUE[+-STD],...', str, 'fixed values, as in hmsa identify',
          {'default': ''}),

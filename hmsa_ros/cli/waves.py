@@ -1,10 +1,10 @@
 """
 Plan a periodic motion of the stretch without ROS.
 
-Plan levels whose response is a wave of the stretch, from rest without a field and back to it, and
-print the frequencies that the coil allows. SHAPE is sine, triangle, square (two-step moves), sweep
-(a sine from --frequency to --to) or a CSV with one period in the columns time and stretch, of
-which mean and peak become offset and amplitude. hmsa run --levels carries the levels out.
+Plan levels whose response is a wave of the stretch, from rest to rest without a field, and print
+the frequencies that the coil allows. SHAPE is sine, triangle, square (two-step moves), sweep (a
+sine from --frequency to --to) or a CSV with one period in the columns time and stretch; its mean
+and peak become offset and amplitude. Execute the levels with hmsa run --levels.
 
 example: hmsa wave sine --frequency 30 --amplitude 0.05 --out wave.csv
 """

@@ -22,11 +22,11 @@ def options(workers: str) -> tuple[Row, ...]:
     return (
         ('--workers', 'N', int, workers),
         ('--shard', 'I/N', str,
-         'compute part I of N only, as a job of an array does; I from 0 to N-1 or from 1 to N'),
+         'compute part I of N only, for array jobs; I from 0 to N-1 or from 1 to N'),
         ('--dask', 'ADDRESS', str,
          'compute on a Dask cluster: its address, its scheduler file (.json), or "local"; all '
          'workers must see the folder of --out'),
-        ('--resume', 'keep the chunks of an earlier run that are there and whole'))
+        ('--resume', 'reuse the complete chunks of an earlier run'))
 
 
 def asked(arguments: argparse.Namespace) -> list[str]:

@@ -77,7 +77,7 @@ def add_parser(subparsers: Any) -> None:
          'grids of the other columns'),
         ('--out', 'FILE|DIR', Path,
          'file to write, ending in .csv or .parquet; an existing file is replaced. Or a folder, '
-         'which keeps the chunks and gets table.parquet once all are there (default: CSV on '
+         'which keeps the chunks and gets table.parquet at the end (default: CSV on '
          'standard output)'),
         ('--show', 'COLUMN,...', str,
          'columns to draw (default: duration and first level, or residual and offset)'),
