@@ -31,6 +31,9 @@ LISTS = {
 # (permission, name in full), as in ('publish', '/joint_states').
 Grant = tuple[str, str]
 COMMAND = '/flux_density_command'
+# Where control_msgs is installed.
+FOLLOW = {('execute', '/planner/follow_joint_trajectory'),
+          ('publish', '/planner/controller_state')}
 RUNNING = ('planner', 'plant', 'recorder')
 # Ways into a node that are no requests to move: none but operators may use them.
 PARAMETERS = ('set_parameters', 'set_parameters_atomically', 'change_state')
@@ -123,7 +126,7 @@ def watch(
 
 def enclave_of(node: str) -> set[Grant]:
     """Return what a node of this package may do."""
-    return GRANTS[f'/hmsa/{node}']
+    return GRANTS[f'/hmsa/{node}'] - FOLLOW
 
 
 def test_policies_follow_the_schema_and_name_an_enclave_for_every_node_and_person():
@@ -156,6 +159,7 @@ def test_only_the_planner_and_a_replay_may_send_commands():
 
 def test_only_an_operator_may_send_setpoints_and_stop_the_planner():
     requests = {('publish', '/planner/joint_trajectory'), ('publish', '/planner/setpoint'),
+                ('call', '/planner/follow_joint_trajectory'),
                 *(('request', f'/planner/{x}') for x in (
                     'reset_estimate', 'save_estimate', 'stop'))}
     for path, granted in GRANTS.items():

@@ -238,6 +238,16 @@ class Services(Generated):
              for node in topics.NODES for service in services if node in service.meaning))
 
 
+class Actions(Generated):
+    """All actions, and the topics of their states."""
+
+    def markdown(self, argument: str) -> str:
+        """Return a table of all actions (see `Generated.markdown`)."""
+        return table(('node', 'name', 'meaning'), (
+            (x.server, f'`{y.name}`', f'{y.meaning}<br>*`{y.type}`*')
+            for x in declared(topics.Action) for y in (x, x.state)))
+
+
 class Parameters(Generated):
     """The parameters of one node."""
 
@@ -363,7 +373,8 @@ class Api(Generated):
 
 KINDS = kinds()
 DIRECTIVES = {
-    'hmsa-topics': Topics, 'hmsa-services': Services, 'hmsa-parameters': Parameters,
+    'hmsa-topics': Topics, 'hmsa-services': Services, 'hmsa-actions': Actions,
+    'hmsa-parameters': Parameters,
     'hmsa-codes': Codes, 'hmsa-error-kinds': ErrorKinds, 'hmsa-error-messages': ErrorMessages,
     'hmsa-commands': CommandLine, 'hmsa-api': Api}
 

@@ -7,8 +7,10 @@ from hmsa_ros.control.records import (
     Note,
     Output,
     PlanChanged,
+    Request,
     Severity,
     StatusChanged,
+    Trajectory,
     Verdict,
 )
 from hmsa_ros.control.slices import Clock
@@ -94,6 +96,10 @@ class Bulletin:
     def next_change(self) -> int | None:
         """Time in ns at which progress changes next; None for never."""
         return self._until
+
+    def take_goals(self, request: Request) -> None:
+        """Have a request, whose plan was taken just now, judged by what it counts as arrived."""
+        self._watch.goals = request.goals if isinstance(request, Trajectory) else {}
 
     def show(self) -> None:
         """Show what is planned; of a long plan the beginning, and the rest in time."""

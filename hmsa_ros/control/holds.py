@@ -7,6 +7,7 @@ import numpy as np
 from hmsa_ros.judge import (
     ENOUGH,
     Finding,
+    GoalTolerances,
     judge,
     look_length,
     missed,
@@ -37,13 +38,14 @@ class Hold:
     ``found`` is the newest finding; once ``over``, no more samples are waited for.
     """
 
-    def __init__(self, setpoint: Setpoint, *, last: bool) -> None:
+    def __init__(
+            self, setpoint: Setpoint, *, last: bool, goal: GoalTolerances | None = None) -> None:
         self.setpoint = replace(setpoint, held=last)
         self.found: Finding | None = None
         self.over = False
         self.untold = False  # whether it is missed, which nobody has been told
         self.news = False  # whether samples have been judged that nobody has looked at
-        self._last, self._end = last, setpoint.end
+        self._last, self._end, self._goal = last, setpoint.end, goal
         self._samples: dict[int, float] = {}
         self._moving: set[int] = set()  # parts of the move of which there is one
         # Newest sample by its stamp; newest of all that were looked at, and when that was.
@@ -61,6 +63,9 @@ class Hold:
         least = begin + 2 * self._length if self._last else begin
         self._enough = least if setpoint.end is None else max(setpoint.end, least)
         self._closes = max(self._enough, begin + _RARE) if self._last else self._enough
+        # Until when it may arrive.
+        self._grace = begin + (0 if self._goal is None else self._goal.time)
+        self._closes = max(self._closes, self._grace)
         self.due = min(begin + self._length, self._closes)
         self._few: bool | None = None
         self._waits = False  # whether the last sample to come is waited for
@@ -148,11 +153,17 @@ class Hold:
         if self.over or not self._ready(now, steady, observable=observable):
             return None
         # By samples up to now that was due, whenever it is looked at.
+        after, setpoint = self.due - self._begin, self.setpoint
+        if self._grace > self._begin:
+            # Or by those of the second half of the time, or of the last looks.
+            setpoint = replace(setpoint, end=None, moved=(
+                self._begin + after // 2 if self.due < self._closes
+                else self._closes - 2 * self._length))
         found, self.news = self.judged(
-            self.setpoint, tolerances, sensor=sensor, until=self.due), bool(self._samples)
-        self.over = self.due >= self._closes or (
-            self.due >= self._enough and not found.open)
-        after = self.due - self._begin
+            setpoint, self._goal or tolerances, sensor=sensor, until=self.due), bool(
+                self._samples)
+        self.over = self.due >= self._closes or self.due >= self._enough and not (
+            found.open or found.failed and self.due < self._grace)
         due = self._begin + max(2 * after, self._length)
         self.due = min(due, self._closes if self.due >= self._enough else self._enough)
         before = self.found

@@ -126,7 +126,8 @@ class PlannerRuntime:
                 self.hearing.check_clocks()
         except RefusedError as error:
             return self.planning.refuse(error, request)
-        if isinstance(request, Trajectory) and self.settings.trajectory_mode == 'rest':
+        if (isinstance(request, Trajectory) and self.settings.trajectory_mode == 'rest'
+                and not request.follows):
             request = replace(request, path=None)
         self._begin_anew()
         self._check(request)

@@ -131,6 +131,7 @@ class Planning:
         if not isinstance(request, Stop):
             drafts = self._corrections.cautious(drafts)
         changed = self._group.take(drafts, now)
+        self._bulletin.take_goals(request)
         # First, since reporting takes time.
         self._send()
         warnings = [x.warning for x in drafts.values() if x.warning is not None]

@@ -9,7 +9,7 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation.correction import TOLERANCE
 from hmsa_ros.estimation.prior import TRACKED
 from hmsa_ros.identification.known import Known
-from hmsa_ros.judge import Finding, Tolerances
+from hmsa_ros.judge import Finding, GoalTolerances, Tolerances
 from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import Progress
@@ -64,7 +64,7 @@ class Trajectory:
     if raw, the flux density in T of each joint, and the time from which it applies. Points are
     read bit by bit, and again where they are planned again; they may raise `RefusedError` where
     they cannot be read. Those of a ``path``, if there is one, have stretch, rate (1/s) and
-    acceleration (1/s^2, or NaN) of each joint; it is followed if settings say so.
+    acceleration (1/s^2, or NaN) of each joint; it is followed if settings, or ``follows``, say so.
     """
 
     joints: tuple[str, ...]
@@ -74,6 +74,9 @@ class Trajectory:
     name: str = ''  # repeated in the verdict
     raw: bool = False
     path: Iterable[tuple[Sequence[Any], int]] | None = None
+    follows: bool = False
+    # By joint, what counts as having arrived at the end, where it is not as in the settings.
+    goals: Mapping[str, GoalTolerances] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

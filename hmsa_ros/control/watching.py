@@ -1,12 +1,12 @@
 """The setpoints of a request as they were requested, and what samples show of each."""
 
 from bisect import bisect_left, insort
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from hmsa_ros.control.holds import AHEAD, Hold
 from hmsa_ros.control.slices import Clock
-from hmsa_ros.judge import Finding, missed, Sensor, Setpoint, Tolerances, worst
+from hmsa_ros.judge import Finding, GoalTolerances, missed, Sensor, Setpoint, Tolerances, worst
 from hmsa_ros.model.equations import stretch_limits
 from hmsa_ros.model.law import critical_zeta
 from hmsa_ros.planning.group import PlannerGroup
@@ -26,6 +26,7 @@ class _Joint:
     asked: Plan  # as it was accepted
     plan: Plan  # as it is now
     request: int  # its number in the group
+    goal: GoalTolerances | None = None  # what counts as having arrived at the last setpoint
     following: int = 0  # number, from 0, of the next setpoint to watch
     left_out: list[int] = field(default_factory=list)  # numbers that new plans left out
     holds: list[Hold] = field(default_factory=list)  # the last one stays when it is over
@@ -103,6 +104,8 @@ class Watch:
         self.sensor: Callable[[str], Sensor] = lambda name: Sensor()
         #: Looks at the samples of a setpoint of a joint, as soon as they have been judged.
         self.audit: Callable[[str, Hold], None] = lambda name, hold: None
+        #: By joint, what counts as having arrived at the end of the newest request.
+        self.goals: Mapping[str, GoalTolerances] = {}
         self._joints: dict[str, _Joint] = {}
         # Reading a clock for each sample of each joint would take longer than all else.
         self._now = 0
@@ -196,7 +199,8 @@ class Watch:
     def _begin(self, name: str, joint: _Joint, plan: Plan) -> _Joint:
         """Take in a request, or that a joint came to rest in place of the rest of one."""
         if self._group.number != joint.request:
-            self._joints[name] = begun = _Joint(plan, plan, self._group.number)
+            self._joints[name] = begun = _Joint(
+                plan, plan, self._group.number, self.goals.get(name))
             return begun
         joint.plan = plan
         for hold in joint.holds:
@@ -237,7 +241,9 @@ class Watch:
 
     def _hold(self, name: str, joint: _Joint, number: int) -> Hold:
         """Return what gathers samples of a setpoint."""
-        hold = Hold(self._setpoint(name, joint, number), last=number + 1 == joint.count)
+        last = number + 1 == joint.count
+        hold = Hold(
+            self._setpoint(name, joint, number), last=last, goal=joint.goal if last else None)
         _keep_up(hold, joint)
         return hold
 

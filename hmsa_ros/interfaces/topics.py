@@ -58,6 +58,21 @@ class Service:
     meaning: Mapping[str, str] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Action:
+    """
+    An action by its private name and type, the node that serves it, and what a goal is.
+
+    It and the topic of its state are there where their types are installed.
+    """
+
+    name: str
+    type: str
+    server: str
+    meaning: str
+    state: Topic
+
+
 PLANNER = 'planner'
 PLANT = 'plant'
 DRIVER = 'driver'
@@ -153,6 +168,15 @@ DIAGNOSTICS = Topic(
     '/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', RELIABLE,
     'Counters and health, once a second; by them, a second planner, plant or driver of a joint is '
     'noticed.', publishers=NODES, subscribers=(PLANNER, PLANT, DRIVER))
+
+FOLLOW = Action(
+    '~/follow_joint_trajectory', 'control_msgs/action/FollowJointTrajectory', PLANNER,
+    'A trajectory as MoveIt sends it to a `joint_trajectory_controller`: with velocities a path, '
+    'without them a sequence of setpoints. It succeeds if samples show that the actuator arrived.',
+    Topic(
+        '~/controller_state', 'control_msgs/msg/JointTrajectoryControllerState', RELIABLE,
+        'The planned stretch and rate (`reference`), the newest sample (`feedback`), their '
+        'difference (`error`) and the flux density in tesla (`output`), 20 times a second.'))
 
 STOP = Service('~/stop', _TRIGGER, {
     PLANNER: 'Drops the rest of the sequence and comes to rest without vibration.',

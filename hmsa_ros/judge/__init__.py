@@ -7,6 +7,7 @@ Status, commands, reports, studies and benchmarks all show what `judge` finds.
 from hmsa_ros.judge.judging import ENOUGH, judge, look_length, rests_from
 from hmsa_ros.judge.records import (
     Finding,
+    GoalTolerances,
     missed,
     Sensor,
     Setpoint,
@@ -17,5 +18,5 @@ from hmsa_ros.judge.records import (
 )
 
 __all__ = [
-    'ENOUGH', 'Finding', 'judge', 'look_length', 'missed', 'rests_from', 'Sensor', 'Setpoint',
-    'Tolerances', 'unobserved', 'VERDICTS', 'worst']
+    'ENOUGH', 'Finding', 'GoalTolerances', 'judge', 'look_length', 'missed', 'rests_from',
+    'Sensor', 'Setpoint', 'Tolerances', 'unobserved', 'VERDICTS', 'worst']

@@ -80,6 +80,22 @@ class Tolerances:
 
 
 @dataclass(frozen=True)
+class GoalTolerances(Tolerances):
+    """What counts as having arrived where a goal says so itself, and how late; 0 as otherwise."""
+
+    position: float = 0.0  #: largest error of stretch
+    rate: float = 0.0  #: largest rate that is left, in 1/s
+    time: int = 0  #: after the arrival, in ns
+
+    def of(self, setpoint: Setpoint) -> tuple[float, float]:
+        """Return the largest offset and the largest vibration at a setpoint in stretch."""
+        offset, vibration = super().of(setpoint)
+        own = [2.0 * self.position] * (self.position > 0.0) + [
+            2.0 * self.rate / setpoint.frequency] * (self.rate > 0.0)
+        return self.position or offset, min(own, default=vibration)
+
+
+@dataclass(frozen=True)
 class Sensor:
     """
     What is known of the sensor: it shows the bias plus the gain times the stretch, later.

@@ -1,14 +1,16 @@
 """Conversion between messages and the records of `hmsa_ros.planning`."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import zip_longest
 import json
+import math
 from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import MagneticField, TimeReference
+from sensor_msgs.msg import JointState, MagneticField, TimeReference
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -143,6 +145,16 @@ def to_planner_status(status: 'StatusChanged') -> DiagnosticStatus:
             values[key] = trouble
             severity, message = max(severity, 1), f'{message}; but {trouble}'
     return to_status('planner: request', ', '.join(each), severity, message, values)
+
+
+def from_samples(message: JointState) -> Iterator[tuple[str, int, tuple[float, float, float]]]:
+    """Yield joint, stamp in ns, and stretch, rate in 1/s and flux density in T of samples."""
+    stamp = from_time(message.header.stamp)
+    # A field that is not measured is empty.
+    for name, stretch, rate, flux_density in zip_longest(
+            message.name, message.position, message.velocity, message.effort,
+            fillvalue=math.nan):
+        yield str(name), stamp, (stretch, rate, flux_density)
 
 
 def of_joints(key: str, by_joint: Mapping[str, object]) -> dict[str, object]:

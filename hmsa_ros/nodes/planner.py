@@ -3,8 +3,6 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import zip_longest
-import math
 from time import monotonic_ns, time_ns
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -27,6 +25,7 @@ from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.cdr import read_trajectory, stamp_of
 from hmsa_ros.nodes.channel import JointChannel
+from hmsa_ros.nodes.follow import FollowJointTrajectory
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.markers import TargetMarkers
 from hmsa_ros.nodes.newest_clock import NewestClock
@@ -67,6 +66,7 @@ class PlannerNode(ManagedNode):
         self._newest: RawSubscription | None = None
         self._listen_until = 0
         self._crowded = ''
+        self._action: FollowJointTrajectory | None = None
         check_names(self)
         self.on_change(self._take_parameters)
         self.autostart()
@@ -111,6 +111,10 @@ class PlannerNode(ManagedNode):
         if self.linked:
             self._poll.cancel()
         self._presence = Presence(self)
+        if self._action is None:
+            self._action = FollowJointTrajectory.offer(self, self._runtime, self._serve)
+        else:
+            self._action.begin(self._runtime)
         self.diagnose(self._report)
         self._jump = self.get_clock().create_jump_callback(
             JumpThreshold(
@@ -165,7 +169,7 @@ class PlannerNode(ManagedNode):
         except BadInputError as error:
             self.get_logger().error(f'sample ignored: {error}', throttle_duration_sec=1.0)
             return
-        for name, stamp, values in _read(message):
+        for name, stamp, values in conversions.from_samples(message):
             self._runtime.observed(name, stamp, *values)
 
     def _glance(self) -> Iterator[tuple[str, Seen]]:
@@ -178,7 +182,7 @@ class PlannerNode(ManagedNode):
                 message = decode(taken.data, JointState)
             except BadInputError:
                 continue
-            for name, stamp, values in _read(message):
+            for name, stamp, values in conversions.from_samples(message):
                 if name in missing:
                     missing.discard(name)
                     yield name, Seen(
@@ -261,6 +265,8 @@ class PlannerNode(ManagedNode):
 
     def _publish_status(self, status: records.StatusChanged) -> None:
         self._status.publish(conversions.to_planner_status(status))
+        if self._action is not None:
+            self._action.tell(status)
         self._targets.show(self.now(), {
             name: float(x.stretch) if x.stretch else None for name, x in status.each.items()})
 
@@ -306,16 +312,6 @@ class PlannerNode(ManagedNode):
         settings, models = settings_from(changed), models_from(changed, self._runtime.group)
         self._settings = changed
         self._runtime.change(settings, models, simultaneous=changed['simultaneous_arrival'])
-
-
-def _read(message: JointState) -> Iterator[tuple[str, int, tuple[float, float, float]]]:
-    """Yield joint, stamp in ns, and stretch, rate in 1/s and flux density in T of samples."""
-    stamp = conversions.from_time(message.header.stamp)
-    # A field that is not measured is empty.
-    for name, stretch, rate, flux_density in zip_longest(
-            message.name, message.position, message.velocity, message.effort,
-            fillvalue=math.nan):
-        yield str(name), stamp, (stretch, rate, flux_density)
 
 
 #: Run by ``hmsa planner`` with the command line's arguments; returns the exit status.
