@@ -126,6 +126,13 @@ def test_undecided_says_what_would_decide(samples, words):
     assert words in found.message
 
 
+@pytest.mark.parametrize(('frequency', 'gap'), [(1e9, 0), (OMEGA, 100_000 * MS)])
+def test_samples_that_say_nothing_of_a_vibration_decide_nothing(frequency, gap):
+    time, stretch = held(noise=0.1)
+    asked = setpoint(frequency=frequency, end=None)
+    assert judge(time + gap, stretch, asked).verdict == 'undecided'
+
+
 def test_a_sensor_that_rounds_at_rest_is_not_frozen():
     time, stretch = held(vibration=1.5)
     before = np.linspace(-20, -1, 20).astype(np.int64) * MS

@@ -103,11 +103,12 @@ def trajectory(time, points):
             for after, *values in points])
 
 
-def status(level, code, message, stretch=''):
+def status(level, code, message, stretch='', **more):
     value = STORE.types['diagnostic_msgs/msg/KeyValue']
     return STORE.types[TYPES[STATUS]](
         level=level, name='planner: request', message=message, hardware_id='actuator',
-        values=[value(key='code', value=code), value(key='stretch', value=stretch)])
+        values=[value(key=x, value=y) for x, y in {
+            'code': code, 'stretch': stretch, **more}.items()])
 
 
 def parameters(**nodes):
@@ -1139,8 +1140,7 @@ def test_a_latched_plan_of_before_that_comes_after_a_request_is_not_the_one_for_
 def test_a_plan_between_the_same_ticks_as_its_request_is_the_one_for_it(tmp_path, order):
     asked, planned, said, *others = simulated()
     asked[-1].header.frame_id = 'mine'
-    said[-1].values.append(
-        STORE.types['diagnostic_msgs/msg/KeyValue'](key='request', value='mine'))
+    said = *said[:-1], status(0, 'accepted', 'accepted', request='mine')
     # Simulated time as a recorder sees it: until its status nothing has a time of its own, or
     # the request comes even later.
     late = {'before': START, 'after': START + 1}[order]
@@ -1203,6 +1203,23 @@ def test_a_setpoint_that_a_new_plan_leaves_out_is_missed(tmp_path):
         **parameters(planner=ACTUATOR, plant=ACTUATOR))
     assert [str(x.verdict) for x in part.evaluation.findings] == ['arrived', 'missed', 'arrived']
     assert 'missed' in [x['verdict'][1] for x in Page(page([part])).table('setpoint-table')]
+
+
+def test_a_stop_after_a_refused_request_does_not_carry_it_out(tmp_path):
+    asked, planned, said, *others = simulated(extra=0.1)
+    asked[-1].header.frame_id = 'mine'
+    end = others[-1][0]
+    refused = trajectory(0, [(10**9, 9.0)])
+    refused.header.frame_id = 'too far'
+    part = one(tmp_path / 'bag', [
+        asked, planned, (*said[:-1], status(0, 'accepted', '', plan='1', request='mine')), *others,
+        (end - 3000, '/planner/joint_trajectory', TYPES[TRAJECTORY], refused),
+        (end - 2000, '/planner/status', TYPES[STATUS], status(
+            2, 'out_of_range', 'too far', plan='1', request='too far')),
+        (end - 1500, '/planner/plan', TYPES[PLAN], trajectory(end, [(0, 1.4, 0.0, 0.1)])),
+        (end - 1000, '/planner/status', TYPES[STATUS], status(0, 'stopped', '', plan='2'))],
+        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert [x.setpoint.target for x in part.evaluation.findings] == [1.1, 1.2, 1.4]
 
 
 def test_the_findings_of_a_bag_are_printed_as_json(bag, tmp_path, capsys):

@@ -34,6 +34,8 @@ _TRIED, _REFINED, _ROUNDS = 3, 7, 3
 # frequency between these.
 _DECAYS = np.array([0.0, 0.07, 0.15, 0.27, 0.4, 0.6, 1.0])
 _FASTER, _LEAST, _MOST = 2.0, 0.1, 0.7
+# Time constants by which a vibration may have faded at the first sample.
+_LONGEST = 20.0
 # Time constants of an exponential creep in spans. It is looked for below this share of independent
 # samples, and shown where it leaves less than this share of the squares.
 _CREEPS, _INDEPENDENT, _EXPLAINED = np.geomspace(0.07, 3.0, 8), 0.4, 0.5
@@ -84,12 +86,14 @@ def fit(time: Array, rest: Array, frequency: float, decay: float) -> Fit | None:
     dense = interval * frequency < 2.0 * math.pi * _DENSE
     low, high = (x * frequency for x in (
         (_WIDE if periods >= _FAR else _MIDDLE) if dense else _NEAR))
-    if dense:
-        high = min(high, 0.9 * math.pi / interval)
+    # Beyond these the samples show no other vibration.
+    high = min(high, 0.9 * math.pi / interval if dense else low + 2.0 * math.pi / interval)
     omegas: Array = np.linspace(
         low, high, max(int((high - low) * span * _TRIED / (2.0 * math.pi)), _REFINED)
     ).astype(np.float64)
-    decays = _DECAYS * min(max(_FASTER * decay, _LEAST * frequency), _MOST * frequency)
+    decays = _DECAYS * min(
+        max(_FASTER * decay, _LEAST * frequency), _MOST * frequency,
+        _LONGEST / max(float(time[0]), interval))
     searched = 2.0 * math.log(max((high - low) * span / (2.0 * math.pi), 1.0))
 
     coarse = _Sinusoids(time, omegas, decays)

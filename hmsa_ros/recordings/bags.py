@@ -288,10 +288,10 @@ class _Collected:
                     (x.positions[place], x.time) for x in asked.points
                     if len(x.positions) == max(len(asked.joints), 1))
                 moves = len(points) > 0 and any(any(x.velocities) for x in asked.points)
+                path = points[-1][1] if moves else None
                 requests.append(RecordedRequest(
-                    self._sent(asked), asked.stamp, points, None) if not moves else (
-                        RecordedRequest(self._sent(asked), asked.stamp, (
-                            (points[-1][0], None),), points[-1][1])))
+                    self._sent(asked), asked.stamp,
+                    points if path is None else ((points[-1][0], None),), path, asked.name))
         return sorted(requests, key=lambda x: x.sent)
 
     def _sent(self, asked: _Trajectory) -> int:

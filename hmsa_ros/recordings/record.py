@@ -33,6 +33,7 @@ class RecordedRequest:
     points: tuple[tuple[float, int | None], ...]
     # End in ns from the start of a path, whose one point is where it ends; None for rests.
     path: int | None = None
+    name: str = ''  # if it has one
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from hmsa_ros.model.equations import Array, equilibrium_stretch, natural_frequen
 from hmsa_ros.model.law import critical_zeta
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.levels import in_force, Level, without_repeats
-from hmsa_ros.recordings.record import RecordedRequest, Run
+from hmsa_ros.recordings.record import RecordedRequest, Run, Verdict
 
 #: Stretches that differ by less are one setpoint.
 SAME = 1e-6
@@ -93,18 +93,26 @@ def _acts(run: Run, levels: Sequence[Level]) -> Iterator[_Act]:
     for i, request in enumerate(requests):
         until = requests[i + 1].sent if i + 1 < len(requests) else math.inf
         answers = [x for x in run.verdicts if request.sent <= x.sent < until]
+        own = [x for x in answers if request.name and x.request == request.name]
         taken = sorted({x.plan for x in answers if x.plan > number})
         if any(x.plan for x in answers):
-            accepted = bool(taken)
+            accepted = bool(taken) and (not own or any(x.plan in taken for x in own))
         else:
-            accepted = not answers or any(x.level != 'error' for x in answers)
+            accepted = not answers or any(x.level != 'error' for x in own or answers)
         if accepted:
             yield _Act(request, request.sent, _begin(run, request, levels))
-        for later in taken[1:]:
+        for later in taken[accepted:]:
             # Nobody asked for it here: the joint was to stop.
-            sent = min(x.sent for x in answers if x.plan == later)
+            sent = _stopped(run, next(x for x in answers if x.plan == later))
             yield _Act(None, sent, _new(run, _plan_at(run, sent)) or sent)
         number = taken[-1] if taken else number
+
+
+def _stopped(run: Run, verdict: Verdict) -> int:
+    """Return when a stop was recorded: its plan is published right before the status of it."""
+    before = max((x.sent for x in run.verdicts if x.sent < verdict.sent), default=0)
+    return max((x[0].sent for x in run.plans if x and before < x[0].sent < verdict.sent),
+               default=verdict.sent)
 
 
 def _begin(run: Run, request: RecordedRequest, levels: Sequence[Level]) -> int:
