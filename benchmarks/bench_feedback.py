@@ -192,7 +192,7 @@ def compare(*, quick: bool) -> Sheet:
                         seen[feedback] += moves
             for feedback, moves in seen.items():
                 left = _left(moves)
-                name = f'{graph.name}: G {100.0 * size:.0f} % off, {feedback}'
+                name = f'{graph.name}: {100.0 * size:.0f} % error in G, {feedback}'
                 figures[name] = {'moves': [vars(x) for x in moves], 'rms': left}
                 rows.append([
                     name, str(len(moves) // len(TARGETS)), *(f'{100.0 * x:.3g}' for x in left),

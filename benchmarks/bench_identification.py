@@ -52,7 +52,7 @@ def compare(*, quick: bool = False, runs: int = RUNS) -> Sheet:
     most = binom.ppf(1.0 - _CHANCE, runs, LARGEST_COVERAGE) / runs
     rows, figures, passed = [], {}, True
     for name, shaped, repeats in (
-            ('one unshaped pass', False, 1), ('unshaped, repeated', False, 15),
+            ('one unshaped sequence', False, 1), ('unshaped, repeated', False, 15),
             ('shaped, repeated', True, 15)):
         for noise in (1e-3, 1e-4):
             for rate in (1000, 200, 60):
@@ -159,10 +159,10 @@ def _spoilt(kind: str, clean: Array, random: np.random.Generator) -> Array:
 
 
 _FAR, _LOST, _JUMPS, _CORRELATED, _PIXELS, _JITTER, _LARGE_JITTER = (
-    'start values up to 10 times off', '1 % outliers of 0.05 to 0.5',
+    'start values wrong by up to a factor of 10', '1 % outliers of 0.05 to 0.5',
     '1 % outliers, jumps of five samples', 'correlated noise, 0.9 from sample to sample',
-    'steps of 8 bits, 0.0031 of stretch', 'stamps that jitter by 5 microseconds',
-    'stamps that jitter by 20 microseconds')
+    'steps of 8 bits, 0.0031 of stretch', 'timestamps with jitter of 5 us',
+    'timestamps with jitter of 20 us')
 _ERRORS = {_JITTER: 5e-6, _LARGE_JITTER: 2e-5}
 
 
@@ -212,7 +212,7 @@ def robustness(*, quick: bool = False, runs: int = ROBUST_RUNS) -> Sheet:
         f'worst parameter; {1.0 / np.sqrt(runs):.2f} by chance) and error in reported standard '
         'deviations; width of the intervals and change of the result relative to white noise '
         'alone',
-        ['what is bad', 'identified / not identifiable / rejected', 'bias', 'error, rms',
+        ['disturbance', 'identified / not identifiable / rejected', 'bias', 'error, rms',
          'covered by 95 % [%]', 'intervals wider by', 'largest move [std]'], rows, figures)
 
 

@@ -240,10 +240,10 @@ CHOICES = [
     *((f'guess: {guess}', [f'-DGUESS={key}', *option], passes)
       for guess, key in reversed(_GUESSES)
       for option, passes in (
-          ([], 'all passes fine'), (['-DCOARSE=1e-7'], 'first at 1e-7'),
+          ([], 'all iterations fine'), (['-DCOARSE=1e-7'], 'first at 1e-7'),
           (['-DCOARSE=1e-5'], 'first at 1e-5'),
           (['-DCOARSE=1e-7', '-DCUBICS'], 'first at 1e-7, ends by cubics'))),
-    *((f'guess: {guess}; secant', [f'-DGUESS={key}', '-DSECANT'], 'all passes fine')
+    *((f'guess: {guess}; secant', [f'-DGUESS={key}', '-DSECANT'], 'all iterations fine')
       for guess, key in reversed(_GUESSES)),
 ]
 

@@ -186,7 +186,7 @@ def _feed(
             except (Exception, CancelledError) as error:
                 raise HmsaError(
                     f'chunk {index} failed ({type(error).__name__}: {error}): expected workers '
-                    'that have this package and see the folder; mend it, then go on with '
+                    'that have this package and see the folder; correct it, then continue with '
                     '--resume') from error
             del running[future]
             outcome.computed += 1

@@ -93,7 +93,7 @@ def test_hardware_that_breaks_ends_the_driver_with_all_coils_switched_off(start,
     assert driver.wait() == 1
     assert driver.stderr.splitlines()[-1] == (
         "hmsa: error: Coil.read of joint actuator raised OSError: 'the cable is out': the coil is "
-        'switched off; mend it, then start the driver again')
+        'switched off; correct it, then start the driver again')
     written = (tmp_path / 'actuator').read_text().split()
     assert (written[:2], written[-1]) == (['0.0', '0.25'], '0.0')
 

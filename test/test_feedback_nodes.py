@@ -47,7 +47,7 @@ def test_a_planner_that_observes_says_what_is_wrong_with_the_actuator(start, ros
     ros.spin_until(lambda: 'G about +20 %' in estimate()[0], 'the estimate')
     message, values = estimate()
     assert 'rests 18 % short' in message
-    assert 'feedback: adapt mends it' in message
+    assert 'feedback: adapt corrects it' in message
     assert float(values['shear_modulus']) == pytest.approx(1.2e4, rel=0.01)
     assert float(values['shear_modulus.nominal']) == 1e4
     assert (values['used_by_plans'], values['corrections']) == ('False', '0')

@@ -663,7 +663,7 @@ def test_whatever_hardware_raises_ends_the_worker_with_all_coils_switched_off(me
     wait_until(lambda: worker.failure is not None, 'the failure')
     assert str(worker.failure).startswith(
         f'Bench.{method} of joint joint_0 raised {type(error).__name__}')
-    assert 'the coil is switched off; mend it' in str(worker.failure)
+    assert 'the coil is switched off; correct it' in str(worker.failure)
     assert [x.levels[-1] for x in benches] == [0.0, 0.0]
     worker.close()
 

@@ -130,7 +130,7 @@ def test_a_recorder_whose_host_goes_away_holds_nobody_up(laboratory, where):
 
 
 @pytest.mark.parametrize(('ahead', 'text'), [
-    (0.6, 'after their stamps'), (-3.0, 'before their stamps')])
+    (0.6, 'after their timestamps'), (-3.0, 'before their timestamps')])
 def test_a_planner_with_another_clock_refuses_to_move(start, tmp_path, ahead, text):
     plant = start.hmsa('plant')
     planner = start.python('-c', PLANNER.format(ahead=ahead))

@@ -57,7 +57,7 @@ def test_observing_says_what_is_wrong_and_changes_nothing(factor):
     assert last.severity is Severity.WARN
     assert f'% {short}' in last.message
     assert ' Hz: G about ' + change in last.message
-    assert 'feedback: adapt mends it' in last.message
+    assert 'feedback: adapt corrects it' in last.message
     assert float(last.values['shear_modulus']) == pytest.approx(
         factor * 1e4, abs=5 * float(last.values['shear_modulus.std']))
     assert last.values['used_by_plans'] is False

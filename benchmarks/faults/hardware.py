@@ -30,7 +30,7 @@ _TIMEOUT, _CALL, _FIRMWARE = 0.5, 0.5, 0.4
 _PROMPT, _SOON = 3.0, 5.0
 # What stands around what a driver says, in its log and its last words.
 _AROUND = re.compile(
-    r'^(hmsa: error: |\[\w+\] \[[\d.]+\] \[\w+\]: )|; mend it, then start the driver again$')
+    r'^(hmsa: error: |\[\w+\] \[[\d.]+\] \[\w+\]: )|; correct it, then start the driver again$')
 
 
 class _Bench:

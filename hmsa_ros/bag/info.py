@@ -149,7 +149,7 @@ def _lines(summary: BagSummary, parameters: bool) -> Iterator[str]:
         yield f'start     {_time(summary.start_ns)}'
     yield f'duration  {summary.duration:.3f} s'
     yield f'messages  {summary.message_count}'
-    yield 'lost      ' + ('not told' if summary.lost is None else str(summary.lost))
+    yield 'lost      ' + ('unknown' if summary.lost is None else str(summary.lost))
     if summary.topics:
         rows = [('topic', 'type', 'count', 'rate [1/s]', 'lost', 'offered')]
         rows += [(

@@ -161,7 +161,7 @@ class Takeover:
         raise RefusedError(
             Code.CLOCKS_DIFFER,
             f'samples of joint {name} come {abs(lag) / NANOSECONDS:.3f} s '
-            f'{"after" if lag > 0 else "before"} their stamps, by the clock of the planner: '
+            f'{"after" if lag > 0 else "before"} their timestamps, by the clock of the planner: '
             f'expected at most {settings.takeover_max_age / NANOSECONDS:g} s (takeover_max_age). '
             + ('One side has simulated time, or time since a start: set use_sim_time alike'
                if abs(lag) > _ANOTHER_CLOCK else
@@ -237,7 +237,7 @@ class Takeover:
             Code.UNSEEN,
             f'no sample of joint {name} for {silence / NANOSECONDS:.1f} s, though there were '
             'some and joint_states has a publisher: expected one before the actuator is moved; '
-            'mend the sensor, or end what publishes')
+            'repair the sensor, or end its publisher')
 
     def _settle(self, keep: str = '') -> None:
         """Wait for nothing more, and doubt nothing but a joint of which nothing is known."""

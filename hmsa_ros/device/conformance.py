@@ -252,18 +252,18 @@ class Trial:
         falling = int(np.count_nonzero(np.diff(stamps) <= 0))
         self._note(
             'stamps_rise', float(falling), 'samples', 0.0,
-            f'{falling} of {len(stamps)} samples are not stamped after the one before',
+            f'{falling} of {len(stamps)} samples do not have later timestamps than the one before',
             'return each sample once, with the time of its exposure')
         ahead = max(0.0, (int(stamps[-1]) - time_ns()) / NANOSECONDS)
         self._note(
-            'stamps_past', ahead, 's', 0.0, f'samples are stamped {ahead:.3g} s ahead',
-            'stamp by the clock of now, or have clock() answer the clock of the device')
+            'stamps_past', ahead, 's', 0.0, f'timestamps are {ahead:.3g} s ahead',
+            'take timestamps by the clock of now, or have clock() return that of the device')
         moving = timed.stretch
         repeated = float(np.mean(np.diff(moving) == 0.0)) if len(moving) > 1 else 0.0
         self._note(
             'samples_new', repeated, '', _REPEATED,
             f'{repeated:.0%} of the samples repeat the value before',
-            'return [] where nothing is new, and batches as a list with a stamp each')
+            'return [] where nothing is new, and batches as a list with a timestamp each')
         rate = 1e9 * (len(stamps) - 1) / max(int(stamps[-1] - stamps[0]), 1)
         self._note(
             'samples_lost', max(1.0 - rate / self._rate, 0.0), '', 0.5,

@@ -362,8 +362,8 @@ class Instrument:
         except (TypeError, ValueError) as error:
             raise HardwareError(
                 f'{self.name}.read of joint {self._joint} returned {excerpt(answer)}: expected '
-                f'stretch, (stretch, rate), (stretch, rate, stamp in ns, near now, {now}) or a '
-                f'list of the latter, at most {_MOST_PIECES}, with NaN for what is not measured'
+                f'stretch, (stretch, rate), (stretch, rate, timestamp in ns, near now, {now}) or '
+                f'a list of the latter, at most {_MOST_PIECES}, with NaN for what is not measured'
             ) from error
 
     def _stamped(self, found: Reading, now: int) -> Reading:
@@ -426,7 +426,7 @@ class Instrument:
         except (TypeError, ValueError) as error:
             raise HardwareError(
                 f'{self._names["applied"]} returned {excerpt(answer)}: expected a list of '
-                '(stamp in ns, level in T)') from error
+                '(timestamp in ns, level in T)') from error
         return found
 
     def forget_clock(self) -> None:

@@ -285,7 +285,7 @@ class Device(ABC):
         """Refuse a stamp in ns of a clock that began at another time, before it is obeyed."""
         if stamp and self.time and abs(stamp - self.time) > ANOTHER_CLOCK:
             raise BadInputError(
-                f'command stamped {stamp / NANOSECONDS:.3f} s, and the time is '
+                f'command has timestamp {stamp / NANOSECONDS:.3f} s, and the time is '
                 f'{self.time / NANOSECONDS:.3f} s: expected one clock for both (use_sim_time the '
                 'same on both sides, no time since a start beside the time of day)')
 

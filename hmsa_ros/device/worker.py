@@ -32,7 +32,7 @@ _PAUSE, _LONGEST_PAUSE, _LAST_ATTEMPTS = 0.05, 1.0, 0.7
 _PATIENCE, _PAST, _HANGING = 0.8, 0.4, 2.5
 # Longest start of a lone coil, in s.
 _START = 10.0
-_MEND = 'mend it, then start the driver again'
+_MEND = 'correct it, then start the driver again'
 
 
 class _Command(NamedTuple):

@@ -96,7 +96,7 @@ def sentence(
     words = ' and '.join(wrong)
     words += f'{": " if words and found else ""}{found}'
     if not use:
-        words += '; `hmsa identify` or feedback: adapt mends it'
+        words += '; `hmsa identify` or feedback: adapt corrects it'
     elif found:
         words += f'; {use}'
     return f'{words}; {apart}' if apart else words

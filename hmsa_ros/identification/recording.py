@@ -140,8 +140,8 @@ class Recording:
             raise BadInputError(
                 f'the {self.coordinate.name} of {self.label} is a staircase: in motion most '
                 f'values come {repeated} times, as where a sensor is read more often than it '
-                'measures, or measures in batches; expected each measurement once, with the '
-                'stamp of its own')
+                'measures, or measures in batches; expected each measurement once, with its '
+                'timestamp')
         if clipped:
             raise BadInputError(
                 f'the {self.coordinate.name} of {self.label} is cut off {clipped} times at '

@@ -108,15 +108,15 @@ def _kept(path: Path, table: Table, notes: list[str]) -> NDArray[np.int64]:
     double = int(np.count_nonzero(steps == 0.0))
     if double:
         places = places[np.append(True, steps > 0.0)]
-        notes.append(f'{double} rows with the stamp of the row before were left out')
+        notes.append(f'{double} rows with the timestamp of the row before were left out')
     if lost + double > _MOST_LEFT_OUT * len(time):
         raise BadInputError(
-            f'{path} has {lost + double} of {len(time)} rows without a number or with the stamp '
-            'of the row before: expected a stamp of its own for each sample')
+            f'{path} has {lost + double} of {len(time)} rows without a number or with the '
+            'timestamp of the row before: expected a different timestamp for each sample')
     steps = steps[steps > 0.0]
     if len(steps) and float(np.max(steps)) > _GAP * float(np.median(steps)):
         notes.append(
-            f'the stamps have a gap of {np.max(steps):.3g} s, where the others are '
+            f'the timestamps have a gap of {np.max(steps):.3g} s, where the others are '
             f'{np.median(steps):.3g} s apart')
     return places
 

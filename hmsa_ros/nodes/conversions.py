@@ -66,7 +66,7 @@ def from_command(message: MagneticField) -> tuple[int, float]:
             'field along z, with x = y = 0')
     stamp = from_time(message.header.stamp)
     if stamp < 0:
-        raise BadInputError(f'flux density command stamped {stamp} ns: expected at least 0')
+        raise BadInputError(f'flux density command has timestamp {stamp} ns: expected at least 0')
     return stamp, float(field.z)
 
 

@@ -108,7 +108,7 @@ def _from_wrench(message: WrenchStamped) -> tuple[int, float]:
             'along the field only')
     stamp = conversions.from_time(message.header.stamp)
     if stamp < 0:
-        raise BadInputError(f'disturbing force stamped {stamp} ns: expected at least 0')
+        raise BadInputError(f'disturbing force has timestamp {stamp} ns: expected at least 0')
     return stamp, float(force.z)
 
 

@@ -318,7 +318,7 @@ class SenseNode(ManagedNode):
     def _report(self) -> Iterable[DiagnosticStatus]:
         silent = monotonic_ns() - self._heard > _SILENT
         message = self._trouble or (
-            f'nobody publishes {self._topic}' if not self._type else
+            f'no node publishes {self._topic}' if not self._type else
             f'no reading on {self._topic} ({self._type})' if silent else 'readings come')
         yield to_status(
             f'{self.get_name()}: readings', self._values['joint'],

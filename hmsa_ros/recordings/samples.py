@@ -160,8 +160,8 @@ def tidy(
         x[near & good] for x in (stamps, logged, stretch, rate, flux_density))
     if np.any(np.diff(stamps) < -_CLOCK_JUMP):
         notes.append(
-            'The stamps of the samples jump back: the samples are sorted by stamp. Was the '
-            'clock reset in the run?')
+            'The timestamps of the samples jump back: the samples are sorted by timestamp. Was '
+            'the clock reset in the run?')
     order = np.argsort(stamps, kind='stable')
     # Of samples with one stamp the first counts, so that time increases.
     order = order[np.append(True, np.diff(stamps[order]) > 0)]

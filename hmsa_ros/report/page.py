@@ -167,7 +167,8 @@ def _notes_of(part: Part) -> Iterable[str]:
         yield (f'{part.timing.unapplied} changes of level did not take effect according to '
                f'{part.run.topics[APPLIED]}.')
     if part.timing.missing:
-        yield f'The stamps of the samples have gaps with room for {part.timing.missing} more.'
+        yield (f'The timestamps of the samples have gaps with room for {part.timing.missing} '
+               'more.')
     for verdict in part.run.verdicts:
         if verdict.level == 'error':
             yield f'The planner refused a request ({verdict.code}): {verdict.message}'
