@@ -100,6 +100,13 @@ def test_nor_does_it_with_a_slow_actuator(plant, factors, late, word):
     check_harmless(True, plant, factors, late, word)
 
 
+def test_a_creep_alone_is_planned_with_from_the_second_move_on():
+    it = bench(plant={'ratio': 0.05})
+    # Open loop leaves 6 % of each.
+    assert np.max(np.abs(moves(it, MOVES[:2]))[1]) < 0.1
+    assert 'creep about 5 %; plans use it' in it.message
+
+
 def test_with_a_gain_of_the_sensor_moves_rest_where_it_shows_the_target():
     gain = 1.02
     it = bench(False, 1e-3)

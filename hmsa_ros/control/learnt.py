@@ -12,7 +12,7 @@ from hmsa_ros.estimation import Estimate
 from hmsa_ros.files import write_text, yaml_text
 from hmsa_ros.identification.files import known_lines
 from hmsa_ros.identification.known import Known
-from hmsa_ros.identification.quantities import derivative, QUANTITIES, values_of
+from hmsa_ros.identification.quantities import BRANCHES, derivative, QUANTITIES, values_of
 from hmsa_ros.interfaces.actuator import parameters_of
 from hmsa_ros.model.simulation import check_stretch
 from hmsa_ros.planning.timeline import Model
@@ -35,9 +35,14 @@ def learnt_model(model: Model, estimate: Estimate, held: float) -> Model:
 
 def differs(model: Model, estimate: Estimate) -> bool:
     """Return whether an estimate is known to be of another actuator than a model."""
+    creep = model.actuator.creep
+    if bool(creep) is not bool(estimate.actuator.creep):
+        return True
+    branch = dict(zip(BRANCHES[0], (*creep.ratios, *creep.times), strict=False))
     for key in estimate.free:
         value = estimate.values[key]
-        before = getattr(model.options, key, getattr(model.actuator, key, value))
+        before = branch.get(key, getattr(
+            model.options, key, getattr(model.actuator, key, value)))
         if abs(value - before) > max(_NEWS * abs(value), _SURE * estimate.deviations[key]):
             return True
     return False
@@ -48,7 +53,7 @@ def alike(model: Model, other: Model) -> bool:
     one, two = (
         values_of(x.actuator, {'coil_time_constant': x.options.coil_time_constant})
         for x in (model, other))
-    return all(
+    return model.actuator.creep == other.actuator.creep and all(
         math.isclose(one[x], two[x], rel_tol=_NEWS) if isinstance(one[x], float)
         else one[x] == two[x] for x in one)
 
