@@ -132,9 +132,9 @@ class Window:
         found = descend(z, here) or descend(self._at_ease(self.mean))
         if found is None:
             return None
-        if len(self.time) >= _MORE * self.weighed:
+        if len(self.time) >= _MORE * self.weighed or self._is_poor(found, noise):
             found = self._look(found, descend)
-            if loss(found.here.residual, noise, convex=True) > _POOR * len(self.time):
+            if self._is_poor(found, noise):
                 # There may be another valley.
                 before = self.suspected, self.spread
                 self.suspected = self.suspects.places
@@ -151,6 +151,10 @@ class Window:
         return Solution(
             found.z, found.here.values, motion, by, residual, weights,
             sure * covariance + others)
+
+    def _is_poor(self, found: Found, noise: float) -> bool:
+        """Return whether what is sought explains samples poorly."""
+        return loss(found.here.residual, noise, convex=True) > _POOR * len(self.time)
 
     def _look(self, found: Found, descend: Callable[[Array], Found | None]) -> Found:
         """Choose the suspects to be sought, and return the most probable coordinates then."""
