@@ -211,7 +211,8 @@ def _of(
             arrival, left_out = moves.pop(0)[1] if moves else None, False
         else:
             arrival, moves = _by_levels(run, levels, here), []
-            left_out = setpoint.step > SAME and not _within(levels, here)
+            # Without any level nothing is known but requests and samples.
+            left_out = setpoint.step > SAME and bool(levels) and not _within(levels, here)
         yield Requested(
             replace(setpoint, arrival=arrival), end, last, tuple(moves),
             bool(codes) and _NEEDED.isdisjoint(codes), left_out)
