@@ -1,8 +1,7 @@
 """
 The parameters of an actuator out of a recording of its motion.
 
-`identify` takes arrays, or a `Recording`, and returns a frozen `Identification`. Nothing here
-needs ROS.
+`identify` takes a `Recording` and returns a frozen `Identification`. Nothing here needs ROS.
 """
 
 from hmsa_ros.identification.identify import identify
