@@ -89,7 +89,7 @@ def draw_bands(
         for panel in panels[count:]:
             panel.set_visible(False)
         for number, panel in enumerate(panels[:count]):
-            grid = np.linspace(0.0, span(parts, number), _POINTS)
+            grid = np.linspace(0.0, span(parts, number), _POINTS).astype(np.float64)
             for place, (label, group) in enumerate(groups.items()):
                 _draw_band(figure, panel, looks.case(place), label, grid, _curves(
                     group, number, grid))
