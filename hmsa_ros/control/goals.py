@@ -175,9 +175,12 @@ class Goals:
         request = goal.request
         plan = self._plan(goal)
         begin = request.stamp or plan.segments[min(plan.kept, len(plan.segments) - 1)].begin
-        points = list(request.points if request.path is None else request.path)
-        goal.begin, goal.duration = begin - plan.segments[-1].since, points[-1][1]
-        if request.path is not None and len(points) > 1:
+        last = plan.segments[-1]
+        goal.begin, goal.duration = begin - last.since, (last.until or last.begin) - begin
+        points = list(request.path or ())
+        if points:
+            goal.duration = points[-1][1]
+        if len(points) > 1:
             times = np.array([x for _, x in points]) / NANOSECONDS
             rows = np.array([x for x, _ in points])
             goal.paths = {
