@@ -71,8 +71,13 @@ def laboratory(start, tmp_path, wait_until):
 
 
 @on_hosts
-@pytest.mark.parametrize('outage', [2.0, 25.0])
-def test_after_an_outage_nothing_moves_that_nobody_has_asked_for(laboratory, outage):
+@pytest.mark.parametrize(('end', 'lost', 'outage', 'words'), [
+    ('cut', ['desk'], 2.0, 'no receipt'), ('cut', ['desk'], 25.0, 'no receipt'),
+    # One way alone.
+    ('lose', ['desk', 'bench'], 8.0, 'commands of joint actuator do not arrive'),
+    ('lose', ['bench', 'desk'], 8.0, 'no receipt')])
+def test_after_an_outage_nothing_moves_that_nobody_has_asked_for(
+        laboratory, end, lost, outage, words):
     plant = laboratory.hmsa('bench', *PLANT, '-p', 'safe_flux:=zero')
     planner = laboratory.hmsa('desk', *PLANNER_AHEAD)
     laboratory.look_on('bench')
@@ -83,11 +88,11 @@ def test_after_an_outage_nothing_moves_that_nobody_has_asked_for(laboratory, out
     laboratory.wait(1.0)
     # A busy machine takes its time for the cut itself.
     cut = time()
-    laboratory.hosts.cut('desk')
+    getattr(laboratory.hosts, end)(*lost)
     plant.wait_for_output('the field goes to zero')
-    planner.wait_for_output('no receipt')
+    planner.wait_for_output(words)
     laboratory.wait(cut + outage - time())
-    laboratory.hosts.join('desk')
+    getattr(laboratory.hosts, {'cut': 'join', 'lose': 'find'}[end])(*lost)
     joined = time()
     planner.wait_for_output('was cut off by the plant or driver')
     assert sent.wait() == 1, sent.output

@@ -14,6 +14,8 @@ import subprocess
 #: Environment of processes that are to find each other across hosts.
 ACROSS = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}
 _TOOLS = ('ip', 'nsenter', 'unshare')
+# An address of Ethernet that no host has.
+_NOBODY = '02:00:00:00:00:99'
 _HOLD = 'mount -t tmpfs shm /dev/shm && ip link set lo up && echo ready && exec sleep infinity'
 
 
@@ -81,6 +83,15 @@ class Hosts:
     def join(self, name: str) -> None:
         """Join a host to the others again."""
         self._ip('switch', f'link set {name} up')
+
+    def lose(self, sender: str, receiver: str) -> None:
+        """Lose what a host sends to another one alone; what comes back arrives."""
+        self._ip(sender, f'neigh replace {self.address(receiver)} lladdr {_NOBODY} nud permanent '
+                 'dev eth0')
+
+    def find(self, sender: str, receiver: str) -> None:
+        """Have what a host sends to another one arrive again."""
+        self._ip(sender, f'neigh del {self.address(receiver)} dev eth0')
 
     def close(self) -> None:
         """End the hosts."""
