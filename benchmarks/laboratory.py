@@ -54,6 +54,7 @@ class Bench:
     dropouts: float  # share of samples that are lost, in bursts
     targets: tuple[float, ...]
     kinds: tuple[str, ...] = ()  # of `KINDS`: what is wrong
+    iron: 'Iron | None' = None  # the core of the coil
 
     @property
     def unit(self) -> float:
@@ -125,6 +126,32 @@ def drawn(seed: int, targets: int = 3) -> Bench:
         dropouts, tuple(stretches), tuple(x for x in KINDS if x in wrong))
 
 
+class Iron:
+    """
+    A core whose field lags behind the current, after Coleman and Hodgdon (1986).
+
+    The field is the current's, in T, less a part that approaches ``half`` with a rising current
+    and its negative with a falling one; ``reach`` T change the rest by a factor of e.
+    """
+
+    def __init__(self, half: float, reach: float) -> None:
+        self._half, self._reach = half, reach
+        self._from, self._before = 0.0, 0.0  # since the last reversal or level
+
+    def field(self, current: float) -> float:
+        """Return the field at a current that is approached from where the last one began."""
+        return current - self._part(current)
+
+    def _part(self, current: float) -> float:
+        way = current - self._from
+        most = math.copysign(self._half, way)
+        return most + (self._before - most) * math.exp(-abs(way) / self._reach)
+
+    def turn(self, current: float) -> None:
+        """Begin at a current that was reached."""
+        self._from, self._before = current, self._part(current)
+
+
 class Plant:
     """The actuator of a bench; times in ns, levels in T."""
 
@@ -143,8 +170,9 @@ class Plant:
         self._ahead = round(1e9 * _AHEAD * bench.unit)
         self.time = self._begin = self._since = self._until = time
         self._levels: list[tuple[int, float]] = []
-        # The field decays from the level before to the one in force.
-        self._field = self._level = 0.0
+        # The field without a core decays from the level before to the one in force.
+        self._free = self._level = 0.0
+        self._iron = bench.iron
         self._motion: OdeSolution | None = None  # from `_since` until `_until`
         self.applied: list[tuple[int, float]] = []
         state = 1.0
@@ -171,15 +199,26 @@ class Plant:
     def _begin_with(self, level: float) -> None:
         if self._motion is not None:
             self.state = self._motion(1e-9 * (self.time - self._since))
-        self._field, self._level = self._field_at(self.time), level
+        self._free, self._level = self._free_at(self.time), level
+        if self._iron is not None:
+            self._iron.turn(self._free)
         self._begin, self._since, self._motion = self.time, self.time, None
 
-    def _field_at(self, time: float) -> float:
-        """Return the field in T at a time in ns while a level is in force."""
+    def _free_at(self, time: float) -> float:
+        """Return the field without a core in T at a time in ns while a level is in force."""
         if not self._lag:
             return self._level
-        return self._level + (self._field - self._level) * math.exp(
+        return self._level + (self._free - self._level) * math.exp(
             -1e-9 * (time - self._begin) / self._lag)
+
+    @property
+    def field(self) -> float:
+        """The field in T now."""
+        return self._field_at(self.time)
+
+    def _field_at(self, time: float) -> float:
+        free = self._free_at(time)
+        return free if self._iron is None else self._iron.field(free)
 
     def _elastic(self, stretch: float) -> float:
         """Return psi' of the Gent law."""

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from hmsa_ros.device.assembly import SensorScale
     from hmsa_ros.device.calibration import CoilCalibration
+    from hmsa_ros.device.iron_core import IronCore
     from hmsa_ros.identification.delays import Interval
     from hmsa_ros.lab.calibrating import Source
     from hmsa_ros.model.equations import Array
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 # Readings of a probe that are averaged.
 _READINGS = 20
 _SIMULATED = 'hmsa_ros.device.simulated_bench:'
+# Share of the range that is not worth a model.
+_NO_HYSTERESIS = 1e-4
 # Share of the range by which a stretch may still go at the end of a level.
 _SETTLED = 0.01
 
@@ -58,6 +61,8 @@ def add_parser(subparsers: Any) -> None:
         ('--probe', 'MODULE:NAME', str,
          'class or function without arguments for the field probe, an object whose read() '
          'returns a flux density in T (default: type the readings, with or without a unit)'),
+        ('--hysteresis',
+         'also write the hysteresis of an iron core, which the driver then compensates'),
         ('--out', 'YAML', Path,
          'parameter file of the driver to write; a table is written beside it as CSV'),
         JSON)
@@ -139,6 +144,7 @@ def _coil(arguments: argparse.Namespace) -> int:
     example: hmsa calibrate coil my_lab:Coil --limit 0.1 --out coil.yaml
     """
     from hmsa_ros.device.calibration import calibrate_coil
+    from hmsa_ros.device.iron_core import fit_core
 
     check_targets([] if arguments.out is None else [arguments.out])
     if not (arguments.limit > 0.0 and arguments.settle >= 0.0 and arguments.steps >= 2):
@@ -148,18 +154,25 @@ def _coil(arguments: argparse.Namespace) -> int:
     paper = paper_of(arguments)
     current, flux = _readings(arguments)
     found = calibrate_coil(current, flux)
+    core, left = None, math.nan
+    try:
+        core, left = fit_core(found.curve(current), flux)
+    except BadInputError:
+        if arguments.hysteresis:
+            raise
     if arguments.picture:
         from hmsa_ros.report.calibration import draw_coil
 
         draw_coil(arguments.picture, current, flux, found, paper)
     table = ''
     if arguments.out is not None:
-        table = str(_write(arguments.out, found))
+        table = str(_write(arguments.out, found, core if arguments.hysteresis else None))
     if arguments.json:
         print(json_text({
             **{x: getattr(found, x) for x in (
                 'tesla_per_ampere', 'std', 'interval', 'saturation', 'offset', 'misses',
                 'hysteresis', 'model')},
+            'compensated': left,
             'current': found.current.tolist(), 'flux_density': found.flux_density.tolist(),
             'file': None if arguments.out is None else str(arguments.out)}))
         return 0
@@ -169,8 +182,11 @@ def _coil(arguments: argparse.Namespace) -> int:
     for label, text in (
             ('saturation', f'{found.saturation:.4g} T' if math.isfinite(found.saturation)
              else 'does not show'),
-            ('hysteresis', f'{100.0 * found.hysteresis:.2g} % of the range' if math.isfinite(
-                found.hysteresis) else 'unknown: no current was approached from both sides'),
+            ('hysteresis', 'unknown: no current was approached from both sides' if math.isnan(
+                found.hysteresis) else f'{100.0 * found.hysteresis:.2g} % of the range' + (
+                '' if core is None or found.hysteresis < _NO_HYSTERESIS else
+                f', {100.0 * left:.2g} % from the model' + (
+                    '' if arguments.hysteresis else ' that --hysteresis writes'))),
             ('probe offset', f'{found.offset:.3g} T'),
             ('model', f'{found.model}, off by at most {100.0 * found.misses:.2g} % of the range')):
         print(f'{label:<16}{text}')
@@ -241,7 +257,7 @@ def _made(name: str, option: str) -> Any:
     return found
 
 
-def _write(out: Path, found: 'CoilCalibration') -> Path:
+def _write(out: Path, found: 'CoilCalibration', core: 'IronCore | None') -> Path:
     """Write the driver's parameters, and a table beside them; return the path of that."""
     table = out.with_suffix('.csv')
     if found.model == 'table':
@@ -251,7 +267,10 @@ def _write(out: Path, found: 'CoilCalibration') -> Path:
     low, high = found.interval
     _write_parameters(
         out, f'{found.tesla_per_ampere:.6g} T/A, 95 % interval {low:.6g} to {high:.6g}, by hmsa '
-        'calibrate coil', {'driver': found.settings(str(table.resolve()))})
+        'calibrate coil', {'driver': found.settings(str(table.resolve())) | (
+            {} if core is None else {
+                'hardware.coil.play_widths': list(core.widths),
+                'hardware.coil.play_weights': list(core.weights)})})
     return table
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from hmsa_ros.columns import read_table
 from hmsa_ros.device.hardware import is_number, readings
+from hmsa_ros.device.iron_core import Compensation, IronCore
 from hmsa_ros.device.protocol import StateLostError
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.equations import Array
@@ -50,11 +51,15 @@ class CoilModel:
     limit: float = math.inf  #: largest current in A
     rms: float = math.inf  #: largest effective current in A ...
     rms_time: float = 10.0  #: ... over this time in s, the thermal time constant of the coil
+    #: of an iron core whose hysteresis is compensated: see `IronCore`; empty for none
+    play_widths: Sequence[float] = ()
+    play_weights: Sequence[float] = ()
     _table: tuple[Array, Array] | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name in ('saturation', 'limit', 'rms', 'rms_time'):
             require(f'coil.{name}', getattr(self, name), positive=True)
+        self.compensation()
         if self.file:
             object.__setattr__(self, '_table', _table_in(Path(self.file)))
         elif not is_number(self.tesla_per_ampere) or self.tesla_per_ampere == 0.0:
@@ -62,8 +67,14 @@ class CoilModel:
                 f'coil.tesla_per_ampere is {excerpt(self.tesla_per_ampere)}: expected the flux '
                 'density in T at 1 A (1 V) of the source, or coil.file')
 
+    def compensation(self) -> Compensation | None:
+        """Return what undoes the hysteresis of the core, if it is to be."""
+        if not (len(self.play_widths) or len(self.play_weights)):
+            return None
+        return Compensation(IronCore(self.play_widths, self.play_weights))
+
     def flux_density(self, current: float) -> float:
-        """Return the flux density in T at a current in A."""
+        """Return the flux density in T at a current in A, without hysteresis."""
         if self._table is not None:
             return float(np.interp(current, *self._table))
         linear = self.tesla_per_ampere * current
@@ -243,7 +254,7 @@ class Assembly:
         self.source, self.coil = source, coil
         self.scale = SensorScale() if scale is None else scale
         self.sensor = source if sensor is None else sensor
-        self._heat = _Heat(coil)
+        self._heat, self._core = _Heat(coil), coil.compensation()
         most, least_slope, slope = coil.within(getattr(source, 'limit', None) or math.inf)
         self.limit = most
         self.resolution, self.slew = (
@@ -260,15 +271,26 @@ class Assembly:
 
     def write(self, level: float, now: int) -> tuple[Any, Any]:
         """Set the coil to a level in T; return when, and the level really set."""
-        current = self.coil.current(level)
+        current = self._current(now, level, off=not level)
         self._heat.check(current)
         answer = self.source.write(current, now)
         when, really = answer if isinstance(answer, (tuple, list)) else (answer, current)
         self._heat.set(really)
-        return when, self.coil.flux_density(really)
+        return when, self._level(now, really)
+
+    def _current(self, stamp: int, level: float, *, off: bool = False) -> float:
+        """Return the current in A for a level in T from a stamp in ns on."""
+        return self.coil.current(
+            level if self._core is None else self._core.ask(stamp, level, off=off))
+
+    def _level(self, stamp: int, current: float) -> float:
+        """Return the level in T that was asked for where a current in A is set by a stamp."""
+        level = self.coil.flux_density(current)
+        return level if self._core is None else self._core.field_of(
+            stamp, level, 2.0 * (self.resolution or 1e-9 * abs(level)))
 
     def _schedule(self, levels: Sequence[tuple[int, float]]) -> None:
-        currents = [(stamp, self.coil.current(level)) for stamp, level in levels]
+        currents = [(stamp, self._current(stamp, level)) for stamp, level in levels]
         most = max((abs(x) for _, x in currents), default=None)
         self._heat.check(most)
         self.source.schedule(currents)
@@ -279,7 +301,7 @@ class Assembly:
         found = [*self.source.applied()]
         for _, current in found:
             self._heat.set(current)
-        return [(stamp, self.coil.flux_density(current)) for stamp, current in found]
+        return [(stamp, self._level(stamp, current)) for stamp, current in found]
 
     def read(self, now: int) -> list[tuple[float, float, int]]:
         """Return stretch, rate in 1/s and timestamp in ns of each new reading."""

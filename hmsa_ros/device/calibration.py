@@ -76,6 +76,11 @@ class CoilCalibration:
         return {'hardware.coil.tesla_per_ampere': self.tesla_per_ampere} | (
             {'hardware.coil.saturation': self.saturation} if self.model == 'saturation' else {})
 
+    def curve(self, current: Array) -> Array:
+        """Return the flux density in T at currents in A by the model, without offset."""
+        return np.interp(current, self.current, self.flux_density) if self.model == 'table' else (
+            _model(current, self.tesla_per_ampere, 0.0, self.saturation))
+
 
 def calibrate_coil(current: Array, flux_density: Array) -> CoilCalibration:
     """
