@@ -12,7 +12,14 @@ from rich.console import Console
 from scipy.integrate import solve_ivp
 
 from benchmarks import __main__ as program
-from benchmarks import bench_defects, bench_harm, bench_judge, bench_plant, contenders
+from benchmarks import (
+    bench_defects,
+    bench_harm,
+    bench_judge,
+    bench_laboratory,
+    bench_plant,
+    contenders,
+)
 from benchmarks.bounds import bound
 from benchmarks.laboratory import Device, drawn, KINDS, Plant
 from benchmarks.measure import Contender, loosest, race, Report, Row, text_of_time
@@ -160,6 +167,15 @@ def test_a_laboratory_is_the_same_for_the_same_seed_and_in_open_loop_leaves_what
     assert bench_harm.harm({'open loop': [exact], 'adapt': [weak]}, 'adapt') == [
         weak.size - exact.size]
     assert Device(bench, 0).next_sample > 0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_laboratory_behind_a_board_is_tuned_to_half_a_percent_of_a_step():
+    found = bench_laboratory.run_one(bench_laboratory.SEED + 3, iron=False)
+    assert max(x.size for x in found.before) > 0.1
+    assert found.last <= bench_laboratory.GOALS[False]
+    assert (found.verdict, found.silent) == ('identified', 0)
 
 
 def test_a_laboratory_bounds_what_the_second_move_leaves_by_what_may_be_wrong():

@@ -97,6 +97,7 @@ class Loop:
     def _follow(self) -> None:
         """Let the device act up to now, and take in what came of it."""
         self.device.advance(self.now)
+        self.now = max(self.now, self.device.time)
         for joint, stamp, level in self.device.changes():
             self.runtime.applied(self._names[joint], stamp, level)
         for stamp, *measured in self.device.samples():

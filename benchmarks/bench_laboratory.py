@@ -1,0 +1,407 @@
+"""
+Laboratories that nothing was tuned to: a serial board, and what no data sheet says.
+
+    python -m benchmarks laboratory [--runs N] [--page FILE] [--quick]
+
+The shipped driver class speaks to the firmware of the board over a line that takes its time. The
+board has a clock of its own; behind it, SciPy integrates coil, actuator and sensor. All is in
+simulated time. What ``hmsa tune`` does is done by the same functions: moves as they are, an
+excitation, an identification, the choice of a shaper, and the moves again; so is what ``hmsa
+calibrate coil --hysteresis`` does where there is an iron core. The true motion is judged, which
+nothing else reads.
+"""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.laboratory import Bench, Iron, Plant
+from benchmarks.sheet import Sheet
+from hmsa_ros.control.loop import Loop
+from hmsa_ros.control.records import Output, Settings, StatusChanged, Trajectory
+from hmsa_ros.device import _board, serial_board
+from hmsa_ros.device.assembly import Assembly, CoilModel, SensorScale
+from hmsa_ros.device.calibration import calibrate_coil, loop
+from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
+from hmsa_ros.device.iron_core import fit_core
+from hmsa_ros.device.simulated_board import REST_LENGTH, SimulatedBoard, TESLA_PER_AMPERE
+from hmsa_ros.device.watchdog import Fallback
+from hmsa_ros.identification.files import read_belief
+from hmsa_ros.identification.recording import Recording
+from hmsa_ros.interfaces.actuator import planned_from
+from hmsa_ros.interfaces.topics import PLANNER
+from hmsa_ros.lab.tuning import chosen, excitation, identified, Tuning
+from hmsa_ros.model.equations import natural_frequency
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.planner import Options, Planner
+
+#: Laboratories of each kind, and the seed of the first; those before it are for development.
+RUNS, SEED = 20, 31_000
+#: What the last two moves may leave, as a share of the step: without and with hysteresis.
+GOALS = {False: 0.005, True: 0.015}
+#: The share of laboratories that is to reach that, and what counts as worse than before.
+REACH, WORSE = 0.9, 0.005
+# Offset or vibration of a move, as a share of the step, from which on a verdict is to say so.
+_FAILED = 0.03
+_MS = 1_000_000
+_PERIOD = _MS  # of samples in ns
+_LEVEL = 0.14  # T, what the largest stretch needs
+_LIMIT, _LEAD = 0.5, 200 * _MS
+_TRIP = (150_000, 600_000)  # of a request and its answer in ns
+_JOINT = 'actuator'
+# Of the calibration of a coil with a core: levels on a quarter, ns at each of them and between
+# signs of life, and the noise of the probe in T.
+_STEPS, _SETTLE, _BEAT, _PROBE = 6, 200 * _MS, 10 * _MS, 2e-5
+
+
+@dataclass(frozen=True)
+class Laboratory:
+    """What a seed draws."""
+
+    bench: Bench
+    fast: float  # by how much the clock of the board is fast
+    constant: float  # of the coil, over that of its data sheet
+    hysteresis: float  # share of the range
+
+    @property
+    def period(self) -> float:
+        """Period of the actuator in s, by its data sheet."""
+        given = self.bench.given
+        return 2.0 * math.pi * given.time_unit / float(
+            natural_frequency(given.rest, given.nondimensional))
+
+    @property
+    def words(self) -> str:
+        """What is wrong, in words."""
+        bench = self.bench
+        return (f'{bench.wrong}; lag {1e3 * bench.lag:.2f} ms, latency {1e3 * bench.late:.2f} ms, '
+                f'clock {1e6 * self.fast:.0f} ppm, T/A {100.0 * (self.constant - 1.0):+.1f} %, '
+                f'hysteresis {100.0 * self.hysteresis:.1f} %, noise {bench.noise:.1e}, '
+                f'L sqrt(rho/G) {1e3 * bench.unit:.1f} ms')
+
+
+def drawn(seed: int, *, iron: bool) -> Laboratory:
+    """Return the laboratory of a seed, with a core in its coil or without."""
+    random = np.random.default_rng((29, seed))
+
+    def log(low: float, high: float) -> float:
+        return math.exp(random.uniform(math.log(low), math.log(high)))
+
+    size = log(1.0, 4.0)
+    paper = paper_actuator()
+    given = replace(
+        paper, half_length=size * paper.half_length, half_thickness=size * paper.half_thickness,
+        damping_coefficient=size**2 * paper.damping_coefficient)
+    block = replace(
+        given, shear_modulus=random.uniform(0.8, 1.2) * given.shear_modulus,
+        damping_coefficient=log(0.7, 1.4) * given.damping_coefficient)
+    lag, late = log(2e-4, 2e-3), log(5e-4, 5e-3)
+    fast, constant = random.uniform(0.0, 1e-4), random.uniform(0.95, 1.05)
+    ratio, relaxation = random.uniform(0.0, 0.06), log(0.5, 10.0) * given.time_unit
+    noise, hysteresis = log(1e-4, 3e-3), random.uniform(0.0, 0.02)
+    targets: list[float] = []
+    while len(targets) < 4:
+        stretch = round(random.uniform(1.08, 1.4), 2)
+        if abs(stretch - (targets[-1] if targets else 1.0)) >= 0.1:
+            targets.append(stretch)
+    hysteresis *= iron
+    return Laboratory(Bench(
+        'several', seed, given, block, lag, late, late, 1.0, 0.0, ratio, relaxation, 0.0, noise,
+        1e-9 * _PERIOD, 0.0, tuple(targets),
+        iron=Iron(hysteresis * _LEVEL, 0.3 * _LEVEL) if iron else None),
+        fast, constant, hysteresis)
+
+
+class Board(SimulatedBoard):
+    """The board of a laboratory in simulated time; ``motion`` is the truth, ns and stretch."""
+
+    def __init__(self, lab: Laboratory) -> None:
+        self.lab, self.fast = lab, lab.fast
+        self.tesla_per_ampere = lab.constant * TESLA_PER_AMPERE
+        self.motion: list[tuple[int, float]] = []
+        self.now = 0  # of the host in ns
+        self._draw = np.random.default_rng((30, lab.bench.seed))
+        super().__init__(clock=self.time_ns)
+
+    def time_ns(self) -> int:
+        """Return the time of the host."""
+        return self.now
+
+    def _make_block(self) -> Any:
+        return Plant(self.lab.bench, 0)
+
+    @property
+    def field(self) -> float:
+        """The field in T now."""
+        return self._block.field
+
+    def write(self, text: bytes) -> None:
+        """Take a request; half of its time passes before it is there, and half after it."""
+        trip = int(self._draw.uniform(*_TRIP))
+        self.now += trip // 2
+        super().write(text)
+        self.now += trip - trip // 2
+
+    def read(self, size: int) -> bytes:
+        """Return bytes; time passes where there are none."""
+        self.now += 0 if self._answer else _MS
+        return super().read(size)
+
+    def _sample(self, time: int) -> None:
+        """Measure: the reading has the timestamp of now, and is of some time ago."""
+        then = self._host(time) - round(1e9 * self.lab.bench.late)
+        if then >= 0:
+            stretch = self._block.advance(max(then, self._block.time))
+            self.motion.append((then, stretch))
+            noise = self.lab.bench.noise * float(self._draw.standard_normal())
+            _board.sample(self._board, time, round(1e6 * REST_LENGTH * (stretch + noise)))
+        self._next_sample += _PERIOD // 1000
+
+
+class Driver:
+    """The shipped driver before a board, as `Loop` wants it."""
+
+    def __init__(self, board: Board, coil: CoilModel) -> None:
+        self.board = board
+        serial = type('Serial', (serial_board.Board,), {'simulate': lambda *_: board})
+        # It waits for answers in simulated time, too.
+        serial_board.monotonic = lambda: 1e-9 * board.now  # type: ignore[assignment]
+        hardware = Assembly(
+            serial('sim'), coil, SensorScale(rest_length=REST_LENGTH))
+        self._device = HardwareDevice(
+            [HardwareJoint(hardware, _LIMIT, Fallback(0.0))], time=board.now, period=5 * _MS,
+            clock=board.time_ns)
+        self._device.switch_off(board.now)
+        self.samples_seen: list[tuple[int, float]] = []
+        self.changes_seen: list[tuple[int, float]] = []
+
+    @property
+    def time(self) -> int:
+        """Time of the host in ns."""
+        return self.board.now
+
+    @property
+    def next_sample(self) -> int:
+        """When it is to be advanced next."""
+        return max(self._device.due or 0, self.board.now + _MS // 10)
+
+    def receive(self, joint: int, stamp: int, level: float) -> None:
+        """Take a level."""
+        self._device.receive(joint, stamp, level)
+
+    def advance(self, time: int) -> None:
+        """Do what is due; that takes time, too."""
+        self.board.now = max(self.board.now, time)
+        self._device.advance(self.board.now)
+
+    def changes(self) -> Sequence[tuple[int, int, float]]:
+        """Return which levels took effect."""
+        found = [(x.joint, x.stamp, x.level) for x in self._device.changes()]
+        self.changes_seen += [x[1:] for x in found]
+        return found
+
+    def samples(self) -> Sequence[tuple[int, Any, Any, Any]]:
+        """Return what was measured."""
+        found = [(x.time, x.stretch, x.rate, x.flux_density) for x in self._device.samples()]
+        self.samples_seen += [(x[0], float(x[1][0])) for x in found]
+        return found
+
+
+@dataclass(frozen=True)
+class Left:
+    """What a move left in truth, as shares of its step, and the verdict on it."""
+
+    vibration: float
+    offset: float
+    verdict: str
+
+    @property
+    def size(self) -> float:
+        """The larger one."""
+        return max(self.vibration, self.offset)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What tuning a laboratory came to."""
+
+    lab: Laboratory
+    verdict: str  # of the identification
+    reason: str
+    shaper: str
+    before: list[Left]
+    after: list[Left]  # empty where nothing was written
+
+    @property
+    def last(self) -> float:
+        """The most that is left by the last two moves."""
+        return max(x.size for x in (self.after or self.before)[2:])
+
+    @property
+    def worse(self) -> float:
+        """How much more than before a move leaves at most."""
+        return max((x.size - y.size for x, y in zip(self.after, self.before, strict=False)),
+                   default=0.0)
+
+    @property
+    def silent(self) -> int:
+        """Moves that failed and were said to have arrived."""
+        return sum(x.size > _FAILED and x.verdict == 'arrived' for x in (
+            *self.before, *self.after))
+
+
+class Trial:
+    """A laboratory, its driver and a planner in one loop."""
+
+    def __init__(self, lab: Laboratory, planner: Planner, coil: CoilModel) -> None:
+        self.lab, self.driver = lab, Driver(Board(lab), coil)
+        self.loop = Loop(PlannerGroup({_JOINT: planner}), Settings(
+            takeover_timeout=0, heartbeat_period=100 * _MS), self.driver)
+        self.verdicts: dict[int, str] = {}
+        self.loop.tell = self._hear
+        self.loop.run(self.loop.now + 500 * _MS)
+
+    def _hear(self, output: Output) -> None:
+        if isinstance(output, StatusChanged):
+            self.verdicts |= {x.setpoint.number: str(x.verdict) for x in output.findings.values()}
+
+    def request(self, points: Sequence[tuple[float, float]], *, raw: bool) -> int:
+        """Carry out setpoints or levels with their times in s; return when it began, in ns."""
+        self.verdicts.clear()
+        self.loop.runtime.request(Trajectory(
+            (_JOINT,), [((x,), round(1e9 * y)) for x, y in points], len(points), raw=raw))
+        begin = self.loop.now
+        self.loop.run(begin + 2 * _LEAD + round(1e9 * (points[-1][1] + 5.0 * self.lab.period)))
+        return begin
+
+    def moves(self, hold: float) -> list[Left]:
+        """Make the moves; return what they left in truth."""
+        targets = self.lab.bench.targets
+        begin = self.request([(x, hold * (i + 1)) for i, x in enumerate(targets)], raw=False)
+        segments = self.loop.runtime.group.planners[_JOINT].plan.segments[-len(targets):]
+        time, stretch = np.array([x for x in self.driver.board.motion if x[0] >= begin]).T
+        found, start, look = [], 1.0, 1e9 * self.lab.period
+        for i, (target, segment) in enumerate(zip(targets, segments, strict=True)):
+            rests, end = segment.arrival, segments[0].begin + round(1e9 * hold * (i + 1))
+            early = (time >= rests) & (time < rests + look)
+            late = (time >= end - 2.0 * look) & (time < end)
+            found.append(Left(
+                float(np.ptp(stretch[early])) / abs(target - start),
+                abs(float(np.mean(stretch[late])) - target) / abs(target - start),
+                self.verdicts.get(i + 1, 'unobserved')))
+            start = target
+        return found
+
+    def recorded(self, begin: int) -> Recording:
+        """Return what was recorded since then."""
+        zero, samples = begin, [x for x in self.driver.samples_seen if x[0] >= begin]
+        changes = self.driver.changes_seen
+        first = max((i for i, x in enumerate(changes) if x[0] <= begin), default=0)
+        return Recording(
+            *(1e-9 * np.array([x[0] - zero for x in samples]), np.array([x[1] for x in samples])),
+            np.maximum(1e-9 * np.array([x[0] - zero for x in changes[first:]]), 0.0),
+            np.array([x[1] for x in changes[first:]]))
+
+
+def calibrated(lab: Laboratory) -> CoilModel:
+    """Return the coil of a laboratory as ``hmsa calibrate coil --hysteresis`` finds it."""
+    driver = Driver(Board(lab), CoilModel(TESLA_PER_AMPERE))
+    random, rows = np.random.default_rng((31, lab.bench.seed)), []
+    for level in loop(_LEVEL, _STEPS):
+        driver.receive(0, 0, level)
+        for _ in range(round(_SETTLE / _BEAT)):
+            driver.advance(driver.time + _BEAT)
+            driver.receive(0, 0, level)
+        rows.append((level / TESLA_PER_AMPERE, driver.board.field + _PROBE * float(
+            random.standard_normal())))
+    current, field = np.array(rows).T
+    found = calibrate_coil(current, field)
+    core, _ = fit_core(found.curve(current), field)
+    settings = found.settings('')
+    return CoilModel(
+        **{x.removeprefix('hardware.coil.'): y for x, y in settings.items()},
+        play_widths=core.widths, play_weights=core.weights)
+
+
+def run(lab: Laboratory) -> Outcome:
+    """Tune a laboratory, and judge the moves before and after."""
+    sheet = CoilModel(TESLA_PER_AMPERE)
+    hold = max(0.4, 12.0 * lab.period)
+    entries = [(PLANNER, f'actuator.{x}', getattr(lab.bench.given, x)) for x in (
+        'half_length', 'half_thickness', 'damping_coefficient')]
+    tuning = Tuning(
+        Path(), tuple(((x,), hold) for x in lab.bench.targets), Path(), entries, lambda _: (),
+        accept=True)
+    belief = read_belief(None, entries)
+    trial = Trial(lab, _planner(belief.actuator), sheet)
+    before = trial.moves(hold)
+    coil = calibrated(lab) if lab.hysteresis else sheet
+    if lab.hysteresis:
+        trial = Trial(lab, _planner(belief.actuator), coil)
+    trial.request([(1.0, hold)], raw=False)
+    begin = trial.request(
+        [(y, x) for x, y in excitation(tuning, belief, 1e9 / _PERIOD)], raw=True)
+    found = identified(
+        tuning, belief, trial.recorded(begin), belief.actuator, {'coil_time_constant': 0.0})
+    if found.verdict != 'identified' and not found.acceptable:
+        return Outcome(lab, found.verdict, found.reason, '', before, [])
+    _, settings = chosen(tuning, belief, found)
+    trial = Trial(lab, _planner(
+        planned_from(settings), shaper=settings['shaper'],
+        coil_time_constant=settings.get('coil_time_constant', 0.0)), coil)
+    return Outcome(
+        lab, found.verdict, found.reason, settings['shaper'], before, trial.moves(hold))
+
+
+def _planner(actuator: Any, **options: Any) -> Planner:
+    return Planner(actuator, Options(
+        flux_density_min=-_LIMIT, flux_density_max=_LIMIT, lead_time=_LEAD, **options))
+
+
+def run_one(seed: int, *, iron: bool) -> Outcome:
+    """Tune the laboratory of a seed."""
+    return run(drawn(seed, iron=iron))
+
+
+def compare(*, quick: bool, runs: int = RUNS) -> Sheet:
+    """Tune laboratories without and with hysteresis; passed if all goals are met."""
+    seeds = range(SEED, SEED + (1 if quick else runs))
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        found = {iron: list(pool.map(partial(run_one, iron=iron), seeds))
+                 for iron in (False, True)}
+    return sheet(found, quick=quick)
+
+
+def sheet(outcomes: Mapping[bool, Sequence[Outcome]], *, quick: bool = False) -> Sheet:
+    """Return what came of laboratories without and with hysteresis."""
+    rows, figures, passed = [], {}, True
+    for iron, found in outcomes.items():
+        left, before = ([x.last for x in found], [
+            max(y.size for y in x.before[2:]) for x in found])
+        reached = sum(x <= GOALS[iron] for x in left)
+        worse, silent = sum(x.worse > WORSE for x in found), sum(x.silent for x in found)
+        rows.append([
+            '0 to 2 %' if iron else 'none', str(len(found)), _percent(float(np.median(before))),
+            _percent(float(np.median(left))), _percent(max(left)),
+            f'{reached} within {_percent(GOALS[iron])}', str(worse), str(silent)])
+        figures['with hysteresis' if iron else 'without'] = [{
+            'laboratory': x.lab.words, 'verdict': x.verdict, 'shaper': x.shaper, 'last': x.last,
+            'worse': x.worse, 'silent': x.silent} for x in found]
+        passed &= reached >= REACH * len(found) and not worse and not silent
+    return Sheet(
+        'laboratory', 'Random laboratories behind a serial board: the most that the last two of '
+        'four moves leave, vibration or offset in % of the step, before and after tuning', (
+            'hysteresis', 'laboratories', 'before, median', 'after, median', 'after, largest',
+            'goal', 'worse than before', 'silent'), rows, figures, quick or passed)
+
+
+def _percent(share: float) -> str:
+    return f'{100.0 * share:.2g} %'
