@@ -18,6 +18,7 @@ from hmsa_ros.model.law import critical_zeta
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.levels import in_force, Level, without_repeats
 from hmsa_ros.recordings.record import RecordedRequest, Run, Verdict
+from hmsa_ros.recordings.topics import COMMAND
 
 #: Stretches that differ by less are one setpoint.
 SAME = 1e-6
@@ -211,8 +212,9 @@ def _of(
             arrival, left_out = moves.pop(0)[1] if moves else None, False
         else:
             arrival, moves = _by_levels(run, levels, here), []
-            # Without any level nothing is known but requests and samples.
-            left_out = setpoint.step > SAME and bool(levels) and not _within(levels, here)
+            # Where commands were not recorded nothing is known but requests and samples.
+            left_out = setpoint.step > SAME and COMMAND in run.topics and not _within(
+                levels, here)
         yield Requested(
             replace(setpoint, arrival=arrival), end, last, tuple(moves),
             bool(codes) and _NEEDED.isdisjoint(codes), left_out)
