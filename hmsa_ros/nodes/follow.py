@@ -22,7 +22,7 @@ from trajectory_msgs.msg import JointTrajectoryPoint
 from hmsa_ros.control.goals import ErrorCode, Goals, Outcome, Wish
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import Severity, StatusChanged, Trajectory
-from hmsa_ros.errors import BadInputError, BagError
+from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.capture import decode, RawSubscription
@@ -43,19 +43,6 @@ class FollowJointTrajectory:
     A goal is executed until the planner has judged it, without a coroutine that waits: executors
     of rclpy would call that again and again.
     """
-
-    @classmethod
-    def offer(
-            cls, node: ManagedNode, runtime: PlannerRuntime,
-            serve: Callable[[], None]) -> 'FollowJointTrajectory | None':
-        """Return the server, or None where the package of its messages is not installed."""
-        try:
-            return cls(node, runtime, serve, *(endpoints.interface_class(x.type) for x in (
-                topics.FOLLOW, topics.FOLLOW.state)))
-        except BagError:
-            node.get_logger().info(
-                f'no action {topics.FOLLOW.name}: it needs the package control_msgs')
-            return None
 
     def __init__(
             self, node: ManagedNode, runtime: PlannerRuntime, serve: Callable[[], None],

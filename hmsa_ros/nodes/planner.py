@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from time import monotonic_ns, time_ns
+from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import JumpThreshold, TimeJump
@@ -15,7 +16,7 @@ from sensor_msgs.msg import JointState
 from hmsa_ros.control import records
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.takeover import Seen
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.actuator import actuator_from
 from hmsa_ros.model.actuators import unheld
@@ -25,7 +26,6 @@ from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.cdr import read_trajectory, stamp_of
 from hmsa_ros.nodes.channel import JointChannel
-from hmsa_ros.nodes.follow import FollowJointTrajectory
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.markers import TargetMarkers
 from hmsa_ros.nodes.newest_clock import NewestClock
@@ -34,6 +34,9 @@ from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from,
 from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.timekeeping import StepWatch
+
+if TYPE_CHECKING:
+    from hmsa_ros.nodes.follow import FollowJointTrajectory
 
 PARAMETERS = SPECS
 
@@ -112,7 +115,7 @@ class PlannerNode(ManagedNode):
             self._poll.cancel()
         self._presence = Presence(self)
         if self._action is None:
-            self._action = FollowJointTrajectory.offer(self, self._runtime, self._serve)
+            self._action = self._offer_action()
         else:
             self._action.begin(self._runtime)
         self.diagnose(self._report)
@@ -121,6 +124,19 @@ class PlannerNode(ManagedNode):
                 min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False),
             post_callback=self._on_jump)
         self._serve()
+
+    def _offer_action(self) -> 'FollowJointTrajectory | None':
+        """Return the server of the action, or None where its messages are not installed."""
+        try:
+            interfaces = [
+                endpoints.interface_class(x.type) for x in (topics.FOLLOW, topics.FOLLOW.state)]
+        except BagError:
+            self.get_logger().info(
+                f'no action {topics.FOLLOW.name}: it needs the package control_msgs')
+            return None
+        # Actions take time to load, for which others need not wait.
+        from hmsa_ros.nodes.follow import FollowJointTrajectory
+        return FollowJointTrajectory(self, self._runtime, self._serve, *interfaces)
 
     def activate(self) -> None:
         """Take requests; the first of them reads the state in force."""
