@@ -1136,6 +1136,27 @@ def test_a_latched_plan_of_before_that_comes_after_a_request_is_not_the_one_for_
     assert [str(x.verdict) for x in part.evaluation.findings] == ['arrived'] * 3
 
 
+def test_a_level_that_took_effect_before_its_time_begins_no_request(tmp_path):
+    asked, planned, said, *others = simulated()
+    before = START - 20_000_000
+    levels = [before, *(
+        planned[-1].header.stamp.sec * NANOSECONDS + planned[-1].header.stamp.nanosec
+        + x.time_from_start.sec * NANOSECONDS + x.time_from_start.nanosec
+        for x in planned[-1].points)]
+    # As a board reports it that counts in us.
+    plan = trajectory(before - 490, [(0, 1.0, 0.0, 0.0), *(
+        (stamp - before + 490, x.positions[0], x.velocities[0], x.effort[0])
+        for stamp, x in zip(levels[1:], planned[-1].points, strict=True))])
+    old = trajectory(before - 6_000_000, [(0, 1.0, 0.0, 0.02), (6_000_000, 1.0, 0.0, 0.0)])
+    part = one(
+        tmp_path / 'run', [
+            (START - 2, '/planner/plan', TYPES[PLAN], old),
+            (START - 1, '/planner/status', TYPES[STATUS], status(0, 'arrived', 'arrived')),
+            asked, (START + 1, '/planner/plan', TYPES[PLAN], plan), (START + 2, *said[1:]),
+            *others], **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert [str(x.verdict) for x in part.evaluation.findings] == ['arrived'] * 3
+
+
 @pytest.mark.parametrize('order', ['before', 'after'])
 def test_a_plan_between_the_same_ticks_as_its_request_is_the_one_for_it(tmp_path, order):
     asked, planned, said, *others = simulated()

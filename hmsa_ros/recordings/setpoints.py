@@ -169,7 +169,10 @@ def _fresh(
         return math.inf
     begun = _begun(plan, before)
     new = {(x.stamp, x.flux_density) for x in plan[begun:]}
-    old = {(x.stamp, x.flux_density) for x in before if plan[0].stamp < x.stamp}
+    # What is in force took effect when the device says, perhaps a little before its time.
+    old = {(x.stamp, x.flux_density) for x in before if plan[0].stamp < x.stamp and not (
+        begun and x.stamp <= plan[0].sent
+        and math.isclose(x.flux_density, plan[0].flux_density, rel_tol=_ROUNDED))}
     if begun and sent is not None:
         old |= {(x.stamp, x.flux_density) for x in before[1:] if x.stamp not in sent}
     return min((stamp for stamp, level in new ^ old if (stamp, level) in new
