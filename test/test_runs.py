@@ -139,6 +139,19 @@ def test_a_level_that_was_in_force_already_is_no_command_without_effect():
     assert lateness[1] == 0.0
 
 
+def test_levels_that_a_board_rounds_took_effect():
+    asked = np.array([0.0201004, 0.0345398, 0.0648543, 0.0291936, 0.0])
+    commands = [Level(BEGIN + i * STEP, x, BEGIN) for i, x in enumerate(asked.tolist())]
+    # It counts in us, and sets multiples of 5 uT.
+    off = [445, -237, 1854, -435, 493]
+    applied = [Level(x.stamp + late, round(x.flux_density / 5e-6) * 5e-6, BEGIN)
+               for x, late in zip(commands, off, strict=True)]
+    lateness, unapplied = lateness_of(commands, applied, BEGIN + 9 * STEP)
+    assert unapplied == 0
+    assert lateness == pytest.approx(np.array(off) * 1e-9)
+    assert lateness_of(commands, applied[:2], BEGIN + 9 * STEP)[1] == 3
+
+
 def test_a_table_has_the_samples_in_full_precision_and_the_levels_at_their_times(tmp_path):
     run = moved()
     for columns, name in ((samples_of(run), 'a.csv'), (levels_of(run), 'b.csv')):

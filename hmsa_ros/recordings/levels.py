@@ -1,6 +1,6 @@
 """Levels of the field: commanded, superseded, repeated, and applied."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 import math
 
@@ -10,8 +10,10 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.schedule import CommandSchedule, Superseding
 from hmsa_ros.model.units import NANOSECONDS
 
-# Stamps of what took effect may be rounded, in ns.
-_ROUNDED_STAMP = 1000
+#: By how much hardware may round a level, as a share of the largest.
+ROUNDED = 1e-3
+# By how much the clock of a device may be off in the stamps of what took effect, in ns.
+_ROUNDED_STAMP = 100_000
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,7 @@ def lateness_of(
     # What was replaced before its time never took effect.
     standing = in_force((x,) for x in commands)
     places = {x: i for i, x in enumerate(commands)}
+    same = _same_for(commands)
     # What was in force when the first command was due; applied levels may be older than that.
     begin = standing[0].stamp if standing else 0
     before: Level | None = max(
@@ -64,16 +67,18 @@ def lateness_of(
         default=min(applied, key=lambda x: x.stamp))
     for i, command in enumerate(standing):
         until = next(
-            (x.stamp for x in standing[i + 1:] if _same_level(x, command)), math.inf)
-        when = [x.stamp for x in applied if _same_level(x, command)
+            (x.stamp for x in standing[i + 1:] if same(x, command)), math.inf)
+        when = [x.stamp for x in applied if same(x, command)
                 and command.stamp - _ROUNDED_STAMP <= x.stamp < until - _ROUNDED_STAMP]
         if when:
             result[places[command]] = (min(when) - command.stamp) / NANOSECONDS
-        elif command.stamp < last and not (before and _same_level(before, command)):
+        elif command.stamp < last and not (before and same(before, command)):
             unapplied += 1
         before = command
     return result, unapplied
 
 
-def _same_level(one: Level, other: Level) -> bool:
-    return math.isclose(one.flux_density, other.flux_density, rel_tol=1e-9, abs_tol=1e-12)
+def _same_for(commands: Sequence[Level]) -> Callable[[Level, Level], bool]:
+    """Return whether hardware may have rounded one level to another one."""
+    rounding = ROUNDED * max((abs(x.flux_density) for x in commands), default=0.0)
+    return lambda one, other: abs(one.flux_density - other.flux_density) <= rounding

@@ -16,7 +16,7 @@ from hmsa_ros.judge import Setpoint
 from hmsa_ros.model.equations import Array, equilibrium_stretch, natural_frequency, stretch_limits
 from hmsa_ros.model.law import critical_zeta
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.recordings.levels import in_force, Level, without_repeats
+from hmsa_ros.recordings.levels import in_force, Level, ROUNDED, without_repeats
 from hmsa_ros.recordings.record import RecordedRequest, Run, Verdict
 from hmsa_ros.recordings.topics import COMMAND
 
@@ -27,8 +27,6 @@ SAME = 1e-6
 _AT_REST = ((0.0, 1e-3), (2e-3, 1e-2))
 # Codes of plans that were made anew in need; feedback corrects others.
 _NEEDED = {'replanned', 'saturated'}
-# What holds a setpoint is known to the resolution of the hardware, as a share of its distance.
-_ROUNDED = 1e-3
 
 
 @dataclass(frozen=True)
@@ -140,7 +138,7 @@ def _new(run: Run, place: int | None) -> int | None:
     plan, before = run.plans[place], run.plans[place - 1] if place else ()
     if not before and len(plan) > 1 and (
             plan[0].stamp < plan[0].sent or _uncommanded(run, plan[0])) and (
-            abs(float(balance(run, plan[:1])[0]) - plan[0].stretch) <= _ROUNDED):
+            abs(float(balance(run, plan[:1])[0]) - plan[0].stretch) <= ROUNDED):
         # It was in force, and holds what was there.
         plan = plan[1:]
     fresh = _fresh(plan, before)
@@ -172,7 +170,7 @@ def _fresh(
     # What is in force took effect when the device says, perhaps a little before its time.
     old = {(x.stamp, x.flux_density) for x in before if plan[0].stamp < x.stamp and not (
         begun and x.stamp <= plan[0].sent
-        and math.isclose(x.flux_density, plan[0].flux_density, rel_tol=_ROUNDED))}
+        and math.isclose(x.flux_density, plan[0].flux_density, rel_tol=ROUNDED))}
     if begun and sent is not None:
         old |= {(x.stamp, x.flux_density) for x in before[1:] if x.stamp not in sent}
     return min((stamp for stamp, level in new ^ old if (stamp, level) in new
@@ -289,7 +287,7 @@ def _by_levels(run: Run, levels: Sequence[Level], setpoint: Setpoint) -> int | N
     inside = _within(levels, setpoint)
     if setpoint.step <= SAME:
         return setpoint.begins
-    near = _ROUNDED * max(setpoint.step, abs(setpoint.target - run.planner.rest))
+    near = ROUNDED * max(setpoint.step, abs(setpoint.target - run.planner.rest))
     held = None
     for level, stretch in zip(inside[:0:-1], balance(run, inside)[:0:-1].tolist(), strict=True):
         if abs(stretch - setpoint.target) > near:
