@@ -23,9 +23,12 @@ SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
 def test_without_its_messages_there_is_no_action_and_one_line_says_so(start, ros):
     planner = start.hmsa('planner')
     planner.wait_for_output('no action ~/follow_joint_trajectory')
-    ros.spin_until(lambda: ros.node.count_publishers('/planner/status'), 'the planner')
-    served = ros.node.get_service_names_and_types_by_node('planner', '/')
-    assert not [x for x, _ in served if '_action' in x]
+
+    def served():
+        return [x for x, _ in ros.node.get_service_names_and_types()]
+
+    ros.spin_until(lambda: '/planner/stop' in served(), 'the planner')
+    assert not [x for x in served() if '_action' in x]
     assert not ros.node.count_publishers('/planner/controller_state')
     assert planner.stop() == 0
     assert planner.output.count('control_msgs') == 1
