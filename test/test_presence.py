@@ -126,7 +126,7 @@ def test_a_request_that_no_planner_took_is_named_by_those_who_read_the_bag(
     ros.spin_until(lambda: asked.get_subscription_count() > 1, 'the recorder')
     asked.publish(to_trajectory([(1.1, 500_000_000)], 'actuator', frame='mine'))
     states = ros.collect(JointState, 'joint_states', topics.JOINT_STATES.qos)
-    ros.spin_until(lambda: len(states) > 1000, 'samples')
+    ros.spin_until(lambda: len(states) > 2000, 'samples')
     assert recorder.stop() == 0, recorder.output
     assert main(['bag', 'info', str(folder)]) == 0
     assert 'note: 1 request on /planner/joint_trajectory has no verdict' in capsys.readouterr().out
