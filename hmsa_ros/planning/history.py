@@ -141,10 +141,12 @@ class History:
             self, sent: range, stamp: int, flux_density: float, tolerance: int) -> int | None:
         """Return which of the levels that were sent has taken effect."""
         levels = self.levels
-        same = [i for i in sent if self._near(levels[i].flux_density, flux_density)]
-        for i in same:
-            if abs(levels[i].stamp - stamp) <= tolerance:
+        # Nearly always the next one, of perhaps hundreds along a path.
+        for i in sent:
+            if abs(levels[i].stamp - stamp) <= tolerance and self._near(
+                    levels[i].flux_density, flux_density):
                 return i
+        same = [i for i in sent if self._near(levels[i].flux_density, flux_density)]
         for i in same:
             if levels[i].stamp < stamp and levels[i].flux_density != levels[i - 1].flux_density:
                 return i
