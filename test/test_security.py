@@ -119,7 +119,7 @@ def watch(
     finally:
         # Shown if it fails.
         for node in nodes:
-            granted = GRANTS['/hmsa/replay'] if node == 'player' else enclave_of(node)
+            granted = enclave_of('replay' if node == 'player' else node)
             print(node, 'granted, not used:', sorted(granted - seen.get(node, set())))
             print(node, 'used, not granted:', sorted(seen.get(node, set()) - granted))
 
@@ -260,14 +260,14 @@ def test_policies_grant_exactly_what_the_nodes_do(tmp_path, start, ros):
         '-p', f'play.wait_for_samples:=[{topics.JOINT_STATES.name}]')
     watch(ros, ('player', 'plant', 'recorder'), seen,
           lambda: nothing_left('plant', 'recorder')()
-          and GRANTS['/hmsa/replay'] <= seen.get('player', set()),
+          and enclave_of('replay') <= seen.get('player', set()),
           'all that player, plant and recorder may do')
     for process in (player, plant, again):
         assert process.stop() == 0, process.output
 
     for name in RUNNING:
         assert seen[name] == enclave_of(name)
-    assert seen['player'] == GRANTS['/hmsa/replay']
+    assert seen['player'] == enclave_of('replay')
 
 
 @pytest.mark.ros
