@@ -70,7 +70,7 @@ def _compare_repeats(
     """Compare runs that were repeated, or some of which were."""
     from hmsa_ros.recordings.bags import read_run
     from hmsa_ros.report.arrivals import Part
-    from hmsa_ros.report.repeats import draw_bands, statistics, statistics_table
+    from hmsa_ros.report.repeats import statistics, statistics_table
 
     labels = [x.parent.name if x.name == 'run' else x.name for x in map(
         Path.resolve, arguments.runs)]
@@ -83,6 +83,7 @@ def _compare_repeats(
                  for label, group in parts.items()}
         table = statistics_table(found)
         if arguments.picture:
+            from hmsa_ros.report.bands import draw_bands
             draw_bands(arguments.picture, parts, paper)
     if arguments.json:
         print(json_text({

@@ -89,8 +89,6 @@ def run(arguments: argparse.Namespace) -> int:
     experiments = [_experiment(arguments, x) for x in folders]
     for x in folders:
         prepare(x)
-    from hmsa_ros.report.repeats import statistics, statistics_table
-
     ENDING.note()
     console = Console(stderr=True)
     records, each, verdicts = [], [], []
@@ -113,6 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
             'report': None if report is None else str(report)})
         if not arguments.json:
             _print(experiment, parts, reason, done, report)
+    from hmsa_ros.report.repeats import statistics, statistics_table
     if arguments.json:
         print(json_text(records[0] if arguments.repeat == 1 else {
             'repeats': records, 'statistics': statistics(each)}))
