@@ -20,7 +20,7 @@ from hmsa_ros.model.schedule import obeyed
 from hmsa_ros.recordings import topics as roles
 from hmsa_ros.recordings.levels import Level
 from hmsa_ros.recordings.parameters import actuators, named_joint, recorded
-from hmsa_ros.recordings.record import LearntSensor, RecordedRequest, Run, Verdict
+from hmsa_ros.recordings.record import announced, LearntSensor, RecordedRequest, Run, Verdict
 from hmsa_ros.recordings.samples import nanoseconds_of, SampleReader
 from hmsa_ros.recordings.topics import topics_by_joint
 
@@ -300,15 +300,13 @@ class _Collected:
 
         A recorder may receive it after them, and latched news of an earlier one after it.
         """
-        said = [x for _, x in self.published]
-        own = next((i for i, x in enumerate(said) if isinstance(x, Verdict)
-                    and asked.name and x.request == asked.name), None)
+        own = next((x.sent for x in self.verdicts if asked.name and x.request == asked.name), None)
         if own is None:
             return asked.sent
-        if own and isinstance(said[own - 1], _Trajectory):
-            own -= 1
-        before = said[own - 1].sent + 1 if own else asked.sent
-        return min(max(asked.sent, before), said[own].sent - 1)
+        verdicts, plans = ([x.sent for x in said] for said in (self.verdicts, self.plans))
+        begun = announced(own, verdicts, plans)
+        before = max((x for x in (*verdicts, *plans) if x < begun), default=asked.sent - 1)
+        return min(max(asked.sent, before + 1), begun - 1)
 
     def finish(
             self, label: str, reader: BagReader, summary: BagSummary, topics: Mapping[str, str],

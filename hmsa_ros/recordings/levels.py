@@ -79,6 +79,6 @@ def lateness_of(
 
 
 def _same_for(commands: Sequence[Level]) -> Callable[[Level, Level], bool]:
-    """Return whether hardware may have rounded one level to another one."""
+    """Return what says whether hardware may have rounded one of two levels to the other."""
     rounding = ROUNDED * max((abs(x.flux_density) for x in commands), default=0.0)
     return lambda one, other: abs(one.flux_density - other.flux_density) <= rounding

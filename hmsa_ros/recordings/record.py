@@ -1,6 +1,6 @@
 """The record of a run: what was measured, commanded, planned and known of one actuator."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 import math
 from pathlib import Path
@@ -46,6 +46,16 @@ class Verdict:
     message: str
     plan: int = 0  # number of the request that is carried out, from 1; 0 where not told
     request: str = ''  # its name, if it has one
+
+
+def announced(said: int, verdicts: Iterable[int], plans: Iterable[int]) -> int:
+    """
+    Return when what a verdict says first was recorded: a plan, if one was published right before.
+
+    Times in ns: of the verdict, and of all verdicts and plans, no two of which are equal.
+    """
+    before = max((x for x in verdicts if x < said), default=-1)
+    return max((x for x in plans if before < x < said), default=said)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from hmsa_ros.model.equations import Array, equilibrium_stretch, natural_frequen
 from hmsa_ros.model.law import critical_zeta
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.levels import in_force, Level, ROUNDED, without_repeats
-from hmsa_ros.recordings.record import RecordedRequest, Run, Verdict
+from hmsa_ros.recordings.record import announced, RecordedRequest, Run
 from hmsa_ros.recordings.topics import COMMAND
 
 #: Stretches that differ by less are one setpoint.
@@ -102,16 +102,11 @@ def _acts(run: Run, levels: Sequence[Level]) -> Iterator[_Act]:
             yield _Act(request, request.sent, _begin(run, request, levels))
         for later in taken[accepted:]:
             # Nobody asked for it here: the joint was to stop.
-            sent = _stopped(run, next(x for x in answers if x.plan == later))
+            sent = announced(
+                next(x.sent for x in answers if x.plan == later), (x.sent for x in run.verdicts),
+                (x[0].sent for x in run.plans if x))
             yield _Act(None, sent, _new(run, _plan_at(run, sent)) or sent)
         number = taken[-1] if taken else number
-
-
-def _stopped(run: Run, verdict: Verdict) -> int:
-    """Return when a stop was recorded: its plan is published right before the status of it."""
-    before = max((x.sent for x in run.verdicts if x.sent < verdict.sent), default=0)
-    return max((x[0].sent for x in run.plans if x and before < x[0].sent < verdict.sent),
-               default=verdict.sent)
 
 
 def _begin(run: Run, request: RecordedRequest, levels: Sequence[Level]) -> int:
