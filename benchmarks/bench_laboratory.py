@@ -302,13 +302,11 @@ class Trial:
 
     def recorded(self, begin: int) -> Recording:
         """Return what was recorded since then."""
-        zero, samples = begin, [x for x in self.driver.samples_seen if x[0] >= begin]
-        changes = self.driver.changes_seen
+        samples, changes = self.driver.samples_seen, self.driver.changes_seen
         first = max((i for i, x in enumerate(changes) if x[0] <= begin), default=0)
-        return Recording(
-            *(1e-9 * np.array([x[0] - zero for x in samples]), np.array([x[1] for x in samples])),
-            np.maximum(1e-9 * np.array([x[0] - zero for x in changes[first:]]), 0.0),
-            np.array([x[1] for x in changes[first:]]))
+        time, stretch = np.array([(x - begin, y) for x, y in samples if x >= begin]).T
+        since, levels = np.array([(x - begin, y) for x, y in changes[first:]]).T
+        return Recording(1e-9 * time, stretch, np.maximum(1e-9 * since, 0.0), levels)
 
 
 def calibrated(lab: Laboratory) -> CoilModel:

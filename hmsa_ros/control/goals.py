@@ -1,7 +1,7 @@
 """
 Goals of the action FollowJointTrajectory: whether they are valid, how they fare and how they end.
 
-Knows no ROS. Codes and semantics are those of ``control_msgs`` and of the
+Without ROS. Codes and semantics are those of ``control_msgs`` and of the
 ``joint_trajectory_controller`` of ros2_controllers, but success is what samples have shown.
 """
 
