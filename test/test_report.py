@@ -32,6 +32,7 @@ from hmsa_ros.model.residual import percent, residual_vibration
 from hmsa_ros.model.simulation import ActuatorSimulation, simulate
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.drafting import finish
+from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Options, Planner
 from hmsa_ros.recordings.bags import read_runs
 from hmsa_ros.recordings.levels import in_force, Level, without_repeats
@@ -1242,6 +1243,50 @@ def test_a_stop_after_a_refused_request_does_not_carry_it_out(tmp_path):
         (end - 1000, '/planner/status', TYPES[STATUS], status(0, 'stopped', '', plan='2'))],
         **parameters(planner=ACTUATOR, plant=ACTUATOR))
     assert [x.setpoint.target for x in part.evaluation.findings] == [1.1, 1.2, 1.4]
+
+
+@pytest.mark.parametrize('late', [0, 500_000])
+def test_joints_that_are_moved_in_turn_keep_their_setpoints(tmp_path, late):
+    joints = 'left', 'right'
+    group = PlannerGroup({x: Planner(ACTUATOR, Options(lead_time=LEAD)) for x in joints})
+    plants = {x: ActuatorSimulation(ACTUATOR, time=START) for x in joints}
+    asked = ('left', 1.1), ('right', 1.05), ('left', 1.2), ('right', 1.0), ('left', 1.0)
+    pause = 200_000_000
+    setpoint = 'std_msgs/msg/Float64'
+    messages = [(START - 1, '/planner/status', TYPES[STATUS], status(0, 'none', '', plan='0'))]
+    for number, (joint, target) in enumerate(asked, 1):
+        time = START + number * pause
+        group.take(finish(group.draft_setpoint(joint, target, time)), time)
+        stamps, samples = group.preview(time, 100)
+        plan = trajectory(stamps[0], [(x - stamps[0],) for x in stamps])
+        plan.joint_names = list(joints)
+        for i, point in enumerate(plan.points):
+            point.positions, point.velocities, point.effort = np.array(
+                [samples[x][i] for x in joints]).T.copy()
+        messages += [
+            # The recorder may receive it last.
+            (time + late, f'/planner/{joint}/setpoint', setpoint,
+             STORE.types[setpoint](data=target)),
+            (time + 100_000, '/planner/plan', TYPES[PLAN], plan),
+            (time + 200_000, '/planner/status', TYPES[STATUS], status(
+                0, 'accepted', 'accepted', plan=str(number)))]
+        for level in group.planners[joint].plan.levels:
+            if level.stamp > time:
+                plants[joint].command(level.stamp, level.flux_density)
+                messages.append((
+                    level.stamp - LEAD, f'/{joint}/flux_density_command', TYPES[COMMAND],
+                    command(level.stamp, level.flux_density)))
+    for time in range(START, START + 6 * pause, 500_000):
+        for plant in plants.values():
+            plant.advance(time)
+        messages.append((time, '/joint_states', TYPES[JOINT_STATES], joint_state(
+            time, *([getattr(plants[x], y) for x in joints]
+                    for y in ('stretch', 'rate', 'flux_density')), joints)))
+    parts = parts_of(write(
+        tmp_path / 'run', messages, **parameters(planner=ACTUATOR, plant=ACTUATOR)))
+    assert [(x.run.joint, [(y.setpoint.target, str(y.verdict)) for y in x.evaluation.findings])
+            for x in parts] == [
+        (x, [(target, 'arrived') for of, target in asked if of == x]) for x in joints]
 
 
 def test_the_findings_of_a_bag_are_printed_as_json(bag, tmp_path, capsys):

@@ -5,6 +5,7 @@ Topics are found by the end of their name and their type, so that any namespace 
 bag may come from this package's recorder, from rosbag2, from a simulated plant or from a coil.
 """
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,10 +18,11 @@ from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.interfaces.status import whole
 from hmsa_ros.judge import Sensor
 from hmsa_ros.model.schedule import obeyed
+from hmsa_ros.recordings import answers
 from hmsa_ros.recordings import topics as roles
 from hmsa_ros.recordings.levels import Level
 from hmsa_ros.recordings.parameters import actuators, named_joint, recorded
-from hmsa_ros.recordings.record import announced, LearntSensor, RecordedRequest, Run, Verdict
+from hmsa_ros.recordings.record import LearntSensor, RecordedRequest, Run, Verdict
 from hmsa_ros.recordings.samples import nanoseconds_of, SampleReader
 from hmsa_ros.recordings.topics import topics_by_joint
 
@@ -155,6 +157,7 @@ class _Trajectory:
     stamp: int
     points: tuple[_Point, ...]
     name: str  # of the request, if it has one
+    taken: bool = True  # whether it is not known that the planner refused it
 
     @classmethod
     def of(cls, sent: int, message: Any) -> '_Trajectory':
@@ -176,8 +179,9 @@ class _Collected:
     refused: dict[str, int] = field(default_factory=dict)
     # Of all joints, as they were received; plans and verdicts are known once they are in order.
     plans: list[_Trajectory] = field(default_factory=list)
-    trajectories: list[_Trajectory] = field(default_factory=list)
-    setpoints: dict[str, list[RecordedRequest]] = field(default_factory=dict)
+    # Trajectories, and setpoints with the joint in the name of their topic.
+    requests: list[tuple[str | None, _Trajectory | RecordedRequest]] = field(default_factory=list)
+    stops: list[int] = field(default_factory=list)  # when plans without a request were recorded
     verdicts: list[Verdict] = field(default_factory=list)
     # Plans and verdicts, and when each was published, by the clock of the planner.
     published: list[tuple[int, _Trajectory | Verdict]] = field(default_factory=list)
@@ -226,10 +230,10 @@ class _Collected:
         elif role == roles.PLAN:
             self.published.append((message.publish_time, _Trajectory.of(sent, content)))
         elif role == roles.TRAJECTORY:
-            self.trajectories.append(_Trajectory.of(sent, content))
+            self.requests.append((None, _Trajectory.of(sent, content)))
         elif role == roles.SETPOINT:
-            self.setpoints.setdefault(joint, []).append(
-                RecordedRequest(sent, 0, ((float(content.data), None),)))
+            self.requests.append((
+                joint, RecordedRequest(sent, 0, ((float(content.data), None),))))
         elif role == roles.ESTIMATE:
             self.sensors += (
                 (x.hardware_id, LearntSensor(sent, Sensor.of({y.key: y.value for y in x.values})))
@@ -249,18 +253,54 @@ class _Collected:
         count as received no later than what was published after them, and no two at one time:
         between two ticks of a clock everything is recorded at the same.
         """
+        if all(time in (0, x.sent) for time, x in self.published):
+            self._pair()
         self.published.sort(key=lambda x: x[0])
         times = [x.sent for _, x in self.published]
         for i in reversed(range(len(times) - 1)):
             times[i] = min(times[i], times[i + 1])
         for i in range(1, len(times)):
             times[i] = max(times[i], times[i - 1] + _APART)
-        self.published = [
-            (x, replace(one, sent=sent))
-            for (x, one), sent in zip(self.published, times, strict=True)]
-        for _, one in self.published:
+        for (_, one), sent in zip(self.published, times, strict=True):
             kept: list[Any] = self.verdicts if isinstance(one, Verdict) else self.plans
-            kept.append(one)
+            kept.append(replace(one, sent=sent))
+        self._answer(times)
+
+    def _pair(self) -> None:
+        """Put plans right before their verdicts where only times of recording are known."""
+        verdicts = sorted(
+            (x for _, x in self.published if isinstance(x, Verdict)), key=lambda x: x.sent)
+        before = answers.plans_of(verdicts, sorted(
+            x.sent for _, x in self.published if isinstance(x, _Trajectory)))
+        self.published = [
+            (2 * before[x.sent] - 1 if isinstance(x, _Trajectory) and x.sent in before
+             else 2 * x.sent, x) for _, x in self.published]
+
+    def _answer(self, times: Sequence[int]) -> None:
+        """
+        Find out which requests were taken, and put each right before its own plan and verdict.
+
+        A recorder may receive a request after them, and latched news of an earlier one after it.
+        The times are those of all plans and verdicts, in order.
+        """
+        plans = {x.sent for x in self.plans}
+
+        def announced(verdict: Verdict) -> int:
+            place = bisect_left(times, verdict.sent)
+            return times[place - (place > 0 and times[place - 1] in plans)]
+
+        self.requests.sort(key=lambda x: x[1].sent)
+        found, others = answers.answered([x for _, x in self.requests], self.verdicts)
+        self.stops = [announced(x) for x in others]
+        for i, ((key, request), (answer, taken)) in enumerate(
+                zip(self.requests, found, strict=True)):
+            sent = request.sent
+            if answer is not None:
+                begun = announced(answer)
+                place = bisect_left(times, begun)
+                before = times[place - 1] if place else sent - 1
+                sent = min(max(sent, before + 1), begun - 1)
+            self.requests[i] = key, replace(request, sent=sent, taken=taken)
 
     def _plans(self, joint: str) -> Iterable[tuple[Level, ...]]:
         """Return the plans of a joint, or of the one that they are of."""
@@ -273,15 +313,21 @@ class _Collected:
                       x.velocities[place])
                 for x in plan.points
                 if min(len(x.positions), len(x.velocities), len(x.effort)) > place]
-            # Of several joints there is a point wherever one of them changes.
-            yield tuple(
-                x for i, x in enumerate(levels) if i == 0 or len(plan.joints) == 1
-                or x.flux_density != levels[i - 1].flux_density)
+            if len(plan.joints) > 1:
+                # There is a point wherever one of them changes, from what is in force on.
+                first = bisect_right(levels, plan.sent, key=lambda x: x.stamp)
+                levels = levels[max(first - 1, 0):]
+                levels = [x for i, x in enumerate(levels) if i == 0
+                          or x.flux_density != levels[i - 1].flux_density]
+            yield tuple(levels)
 
     def _requests(self, joint: str, key: str) -> list[RecordedRequest]:
         """Return what was asked of a joint, by time."""
-        requests = list(self.setpoints.get(key, ()))
-        for asked in self.trajectories:
+        requests: list[RecordedRequest] = []
+        for of, asked in self.requests:
+            if isinstance(asked, RecordedRequest):
+                requests += [asked] * (of == key)
+                continue
             place = _place(asked.joints, joint)
             if place is not None:
                 points = tuple(
@@ -290,23 +336,10 @@ class _Collected:
                 moves = len(points) > 0 and any(any(x.velocities) for x in asked.points)
                 path = points[-1][1] if moves else None
                 requests.append(RecordedRequest(
-                    self._sent(asked), asked.stamp,
-                    points if path is None else ((points[-1][0], None),), path, asked.name))
+                    asked.sent, asked.stamp,
+                    points if path is None else ((points[-1][0], None),), path, asked.name,
+                    asked.taken))
         return sorted(requests, key=lambda x: x.sent)
-
-    def _sent(self, asked: _Trajectory) -> int:
-        """
-        Return when a request was recorded: before its own plan and status, after all others.
-
-        A recorder may receive it after them, and latched news of an earlier one after it.
-        """
-        own = next((x.sent for x in self.verdicts if asked.name and x.request == asked.name), None)
-        if own is None:
-            return asked.sent
-        verdicts, plans = ([x.sent for x in said] for said in (self.verdicts, self.plans))
-        begun = announced(own, verdicts, plans)
-        before = max((x for x in (*verdicts, *plans) if x < begun), default=asked.sent - 1)
-        return min(max(asked.sent, before + 1), begun - 1)
 
     def finish(
             self, label: str, reader: BagReader, summary: BagSummary, topics: Mapping[str, str],
@@ -340,7 +373,7 @@ class _Collected:
             _begun(self.applied.get(key, ()), int(samples.time[0])),
             tuple(self.forces.get(key, ())), tuple(self._plans(joint)),
             tuple(self._requests(joint, key)),
-            tuple(self.verdicts),
+            tuple(self.verdicts), tuple(self.stops),
             tuple(x for of, x in self.sensors if of == joint or len(
                 {y for y, _ in self.sensors}) == 1), {**parameters, **given},
             plant, planner, known, self.left_out + refused + samples.left_out,

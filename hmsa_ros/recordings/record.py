@@ -1,6 +1,6 @@
 """The record of a run: what was measured, commanded, planned and known of one actuator."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 import math
 from pathlib import Path
@@ -34,6 +34,7 @@ class RecordedRequest:
     # End in ns from the start of a path, whose one point is where it ends; None for rests.
     path: int | None = None
     name: str = ''  # if it has one
+    taken: bool = True  # whether it is not known that the planner refused it
 
 
 @dataclass(frozen=True)
@@ -46,16 +47,6 @@ class Verdict:
     message: str
     plan: int = 0  # number of the request that is carried out, from 1; 0 where not told
     request: str = ''  # its name, if it has one
-
-
-def announced(said: int, verdicts: Iterable[int], plans: Iterable[int]) -> int:
-    """
-    Return when what a verdict says first was recorded: a plan, if one was published right before.
-
-    Times in ns: of the verdict, and of all verdicts and plans, no two of which are equal.
-    """
-    before = max((x for x in verdicts if x < said), default=-1)
-    return max((x for x in plans if before < x < said), default=said)
 
 
 @dataclass(frozen=True)
@@ -84,6 +75,7 @@ class Run:
     plans: tuple[tuple[Level, ...], ...] = ()
     requests: tuple[RecordedRequest, ...] = ()
     verdicts: tuple[Verdict, ...] = ()  # each once
+    stops: tuple[int, ...] = ()  # when plans were recorded for which no request was, in ns
     sensors: tuple[LearntSensor, ...] = ()  # by time; as given before the first
     # Of the nodes, by ``'node.name'``
     parameters: Mapping[str, object] = field(default_factory=dict)

@@ -17,7 +17,7 @@ from hmsa_ros.model.equations import Array, equilibrium_stretch, natural_frequen
 from hmsa_ros.model.law import critical_zeta
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.levels import in_force, Level, ROUNDED, without_repeats
-from hmsa_ros.recordings.record import announced, RecordedRequest, Run
+from hmsa_ros.recordings.record import RecordedRequest, Run
 from hmsa_ros.recordings.topics import COMMAND
 
 #: Stretches that differ by less are one setpoint.
@@ -65,7 +65,7 @@ class _Act:
 def setpoints_of(run: Run) -> list[Requested]:
     """Return the setpoints that were requested in a run, else those that its levels hold."""
     levels = in_force((x,) for x in without_repeats(run.commands)[0])
-    acts = list(_acts(run, levels))
+    acts = _acts(run, levels)
     found: list[Requested] = []
     previous = start_of(run, acts[0].begin if acts else int(run.time[0]))
     for i, act in enumerate(acts):
@@ -83,30 +83,12 @@ def setpoints_of(run: Run) -> list[Requested]:
 
 # -- requests -----------------------------------------------------------------------------------
 
-def _acts(run: Run, levels: Sequence[Level]) -> Iterator[_Act]:
-    """Yield what changed the plan, by time."""
-    # Others are refused.
-    requests = [x for x in run.requests if all(math.isfinite(y) for y, _ in x.points)]
-    number = max((x.plan for x in run.verdicts if requests and x.sent < requests[0].sent),
-                 default=0)
-    for i, request in enumerate(requests):
-        until = requests[i + 1].sent if i + 1 < len(requests) else math.inf
-        answers = [x for x in run.verdicts if request.sent <= x.sent < until]
-        own = [x for x in answers if request.name and x.request == request.name]
-        taken = sorted({x.plan for x in answers if x.plan > number})
-        if any(x.plan for x in answers):
-            accepted = bool(taken) and (not own or any(x.plan in taken for x in own))
-        else:
-            accepted = not answers or any(x.level != 'error' for x in own or answers)
-        if accepted:
-            yield _Act(request, request.sent, _begin(run, request, levels))
-        for later in taken[accepted:]:
-            # Nobody asked for it here: the joint was to stop.
-            sent = announced(
-                next(x.sent for x in answers if x.plan == later), (x.sent for x in run.verdicts),
-                (x[0].sent for x in run.plans if x))
-            yield _Act(None, sent, _new(run, _plan_at(run, sent)) or sent)
-        number = taken[-1] if taken else number
+def _acts(run: Run, levels: Sequence[Level]) -> list[_Act]:
+    """Return what changed the plan, by time."""
+    acts = [_Act(x, x.sent, _begin(run, x, levels)) for x in run.requests
+            if x.taken and all(math.isfinite(y) for y, _ in x.points)]
+    acts += (_Act(None, x, _new(run, _plan_at(run, x)) or x) for x in run.stops)
+    return sorted(acts, key=lambda x: x.sent)
 
 
 def _begin(run: Run, request: RecordedRequest, levels: Sequence[Level]) -> int:
@@ -244,7 +226,8 @@ def _arrivals(
         fresh, begun = _fresh(plan, before, sent), _begun(plan, before)
         goes_on = before and fresh > before[-1].stamp and not last
         before = plan
-        if setpoint.end is not None and fresh >= setpoint.end or arrival and goes_on:
+        if fresh == math.inf or arrival and goes_on or (
+                setpoint.end is not None and fresh >= setpoint.end):
             continue
         new = [x for x in plan[begun:] if x.stamp >= fresh]
         found = _rest(run, new, setpoint)

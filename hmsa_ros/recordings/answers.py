@@ -1,0 +1,112 @@
+"""
+Which verdict of a planner answers which request, as far as a recording shows it.
+
+A request with a name is answered by that. One without is answered by the nearest verdict that
+says something new: of a request that came just before it was planned, or just after it, since a
+recorder may receive a planner's answer before the request itself.
+"""
+
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Protocol
+
+from hmsa_ros.model.status import Code
+from hmsa_ros.recordings.record import Verdict
+
+# In ns: by how much later a message may be recorded than one that was sent after it.
+_LATE = 50_000_000
+# In ns: the longest that a request is planned.
+_PLANNED = 2_000_000_000
+# Of requests that leave the plan as it is, beside those that are refused.
+_IDLE = {Code.UNCHANGED.value, Code.SUPERSEDED.value}
+
+
+class Request(Protocol):
+    """A request: when it was recorded, in ns, and its name, if it has one."""
+
+    @property
+    def sent(self) -> int:
+        """When it was recorded."""
+
+    @property
+    def name(self) -> str:
+        """Its name, empty if it has none."""
+
+
+def beginning(verdicts: Iterable[Verdict], number: int = 0) -> Iterator[Verdict]:
+    """Yield the first verdict on each new plan; a planner that starts anew counts from 0."""
+    for verdict in verdicts:
+        if verdict.plan not in (0, number):
+            yield verdict
+        number = verdict.plan
+
+
+def plans_of(verdicts: Sequence[Verdict], plans: Sequence[int]) -> dict[int, int]:
+    """
+    Return the plans that were published right before a verdict, where only records are known.
+
+    Both by time; plans are given by when they were recorded, in ns, and so are the verdicts
+    returned. The first verdict may be of a plan of before the recording.
+    """
+    found: dict[int, int] = {}
+    for verdict in beginning(verdicts, verdicts[0].plan if verdicts else 0):
+        near = _nearest(plans, verdict.sent, _LATE, _LATE, found)
+        if near is not None:
+            found[near] = verdict.sent
+    return found
+
+
+def answered(
+        requests: Sequence[Request], verdicts: Sequence[Verdict],
+        ) -> tuple[list[tuple[Verdict | None, bool]], list[Verdict]]:
+    """
+    Return each request's answer and whether it was taken, and the verdicts on other new plans.
+
+    Both are given by time. A request without an answer was taken if nothing came after it.
+    """
+    begun = list(beginning(verdicts))
+    new = {x.sent: x for x in begun}
+    named: dict[str, Verdict] = {}
+    for verdict in verdicts:
+        if verdict.request and (verdict.request not in named or (
+                verdict.sent in new and named[verdict.request].sent not in new)):
+            named[verdict.request] = verdict
+    unnamed = {x.sent: x for x in _answers(verdicts) if not x.request or not begun}
+    times = list(unnamed)
+    claimed: set[int] = set()
+    found: list[tuple[Verdict | None, bool]] = []
+    for request in requests:
+        answer = named.get(request.name)
+        if answer is None and not (request.name and begun):
+            near = _nearest(times, request.sent, _LATE if begun else 0, _PLANNED, claimed)
+            answer = None if near is None else unnamed[near]
+        if answer is None:
+            found.append((None, not begun or verdicts[-1].sent < request.sent))
+        elif begun or answer is named.get(request.name):
+            claimed.add(answer.sent)
+            found.append((answer, answer.sent in new if begun else answer.level != 'error'))
+        else:
+            # Without numbers of plans, news of a request before look like an answer.
+            found.append((None, answer.level != 'error'))
+    return found, [x for x in begun if x.sent not in claimed and x is not verdicts[0]]
+
+
+def _answers(verdicts: Sequence[Verdict]) -> Iterator[Verdict]:
+    """Yield the verdicts that may answer a request, by time."""
+    before: Verdict | None = None
+    for verdict in verdicts:
+        fresh = before is None or (verdict.code, verdict.message) != (before.code, before.message)
+        plan = before.plan if before else 0
+        if verdict.plan not in (0, plan) or fresh and (
+                verdict.level == 'error' or verdict.code in _IDLE or not verdict.plan):
+            yield verdict
+        before = verdict
+
+
+def _nearest(
+        times: Sequence[int], time: int, before: int, after: int, without: Iterable[int],
+        ) -> int | None:
+    """Return the nearest of some increasing times within a span of another; None if none is."""
+    begin, end = bisect_left(times, time - before), bisect_left(times, time + after)
+    return min((x for x in times[begin:end] if x not in without),
+               key=lambda x: abs(x - time), default=None)
