@@ -213,6 +213,9 @@ def test_preview_has_every_joint_at_every_change():
             assert stretch == pytest.approx(state.stretch, abs=1e-10)
             assert rate * unit == pytest.approx(state.rate, abs=1e-10)
             assert flux_density == planner.plan.level(stamp).flux_density
+    # From when on each joint has the level that is in force.
+    begun = stamps[len(stamps) // 2]
+    assert joints.preview(begun, 100)[0] == [x for x in stamps if x >= begun]
 
 
 # -- late, lost and foreign commands ------------------------------------------------------------

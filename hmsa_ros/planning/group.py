@@ -192,10 +192,12 @@ class PlannerGroup:
             self, begin: int,
             limit: int) -> tuple[list[int], dict[str, list[tuple[float, float, float]]]]:
         """Return stamps in ns and, by joint, stretch, rate (1/s) and flux density (T) at each."""
-        # From the level in force at begin on, at most limit changes of level of any joint.
-        stamps = sorted({
-            level.stamp for planner in self.planners.values()
-            for level in planner.plan.ahead(begin, limit)})[:limit]
+        # From when on each joint has the level in force at begin, at most limit changes of any.
+        ahead = [
+            [x.stamp for x in planner.plan.ahead(begin, limit)]
+            for planner in self.planners.values()]
+        start = max((x[0] for x in ahead if x and x[0] <= begin), default=0)
+        stamps = sorted({x for each in ahead for x in each if x >= start})[:limit]
         return stamps, {
             name: _samples(planner.plan, stamps) for name, planner in self.planners.items()}
 
