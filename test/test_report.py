@@ -1207,6 +1207,18 @@ def test_noise_is_no_vibration_and_an_offset_is_named(tmp_path):
     assert re.search(r'1\. to 1\.3: residual [\d.]+ %, off target', heading)
 
 
+def test_a_request_that_no_planner_answers_is_told(tmp_path):
+    asked, planned, said, *others = simulated(extra=0.1)
+    asked[-1].header.frame_id = ''
+    part = one(tmp_path / 'bag', [
+        asked, planned, (*said[:-1], status(0, 'accepted', '', plan='1')), *others,
+        (others[-1][0] - 60_000_000, *asked[1:]),
+        (others[-1][0], *said[1:-1], status(0, 'arrived', '', plan='1'))],
+        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert [x.setpoint.target for x in part.evaluation.findings] == [1.1, 1.2, 1.4]
+    assert any('1 of 2 requests have no answer' in x for x in part.run.notes)
+
+
 def test_a_setpoint_that_a_new_plan_leaves_out_is_missed(tmp_path):
     messages = simulated(((1.1, 40.0), (1.2, 40.0), (1.3, 40.0)), period=500_000)
     plan, = (x for _, topic, _, x in messages if topic.endswith('plan'))

@@ -71,7 +71,8 @@ def answered(
         if verdict.request and (verdict.request not in named or (
                 verdict.sent in new and named[verdict.request].sent not in new)):
             named[verdict.request] = verdict
-    unnamed = {x.sent: x for x in _answers(verdicts) if not x.request or not begun}
+    unnamed = {x.sent: x for x in _answers(verdicts, numbered=bool(begun))
+               if not x.request or not begun}
     times = list(unnamed)
     claimed: set[int] = set()
     found: list[tuple[Verdict | None, bool]] = []
@@ -91,14 +92,14 @@ def answered(
     return found, [x for x in begun if x.sent not in claimed and x is not verdicts[0]]
 
 
-def _answers(verdicts: Sequence[Verdict]) -> Iterator[Verdict]:
-    """Yield the verdicts that may answer a request, by time."""
+def _answers(verdicts: Sequence[Verdict], *, numbered: bool) -> Iterator[Verdict]:
+    """Yield the verdicts that may answer a request, by time; whether they have plans' numbers."""
     before: Verdict | None = None
     for verdict in verdicts:
         fresh = before is None or (verdict.code, verdict.message) != (before.code, before.message)
         plan = before.plan if before else 0
         if verdict.plan not in (0, plan) or fresh and (
-                verdict.level == 'error' or verdict.code in _IDLE or not verdict.plan):
+                verdict.level == 'error' or verdict.code in _IDLE or not numbered):
             yield verdict
         before = verdict
 

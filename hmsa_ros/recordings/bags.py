@@ -292,6 +292,11 @@ class _Collected:
         self.requests.sort(key=lambda x: x[1].sent)
         found, others = answers.answered([x for _, x in self.requests], self.verdicts)
         self.stops = [announced(x) for x in others]
+        unheard = sum(answer is None and not taken for answer, taken in found)
+        if unheard:
+            self.notes.append(
+                f'{unheard} of {len(found)} requests have no answer of a planner, and are not '
+                'judged: was it running, and is its ~/status recorded?')
         for i, ((key, request), (answer, taken)) in enumerate(
                 zip(self.requests, found, strict=True)):
             sent = request.sent
