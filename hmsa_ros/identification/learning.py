@@ -31,6 +31,8 @@ _FREQUENCIES, _DAMPINGS, _CERTAIN = (np.geomspace(1.5, 12.0, 120), (0.003, 0.02,
 _PERIODS = 4.0
 # Samples a period, of the second mode, that are needed to see it.
 _FEWEST = 4.0
+# Error of the times of levels, in periods, and from how many levels on a move is smooth.
+_OFF, _MANY = 0.01, 16
 
 
 Places = NDArray[np.intp]
@@ -75,6 +77,8 @@ class Target:
     stretch: float
     begin: float
     end: float
+    #: when it rests by its plan, in s; levels after that follow creep; None: with its last level
+    arrival: float | None = None
 
 
 @dataclass(frozen=True)
@@ -108,14 +112,18 @@ class _Sequence:
         knots: list[float] = []
         self.rests = []
         for target, period in zip(targets, self.period, strict=True):
+            # What a device says of its times is off by the error of its clock.
+            off = _OFF * float(period)
+            until = target.end - 2.0 * off if target.arrival is None else target.arrival
             own = first.level_times[
-                (first.level_times >= target.begin - 1e-9) & (first.level_times < target.end)]
+                (first.level_times >= target.begin - off) & (first.level_times < until + off)]
             if not len(own):
                 raise BadInputError(
                     f'no level belongs to the setpoint {target.stretch:g}: expected one or more')
             length = float(own[-1] - own[0]) or 0.5 * float(period)
             parts = own[0] + length / _PARTS * np.arange(round(_END * _PARTS) + 1)
-            # Those of the sequence itself count where both are about the same.
+            # Of both that are about the same those of the sequence count, if it is not smooth.
+            own = own if len(own) <= _MANY else own[:1]
             knots += [*own, *(x for x in parts if np.min(np.abs(own - x)) > 0.05 * length)]
             self.rests.append(float(own[0]) + _END * length)
             if target.end - self.rests[-1] < period:
@@ -124,15 +132,22 @@ class _Sequence:
                     f'after its move: expected at least a period, {period:.3g} s, to see what is '
                     'left')
         self.knots = np.array(sorted(knots))
+        # Of all levels; those that follow creep change as the last knot before them does.
+        others = first.level_times[first.level_times > self.knots[0]]
+        near = np.min(np.abs(others[:, None] - self.knots), axis=1)
+        self.times = np.sort(np.append(
+            self.knots, others[near > _OFF * float(np.min(self.period))]))
+        self.held = np.eye(len(self.knots))[
+            np.searchsorted(self.knots, self.times, 'right') - 1]
         starts = [actuator.rest, *(x.stretch for x in targets[:-1])]
         self.steps = [x.stretch - y for x, y in zip(targets, starts, strict=True)]
         if min(map(abs, self.steps)) < 1e-6:
             raise BadInputError('a setpoint repeats the one before: expected steps')
 
     def levels(self, trial: Trial) -> Array:
-        """Return the level of a repeat from each knot on, read in the middle until the next."""
-        gaps = np.diff(self.knots, append=self.knots[-1] + 2e-3)
-        return trial.at(self.knots + 0.5 * np.minimum(gaps, 0.05))
+        """Return the level of a repeat from each time on, read in the middle until the next."""
+        gaps = np.diff(self.times, append=self.times[-1] + 2e-3)
+        return trial.at(self.times + 0.5 * np.minimum(gaps, 0.05))
 
     def windows(self, time: Array) -> list[Places]:
         """Return the places of samples at rest at each target; too few are a `BadInputError`."""
@@ -171,17 +186,17 @@ class _Sequence:
         """Return the stretch of the model."""
         unit, scale = self.actuator.time_unit, self.actuator.flux_density_unit
         found: Array = simulate(
-            np.append(self.knots[0] - 1.0, self.knots) / unit, np.append(0.0, levels) / scale,
-            np.maximum(time, self.knots[0] - 1.0) / unit, self.actuator.nondimensional)[0]
+            np.append(self.times[0] - 1.0, self.times) / unit, np.append(0.0, levels) / scale,
+            np.maximum(time, self.times[0] - 1.0) / unit, self.actuator.nondimensional)[0]
         return found
 
     def derivatives(self, levels: Array, time: Array) -> Array:
-        """Return the derivatives of the residual by the levels in T, shape (r, m)."""
+        """Return the derivatives of the residual by levels at the knots in T, shape (r, k)."""
         change = _CHANGE * float(np.max(np.abs(levels)))
         base = self.residual(time, self.simulated(levels, time))
         return np.column_stack([
             (self.residual(time, self.simulated(levels + change * x, time)) - base) / change
-            for x in np.eye(len(levels))])
+            for x in self.held.T])
 
 
 def _ringing(time: Array, frequencies: Sequence[float]) -> Array:
@@ -208,6 +223,21 @@ class _Mode:
         found: Array = response - np.append(response[:, 1:], np.zeros((len(time), 1)), axis=1)
         return found
 
+    def driven(self, times: Array, levels: Array, time: Array) -> Array:
+        """Return its response at some times, from the first on, to levels from others on."""
+        power = self.frequency * complex(-self.damping, math.sqrt(1.0 - self.damping**2))
+        states, state = [], 0j
+        for change, fade in zip(
+                np.diff(levels, prepend=0.0).tolist(),
+                np.exp(power * np.diff(times, append=times[-1])).tolist(), strict=True):
+            states.append(state + change)
+            state = states[-1] * fade
+        place = np.searchsorted(times, time, 'right') - 1
+        ring = np.array(states)[place] * np.exp(power * (time - times[place]))
+        found: Array = self.gain * (
+            levels[place] - ring.real + power.real / power.imag * ring.imag)
+        return found
+
 
 def _second_mode(sequence: _Sequence, trial: Trial, noise: float) -> _Mode | None:
     """Find a mode that the levels excite, beside the first one and twice its frequency."""
@@ -230,7 +260,7 @@ def _second_mode(sequence: _Sequence, trial: Trial, noise: float) -> _Mode | Non
 
     def explained(frequency: float, damping: float) -> tuple[float, float]:
         """Return by how much the sum of squares falls, and the gain."""
-        shape = without(_Mode(frequency, damping).steps(sequence.knots, time) @ levels)
+        shape = without(_Mode(frequency, damping).driven(sequence.times, levels, time))
         power = float(shape @ shape)
         gain = float(shape @ seen) / power if power > 0.0 else 0.0
         return gain**2 * power, gain
@@ -298,11 +328,11 @@ def learn(
     weight = max(noise, 1e-7) / min(map(abs, sequence.steps)) / math.sqrt(
         len(residual) / len(targets)) / (_EXPECTED * size)
     change = np.linalg.lstsq(
-        np.vstack([slopes, weight * np.eye(len(levels))]),
-        np.append(-residual, np.zeros(len(levels))), rcond=None)[0]
+        np.vstack([slopes, weight * np.eye(slopes.shape[1])]),
+        np.append(-residual, np.zeros(slopes.shape[1])), rcond=None)[0]
     radius = _LARGEST * size * 0.5 ** (len(trials) - 1 - best)
     change *= min(1.0, radius / max(float(np.max(np.abs(change))), 1e-300))
     return Learnt(
-        sequence.knots, np.clip(levels + change, *limits),
+        sequence.times, np.clip(levels + sequence.held @ change, *limits),
         tuple(sequence.left(x, mode) for x in trials), best,
         math.nan if mode is None else mode.frequency / (2.0 * math.pi))

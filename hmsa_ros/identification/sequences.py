@@ -49,7 +49,8 @@ def learn_from(runs: Sequence[Run]) -> tuple[Learnt, list[Target]]:
         requested[-1].end if requested[-1].end is not None else begins[0] + last]
     targets = [
         Target(x.target, max((x.begins - begins[0]) / NANOSECONDS, 0.0),
-               (end - begins[0]) / NANOSECONDS)
+               (end - begins[0]) / NANOSECONDS,
+               None if x.arrival is None else (x.arrival - begins[0]) / NANOSECONDS)
         for x, end in zip(requested, ends, strict=True)]
     low, high = (first.number('planner.flux_density_max') or 0.5) * np.array((-1.0, 1.0))
     return learn(
