@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 
+from benchmarks.laboratory import Iron
 from hmsa_ros.cli import main
 from hmsa_ros.device.assembly import Assembly, CoilModel
 from hmsa_ros.device.calibration import calibrate_coil, loop
@@ -105,6 +106,20 @@ def test_a_guided_run_measures_the_coil_and_leaves_it_off(typed, tmp_path, capsy
     assert found['model'] == 'number'
     assert max(map(abs, Supply.written)) == pytest.approx(2.0)
     assert Supply.amperes == 0.0
+
+
+def test_a_core_whose_hysteresis_is_written_is_demagnetised_at_the_end(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, 'bench_under_test', sys.modules[__name__])
+    Supply.written.clear()
+    assert main([
+        'calibrate', 'coil', 'bench_under_test:coil', '--probe', 'bench_under_test:Supply',
+        '--limit', '0.1', '--steps', '2', '--settle', '0', '--hysteresis']) == 0
+    core, left = Iron(0.04, 0.6), []
+    for current in Supply.written:
+        core.turn(current)
+        left.append(core.field(0.0) if current == 0.0 else 0.0)
+    assert max(map(abs, left)) > 0.02
+    assert abs(left[-1]) < 1e-4
 
 
 def test_an_interrupt_leaves_the_coil_off(monkeypatch):

@@ -62,7 +62,8 @@ def add_parser(subparsers: Any) -> None:
          'class or function without arguments for the field probe, an object whose read() '
          'returns a flux density in T (default: type the readings, with or without a unit)'),
         ('--hysteresis',
-         'also write the hysteresis of an iron core, which the driver then compensates'),
+         'also write the hysteresis of an iron core, which the driver then compensates, and '
+         'demagnetise the core at the end'),
         ('--out', 'YAML', Path,
          'parameter file of the driver to write; a table is written beside it as CSV'),
         JSON)
@@ -203,16 +204,21 @@ def _readings(arguments: argparse.Namespace) -> 'tuple[Array, Array]':
 
         columns = read_table(path, ('current', 'flux_density')).columns
         return columns['current'], columns['flux_density']
-    from hmsa_ros.device.calibration import held_coil, loop, read_loop
+    from hmsa_ros.device.calibration import decay, held_coil, loop, read_loop
 
     read = _typed if arguments.probe is None else _probe(arguments.probe)
     settings = dict(setting(x) for x in arguments.set)
     with held_coil(arguments.source, settings, arguments.limit) as held:
         levels = loop(arguments.limit, arguments.steps)
         if arguments.probe is None:
-            return read_loop(held, levels, arguments.settle, read, lambda text, share: None)
-        with progress('starting') as update:
-            return read_loop(held, levels, arguments.settle, read, update)
+            found = read_loop(held, levels, arguments.settle, read, lambda text, share: None)
+        else:
+            with progress('starting') as update:
+                found = read_loop(held, levels, arguments.settle, read, update)
+        if arguments.hysteresis:
+            for level in decay(arguments.limit):
+                held.hold(level, arguments.settle)
+    return found
 
 
 def _typed(current: float) -> float:

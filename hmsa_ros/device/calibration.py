@@ -27,6 +27,8 @@ _MISSES, _FAR = 0.005, 20.0
 _BEAT, _SILENCE = 0.1, 1.0
 # Rate in Hz at which the hardware is looked after.
 _RATE = 50.0
+# Levels that demagnetise a core.
+_DECAY = 12
 # Currents closer than this share of their range are one.
 _SAME = 1e-6
 
@@ -196,6 +198,11 @@ def loop(largest: float, steps: int) -> list[float]:
     """Return levels from 0 up to the largest one, down to its negative, and back to 0."""
     up = np.linspace(0.0, largest, steps + 1)
     return [float(x) for x in (*up, *up[-2::-1], *-up[1:], *-up[-2::-1])]
+
+
+def decay(largest: float) -> list[float]:
+    """Return levels that demagnetise a core: to both sides, ever smaller, and 0."""
+    return [largest * (1.0 - i / _DECAY) * (-1.0)**i for i in range(_DECAY)] + [0.0]
 
 
 class HeldCoil:
