@@ -421,6 +421,16 @@ def test_profile_reaches_the_limit_at_the_ends_of_the_interval():
         profile(found, 'density')
 
 
+def test_what_a_model_lacks_costs_a_share_of_a_usual_step_not_of_the_smallest():
+    time, (switches, levels) = np.arange(0.0, 2.4, 1e-3), steps((1.3, 1.31, 1.0, 1.2), 0.1, 6)
+    since = time - switches[np.searchsorted(switches, time, 'right') - 1]
+    seen = simulate(time, switches, levels) + 4e-3 * np.sin(900.0 * since) * np.exp(-50.0 * since)
+    noise = np.random.default_rng(0).normal(0.0, 1e-3, len(time))
+    found = identify(Recording(time, seen + noise, switches, levels))
+    assert found.verdict == 'model_rejected'
+    assert 0.01 < found.cost < 0.03
+
+
 def test_block_without_limit_of_its_chains_is_identified():
     block = replace(BLOCK, chain_limit=np.inf)
     level_times, levels = steps(SEQUENCE, SPAN, 3)

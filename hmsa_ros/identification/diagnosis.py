@@ -301,14 +301,13 @@ def _remedy(seen: Sequence[Signature]) -> str:
 
 def cost(fit: Fit, marks: Sequence[Signature], alike: Repeated | None) -> float:
     """Return what the model lacks of the motion, peak to peak of a swing, over a step."""
-    if alike is not None and alike.p_value <= _CHANCE:
-        return alike.cost
     share = max((x.share for x in marks if x.found), default=0.0)
     ends = [float(fit.response.stretch[end - 1]) for _, end, _, _ in segments(fit.recording, 1)]
     steps = np.abs(np.diff(ends))
     step = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
     rms = float(np.sqrt(np.mean((fit.root * fit.residual) ** 2)))
-    return 2.0 * math.sqrt(2.0 * share) * rms / step
+    repeats = alike.cost if alike is not None and alike.p_value <= _CHANCE else 0.0
+    return max(2.0 * math.sqrt(2.0 * share) * rms / step, repeats)
 
 
 def considered(

@@ -31,7 +31,7 @@ class Repeated:
 
     p_value: float  # of as much by chance
     size: float  # root mean square over all samples, stretch
-    cost: float  # largest peak to peak, over the change of the stretch
+    cost: float  # largest peak to peak, over the median change of the stretch
 
 
 def repeated(fit: Fit, period: float, floor: float = 0.0) -> Repeated | None:
@@ -53,7 +53,7 @@ def repeated(fit: Fit, period: float, floor: float = 0.0) -> Repeated | None:
     residual, shown = fit.root * fit.residual, fit.response.stretch
     width = min(fit.recording.gap, period / _FINEST)
     grams: list[list[Array]] = []
-    squares, count, cost = 0.0, 0.0, 0.0
+    squares, count, largest, steps = 0.0, 0.0, 0.0, list[float]()
     for group in whole:
         table, seen = _folded(fit.recording.time, residual, group, width)
         size = table.shape[1]
@@ -65,11 +65,13 @@ def repeated(fit: Fit, period: float, floor: float = 0.0) -> Repeated | None:
         squares += mean * float(np.sum(seen))
         count += float(np.sum(seen))
         begin, end, _ = group[0]
-        step = abs(float(shown[end - 1] - shown[max(begin - 1, 0)]))
-        if step > 0.0:
-            cost = max(cost, 2.0 * math.sqrt(2.0 * max(mean, 0.0)) / step)
+        steps.append(abs(float(shown[end - 1] - shown[max(begin - 1, 0)])))
+        largest = max(largest, mean)
     rms = math.sqrt(max(squares, 0.0) / max(count, 1.0))
-    return Repeated(_chance(grams) if rms > floor else 1.0, rms, cost)
+    step = float(np.median(steps))
+    return Repeated(
+        _chance(grams) if rms > floor else 1.0, rms,
+        2.0 * math.sqrt(2.0 * largest) / step if step > 0.0 else 0.0)
 
 
 def _apart(rows: Array) -> Array:
