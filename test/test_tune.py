@@ -3,8 +3,10 @@
 from dataclasses import replace
 import json
 import math
+from pathlib import Path
 
 from core_oracle import follow
+from identification_oracle import simulate, steps
 import numpy as np
 import pytest
 
@@ -12,7 +14,11 @@ import hmsa_ros
 from hmsa_ros.api.choice import choose, compare_shapers, Expected
 from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.files import read_belief
+from hmsa_ros.identification.identify import identify
 from hmsa_ros.identification.known import Known
+from hmsa_ros.identification.recording import Recording
+from hmsa_ros.lab.tuning import chosen, Tuning
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.recordings.bags import read_run
 from hmsa_ros.recordings.parameters import read_parameter_file
@@ -58,6 +64,17 @@ def test_a_shaper_that_cannot_plan_the_moves_is_not_chosen():
     assert choose(found, 1e-6).shaper == 'two_step'
     with pytest.raises(BadInputError, match='no shaper plans the setpoints: too short'):
         choose([Expected('two_step', math.nan, math.nan, 'too short')], 0.01)
+
+
+def test_a_model_that_lacks_something_is_planned_with_smoothly():
+    time, (switches, levels) = np.arange(0.0, 0.4, 1e-3), steps((1.3, 1.0, 1.2), 0.1)
+    seen = simulate(time, switches, levels) + np.random.default_rng(0).normal(0.0, 1e-3, 400)
+    found = identify(Recording(time, seen, switches, levels))
+    tuning = Tuning(Path(), tuple(((x,), y) for x, y in MOVES), Path(), [], lambda _: ())
+    belief = read_belief(None, [])
+    chosen_for = [chosen(tuning, belief, x)[1]['shaper'] for x in (
+        found, replace(found, verdict='model_rejected'))]
+    assert (found.verdict, *chosen_for) == ('identified', 'two_step', 'smooth')
 
 
 @pytest.mark.parametrize(('words', 'what'), [

@@ -258,7 +258,8 @@ def identified(
     if found.verdict == 'not_identifiable' and not tuning.free:
         # Moves that hardly feel the limit of the chains are planned as well with the one given.
         without = tuple(x for x in free if x != 'chain_limit')
-        found = min(found, fit(without), key=lambda x: x.verdict != 'identified')
+        found = min(
+            found, fit(without), key=lambda x: (x.verdict != 'identified', not x.acceptable))
     return found
 
 
@@ -270,7 +271,10 @@ def chosen(
     shapers = compare_shapers(
         Actuator.from_parameters(learnt.settings),
         [(x[0], span) for x, span in tuning.setpoints], learnt.known)
-    return shapers, {**learnt.settings, 'shaper': choose(shapers, _QUIET).shaper}
+    # What an accepted model lacks, such as hysteresis, disturbs a smooth move least.
+    smooth = [x for x in shapers if x.shaper == 'smooth' and not x.reason
+              and found.verdict != 'identified']
+    return shapers, {**learnt.settings, 'shaper': choose(smooth or shapers, _QUIET).shaper}
 
 
 def _apply(tuning: Tuning, settings: Mapping[str, Any]) -> None:
