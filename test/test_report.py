@@ -1257,8 +1257,9 @@ def test_a_stop_after_a_refused_request_does_not_carry_it_out(tmp_path):
     assert [x.setpoint.target for x in part.evaluation.findings] == [1.1, 1.2, 1.4]
 
 
+@pytest.mark.parametrize('topic', ['setpoint', 'joint_trajectory'])
 @pytest.mark.parametrize('late', [0, 500_000])
-def test_joints_that_are_moved_in_turn_keep_their_setpoints(tmp_path, late):
+def test_joints_that_are_moved_in_turn_keep_their_setpoints(tmp_path, late, topic):
     joints = 'left', 'right'
     group = PlannerGroup({x: Planner(ACTUATOR, Options(lead_time=LEAD)) for x in joints})
     plants = {x: ActuatorSimulation(ACTUATOR, time=START) for x in joints}
@@ -1275,10 +1276,13 @@ def test_joints_that_are_moved_in_turn_keep_their_setpoints(tmp_path, late):
         for i, point in enumerate(plan.points):
             point.positions, point.velocities, point.effort = np.array(
                 [samples[x][i] for x in joints]).T.copy()
+        request = trajectory(0, [(pause, target)])
+        request.header.frame_id, request.joint_names = '', [joint]
         messages += [
             # The recorder may receive it last.
             (time + late, f'/planner/{joint}/setpoint', setpoint,
-             STORE.types[setpoint](data=target)),
+             STORE.types[setpoint](data=target)) if topic == 'setpoint' else
+            (time + late, '/planner/joint_trajectory', TYPES[TRAJECTORY], request),
             (time + 100_000, '/planner/plan', TYPES[PLAN], plan),
             (time + 200_000, '/planner/status', TYPES[STATUS], status(
                 0, 'accepted', 'accepted', plan=str(number)))]

@@ -280,8 +280,8 @@ class PlannerClient(Visitor):
             now = self.verdict
             if now.request != verdict.request:
                 raise HmsaError(
-                    'the sequence was not completed: another request replaced it '
-                    f'({now.message})')
+                    'the sequence was not followed to its end: a newer request came, for its '
+                    f'joints or others ({now.message})')
             nonlocal heard
             ended = (
                 now.setpoint == now.setpoints and now.state in ('at_rest', 'settling')

@@ -397,4 +397,4 @@ def _place(names: Sequence[str], joint: str) -> int | None:
     """Return a joint's place among some names: the first if it does not matter."""
     if joint in names:
         return list(names).index(joint)
-    return 0 if not joint or len(names) <= 1 else None
+    return 0 if not joint or not names else None
