@@ -113,6 +113,19 @@ def test_a_repeat_that_left_more_is_taken_back():
     assert len(once.levels) == len(found.levels)
 
 
+def test_samples_that_are_late_teach_as_much():
+    levels = first = planned()
+    bench, late, trials, left = Bench(1, max(abs(b) for _, b in levels)), 40, [], []
+    bench.gain = 0.0
+    for _ in range(3):
+        true = bench.repeat(levels)
+        left.append(judged(true, first).max())
+        trials.append(bench.trial(np.append(np.full(late, true[0]), true[:-late]), levels))
+        found = learn(trials, TARGETS, NOMINAL)
+        levels = list(zip(found.level_times.tolist(), found.levels.tolist(), strict=True))
+    assert left[-1] < 0.1 * left[0]
+
+
 def test_levels_that_follow_creep_are_kept_and_corrected_with_their_move():
     levels = planned()
     ends = [max(t for t, _ in levels if t < x.end) for x in TARGETS]

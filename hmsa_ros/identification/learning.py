@@ -7,7 +7,7 @@ learning control (N. Amann, D. H. Owens, E. Rogers, IEE Proc. D 143, 217 (1996))
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -31,6 +31,8 @@ _FREQUENCIES, _DAMPINGS, _CERTAIN = (np.geomspace(1.5, 12.0, 120), (0.003, 0.02,
 _PERIODS = 4.0
 # Samples a period, of the second mode, that are needed to see it.
 _FEWEST = 4.0
+# Delays of the samples that are tried, in periods.
+_DELAYS = np.linspace(0.0, 0.5, 101)
 # Error of the times of levels, in periods, and from how many levels on a move is smooth.
 _OFF, _MANY = 0.01, 16
 
@@ -190,6 +192,13 @@ class _Sequence:
             np.maximum(time, self.times[0] - 1.0) / unit, self.actuator.nondimensional)[0]
         return found
 
+    def delay(self, trial: Trial) -> float:
+        """Return by how much in s the samples are later than the model, by lag and latency."""
+        seen, shown = trial.stretch, self.simulated(self.levels(trial), trial.time)
+        delays = float(np.min(self.period)) * _DELAYS
+        return float(min(delays, key=lambda x: float(np.sum(
+            (seen - np.interp(trial.time - x, trial.time, shown))**2))))
+
     def derivatives(self, levels: Array, time: Array) -> Array:
         """Return the derivatives of the residual by levels at the knots in T, shape (r, k)."""
         change = _CHANGE * float(np.max(np.abs(levels)))
@@ -311,6 +320,8 @@ def learn(
     if not trials or not targets:
         raise BadInputError(f'{len(trials)} repeats and {len(targets)} setpoints: expected some')
     sequence = _Sequence(trials[0], targets, actuator)
+    delay = sequence.delay(trials[0])
+    trials = [replace(x, time=x.time - delay) for x in trials]
     residuals = [sequence.residual(x.time, x.stretch) for x in trials]
     best = int(np.argmin([float(x @ x) for x in residuals]))
     trial, residual = trials[best], residuals[best]
