@@ -1303,6 +1303,8 @@ def test_joints_that_are_moved_in_turn_keep_their_setpoints(tmp_path, late, topi
     assert [(x.run.joint, [(y.setpoint.target, str(y.verdict)) for y in x.evaluation.findings])
             for x in parts] == [
         (x, [(target, 'arrived') for of, target in asked if of == x]) for x in joints]
+    # Each until the next.
+    assert all(y.error < ROUNDING for x in parts for y in x.evaluation.results)
 
 
 def test_the_findings_of_a_bag_are_printed_as_json(bag, tmp_path, capsys):

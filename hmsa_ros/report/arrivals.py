@@ -140,9 +140,8 @@ def around(part: Part, number: int, curve: Curve) -> tuple[Array, Array]:
 
 def step_of(part: Part, number: int) -> float:
     """Return how far a move was to go."""
-    found = part.evaluation
-    return found.results[number].stretch - (
-        found.results[number - 1].stretch if number else found.start)
+    found = part.evaluation.results[number]
+    return found.stretch - found.start
 
 
 def span(parts: Sequence[Part], number: int) -> float:

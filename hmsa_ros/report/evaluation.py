@@ -53,6 +53,7 @@ class Move:
     """
 
     stretch: float  #: target
+    start: float  #: stretch before
     begin: int  #: of the first command
     arrival: int  #: of planned rest at the target
     end: int  #: until when the target was held
@@ -71,6 +72,7 @@ class MoveResult:
     """The result of one setpoint."""
 
     stretch: float  #: target
+    start: float  #: stretch before
     #: first and last level and the time between begin and arrival, nondimensional as in the paper
     b_p: float
     tau_p: float
@@ -149,11 +151,7 @@ def evaluate(run: Run, tolerances: Tolerances | None = None) -> Evaluation:
     time = (run.time - first) / NANOSECONDS
     period = period_of(run)
     plain = _plain(run, time, found, first, start)
-    results = []
-    previous = start
-    for move in found:
-        results.append(_measure(run, time, plain, move, move.stretch - previous, first))
-        previous = move.stretch
+    results = [_measure(run, time, plain, x, first) for x in found]
     stamps = run.time
     if plan:
         between = np.rint(fine(time, period) * NANOSECONDS).astype(np.int64) + first
@@ -184,7 +182,7 @@ def find_moves(run: Run, levels: Sequence[Level], setpoints: Sequence[Requested]
     moves = []
     for place, asked in enumerate(setpoints):
         setpoint, arrival = asked.setpoint, asked.arrival
-        end = last if asked.due is None else min(asked.due, last)
+        end = min(x for x in (asked.due, asked.until, last) if x is not None)
         inside = [x for x in levels if setpoint.begins <= x.stamp <= (arrival or end)]
         if asked.missed or setpoint.step <= SAME or not inside:
             continue
@@ -194,7 +192,7 @@ def find_moves(run: Run, levels: Sequence[Level], setpoints: Sequence[Requested]
             inside = [x for x in inside if x.stamp <= arrival]
         if arrival < end:
             moves.append(Move(
-                setpoint.target, inside[0].stamp, arrival, end,
+                setpoint.target, setpoint.start, inside[0].stamp, arrival, end,
                 tuple(x.flux_density for x in inside), place))
     return moves
 
@@ -242,16 +240,16 @@ def period_of(run: Run) -> float:
     return 2.0 * math.pi / float(natural_frequency(material.rest, material)) * run.plant.time_unit
 
 
-def _measure(
-        run: Run, time: Array, plain: Curve, move: Move, step: float, zero: int) -> MoveResult:
+def _measure(run: Run, time: Array, plain: Curve, move: Move, zero: int) -> MoveResult:
     """Measure one setpoint."""
+    step = move.stretch - move.start
     begin, arrival, end = (
         (x - zero) / NANOSECONDS for x in (move.begin, move.arrival, move.end))
     window = {'arrival': arrival, 'end': end, 'step': step}
     after = (time >= arrival) & (time <= end)
     error = residual = unshaped = math.nan
     moved = True
-    if np.count_nonzero(after) >= 2 and step != 0.0:
+    if np.count_nonzero(after) >= 2:
         error = float(np.max(np.abs(run.stretch[after] - move.stretch)) / abs(step))
         before = run.stretch[max(int(np.searchsorted(time, begin, side='right')) - 1, 0)]
         moved = bool((np.mean(run.stretch[after]) - before) / step >= _MOVED)
@@ -260,7 +258,7 @@ def _measure(
         unshaped = residual_vibration(plain.time, plain.stretch, **window)
     unit = run.planner.flux_density_unit
     return MoveResult(
-        stretch=move.stretch, b_p=float(signed_root(move.flux_densities[0] / unit)),
+        stretch=move.stretch, start=move.start, b_p=float(signed_root(move.flux_densities[0] / unit)),
         tau_p=(arrival - begin) / run.planner.time_unit,
         b_1=float(signed_root(move.flux_densities[-1] / unit)), begin=begin,
         arrival=arrival - begin, end=end, error=error, residual=residual,
