@@ -258,7 +258,8 @@ def _measure(run: Run, time: Array, plain: Curve, move: Move, zero: int) -> Move
         unshaped = residual_vibration(plain.time, plain.stretch, **window)
     unit = run.planner.flux_density_unit
     return MoveResult(
-        stretch=move.stretch, start=move.start, b_p=float(signed_root(move.flux_densities[0] / unit)),
+        stretch=move.stretch, start=move.start,
+        b_p=float(signed_root(move.flux_densities[0] / unit)),
         tau_p=(arrival - begin) / run.planner.time_unit,
         b_1=float(signed_root(move.flux_densities[-1] / unit)), begin=begin,
         arrival=arrival - begin, end=end, error=error, residual=residual,
