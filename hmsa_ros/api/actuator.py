@@ -218,9 +218,64 @@ class Actuator:
             'half_thickness': 0.5 * number(thickness, 'thickness', 'm'), 'law': 'beam',
             'constants': {'youngs_modulus': youngs_modulus, 'width': width}, **more}
         if damping_coefficient is None:
-            undamped = cls(**made, zeta=0.0).model.material
-            ratio = number(0.05 if damping_ratio is None else damping_ratio, 'damping_ratio')
-            return cls(**made, zeta=ratio * float(critical_zeta(undamped.rest, undamped)))
+            return _damped(cls, made, damping_ratio)
+        return cls(**made, damping_coefficient=damping_coefficient)
+
+    @classmethod
+    def dielectric(
+            cls, *, layer_thickness: float, permittivity: float = 3.0, voltage_max: float = 5e3,
+            damping_ratio: float | None = None, damping_coefficient: float | None = None,
+            **more: Any) -> 'Actuator':
+        """
+        Return a dielectric elastomer between compliant electrodes, driven by steps of a voltage.
+
+        A layer or a stack of them, free at its sides. Positions are capacitances over that at
+        rest, `levels` and ``flux_densities`` voltages in V.
+
+        Parameters
+        ----------
+        layer_thickness : float
+            Of the elastomer between two electrodes at rest, in m.
+        permittivity : float
+            Over that of vacuum.
+        voltage_max : float
+            Of the amplifier, in V; the least voltage is 0.
+        damping_ratio, damping_coefficient : float, optional
+            About rest, or c of the thickness in N s/m; default a ratio of 0.05.
+        **more
+            Shear modulus, density, half length, half thickness and chain limit, as of `Actuator`.
+
+        Returns
+        -------
+        Actuator
+            With the law ``dielectric``.
+
+        Raises
+        ------
+        BadInputError
+            If a value is of another type or out of range, or a remanence, creep, slew limit or
+            time constant of a coil is given.
+
+        Examples
+        --------
+        >>> from hmsa_ros import Actuator
+        >>> stack = Actuator.dielectric(layer_thickness=50e-6, shear_modulus=100e3)
+        >>> plan = stack.plan([(1.1, 0.5)])
+        >>> plan.report()['status'], round(plan.flux_densities[-1])   # V
+        (['two_step'], 1413)
+
+        """
+        if 'remanence' in more:
+            raise BadInputError(
+                f'remanence is {excerpt(more["remanence"])}: expected none, since nothing in a '
+                'dielectric elastomer is magnetised')
+        made = {
+            'law': 'dielectric', 'constants': {
+                'permittivity': permittivity, 'layer_thickness': layer_thickness},
+            'flux_density_limits': (0.0, number(voltage_max, 'voltage_max', 'V', above=0.0)),
+            **more}
+        if damping_coefficient is None:
+            return _damped(cls, made, damping_ratio)
         return cls(**made, damping_coefficient=damping_coefficient)
 
     # -- what it is ----------------------------------------------------------------------------
@@ -268,12 +323,12 @@ class Actuator:
 
     def flux_density(self, stretch: ArrayLike) -> Any:
         """Return the flux density in T that holds a stretch, or an array of them."""
-        found = elastic_force(stretch, self.model.material) * self.model.units.load
+        found = self.model.units.level(elastic_force(stretch, self.model.material))
         return found if np.ndim(found) else float(found)
 
     def stretch(self, flux_density: ArrayLike) -> Any:
         """Return the stretch that a flux density in T holds, or an array of them."""
-        load = np.asarray(flux_density, dtype=np.float64) / self.model.units.load
+        load = self.model.units.of_level(np.asarray(flux_density, dtype=np.float64))
         found = equilibrium_stretch(load, self.model.material)
         return found if np.ndim(found) else float(found)
 
@@ -339,7 +394,7 @@ class Actuator:
                 if name.startswith('law.') and name != LAW_NAME.name}
         if 'constants' in parameters:
             now['constants'] = {**now.get('constants', {}), **parameters.pop('constants')}
-        if LAWS[self.law].scaled is None:
+        if LAWS[self.law].scaled is None or not LAWS[self.law].own_modulus:
             now['shear_modulus'] = block.shear_modulus
         if 'damping_coefficient' in parameters:
             del now['zeta']
@@ -704,6 +759,14 @@ class Actuator:
         write_text(Path(path), '\n'.join([
             '/**:', '  ros__parameters:',
             *(f'    {x}: {yaml_text(y)}' for x, y in self.parameters.items())]) + '\n')
+
+
+def _damped(
+        cls: type[Actuator], made: Mapping[str, Any], damping_ratio: float | None) -> Actuator:
+    """Return an actuator with a damping ratio about rest, by default 0.05."""
+    undamped = cls(**made, zeta=0.0).model.material
+    ratio = number(0.05 if damping_ratio is None else damping_ratio, 'damping_ratio')
+    return cls(**made, zeta=ratio * float(critical_zeta(undamped.rest, undamped)))
 
 
 _KEYS = tuple(x for x in Actuator.__init__.__annotations__ if x != 'return')

@@ -128,7 +128,8 @@ def law_values(
         raise BadInputError(
             f'law {name} has no constant {unknown[0]!r}: expected '
             + (', '.join(names) or 'none'))
-    if law.scaled is not None and modulus is not None:
+    owns = law.scaled is not None and law.own_modulus
+    if owns and modulus is not None:
         raise BadInputError(
             f'shear_modulus is given with law {name}, whose constants it follows from: expected '
             f'constants={{...}} of {", ".join(names)} alone')
@@ -138,7 +139,7 @@ def law_values(
         values[names[key].name] = (
             number(value, key, names[key].unit) if kind is float
             else [number(x, key) for x in value] if kind is list else str(value))
-    if law.scaled is None:
+    if not owns:
         values['actuator.shear_modulus'] = number(
             DEFAULTS['shear_modulus'] if modulus is None else modulus, 'shear_modulus', 'Pa')
     return values

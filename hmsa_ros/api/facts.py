@@ -8,7 +8,7 @@ from hmsa_ros.planning.scales import Scales
 
 def facts(found: Scales, block: ActuatorParameters) -> list[tuple[str, str]]:
     """Return what follows from parameters, as names and values with their units."""
-    beam = block.rest == 0.0
+    beam, drive = block.rest == 0.0, block.coordinate.drive
     words = block.coordinate.plural
     return [
         ('time unit' if beam else 'time unit L sqrt(rho/G)', _time_text(found.time_unit)),
@@ -18,9 +18,10 @@ def facts(found: Scales, block: ActuatorParameters) -> list[tuple[str, str]]:
          f'{found.critical_damping:.4g} N s/m, zeta {found.critical_zeta:.4g}'),
         (f'limiting {words}', '{:.4f} and {:.4f}'.format(*found.stretch_limits)),
         *([] if beam else [('shape c1', f'{found.c1:.4g}')]),
-        *((f'flux density for {stretch:.6g}', f'{1e3 * flux:.4g} mT')
-          for stretch, flux in found.flux_densities),
-        (f'coil holds {words}', '{:.6g} to {:.6g}'.format(*found.held)),
+        *((f'{drive.name} for {stretch:.6g}', drive.text(level, '.4g'))
+          for stretch, level in found.flux_densities),
+        (f'{"amplifier" if drive.squared else "coil"} holds {words}',
+         '{:.6g} to {:.6g}'.format(*found.held)),
         ('two steps reach from rest', 'nothing' if found.reached == (block.rest,) * 2
          else '{:.6g} to {:.6g}'.format(*found.reached)),
         ('a move from rest', 'none in two steps' if math.isnan(found.duration)

@@ -106,7 +106,7 @@ class Motion:
             return setpoints([part])
         from hmsa_ros.report.outcome import level_results, level_table
 
-        return level_table(level_results(self.run))
+        return level_table(level_results(self.run), self.run.plant.coordinate.drive)
 
     def plot(self, path: str | Path | Sequence[str | Path] | None = None, **paper: Any) -> Any:
         """
@@ -289,19 +289,20 @@ def simulated(
     The start is a stretch at rest, without a field by default. Raises `BadInputError` for what
     cannot be used, `HmsaError` for levels that cannot be followed.
     """
+    model, units, unit = truth.model, truth.model.units, truth.model.units.load_name
     back = np.flatnonzero(np.diff(times) <= 0.0)
     if len(back) or times[0] < 0.0 or not np.all(np.isfinite(times) & np.isfinite(levels)):
         place = int(back[0]) + 1 if len(back) else 0
         raise BadInputError(
-            f'levels have the time {times[place]:g} s and the flux density {levels[place]:g} T in '
-            f'row {place + 1}: expected finite numbers, and increasing times from 0 s on')
-    model = truth.model
+            f'levels have the time {times[place]:g} s and the {units.drive.name} '
+            f'{levels[place]:g}{unit} in row {place + 1}: expected finite numbers, and increasing '
+            'times from 0 s on')
     low, high = truth.flux_density_limits
     beyond = np.flatnonzero((levels < low) | (levels > high))
     if plan is None and len(beyond):
         raise BadInputError(
-            f'level {levels[beyond[0]]:g} T in row {int(beyond[0]) + 1} is beyond the limits of '
-            f'the coil, {low:g} to {high:g} T: expected flux densities in T, or '
+            f'level {levels[beyond[0]]:g}{unit} in row {int(beyond[0]) + 1} is beyond the limits '
+            f'of the coil, {low:g} to {high:g}{unit}: expected {units.drive.plural} in{unit}, or '
             'flux_density_limits (in a parameter file flux_density_max) that allow it')
     begin = number(model.material.rest if start is None else start, 'start')
     check_stretch(begin, model.material, 'start stretch')
@@ -352,12 +353,12 @@ def response(
     model = truth.model
     units, material, delivery = model.units, model.material, model.delivery
     held = float(elastic_force(start, material))
-    loads = [Load(x / units.time, y / units.load) for x, y in zip(
+    loads = [Load(x / units.time, units.of_level(y)) for x, y in zip(
         times.tolist(), levels.tolist(), strict=True)]
     if loads[0].time > 0.0:
         loads.insert(0, Load(0.0, held))
     rows = sampled(loads, State(start, load=held), at / units.time, material, delivery)
-    return rows[0], rows[1] / units.time, rows[2] * units.load
+    return rows[0], rows[1] / units.time, units.level(rows[2])
 
 
 def _end(
@@ -369,7 +370,7 @@ def _end(
     if plan is not None and math.isfinite(end := float(np.sum(plan.setpoints[:, 1]))):
         return end
     model = truth.model
-    left = longest_motion(float(levels[-1]) / model.units.load, model.material)
+    left = longest_motion(model.units.of_level(float(levels[-1])), model.material)
     return float(times[-1]) + model.units.time * (left + model.delivery.settling(0.0))
 
 

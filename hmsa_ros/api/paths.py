@@ -139,8 +139,8 @@ def along_wave(
         reach = ', '.join(f'{a / unit:.4g} to {b / unit:.4g} Hz' for a, b in wave.reach(frame))
         raise RefusedError(
             Code.FLUX_LIMIT,
-            f'an amplitude of {wave.amplitude:g} about {wave.mean:g} needs more than flux density '
-            f'and slew limits allow at {sweep[0]:g}'
+            f'an amplitude of {wave.amplitude:g} about {wave.mean:g} needs more than '
+            f'{model.units.drive.name} and slew limits allow at {sweep[0]:g}'
             + (f' to {sweep[1]:g}' if last != first else '') + f' Hz: expected {reach or "less"}')
     path = wave.path(frame, first, last, cycles)
     return segments_along(actuator, path, (model.material.rest,) * 2, tolerance, 0.0)

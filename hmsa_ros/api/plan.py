@@ -80,8 +80,8 @@ class Plan:
             last = i + 1 == len(self.segments)
             rows += [(segment.begin + x.time, x.load) for x in segment.move.levels
                      if last or x.time < segment.setpoint.span]
-        found: Array = np.array(rows) * (units.time, units.load)
-        return found
+        times, loads = np.array(rows).T
+        return np.column_stack([times * units.time, units.level(loads)])
 
     @property
     def times(self) -> Array:
@@ -121,15 +121,16 @@ class Plan:
     def report(self) -> Table:
         """Return the levels of each setpoint, its move time and its status."""
         units, name = self.actuator.model.units, self.actuator.block.coordinate.name
+        unit, level = units.load_name.strip(), units.level
         return table_of(
             self.segments, (
-                Column(name), Column('duration', 's'), Column('first level', 'T'),
-                Column('move time', 's'), Column('last level', 'T')),
+                Column(name), Column('duration', 's'), Column('first level', unit),
+                Column('move time', 's'), Column('last level', unit)),
             [(x.setpoint.stretch, x.setpoint.span * units.time,
-              x.move.levels[0].load * units.load if x.shaped else None,
+              level(x.move.levels[0].load) if x.shaped else None,
               x.move.duration * units.time if x.shaped and math.isfinite(x.move.duration)
-              else None, x.held * units.load) for x in self.segments],
-            Column('between', 'T at s'), units.time, lambda load: load * units.load)
+              else None, level(x.held)) for x in self.segments],
+            Column('between', f'{unit} at s'), units.time, level)
 
     def simulate(
             self, *, truth: Actuator | None = None, noise: float = 0.0,

@@ -20,10 +20,11 @@ from typing import Any, cast, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_command, add_options, JSON, law_of, LAW_OPTION, Row
 from hmsa_ros.cli.quantities import (
-    BEAM,
     BY_KEY,
     DAMPING,
     default_of,
+    EVERY,
+    FORMS,
     joint_names,
     OPTIONAL,
     QUANTITIES,
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
 _JOINT = 'actuator'
 # What is of the coil, and what the actuator takes by another name.
 _COIL = ('flux_max', 'flux_min', 'slew_limit')
+# Those of which nothing but a form of its own has sizes and constants.
+_OF_THEIR_OWN = ('beam', 'dielectric')
 _ARGUMENTS = {'j_lim': 'chain_limit'}
 # In place of which the damping coefficient may be given.
 _DAMPED = ('zeta', 'damping_ratio')
@@ -65,8 +68,11 @@ def add_parser(subparsers: Any) -> None:
         ('--beam',
          'a beam that is clamped at one end, magnetised along its length, in a field across it; '
          'its setpoints are deflections of the tip over the length'),
+        ('--dielectric',
+         'a dielectric elastomer, one layer or a stack, driven by a voltage; its setpoints are '
+         'capacitances over that at rest'),
         *(_option(x) for x in (
-            *QUANTITIES, *(x for x in BEAM if x.key not in BY_KEY), DAMPING)), LAW_OPTION,
+            *QUANTITIES, *(x for x in EVERY if x.key not in BY_KEY), DAMPING)), LAW_OPTION,
         ('--joint', 'NAME', str,
          f'joint name (default {_JOINT}), or several separated by commas for identical actuators',
          {'default': ''}),
@@ -87,7 +93,9 @@ def _option(quantity: Quantity) -> Row:
     note = ', in place of --zeta; with --beam of its tip, in place of --damping-ratio'
     if quantity is not DAMPING:
         default = _FOLLOWS.get(quantity.key) or f'{quantity.default:g}'
-        note = f' (default {default}){"" if quantity.key in BY_KEY else ", with --beam"}'
+        with_ = ' or '.join(f'--{x}' for x in _OF_THEIR_OWN if quantity in FORMS[x] or (
+            quantity.key == 'damping_ratio'))
+        note = f' (default {default}){"" if quantity.key in BY_KEY else f", with {with_}"}'
     unit = f' [{quantity.unit}]' if quantity.unit else ''
     return quantity.option, 'X', read, f'{quantity.text}{unit}{note}'
 
@@ -144,28 +152,39 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _asked(arguments: argparse.Namespace) -> tuple[Quantity, ...]:
     """Return what is to be given; a law has a modulus and a limit of its own."""
+    form = _form(arguments)
     if arguments.law is None:
-        return BEAM if arguments.beam else QUANTITIES
+        return FORMS[form]
     from hmsa_ros.model.laws import LAWS
 
     law = LAWS[law_of(arguments.law)[0]]
-    if arguments.beam or law.name == 'beam':
+    if form != 'block' or law.name in _OF_THEIR_OWN:
+        own = law.name if form == 'block' else form
         raise BadInputError(
-            f'--law {law.name} is given{" with --beam" if arguments.beam else ""}: expected '
-            '--beam for a beam, which has a law of its own, and --law for a block')
+            f'--law {law.name} is given{"" if form == "block" else f" with --{form}"}: expected '
+            f'--{own} for a {own}, which has a law of its own, and --law for a block')
     none = ('shear_modulus', 'j_lim') if law.scaled else ('j_lim',) if law.endless else ()
     return tuple(x for x in QUANTITIES if x.key not in none)
 
 
+def _form(arguments: argparse.Namespace) -> str:
+    """Return what the actuator is, by an option of that name."""
+    forms = [x for x in _OF_THEIR_OWN if getattr(arguments, x)]
+    if len(forms) > 1:
+        raise BadInputError('both --beam and --dielectric are given: expected one of them')
+    return forms[0] if forms else 'block'
+
+
 def _given(arguments: argparse.Namespace, asked: Sequence[Quantity]) -> dict[str, float]:
     """Return the values of the options, checked against each other."""
-    given = {x.key: value for x in (*QUANTITIES, *BEAM, DAMPING)
+    form = _form(arguments)
+    given = {x.key: value for x in (*EVERY, DAMPING)
              if (value := getattr(arguments, x.key)) is not None}
     for key in _DAMPED:
         if key in given and DAMPING.key in given:
             raise BadInputError(
                 f'both --{key.replace("_", "-")} and --damping are given: expected one of them')
-    if arguments.beam and 'shear_modulus' in given:
+    if form == 'beam' and 'shear_modulus' in given:
         if 'youngs_modulus' in given:
             raise BadInputError(
                 'both --shear-modulus and --youngs-modulus are given: expected one of them, '
@@ -176,8 +195,13 @@ def _given(arguments: argparse.Namespace, asked: Sequence[Quantity]) -> dict[str
         raise BadInputError(
             f'{", ".join(sorted("--" + x.replace("_", "-") for x in others))} is given: expected '
             + ('sizes of a beam, --length, --thickness and --width, and no --zeta or --j-lim'
-               if arguments.beam else '--beam with it' if others <= {x.key for x in BEAM}
-               else f'constants of --law {arguments.law.partition(":")[0]} in its place'))
+               if form == 'beam'
+               else f'of a dielectric elastomer {", ".join(x.option for x in asked)}'
+               if form == 'dielectric'
+               else f'constants of --law {arguments.law.partition(":")[0]} in its place'
+               if arguments.law is not None and others <= {x.key for x in QUANTITIES}
+               else next((f'--{x} with it' for x in _OF_THEIR_OWN
+                          if others <= {y.key for y in FORMS[x]}), '--beam or --dielectric')))
     return given
 
 
@@ -243,35 +267,42 @@ def _actuator(
     """Return the actuator with its coil."""
     from hmsa_ros.api.actuator import Actuator
 
-    values: dict[str, Any] = {
+    form = _form(arguments)
+    values: dict[str, Any] = {} if form == 'dielectric' else {
         'flux_density_limits': (given['flux_min'], given['flux_max']),
         'slew_limit': given['slew_limit'] or math.inf}
-    sizes = [x.key for x in (BEAM if arguments.beam else QUANTITIES) if x.key not in _COIL]
+    sizes = [x.key for x in FORMS[form] if x.key not in _COIL]
     values |= {_ARGUMENTS.get(x, x): given[x] for x in sizes if x in given}
     if DAMPING.key in given:
         values = {x: y for x, y in values.items() if x not in _DAMPED} | {
             'damping_coefficient': given[DAMPING.key]}
     if arguments.law is not None:
         values['law'], values['constants'] = law_of(arguments.law)
-    return Actuator.beam(**values) if arguments.beam else Actuator(**values)
+    if form == 'dielectric':
+        return Actuator.dielectric(**values)
+    return Actuator.beam(**values) if form == 'beam' else Actuator(**values)
 
 
 def _doubts(given: Mapping[str, float], found: 'Scales') -> list[str]:
     """Return what is implausible, a sentence each."""
-    beam = 'length' in given
+    form = 'beam' if 'length' in given else 'dielectric' if 'voltage_max' in given else 'block'
+    beam = form == 'beam'
     values = {**given, 'zeta': found.zeta, 'damping_ratio': found.zeta / found.critical_zeta}
-    doubts = [x for quantity in (BEAM if beam else QUANTITIES)
+    doubts = [x for quantity in FORMS[form]
               if quantity.key in values and (x := quantity.doubt(values[quantity.key]))]
     if found.zeta >= found.critical_zeta:
         doubts.append(
             f'zeta {found.zeta:g} is above the critical {found.critical_zeta:g}: small motion '
             'about rest does not oscillate, and there is no two-step command for it')
     if found.held[1] - found.held[0] < 2.0 * _HARDLY:
-        what = 'deflection of 0.1' if beam else 'stretch of 1.1 or 0.9'
+        drive, words, what, level = {
+            'beam': ('coil', 'deflections', 'deflection of 0.1', '{:.3g} T'),
+            'dielectric': ('amplifier', 'capacitance ratios', 'ratio of 1.1', '{:.3g} V'),
+            'block': ('coil', 'stretches', 'stretch of 1.1 or 0.9', '{:.3g} T')}[form]
         doubts.append(
-            f'the coil only reaches {"deflections" if beam else "stretches"} from '
+            f'the {drive} only reaches {words} from '
             f'{found.held[0]:.6g} to {found.held[1]:.6g}: a {what} needs about '
-            f'{0.3 * found.flux_density_unit:.3g} T')
+            f'{level.format(0.3 * found.flux_density_unit)}')
     if beam:
         # q L^4/(8 E I) of an even load, over L.
         sag = 1.5 * given['density'] * _GRAVITY * given['length'] ** 3 / (
@@ -280,6 +311,8 @@ def _doubts(given: Mapping[str, float], found: 'Scales') -> list[str]:
             doubts.append(
                 f'lying, the beam sags by {sag:.2g} of its length under its own weight, which the '
                 'model does not know: clamp it so that it bends in a horizontal plane')
+        return doubts
+    if form == 'dielectric':
         return doubts
     ratio = given['half_thickness'] / given['half_length']
     if not 0.05 <= ratio <= 20.0:
@@ -311,9 +344,14 @@ def file_text(path: Path, made: 'Actuator', joints: list[str]) -> str:
     if not actuator.rest:
         texts |= {
             x.parameter: (('half of the ' if 'half_' in x.parameter else '') + x.text, x.unit)
-            for x in BEAM} | {
+            for x in FORMS['beam']} | {
             LAW_NAME.name: ('a beam: positions are deflections of the tip over the length', ''),
             DAMPING.parameter: ('damping coefficient of the tip', DAMPING.unit)}
+    if made.law == 'dielectric':
+        texts |= {x.parameter: (x.text, x.unit) for x in FORMS['dielectric'] if x.parameter} | {
+            LAW_NAME.name: (
+                'driven by a voltage: positions are capacitances over that at rest', ''),
+            'flux_density_min': ("amplifier's minimum voltage", 'V')}
     for name, value in _parameters(made).items():
         text, unit = texts[name]
         lines += [f'    # {text[0].upper()}{text[1:]}{f" [{unit}]" if unit else ""}.',
@@ -355,7 +393,9 @@ def _parameters(made: 'Actuator') -> dict[str, Any]:
     """Return the nodes' parameters by name."""
     values = made.parameters
     del values['coil_time_constant']
-    if made.block.law is not None:
+    if made.law == 'dielectric':
+        del values['actuator.remanence'], values['slew_limit']
+    elif made.block.law is not None:
         # They follow from the others, or have no effect.
         del values['actuator.shear_modulus'], values['actuator.chain_limit']
     return values

@@ -102,24 +102,26 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.out is not None:
             plan.save(arguments.out)
         group, units = actuator.model.material, actuator.model.units
+        named, word = units.load_name.strip(), units.drive.name.replace(' ', '_')
+        if units.drive.squared and arguments.tesla_per_ampere is not None:
+            raise BadInputError(
+                f'--tesla-per-ampere is {arguments.tesla_per_ampere:g} T/A: expected it with a '
+                'coil alone, the actuator of the file is driven by a voltage')
         facts = {'c1': group.c1, 'zeta': group.zeta, 'j_lim': group.j_lim,
                  'time_unit': units.time, 'flux_density_unit': units.load}
-        rows = [_si_row(x, units.time, units.load, arguments.tesla_per_ampere) for x in segments]
+        rows = [_si_row(x, units, arguments.tesla_per_ampere) for x in segments]
         if arguments.amplifier:
             with progress('planning for amplifiers'):
                 amplifiers = actuator.amplifiers(
                     arguments.setpoints, shaper=arguments.shaper or 'two_step',
                     **_more(arguments), **{x: getattr(arguments, x) for x in _WINDING})
         shown = [
-            Column('span', 's', head='duration'), Column('flux_density_p', 'T'),
-            Column('time_p', 's'), Column('flux_density_1', 'T')]
+            Column('span', 's', head='duration'),
+            Column('flux_density_p', named, head=f'{word}_p'), Column('time_p', 's'),
+            Column('flux_density_1', named, head=f'{word}_1')]
         if arguments.tesla_per_ampere is not None:
             shown += [Column('current_p', 'A'), Column('current_1', 'A')]
-        unit, middle = units.time, Column('between', 'T at s')
-
-        def level(load: float) -> float:
-            return load * units.load
-
+        unit, middle, level = units.time, Column('between', f'{named} at s'), units.level
         caption = (f'c1 {group.c1:.6g}, zeta {group.zeta:.6g}, time unit L sqrt(rho/G) '
                    f'{units.time:.6g} s')
     else:
@@ -267,18 +269,19 @@ def _errors(arguments: argparse.Namespace) -> list[float] | None:
 
 
 def _si_row(
-        segment: 'Segment', time: float, load: float, per_ampere: float | None) -> dict[str, Any]:
+        segment: 'Segment', units: 'Units', per_ampere: float | None) -> dict[str, Any]:
     """Return a segment with its times in s, its flux densities in T and currents in A as well."""
     row: dict[str, Any] = _row(segment)
-    levels = segment.move.levels
+    first: float | None = None if row['beta_p'] is None else units.level(row['beta_p'])
+    last: float = units.level(row['beta_1'])
     return row | {
-        'span': row['span'] * time,
-        'time_p': None if row['tau_p'] is None else row['tau_p'] * time,
-        'flux_density_p': None if row['beta_p'] is None else row['beta_p'] * load,
-        'flux_density_1': row['beta_1'] * load,
-        'levels': [[x.time * time, x.load * load] for x in levels]} | ({} if not per_ampere else {
-            'current_p': None if row['beta_p'] is None else row['beta_p'] * load / per_ampere,
-            'current_1': row['beta_1'] * load / per_ampere})
+        'span': row['span'] * units.time,
+        'time_p': None if row['tau_p'] is None else row['tau_p'] * units.time,
+        'flux_density_p': first, 'flux_density_1': last,
+        'levels': [[x.time * units.time, units.level(x.load)] for x in segment.move.levels]} | (
+            {} if not per_ampere else {
+                'current_p': None if first is None else first / per_ampere,
+                'current_1': last / per_ampere})
 
 
 def _row(segment: 'Segment') -> dict[str, float | str | None]:

@@ -233,7 +233,7 @@ def _print(
 
     levels = _levels(parts) if experiment.levels else []
     if levels:
-        print(level_table(levels))
+        print(level_table(levels, parts[0].run.plant.coordinate.drive))
     elif any(x.evaluation.findings for x in parts):
         print(setpoints(parts))
     seconds = [f'{key} {x:.1f} s' for key, x in done.seconds.items()]

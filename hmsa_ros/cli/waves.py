@@ -74,8 +74,9 @@ def run(arguments: argparse.Namespace) -> int:
             'bands': bands.tolist(), 'duration': duration, 'levels': plan.levels.tolist(),
             'notes': notes}))
         return 0
+    units = actuator.model.units
     print(f'{len(plan.levels)} levels of {plan.flux_densities.min():.4g} to '
-          f'{plan.flux_densities.max():.4g} T, at rest after {duration:.4g} s')
+          f'{plan.flux_densities.max():.4g}{units.load_name}, at rest after {duration:.4g} s')
     for note in notes:
         print(f'note: {note}')
     if arguments.out is not None:

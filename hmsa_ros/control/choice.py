@@ -83,7 +83,7 @@ def _planned(model: Model, start: float, target: float) -> Course | None:
         return None
     return Course(
         tuple((x.stamp, x.flux_density) for x in plan.levels if x.stamp >= 0), arrival, target,
-        model.holding(start) * model.units.load)
+        float(model.units.level(model.holding(start))))
 
 
 def _left(estimate: Estimate, course: Course | None, slew_limit: float) -> Outcome | None:

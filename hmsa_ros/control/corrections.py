@@ -110,7 +110,7 @@ class Corrections:
             draft = yield from planner.draft_resumption(now)
             return {} if draft is None or draft.missed else {name: draft}
         model, level = planner.model, plan.levels[-1].flux_density
-        holding = model.holding(segment.stretch) * model.units.load
+        holding = float(model.units.level(model.holding(segment.stretch)))
         return {} if abs(holding - level) < _SAME * model.units.load else {
             name: (yield from planner.draft_trim(now, holding))}
 
@@ -181,7 +181,8 @@ def _drafted(draft: Draft, plan: Plan) -> Course:
 
 def _relaxed(model: Model, stretch: float) -> float:
     """Return the level in T where a tail leads that the next setpoint cuts; NaN without creep."""
-    return model.holding(stretch) * model.units.load if model.material.creep else math.nan
+    return float(
+        model.units.level(model.holding(stretch))) if model.material.creep else math.nan
 
 
 def _course(plan: Plan, begin: int, gain: float) -> tuple[Course, float]:

@@ -42,4 +42,5 @@ class Field:
                 abs(field - wanted) <= max(
                     _OFF * max(abs(field), abs(wanted)), _LEAST * units.load)):
             return ''
-        return f'the coil has {1e3 * field:.3g} mT where {1e3 * wanted:.3g} mT were commanded'
+        return (f'the coil has {units.drive.text(field)} where {units.drive.text(wanted)} were '
+                'commanded')

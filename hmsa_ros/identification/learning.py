@@ -186,9 +186,9 @@ class _Sequence:
 
     def simulated(self, levels: Array, time: Array) -> Array:
         """Return the stretch of the model."""
-        unit, scale = self.actuator.time_unit, self.actuator.flux_density_unit
+        unit, loads = self.actuator.time_unit, self.actuator.units.of_level(levels)
         found: Array = simulate(
-            np.append(self.times[0] - 1.0, self.times) / unit, np.append(0.0, levels) / scale,
+            np.append(self.times[0] - 1.0, self.times) / unit, np.append(0.0, loads),
             np.maximum(time, self.times[0] - 1.0) / unit, self.actuator.nondimensional)[0]
         return found
 

@@ -98,8 +98,13 @@ def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, .
     ``actuator.`` or ``law.`` before a name is dropped, and the modulus may have the name that it
     has in the law. With a law in place of Gent J_lim is not sought, but constants of the
     law may be: ``law.c10``, or for all of a list ``law.mu`` and for its first ``law.mu.1``. Raises
-    `BadInputError` if a name is unknown, none is given, or two exclude each other.
+    `BadInputError` if a name is unknown, none is given, or two exclude each other, or
+    the law is driven by a voltage.
     """
+    if law is not None and law.volts:
+        raise BadInputError(
+            f'the actuator has law {law.law}: expected one that a magnetic field drives, since a '
+            'voltage is planned with but not identified with (feedback: off)')
     constants = constants_of(law)
     whole = {'shear_modulus': ['shear_modulus'], modulus_of(law)[0]: ['shear_modulus']}
     for name in constants:

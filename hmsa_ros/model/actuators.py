@@ -41,15 +41,26 @@ def check_stretch(stretch: float, material: Material, name: str = 'stretch') -> 
             else f'law {elastic.law}'
         # Parameters keep their names.
         called = re.sub(r'\bstretch\b', coordinate, name)
+        why = f'; {more}' if (more := pulls_in(material)) else ''
         raise BadInputError(
             f'{called} is {stretch:g}: expected a {coordinate} '
-            f'between the limits {lower:.4f} and {upper:.4f} of {whose}')
+            f'between the limits {lower:.4f} and {upper:.4f} of {whose}{why}')
+
+
+def pulls_in(material: Material) -> str:
+    """Return in words where a voltage has no equilibrium that is stable; empty for nowhere."""
+    elastic = getattr(material, 'law', None)
+    upper = stretch_limits(material)[1]
+    if elastic is None or not elastic.volts or upper == elastic.limits[1]:
+        return ''
+    return (f'above {upper:.4f}, a stretch of {upper ** 0.25:.4f} in the plane, the actuator '
+            'pulls in: no constant voltage holds it there')
 
 
 def unheld(material: NondimensionalParameters) -> str:
     """Return in words which stretches the force falls at, so that none is held; empty for none."""
-    if material.law is None:
-        return ''
+    if material.law is None or material.law.volts:
+        return pulls_in(material)
     sides = [
         f'{words} {limit:.4f}' for words, limit, end in zip(
             ('below', 'above'), stretch_limits(material), material.law.limits, strict=True)
@@ -85,12 +96,13 @@ class Setup:
                 f'time constant of the coil is {self.coil_time_constant:g} s: expected a '
                 'finite number of at least 0')
         self.creep.check(self.actuator.time_unit)
+        self.actuator.check_drive(self.slew_limit, self.coil_time_constant, self.creep)
 
     def holding(self, stretch: float) -> float:
         """Return the flux density in T that holds a stretch."""
         return float(
-            law.elastic_force(stretch, self.actuator.nondimensional.packed)
-            * self.actuator.flux_density_unit)
+            self.actuator.units.level(
+                law.elastic_force(stretch, self.actuator.nondimensional.packed)))
 
     @property
     def load_per_newton(self) -> float:
@@ -99,10 +111,15 @@ class Setup:
 
     def check_level(self, flux_density: float) -> None:
         """Refuse with `BadInputError` a level in T that nobody could follow."""
-        _check_load('flux density', flux_density, 'T', self.actuator.flux_density_unit)
+        units = self.actuator.units
+        _check_load(units.drive.name, flux_density, units.load_name.strip(), units.load)
 
     def check_force(self, force: float) -> None:
         """Refuse with `BadInputError` a disturbing force in N that nobody could follow."""
+        if self.actuator.units.drive.squared and force:
+            raise BadInputError(
+                f'disturbing force is {force:g} N: expected 0 for law dielectric, whose load is '
+                'no force along the thickness')
         _check_load('disturbing force', force, 'N', 1.0 / self.load_per_newton)
 
 
@@ -142,6 +159,7 @@ class Actuators:
         count = len(blocks)
         self._time_units = np.array([x.time_unit for x in blocks])
         self._units = np.array([x.flux_density_unit for x in blocks])
+        self._scales = [x.units for x in blocks]
         self._per_newton = [x.load_per_newton for x in self.setups]
         self._lags = np.array([
             x.coil_time_constant / x.actuator.time_unit for x in self.setups])
@@ -226,7 +244,7 @@ class Actuators:
     def equilibrium(self, i: int) -> float:
         """Return the stretch at which the flux density in force would hold one."""
         return float(law.equilibrium_stretch(
-            self.flux_density[i] / self._units[i], self._material[i]))
+            self._scales[i].of_level(self.flux_density[i]), self._material[i]))
 
     # -- what drives them ----------------------------------------------------------------------
 
@@ -267,12 +285,13 @@ class Actuators:
 
     def _set_drive(self, i: int, slope: float, level: float | None = None) -> None:
         """Bring the load into line with amplifier, coil and force; the field does not jump."""
-        flux = self.flux_density[i] / self._units[i]
+        lag = self._lags[i]
+        # A voltage has none.
+        flux = self.flux_density[i] / self._units[i] if lag > 0.0 else 0.0
         if level is not None:
             self._levels[i] = level
-        load = self._levels[i] / self._units[i]
+        load = self._scales[i].of_level(self._levels[i])
         force = self.forces[i].current * self._per_newton[i]
-        lag = self._lags[i]
         if lag > 0.0:
             # u0 + s t, followed with a lag: u0 + s (t - T) + (flux - u0 + s T) exp(-t/T).
             follower = load - slope * lag

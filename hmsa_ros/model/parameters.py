@@ -12,7 +12,7 @@ from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.laws.coordinate import Coordinate, coordinate_of
 from hmsa_ros.model.laws.record import Elastic
-from hmsa_ros.model.units import MU_0
+from hmsa_ros.model.units import MU_0, Units
 
 _ZERO_ALLOWED = ('zeta', 'damping_coefficient')
 # Infinite for neo-Hookean.
@@ -203,6 +203,17 @@ class ActuatorParameters:
                 f'density of {scales[1]:g} T and c1 of {scales[2]:g}: expected values of a block, '
                 'in SI units')
         self.creep.check(scales[0])
+        self.check_drive(creep=self.creep)
+
+    def check_drive(
+            self, slew_limit: float = math.inf, lag: float = 0.0, creep: Creep | None = None,
+            ) -> None:
+        """Refuse with `BadInputError` ramps, a lag in s or creep, if a voltage is the drive."""
+        if self.units.drive.squared and (slew_limit < math.inf or lag or creep):
+            raise BadInputError(
+                f'slew limit {slew_limit:g} V/s, time constant {lag:g} s and '
+                f'{len(creep.ratios) if creep else 0} viscoelastic branches are given: expected '
+                'inf, 0 and 0 for law dielectric, which is driven by steps of the voltage alone')
 
     @classmethod
     def from_nondimensional(
@@ -269,8 +280,18 @@ class ActuatorParameters:
 
     @property
     def flux_density_unit(self) -> float:
-        """Flux density in T of the load beta = 1, mu0 G/Br."""
+        """Level of the load 1: flux density mu0 G/Br in T, or voltage h sqrt(2 G/eps) in V."""
+        if self.law is not None and self.law.volts:
+            return self.law.volts * math.sqrt(self.shear_modulus)
         return MU_0 * self.shear_modulus / self.remanence
+
+    @cached_property
+    def units(self) -> Units:
+        """Sizes of the nondimensional units in s, and in T or V."""
+        coordinate = self.coordinate
+        return Units(
+            self.time_unit, self.flux_density_unit, ' s', f' {coordinate.drive.unit}',
+            coordinate.name, coordinate.drive)
 
     @property
     def damping_unit(self) -> float:

@@ -1,11 +1,35 @@
 """Units: of time, and of what messages to a person give."""
 
 from dataclasses import dataclass
+from typing import Any
 
 #: Nanoseconds in a second; times that must not drift are integer nanoseconds.
 NANOSECONDS = 1_000_000_000
 #: Vacuum permeability in H/m (CODATA 2022); SciPy's table of constants takes 0.2 s to load.
 MU_0 = 1.25663706127e-6
+#: Vacuum permittivity in F/m, of the same table.
+EPSILON_0 = 8.8541878188e-12
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What moves an actuator, and the level of which a load is made."""
+
+    name: str
+    plural: str
+    symbol: str
+    unit: str
+    shown: str  #: unit in tables and figures
+    per: float  #: of these in one of the other
+    squared: bool = False  #: whether a load grows as the square of the level
+
+    def text(self, level: float, form: str = '.3g') -> str:
+        """Word a level as it is shown."""
+        return f'{self.per * level:{form}} {self.shown}'
+
+
+FLUX = Drive('flux density', 'flux densities', 'B', 'T', 'mT', 1e3)
+VOLTAGE = Drive('voltage', 'voltages', 'U', 'V', 'V', 1.0, squared=True)
 
 
 @dataclass(frozen=True)
@@ -13,10 +37,32 @@ class Units:
     """Units in which messages give times and loads."""
 
     time: float = 1.0  #: size of the nondimensional unit in the named one, as load
-    load: float = 1.0
+    load: float = 1.0  #: level of the load 1
     time_name: str = ''  #: with a leading space; empty for nondimensional values, as load_name
     load_name: str = ''
     coordinate: str = 'stretch'  #: what a position is called
+    drive: Drive = FLUX
+
+    def level(self, load: Any) -> Any:
+        """Return the level of a load, or an array of them; of one that no voltage has, minus."""
+        if self.drive.squared:
+            return abs(load) ** 0.5 * ((load >= 0.0) * 2.0 - 1.0) * self.load
+        return load * self.load
+
+    def of_level(self, level: Any) -> Any:
+        """Return the load of a level, or an array of them; voltages of either sign attract."""
+        load = level / self.load
+        return load * load if self.drive.squared else load
+
+    def change(self, level: float, by: float) -> float:
+        """Return by how much the load changes at the most as a level changes."""
+        more = (2.0 * abs(level) + abs(by)) / self.load if self.drive.squared else 1.0
+        return by / self.load * more
+
+    def range(self, least: float, largest: float) -> tuple[float, float]:
+        """Return the least and the largest load of levels within two."""
+        least = max(least, 0.0) if self.drive.squared else least
+        return self.of_level(least), self.of_level(largest)
 
     def time_text(self, value: float) -> str:
         """Word a nondimensional time with four significant digits."""
@@ -29,4 +75,4 @@ class Units:
 
     def load_text(self, value: float) -> str:
         """Word a nondimensional load beta with four significant digits."""
-        return f'{value * self.load:.4g}{self.load_name}'
+        return f'{self.level(value):.4g}{self.load_name}'

@@ -32,6 +32,7 @@ from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.actuator import actuator_from
 from hmsa_ros.interfaces.parameters import ParameterSpec
 from hmsa_ros.model.laws.bending import centreline, tangent
+from hmsa_ros.model.laws.coordinate import CAPACITANCE
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
@@ -79,7 +80,8 @@ class Block:
     half_thickness: float
     remanence: float  #: Br in T, greater than 0
     width: float = 0.0  #: width of a beam in m; 0 for a block
-    per_tesla: float = 0.0  #: length of the arrow of a beam's field in m/T
+    per_tesla: float = 0.0  #: length of the arrow of a beam's field in m/T, of a voltage in m/V
+    capacitance: bool = False  #: whether positions are capacitances, of what is not magnetised
 
     def __post_init__(self) -> None:
         if not self.joint:
@@ -89,12 +91,14 @@ class Block:
     def of(cls, joint: str, actuator: ActuatorParameters) -> 'Block':
         """Return the block of a joint's parameters."""
         block = cls(joint, actuator.half_length, actuator.half_thickness, actuator.remanence)
+        per = 2.0 * actuator.half_length / (3.0 * actuator.flux_density_unit)
+        if actuator.coordinate is CAPACITANCE:
+            return replace(block, per_tesla=per, capacitance=True)
         if actuator.law is None or not actuator.law.section:
             return block
         return replace(
-            block, width=2.0 * actuator.law.section * actuator.half_length ** 2
-            / actuator.half_thickness,
-            per_tesla=2.0 * actuator.half_length / (3.0 * actuator.flux_density_unit))
+            block, per_tesla=per, width=2.0 * actuator.law.section * actuator.half_length ** 2
+            / actuator.half_thickness)
 
     def bent(self, deflection: float) -> list[tuple[float, float, float]]:
         """
@@ -120,8 +124,13 @@ class Block:
             points += [ring[0], ring[1], ring[2], ring[0], ring[2], ring[3]]
         return points
 
-    def size(self, stretch: float) -> tuple[float, float, float]:
-        """Return 2 l, 2 l and 2 h in m at a stretch along z; the volume stays as it is."""
+    def thickness(self, position: float) -> float:
+        """Return the stretch along z at a position, itself unless that is a capacitance."""
+        return position ** -0.5 if self.capacitance else position
+
+    def size(self, position: float) -> tuple[float, float, float]:
+        """Return 2 l, 2 l and 2 h in m at a position; the volume stays as it is."""
+        stretch = self.thickness(position)
         side = 2.0 * self.half_length / math.sqrt(stretch)
         return side, side, 2.0 * self.half_thickness * stretch
 
@@ -189,8 +198,10 @@ class _Drawing:
             height = block.half_length
             yield self._along(state.stretch)
         else:
-            height = block.half_thickness * state.stretch
-            yield self._arrow(MAGNETISATION, unit * block.remanence * state.stretch)
+            stretch = block.thickness(state.stretch)
+            height = block.half_thickness * stretch
+            if not block.capacitance:
+                yield self._arrow(MAGNETISATION, unit * block.remanence * stretch)
         yield self._arrow(FIELD, unit * state.flux_density, BESIDE * block.half_length)
         yield self._marker(
             LABEL, pose=self._pose(height + 0.8 * block.half_thickness),

@@ -1,7 +1,7 @@
 """What the panel does with ROS, in one thread that never waits for an answer."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 import json
 import math
 from pathlib import Path
@@ -246,7 +246,8 @@ class Desk:
             'slot': math.floor(scene.now / (self._options.span / SLOTS)),
             'span': self._options.span, 'slots': SLOTS, 'charts': {
                 x.name: {
-                    'coordinate': x.coordinate, 'stretch': _tail(x.stretches, scene.now, tail),
+                    'coordinate': x.coordinate, 'drive': asdict(x.drive),
+                    'stretch': _tail(x.stretches, scene.now, tail),
                     'target': _tail(x.targets, scene.now, tail),
                     'flux': _tail(x.fluxes, scene.now, tail)} for x in scene.joints},
             'feedback': feedback, 'modes': MODES, 'setting': self._set is not None,

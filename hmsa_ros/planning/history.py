@@ -185,13 +185,13 @@ class History:
 
 def agree(one: PlannedLevel, other: PlannedLevel) -> bool:
     """Return whether two predictions are the same but for what rounding makes of them."""
-    x, y, unit = one.state, other.state, one.model.units.load
+    x, y, level = one.state, other.state, one.model.units.level
     return (
         abs(x.stretch - y.stretch) <= _AS_PLANNED
         and abs(x.rate - y.rate) <= _AS_PLANNED * one.model.frequency(x.stretch)
         and (x.amplifier is None) is (y.amplifier is None)
-        and _same(x.load * unit, y.load * unit)
-        and _same(x.ramps_from * unit, y.ramps_from * unit)
+        and _same(level(x.load), level(y.load))
+        and _same(level(x.ramps_from), level(y.ramps_from))
         and len(x.followed) == len(y.followed)
         and all(abs(a - b) <= _AS_PLANNED for a, b in zip(x.followed, y.followed, strict=True)))
 

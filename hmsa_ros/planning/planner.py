@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 import math
 
+from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import equilibrium_stretch
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.simulation import check_stretch
@@ -50,9 +51,18 @@ class Planner(RunningPlan):
         self.take_model(self.checked_model(options, actuator or self.model.actuator))
 
     def checked_model(self, options: Options, actuator: ActuatorParameters) -> Model:
-        """Return a model after checking that the block can be where it is held."""
+        """
+        Return a model after checking that the block can be where it is held.
+
+        A block that cannot, or whose position is another quantity, is a `BadInputError`.
+        """
         if (options, actuator) == (self.model.options, self.model.actuator):
             return self.model
+        was, made = self.model.actuator.coordinate.plural, actuator.coordinate.plural
+        if was != made:
+            raise BadInputError(
+                f'parameter law.name would turn {was} into {made}: expected a law that has {was}, '
+                'or a planner that is started with the other')
         model = Model(actuator, options)
         segments = self.plan.segments
         check_stretch(
@@ -163,7 +173,7 @@ class Planner(RunningPlan):
         state, place = self.state(begin), self.plan.under_way(begin)
         # Beside the target, by what the model does not know of: it goes by its own stretches.
         held, wanted = (float(equilibrium_stretch(x, model.material)) for x in (
-            self.plan.level(begin).load, flux_density / model.units.load))
+            self.plan.level(begin).load, model.units.of_level(flux_density)))
         draft = yield from drafting.draft_moves(
             Outset(self.plan, model, begin, replace(state, stretch=held, rate=0.0)),
             [Setpoint(wanted, math.inf)])

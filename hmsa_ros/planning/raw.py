@@ -32,17 +32,18 @@ def check_levels(points: Sequence[tuple[float, int]], model: Model) -> None:
     Where there are none, times do not increase or the coil has no such level: `RefusedError`.
     """
     least, most = model.options.flux_density_min, model.options.flux_density_max
+    unit = model.units.load_name
     check_any(points)
     previous = -1
     for number, (level, time) in enumerate(points):
         if not math.isfinite(level):
             raise RefusedError(
-                Code.BAD_INPUT, f'level {number} is {level:g} T: expected a finite number')
+                Code.BAD_INPUT, f'level {number} is {level:g}{unit}: expected a finite number')
         if not least <= level <= most:
             raise RefusedError(
                 Code.FLUX_LIMIT,
-                f'level {number} is {level:g} T: expected {least:g} to {most:g} T, the limits of '
-                'the coil (flux_density_min, flux_density_max)')
+                f'level {number} is {level:g}{unit}: expected {least:g} to {most:g}{unit}, the '
+                'limits of the coil (flux_density_min, flux_density_max)')
         if time <= previous:
             raise RefusedError(
                 Code.NOT_INCREASING,
@@ -132,6 +133,6 @@ def _check_motion(number: int, level: PlannedLevel, state: State, end: int | Non
         if not least < stretch < most:
             raise RefusedError(
                 Code.OUT_OF_RANGE,
-                f'level {number} of {level.flux_density:g} T takes the '
+                f'level {number} of {level.flux_density:g}{model.units.load_name} takes the '
                 f'{model.units.coordinate} to {stretch:.4g}: expected {least:.4g} to {most:.4g}, '
                 'as the law of the actuator allows; lower the levels, or correct its parameters')

@@ -50,9 +50,10 @@ class RunningPlan:
 
     def restart(self) -> None:
         """Drop all plans: at rest where it was before the first request, as the clock begins."""
-        load = self.model.holding(self._initial)
+        model, stretch = self.model, self._initial
+        load = model.holding(stretch)
         self._begin_with(PlannedLevel(
-            ALWAYS, load * self.model.units.load, State(self._initial, 0.0, load), self.model))
+            ALWAYS, float(model.units.level(load)), State(stretch, 0.0, load), model))
 
     def clock_set(self, by: int) -> None:
         """Take in that the clock was set ahead by some ns: what is planned goes on as before."""
@@ -79,15 +80,15 @@ class RunningPlan:
         to. A state that the block cannot have is a `BadInputError`. The setpoints ahead may be
         kept, to be planned anew.
         """
-        model = self.model
+        model, units = self.model, self.model.units
         check_stretch(stretch, model.material, 'stretch in force')
         level = in_force if flux_density is None else flux_density
         if not math.isfinite(rate + in_force + level):
             raise BadInputError(
-                f'state in force is rate {rate:g} 1/s, flux density {in_force:g} T: expected '
-                'finite numbers')
+                f'state in force is rate {rate:g} 1/s, {units.drive.name} {in_force:g}'
+                f'{units.load_name}: expected finite numbers')
         begin = PlannedLevel(stamp, level, State(
-            stretch, rate * model.units.time, in_force / model.units.load), model)
+            stretch, rate * units.time, units.of_level(in_force)), model)
         held = float(equilibrium_stretch(begin.load, model.material))
         at_rest = abs(begin.state.rate) <= _SAMPLED_AT_REST * model.frequency(stretch)
         if at_rest and level == in_force:
@@ -96,8 +97,9 @@ class RunningPlan:
                 begin.state, rate=0.0, stretch=held if agrees else stretch))
         if not _can_be_followed(begin):
             raise BadInputError(
-                f'state in force is stretch {stretch:g}, rate {rate:g} 1/s, flux density '
-                f'{in_force:g} T: expected one that the model can follow')
+                f'state in force is {units.coordinate} {stretch:g}, rate {rate:g} 1/s, '
+                f'{units.drive.name} {in_force:g}{units.load_name}: expected one that the model '
+                'can follow')
         self._begin_with(begin, keep=keep)
 
     def follows(self, flux_density: float) -> bool:
@@ -246,7 +248,7 @@ class RunningPlan:
         stretch = equilibrium_stretch(level.load, model.material)
         stiffness = elastic_stiffness(stretch, model.material)
         return float(
-            abs(model.time(late) * change / model.units.load / stiffness)
+            abs(model.time(late) * model.units.change(level.flux_density, change) / stiffness)
             * model.frequency(float(stretch)))
 
     @property

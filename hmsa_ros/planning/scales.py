@@ -60,8 +60,8 @@ class Scales:
     critical_zeta: float  #: above which small motion about rest does not oscillate
     damping: float  #: zeta as a coefficient in N s/m
     critical_damping: float
-    flux_density_unit: float  #: of the load 1, mu0 G/Br in T
-    #: Stretches within reach of the coil, and the T that hold them.
+    flux_density_unit: float  #: of the load 1, mu0 G/Br in T, or in V
+    #: Stretches within reach of the coil, and the levels that hold them.
     flux_densities: tuple[tuple[float, float], ...]
     stretch_limits: tuple[float, float]  #: at which the chains are fully extended
     held: tuple[float, float]  #: lowest and highest stretch that the coil can hold
@@ -75,8 +75,8 @@ def scales(actuator: ActuatorParameters, coil: Coil) -> Scales:
     """Work out what follows from parameters and coil; ramps are left out of account."""
     material = actuator.nondimensional
     home = material.rest
-    unit = actuator.flux_density_unit
-    loads = coil.flux_density_min / unit, coil.flux_density_max / unit
+    units = actuator.units
+    loads = units.range(coil.flux_density_min, coil.flux_density_max)
     lower, upper = stretch_limits(material)
     held = tuple(float(equilibrium_stretch(x, material)) for x in loads)
 
@@ -118,9 +118,9 @@ def scales(actuator: ActuatorParameters, coil: Coil) -> Scales:
         frequency=float(natural_frequency(home, material)) / (2.0 * math.pi) / actuator.time_unit,
         c1=material.c1, zeta=material.zeta, critical_zeta=critical,
         damping=actuator.damping_coefficient,
-        critical_damping=critical * actuator.damping_unit, flux_density_unit=unit,
+        critical_damping=critical * actuator.damping_unit, flux_density_unit=units.load,
         flux_densities=tuple(
-            (x, float(elastic_force(x, material)) * unit)
+            (x, float(units.level(elastic_force(x, material))))
             for x in _shown(held[0], held[1], home)),
         stretch_limits=(lower, upper), held=(held[0], held[1]),
         reached=(reached[0], reached[1]), target=target,

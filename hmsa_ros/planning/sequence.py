@@ -7,9 +7,9 @@ import math
 
 import numpy as np
 
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.delivery import Delivery, ramps
-from hmsa_ros.model.equations import elastic_force, natural_frequency
+from hmsa_ros.model.equations import elastic_force, natural_frequency, stretch_limits
 from hmsa_ros.model.laws.record import ENDLESS
 from hmsa_ros.model.moves import Level, Move, State
 from hmsa_ros.model.parameters import NondimensionalParameters
@@ -25,6 +25,8 @@ from hmsa_ros.planning.shapers.request import Request, Shaper, Work
 SHORT_SPELL = ('refuse', 'continue')
 # Samples of a motion, and their tolerance, where it must keep inside the limits of its law.
 _LOOK, _LOOK_RTOL = 300, 1e-7
+# Periods of small motion that a motion towards pull-in may take.
+_LINGERS = 5.0
 
 
 @dataclass(frozen=True)
@@ -202,7 +204,7 @@ def _check_known(
         state: State, levels: Sequence[Level], ends: tuple[float, float], target: float,
         material: NondimensionalParameters, delivery: Delivery) -> None:
     """
-    Refuse a move that swings to where nothing is known of the elastic force.
+    Refuse a move that swings to where nothing is known of the elastic force, or pulls in.
 
     Ends are those of the last ramp and of what is looked at.
     """
@@ -211,9 +213,27 @@ def _check_known(
         return
     # The first swing about the last level is the widest.
     swing = 2.0 * math.pi / float(natural_frequency(target, material))
+    if elastic.volts:
+        # It lingers where it only just does not pull in.
+        swing *= _LINGERS
     times = np.linspace(
         levels[0].time, min(ends[1], ends[0] + swing), _LOOK, dtype=np.float64)
-    stretch = sampled(levels, state, times, material, delivery, _LOOK_RTOL)[STRETCH]
+    try:
+        stretch = sampled(levels, state, times, material, delivery, _LOOK_RTOL)[STRETCH]
+        # A voltage wins over the elastic force where that falls.
+        over = stretch[stretch > stretch_limits(material)[1]]
+        pulled = elastic.volts and np.any(elastic_force(over, material) < levels[-1].load)
+    except HmsaError:
+        # Without a limit of the chains there is no end to it.
+        if not elastic.volts:
+            raise
+        pulled = True
+    if pulled:
+        raise RefusedError(
+            Code.OUT_OF_RANGE,
+            f'the move from {material.coordinate.name} {state.stretch:.6g} to {target:g} '
+            f'overshoots and pulls in: expected a target of less, or a shaper that does not '
+            'overshoot, such as two_step')
     for widest, beyond in ((np.min(stretch), -1.0), (np.max(stretch), 1.0)):
         limit = elastic.limits[beyond > 0.0]
         if beyond * (widest - limit) > 0.0:

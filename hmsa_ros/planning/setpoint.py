@@ -20,7 +20,7 @@ def impossible(stretch: float, rest: float) -> str:
 class Setpoint:
     """A stretch and how long it lasts, the paper's (lambda_d, span)."""
 
-    stretch: float  #: target; the deflection of a beam
+    stretch: float  #: target, or another position
     #: Time from leaving the setpoint before to leaving this one, above 0; infinite to stay.
     span: float
 

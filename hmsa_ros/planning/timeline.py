@@ -60,7 +60,7 @@ class Model:
     actuator: ActuatorParameters
     options: Options
     material: NondimensionalParameters = field(init=False)
-    units: Units = field(init=False)  #: sizes of the nondimensional units of time (s) and load (T)
+    units: Units = field(init=False)  #: sizes of the nondimensional units of time and load
     limits: Limits = field(init=False)
     delivery: Delivery = field(init=False)  #: nondimensional, as limits and pace are
     pace: Pace = field(init=False)
@@ -77,11 +77,13 @@ class Model:
         if options.lead_time < 0:
             raise BadInputError(
                 f'lead_time is {options.lead_time / NANOSECONDS:g} s: expected at least 0 s')
-        time, load = actuator.time_unit, actuator.flux_density_unit
+        actuator.check_drive(options.slew_limit, options.coil_time_constant)
+        units = actuator.units
+        time, load = units.time, units.load
         worked_out = {
             'material': actuator.nondimensional,
-            'units': Units(time, load, ' s', ' T', actuator.coordinate.name),
-            'limits': Limits(options.flux_density_min / load, options.flux_density_max / load),
+            'units': units,
+            'limits': Limits(*units.range(options.flux_density_min, options.flux_density_max)),
             'delivery': Delivery(
                 options.period / NANOSECONDS / time, options.slew_limit / load * time,
                 1.0 / NANOSECONDS / time, options.coil_time_constant / time,
@@ -123,7 +125,7 @@ class Model:
         """Return a state of another model in the units of this one."""
         if other is self:
             return state
-        loads = other.units.load / self.units.load
+        loads = self.units.of_level(other.units.load)
         return State(
             state.stretch, state.rate / other.units.time * self.units.time, state.load * loads,
             None if state.amplifier is None else state.amplifier * loads,
@@ -154,12 +156,12 @@ class PlannedLevel:
     @property
     def in_force(self) -> float:
         """Flux density in T at the stamp, from which a slew limit ramps to the level."""
-        return self.state.load * self.model.units.load
+        return float(self.model.units.level(self.state.load))
 
     @property
     def load(self) -> float:
         """The level without a dimension."""
-        return self.flux_density / self.model.units.load
+        return float(self.model.units.of_level(self.flux_density))
 
     @property
     def due(self) -> int:

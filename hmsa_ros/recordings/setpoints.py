@@ -277,7 +277,7 @@ def _by_levels(run: Run, levels: Sequence[Level], setpoint: Setpoint) -> int | N
 def balance(run: Run, levels: Sequence[Level]) -> Array:
     """Return the stretches that levels hold by the planner's parameters."""
     return equilibrium_stretch(
-        [x.flux_density / run.planner.flux_density_unit for x in levels],
+        [run.planner.units.of_level(x.flux_density) for x in levels],
         run.planner.nondimensional)
 
 

@@ -174,8 +174,8 @@ def _start(run: Run, first: int, creep: Creep) -> 'ActuatorSimulation':
     if math.isnan(field):
         before = [x.flux_density for x in run.levels if x.stamp <= stamp]
         # Else what holds the actuator there: it may have been held so before the recording began.
-        field = before[-1] if before else run.plant.flux_density_unit * float(
-            elastic_force(float(run.stretch[first]), run.plant.nondimensional))
+        field = before[-1] if before else float(run.plant.units.level(
+            elastic_force(float(run.stretch[first]), run.plant.nondimensional)))
     try:
         simulation.set_state(
             float(run.stretch[first]), float(run.rate[first]), field, past[-1] if past else None)

@@ -114,6 +114,7 @@ _SIMULATED = ('unshaped steps', 'plan')
 _KINDS: dict[str, dict[str, Any]] = {
     'recorded': looks.RECORDED.plotly(), 'unshaped steps': looks.PLAIN.plotly(),
     'plan': looks.PLAN.plotly(), 'field in force': looks.FIELD.plotly(),
+    'voltage in force': looks.FIELD.plotly(),
     'command': {**looks.RECORDED.plotly(), 'shape': 'hv'}, 'target': looks.TARGET.plotly()}
 
 
@@ -162,22 +163,26 @@ def response(parts: Sequence[Part], unit: TimeUnit) -> Figure:
         data += _commands(part, unit)
     what = parts[0].run.plant.coordinate
     return Figure(
-        'response', f'Flux density command and {what.name} over time', 560, _grouped(data), {
+        'response', f'{what.drive.name.capitalize()} command and {what.name} over time', 560,
+        _grouped(data), {
             'xaxis': axis(label('time', 't', unit.name), anchor='y'),
             'yaxis': axis(label(what.name, what.symbol), domain=[0.0, 0.6]),
-            'yaxis2': axis(label('flux density', 'B', 'mT'), domain=[0.68, 1.0], anchor='x')})
+            'yaxis2': axis(
+                label(what.drive.name, what.drive.symbol, what.drive.shown),
+                domain=[0.68, 1.0], anchor='x')})
 
 
 def commanded(part: Part) -> tuple[list[float], list[float]]:
     """
-    Return times in s and levels in mT of the command, from the first sample to the last.
+    Return times in s and shown levels of the command, from the first sample to the last.
 
     It begins with the level before the first: as measured, or the one that holds where the block
     rests.
     """
     run, found = part.run, part.evaluation
     times = [found.seconds(x.stamp) for x in found.levels]
-    values = [x.flux_density * 1e3 for x in found.levels]
+    per = run.plant.coordinate.drive.per
+    values = [x.flux_density * per for x in found.levels]
     # The last level holds to the end of the record.
     times.append(max(times[-1], float(found.time[-1])))
     values.append(values[-1])
@@ -185,18 +190,19 @@ def commanded(part: Part) -> tuple[list[float], list[float]]:
     before = int(np.searchsorted(found.time, times[0])) - 1
     held = float(run.flux_density[before]) if before >= 0 else math.nan
     if times[0] >= 0.0 and not math.isfinite(held):
-        held = float(elastic_force(found.start, run.plant.nondimensional)
-                     ) * run.plant.flux_density_unit
+        held = float(run.plant.units.level(
+            elastic_force(found.start, run.plant.nondimensional)))
     if math.isfinite(held):
         times.insert(0, min(float(found.time[0]), times[0] - 0.02 * (times[-1] - times[0])))
-        values.insert(0, held * 1e3)
+        values.insert(0, held * per)
     return times, values
 
 
 def _commands(part: Part, unit: TimeUnit) -> list[dict[str, Any]]:
     """Return the curves of the flux density."""
     run, found = part.run, part.evaluation
-    data = []
+    drive, data = run.plant.coordinate.drive, []
+    in_force = f'{"voltage" if drive.squared else "field"} in force'
     if found.levels:
         times, values = commanded(part)
         switches = {x.stamp for x in found.levels}
@@ -213,14 +219,14 @@ def _commands(part: Part, unit: TimeUnit) -> list[dict[str, Any]]:
             return data
     if np.isfinite(run.flux_density).any():
         data.append(_curve(
-            part, 'field in force', *decimate(unit.of(found.time), run.flux_density * 1e3),
+            part, in_force, *decimate(unit.of(found.time), run.flux_density * drive.per),
             yaxis='y2'))
     elif run.applied:
         told = sorted(run.applied, key=lambda x: x.stamp)
         x = unit.of([*(found.seconds(x.stamp) for x in told), max(
             found.seconds(told[-1].stamp), float(found.time[-1]))])
-        y = np.array([x.flux_density for x in (*told, told[-1])]) * 1e3
-        data.append(_curve(part, 'field in force', x, y, yaxis='y2', shape='hv'))
+        y = np.array([x.flux_density for x in (*told, told[-1])]) * drive.per
+        data.append(_curve(part, in_force, x, y, yaxis='y2', shape='hv'))
     return data
 
 

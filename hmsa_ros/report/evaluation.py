@@ -216,7 +216,7 @@ def _plain(
             run.plant, creep=creep_of(run.parameters, run.joint)).nondimensional
         held = float(elastic_force(start, material))
         stretch, rate, *_ = sampled(
-            [PlannedLoad(x / unit, y.flux_densities[-1] / run.plant.flux_density_unit)
+            [PlannedLoad(x / unit, run.plant.units.of_level(y.flux_densities[-1]))
              for x, y in zip(begins, moves, strict=True)], State(start, load=held), grid / unit,
             material, _delivery(run, run.plant, 'plant'))
     except HmsaError:
@@ -256,12 +256,12 @@ def _measure(run: Run, time: Array, plain: Curve, move: Move, zero: int) -> Move
         if moved:
             residual = residual_vibration(time, run.stretch, **window)
         unshaped = residual_vibration(plain.time, plain.stretch, **window)
-    unit = run.planner.flux_density_unit
+    of_level = run.planner.units.of_level
     return MoveResult(
         stretch=move.stretch, start=move.start,
-        b_p=float(signed_root(move.flux_densities[0] / unit)),
+        b_p=float(signed_root(of_level(move.flux_densities[0]))),
         tau_p=(arrival - begin) / run.planner.time_unit,
-        b_1=float(signed_root(move.flux_densities[-1] / unit)), begin=begin,
+        b_1=float(signed_root(of_level(move.flux_densities[-1]))), begin=begin,
         arrival=arrival - begin, end=end, error=error, residual=residual,
         residual_unshaped=unshaped, moved=moved, place=move.place)
 
@@ -281,7 +281,7 @@ def _predict(run: Run, plan: Sequence[Level], stamps: Times) -> tuple[Array, Arr
     state = State(plan[0].stretch, load=float(elastic_force(plan[0].stretch, material)))
     for i, point in enumerate(plan):
         until = plan[i + 1].stamp if i + 1 < len(plan) else max(int(run.time[-1]), point.stamp)
-        level = PlannedLoad(0.0, point.flux_density / actuator.flux_density_unit)
+        level = PlannedLoad(0.0, actuator.units.of_level(point.flux_density))
         state = replace(state, stretch=point.stretch, rate=point.rate * unit)
         part = slice(
             int(np.searchsorted(stamps, point.stamp)), int(np.searchsorted(

@@ -9,7 +9,7 @@ import numpy as np
 from hmsa_ros.control.holds import Hold
 from hmsa_ros.judge import Finding, Sensor, Tolerances, unobserved
 from hmsa_ros.model.equations import equilibrium_stretch
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.model.units import Drive, FLUX, NANOSECONDS
 from hmsa_ros.recordings.parameters import number_of, of_joint
 from hmsa_ros.recordings.record import Run
 from hmsa_ros.recordings.setpoints import Requested, setpoints_of
@@ -110,7 +110,7 @@ def level_results(run: Run) -> list[LevelResult]:
         parts = [run.stretch[slice(*np.searchsorted(run.time, x))] for x in spans]
         inside = np.concatenate(parts)
         rest = float(equilibrium_stretch(
-            flux_density / run.planner.flux_density_unit, run.planner.nondimensional))
+            run.planner.units.of_level(flux_density), run.planner.nondimensional))
         figures = [float(x(inside)) for x in (np.mean, np.min, np.max)] if len(inside) else [
             math.nan] * 3
         results.append(LevelResult(
@@ -119,18 +119,19 @@ def level_results(run: Run) -> list[LevelResult]:
     return results
 
 
-def level_table(levels: Sequence[LevelResult]) -> Table:
+def level_table(levels: Sequence[LevelResult], drive: Drive = FLUX) -> Table:
     """Return the table of the levels that were in force for the longest."""
     longest = sorted(levels, key=lambda x: -x.duration)[:_MOST_LEVELS]
     chosen = [x for x in levels if x in longest or x is levels[-1]]
     short = len(levels) - len(chosen)
     several = len({x.joint for x in levels}) > 1
     return Table((
-        *([Column('joint')] if several else []), Column('level', 'mT', '.4g'), Column('times'),
+        *([Column('joint')] if several else []), Column('level', drive.shown, '.4g'),
+        Column('times'),
         Column('in all', 'ms', '.4g'), *(
             Column(x, '', '.5f') for x in ('rest', 'mean', 'least', 'greatest'))), tuple(
-        (*([x.joint] if several else []), x.flux_density * 1e3, x.times, x.duration * 1e3, x.rest,
-         x.mean, x.least, x.greatest) for x in chosen),
+        (*([x.joint] if several else []), x.flux_density * drive.per, x.times, x.duration * 1e3,
+         x.rest, x.mean, x.least, x.greatest) for x in chosen),
         'rest: the stretch that the level holds by the parameters; mean, least and greatest: '
         'while it was in force; the last row is the end' + (
             f'; {short} short ones are left out' if short else ''))

@@ -56,6 +56,7 @@ def page(parts: Sequence[Part]) -> str:
         **{'prediction': None, **drawn}, arrivals=arrivals, names=names, single=len(parts) == 1,
         sources=[_source(x.run) for x in parts], summary=_summary(parts), remarks=_notes(parts),
         what=parts[0].run.plant.coordinate.name, shown=shown,
+        level=parts[0].run.plant.coordinate.drive.name,
         count=max(len(x.evaluation.results) for x in parts),
         colours=[(x.run.label, x.colour, looks.DARK.get(x.colour, '')) for x in parts],
         lateness=any(len(x.timing.lateness) for x in parts),
@@ -223,14 +224,17 @@ def _requests(parts: Sequence[Part], unit: TimeUnit) -> PageTable:
 
 def _plan(parts: Sequence[Part], unit: TimeUnit) -> PageTable:
     """Return the table of planned changes of level."""
+    what = parts[0].run.plant.coordinate
+    symbol, drive = what.symbol, what.drive
     rows: list[Values] = [
-        [part.run.label, unit.of(x.time).item(), x.planned * 1e3, x.commanded * 1e3, x.stretch,
+        [part.run.label, unit.of(x.time).item(), x.planned * drive.per, x.commanded * drive.per,
+         x.stretch,
          x.recorded_stretch, x.rate, x.recorded_rate, x.deviation]
         for part in parts for x in plan_points(part.run, part.evaluation)]
-    symbol = parts[0].run.plant.coordinate.symbol
+    shown = f'[{drive.shown}]'
     return formatted('plan-table', {
-            'run': '', f'time [{unit.name}]': '.4f', 'B planned [mT]': '.4f',
-            'B commanded [mT]': '.4f', f'{symbol} planned [1]': '.7f',
+            'run': '', f'time [{unit.name}]': '.4f', f'{drive.symbol} planned {shown}': '.4f',
+            f'{drive.symbol} commanded {shown}': '.4f', f'{symbol} planned [1]': '.7f',
             f'{symbol} recorded [1]': '.7f', 'rate planned [1/s]': '.4g',
             'rate recorded [1/s]': '.4g', f'largest |Δ{symbol}| [1]': '.2e'}, rows[:_MOST_ROWS])
 
@@ -307,7 +311,7 @@ def _parameters(parts: Sequence[Part]) -> PageTable:
         [spec.name, spec.unit or '1', *(_given(x.get(spec.name)) for x in laws)]
         for spec in LAW if any(spec.name in x for x in laws)]
     groups = [x.nondimensional for x in columns]
-    name, rest = columns[0].coordinate.name, columns[0].rest
+    name, rest, drive = columns[0].coordinate.name, columns[0].rest, columns[0].coordinate.drive
     chains: list[Row] = [['J_lim', '1', *(cell(x.j_lim) for x in groups)]] if gent else []
     limits = [stretch_limits(x.nondimensional) for x in columns]
     rows += [
@@ -317,7 +321,8 @@ def _parameters(parts: Sequence[Part]) -> PageTable:
         *chains,
         ['c1', '1', *(cell(x.c1) for x in groups)],
         ['time unit', 'ms', *(cell(x.time_unit * 1e3) for x in columns)],
-        ['flux density of load 1', 'mT', *(cell(x.flux_density_unit * 1e3) for x in columns)],
+        [f'{drive.name} of load 1', drive.shown, *(
+            cell(x.flux_density_unit * drive.per) for x in columns)],
         [f'least {name}', '1', *(cell(x) for x, _ in limits)],
         [f'largest {name}', '1', *(cell(x) for _, x in limits)],
     ]

@@ -63,10 +63,11 @@ def draw(
         for key in ('command', 'response'):
             axes[key].set_xlim(*unit.of(times))
         time = style.axis('time', 't', unit.name)
-        style.finish(axes['command'], time, style.axis('flux density', 'B', 'mT'), 'a')
+        what = parts[0].run.plant.coordinate
+        level = style.axis(what.drive.name, what.drive.symbol, what.drive.shown)
+        style.finish(axes['command'], time, level, 'a')
         axes['command'].tick_params(labelbottom=False)
         axes['command'].xaxis.label.set_visible(False)
-        what = parts[0].run.plant.coordinate
         position = style.axis(what.name, what.tex)
         style.finish(axes['response'], time, position, 'b')
         style.finish(axes['phase'], position, style.axis(

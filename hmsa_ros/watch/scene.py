@@ -8,7 +8,8 @@ import numpy as np
 
 from hmsa_ros.interfaces.status import Verdict
 from hmsa_ros.model.equations import Array
-from hmsa_ros.model.laws.coordinate import POSITION
+from hmsa_ros.model.laws.coordinate import drive_of, POSITION
+from hmsa_ros.model.units import Drive
 
 #: Of a chart.
 SLOTS = 480
@@ -75,6 +76,11 @@ class Joint:
     commanded: float = math.nan
     coordinate: str = POSITION
     fluxes: History = field(default_factory=lambda: History(10.0))
+
+    @property
+    def drive(self) -> Drive:
+        """What moves it, as far as known."""
+        return drive_of(self.coordinate)
 
 
 @dataclass

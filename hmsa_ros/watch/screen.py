@@ -10,7 +10,7 @@ from rich.cells import cell_len
 from rich.text import Text
 
 from hmsa_ros.model.equations import Array
-from hmsa_ros.model.laws.coordinate import shared_name
+from hmsa_ros.model.laws.coordinate import drive_of, shared_name
 from hmsa_ros.model.status import Code
 from hmsa_ros.watch.scene import Joint, LEVELS, Report, Scene
 
@@ -115,8 +115,8 @@ def number(value: float, form: str = '.5f') -> str:
     return f'{value:{form}}' if math.isfinite(value) else '?'
 
 
-def _millitesla(value: float) -> str:
-    return f'{1e3 * value:+.3f} mT' if math.isfinite(value) else '?'
+def _level(value: float, joint: Joint) -> str:
+    return joint.drive.text(value, '+.3f') if math.isfinite(value) else '?'
 
 
 def _off(joint: Joint) -> str:
@@ -207,8 +207,8 @@ class Screen:
             (f'target {number(joint.target)}', _TARGET), (f'off {_off(joint)}', ''),
             (f'rate {number(joint.rate, "+.3f")} 1/s', '')])
         second = _fitted(width, [
-            (f'flux density {_millitesla(joint.flux_density)}', ''),
-            (f'commanded {_millitesla(joint.commanded)}', '')])
+            (f'{joint.drive.name} {_level(joint.flux_density, joint)}', ''),
+            (f'commanded {_level(joint.commanded, joint)}', '')])
         chart, (low, high) = self._chart(joint, now, max(width - _GUTTER, 1), rows)
         lines = []
         for i, row in enumerate(chart):
@@ -249,8 +249,9 @@ class Screen:
         """Return a line for each joint, with a chart of one row at its end."""
         wide = min(max(len(x.name) for x in scene.joints), 16)
         name = shared_name(x.coordinate for x in scene.joints)
+        level = drive_of(name).name
         lines = [Text(
-            f'{"joint":<{wide}} {name:>{_WIDE}} {"target":>8} {"off":>8} {"flux density":>13}',
+            f'{"joint":<{wide}} {name:>{_WIDE}} {"target":>8} {"off":>8} {level:>13}',
             style=_SOFT)]
         if room <= _ENDS:
             # Too small for more than the joints themselves.
@@ -262,7 +263,7 @@ class Screen:
             line = Text(f'{joint.name[:wide]:<{wide}} ')
             line.append(f'{number(joint.stretch):>{_WIDE}}', style=_VALUE)
             line.append(f' {number(joint.target):>8}', style=_TARGET)
-            line.append(f' {_off(joint):>8} {_millitesla(joint.flux_density):>13} ')
+            line.append(f' {_off(joint):>8} {_level(joint.flux_density, joint):>13} ')
             across = width - cell_len(line.plain)
             if across > 0:
                 line.append(self._chart(joint, scene.now, across, 1)[0][0])
@@ -318,7 +319,7 @@ def line(scene: Scene) -> str:
     parts = [] if math.isnan(scene.stamp) else [_time(scene.stamp)]
     parts += [
         f'{x.name} {number(x.stretch)} (target {number(x.target)}, '
-        f'{_millitesla(x.flux_density)})' for x in scene.joints]
+        f'{_level(x.flux_density, x)})' for x in scene.joints]
     if scene.request is not None:
         request = scene.request
         count = f' {request.setpoint}/{request.setpoints}' if request.setpoints else ''

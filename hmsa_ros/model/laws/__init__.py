@@ -4,10 +4,19 @@ The laws of elasticity: one table, and one module for each with its constants an
 Nothing here is compiled; forces and energies are in `hmsa_ros/motion/hmsa/law.hpp`.
 """
 
-from hmsa_ros.model.laws import arruda_boyce, beam, gent, mooney_rivlin, ogden, table, yeoh
+from hmsa_ros.model.laws import (
+    arruda_boyce,
+    beam,
+    dielectric,
+    gent,
+    mooney_rivlin,
+    ogden,
+    table,
+    yeoh,
+)
 from hmsa_ros.model.laws.record import Law
 
 #: By name; the first is the default.
 LAWS: dict[str, Law] = {x.name: x for x in (
     gent.GENT, gent.NEO_HOOKEAN, mooney_rivlin.LAW, yeoh.LAW, ogden.LAW, arruda_boyce.LAW,
-    table.LAW, beam.LAW)}
+    table.LAW, beam.LAW, dielectric.LAW)}

@@ -1,9 +1,10 @@
-"""What the position of an actuator is: the stretch of a block, or the deflection of a beam."""
+"""What the position of an actuator is: a stretch, the deflection of a beam, a capacitance."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 from hmsa_ros.model.laws.record import Elastic
+from hmsa_ros.model.units import Drive, FLUX, VOLTAGE
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,7 @@ class Coordinate:
     possible: tuple[float, float]  #: what a sensor may usually show
     conceivable: tuple[float, float]  #: what can be a position at all
     usual: tuple[float, float]  #: range of a motion that is not too large
+    drive: Drive = FLUX  #: what moves it
     looks: str = ''  #: what other values may be, and how to mend them; empty where the values tell
 
 
@@ -29,18 +31,27 @@ STRETCH = Coordinate(
 DEFLECTION = Coordinate(
     'deflection', 'deflections', 'u', 'u',
     'the deflection of the tip over the length of the beam, around 0', 0.0,
-    (-0.4, 0.4), (-1.2, 1.2), (-2.0, 2.0), (-0.6, 0.6),
+    (-0.4, 0.4), (-1.2, 1.2), (-2.0, 2.0), (-0.6, 0.6), FLUX,
     'a length, in mm perhaps, divide it by that of the beam; if it is the angle of the tip, take '
     'the deflection that goes with it')
+CAPACITANCE = Coordinate(
+    'capacitance ratio', 'capacitance ratios', 'C/C₀', 'C/C_0',
+    'the capacitance over that without a voltage, around 1', 1.0,
+    (0.5, 2.0), (0.05, 50.0), (0.0, 400.0), (0.5, 3.0), VOLTAGE)
 #: What a position is called where nothing more is known.
 POSITION = 'position'
-COORDINATES = {x.name: x for x in (STRETCH, DEFLECTION)}
+COORDINATES = {x.name: x for x in (STRETCH, DEFLECTION, CAPACITANCE)}
 
 
 def shared_name(names: Iterable[str]) -> str:
     """Return what positions of several actuators are called together."""
     found = set(names)
     return found.pop() if len(found) == 1 else POSITION
+
+
+def drive_of(name: str) -> Drive:
+    """Return what moves an actuator whose positions have a name; a field if it is unknown."""
+    return COORDINATES.get(name, STRETCH).drive
 
 
 def coordinate_of(law: Elastic | None) -> Coordinate:

@@ -14,6 +14,8 @@ OGDEN = 3.0  # number of terms, then mu and alpha of each
 TABLE = 4.0  # number of pieces, then what `hmsa_ros.model.laws.curve.Curve.packed` returns
 BEAM = 5.0  # what `hmsa_ros.model.laws.bending.packed` returns
 ARRUDA_BOYCE = 6.0  # mu, lambda_m
+DIELECTRIC = 7.0  # 1/J_lim
+_COORDINATES = {BEAM: 'deflection', DIELECTRIC: 'capacitance ratio'}
 
 #: Place of the constants in a packed material.
 CONSTANTS = 6
@@ -53,16 +55,18 @@ class Elastic:
     limits: tuple[float, float] = ENDLESS  #: beyond which nothing is known
     shape: float | None = None  #: c1 in place of that of a block
     section: float = 0.0  #: width times thickness of a beam over its length squared; 0 for a block
+    #: Voltage of the load 1 over the root of G, in V/sqrt(Pa); 0 for what a field drives.
+    volts: float = 0.0
 
     @property
     def rest(self) -> float:
-        """Coordinate at rest without a field: stretch 1, or deflection 0 of a beam."""
+        """Coordinate at rest without a field: 1, or deflection 0 of a beam."""
         return 0.0 if self.family == BEAM else 1.0
 
     @property
     def coordinate(self) -> str:
         """What the coordinate is called."""
-        return 'deflection' if self.family == BEAM else 'stretch'
+        return _COORDINATES.get(self.family, 'stretch')
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,7 @@ class Law:
     #: From the values of the constants, and of the actuator, to the shear modulus at small strain
     #: and what is left of the law in units of it; none for Gent and its limit.
     scaled: Callable[[Mapping[str, Any]], tuple[float, Elastic]] | None = None
+    own_modulus: bool = True  #: whether G follows from the constants of what is scaled
     endless: bool = False  #: whether J_lim is infinite, whatever the parameter says
     #: From the values of the constants to those that are in a file which they name.
     completed: Callable[[Mapping[str, Any]], dict[str, Any]] | None = None

@@ -2,6 +2,7 @@
 //     m(l) l'' + m'(l) l'^2 / 2 + d l' + psi'(l) = beta
 // with stretch l, time in L sqrt(rho/G) and the load beta = Br B/(mu0 G).
 #pragma once
+#include "dielectric.hpp"
 #include "dop853.hpp"
 #include "flow.hpp"
 #include "law.hpp"
@@ -9,7 +10,7 @@
 namespace hmsa {
 // Places in a packed material, and the families of laws (hmsa_ros/model/law.py, laws/record.py).
 enum Place { kind_at, zeta_at, c1_at, damping_at, lower_at, upper_at, constants_at };
-enum Family { gent, neo_hookean, polynomial, ogden, table, beam, arruda_boyce };
+enum Family { gent, neo_hookean, polynomial, ogden, table, beam, arruda_boyce, dielectric };
 
 // What depends on the stretch alone is differentiated by it, and by all else after; unless the
 // constants of the law have derivatives, too.
@@ -129,6 +130,7 @@ template <class C> struct AnyOf {
     Ogden<C> ogden_law;
     Table<double> table_law;
     Beam beam_law;
+    Dielectric dielectric_law;
 
     void read(int, const double *m)
     {
@@ -139,6 +141,7 @@ template <class C> struct AnyOf {
         case arruda_boyce: return polynomial_law.read(0, m + constants_at);
         case ogden: return ogden_law.read(0, m + constants_at);
         case table: return table_law.read(0, m + constants_at);
+        case dielectric: dielectric_law = {c1, {m[constants_at]}}; return;
         default: beam_law = {drag, m + constants_at};
         }
     }
@@ -157,6 +160,7 @@ template <class C> struct AnyOf {
         case arruda_boyce: return polynomial_law.force(l);
         case ogden: return ogden_law.force(l);
         case table: return table_law.force(l);
+        case dielectric: return dielectric_law.force(l);
         default: return beam_law.force(l);
         }
     }
@@ -171,6 +175,8 @@ template <class C> struct AnyOf {
             damps = shape * i_mass;
             return;
         }
+        if (kind == dielectric)
+            return dielectric_law.inertia(l, i_mass, falls, damps);
         const L l2 = l * l, l4 = l2 * l2, q = inverse(l + l4 * c1);
         i_mass = 6.0 * l4 * q;
         falls = -1.5 * q;
@@ -196,6 +202,7 @@ template <class C> struct AnyOf {
         case arruda_boyce: return polynomial_law.energy(l);
         case ogden: return ogden_law.energy(l);
         case table: return table_law.energy(l);
+        case dielectric: return dielectric_law.energy(l);
         default: return beam_law.energy(l);
         }
     }

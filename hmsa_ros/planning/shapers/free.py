@@ -85,7 +85,8 @@ def through(request: Request, duration: float) -> Move:
 def no_single(request: Request) -> str:
     """Word why levels of free heights are used."""
     settled = ' and a push that settles the field' if request.delivery.lag > 0.0 else ''
-    return (f'no single intermediate flux density{settled} within the limits leads as soon from '
+    level = request.units.drive.name
+    return (f'no single intermediate {level}{settled} within the limits leads as soon from '
             f'{request.named_state} to rest at {request.target:g}: '
             f'{_NUMBERS[unknowns(request)]} are used')
 
@@ -123,7 +124,7 @@ def _swings(request: Request) -> Iterator[Template]:
 
 def _refusal(request: Request) -> tuple[Code, str]:
     units, delivery, limits = request.units, request.delivery, request.limits
-    within = (f'flux densities of {units.load_text(limits.minimum)} to '
+    within = (f'{units.drive.plural} of {units.load_text(limits.minimum)} to '
               f'{units.load_text(limits.maximum)}')
     if delivery.lag > 0.0:
         text = (f'no command for a coil time constant of {units.time_text(delivery.lag)} brings '

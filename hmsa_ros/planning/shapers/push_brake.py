@@ -234,6 +234,6 @@ def _durations(request: Request, push: float, brake: float) -> tuple[float, floa
         raise RefusedError(
             Code.FLUX_LIMIT,
             f'{request.named_target} is not reached under {request.units.load_text(push)}: '
-            'expected wider flux density limits')
+            f'expected wider {request.units.drive.name} limits')
     # What the last stride went too far.
     return begin + pushing - stride * beyond / (beyond - before), braking

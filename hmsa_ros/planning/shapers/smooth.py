@@ -222,5 +222,6 @@ def _refusal(request: Request) -> tuple[Code, str]:
     ramps = '' if math.isinf(slew) else f', ramps of {units.slew_text(slew)}'
     return code, (
         f'no smooth path of up to {MOST_PERIODS:g} natural periods leads to rest at '
-        f'{request.named_target} within flux densities of {units.load_text(limits.minimum)} to '
+        f'{request.named_target} within {units.drive.plural} of '
+        f'{units.load_text(limits.minimum)} to '
         f'{units.load_text(limits.maximum)}{ramps} and the largest rate')
