@@ -262,7 +262,7 @@ class Actuator:
         >>> stack = Actuator.dielectric(layer_thickness=50e-6, shear_modulus=100e3)
         >>> plan = stack.plan([(1.1, 0.5)])
         >>> plan.report()['status'], round(plan.flux_densities[-1])   # V
-        (['two_step'], 1413)
+        (['two_step'], 1094)
 
         """
         if 'remanence' in more:
