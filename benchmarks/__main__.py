@@ -14,7 +14,8 @@ running nodes and fails if one is not answered as it should be; soak runs for ho
 moves actuators that are not as planned with, in real time, for some three minutes;
 identification fits thousands of simulated runs; defects those of actuators that are not as the
 model has them; harm holds feedback against open loop in random laboratories, for half an hour;
-laboratory tunes laboratories behind a serial board, for a quarter of an hour;
+laboratory tunes laboratories behind a serial board, for a quarter of an hour; line has cables,
+boards, amplifiers and sensors fail there, for two minutes;
 studies kills the workers of a study; rates measures how many plans a second studies make, for some
 seven minutes; lockstep compares the kernel of batches with C.
 A page is a Markdown file with marks ``<!-- begin NAME -->`` and ``<!-- end NAME -->``, between
@@ -41,7 +42,7 @@ NAMES = ('judge', 'planner', 'plant', 'preemption', 'joints', 'controller', 'rec
          'crash')
 #: Not run unless asked for: they take long and need the machine for themselves.
 LONG = ('faults', 'soak', 'feedback', 'identification', 'defects', 'harm', 'laboratory',
-        'studies', 'rates', 'lockstep')
+        'line', 'studies', 'rates', 'lockstep')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -59,8 +60,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--only', action='append', default=[], metavar='KEY',
                         help='faults: beginning of the key of a fault to inject')
     parser.add_argument('--runs', type=int, default=None,
-                        help='harm: laboratories (default 400); laboratory: of each kind (default '
-                             '20); identification, judge, defects: '
+                        help='harm: laboratories (default 400); laboratory, line: of each kind '
+                             '(default 20); identification, judge, defects: '
                              'simulated runs of each kind '
                              '(default 200, defects 30), in identification at most 40 of those')
     parser.add_argument('--hours', type=float, default=8.0,
@@ -150,6 +151,10 @@ def main(arguments: list[str] | None = None) -> int:
 
         add(bench_laboratory.compare(
             quick=options.quick, runs=options.runs or bench_laboratory.RUNS))
+    if 'line' in names:
+        from benchmarks import bench_line
+
+        add(bench_line.compare(quick=options.quick, runs=options.runs or bench_line.RUNS))
     if 'studies' in names:
         from benchmarks import bench_studies
 

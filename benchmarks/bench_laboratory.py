@@ -53,7 +53,7 @@ GOALS = {False: 0.005, True: 0.015}
 #: The share of laboratories that is to reach that, and what counts as worse than before.
 REACH, WORSE = 0.9, 0.005
 # Offset or vibration of a move, as a share of the step, from which on a verdict is to say so.
-_FAILED = 0.03
+FAILED = 0.03
 _MS = 1_000_000
 _PERIOD = _MS  # of samples in ns
 _LEVEL = 0.14  # T, what the largest stretch needs
@@ -161,6 +161,10 @@ class Board(SimulatedBoard):
         self.now += 0 if self._answer else _MS
         return super().read(size)
 
+    def _shown(self, stretch: float) -> float | None:
+        """Return what the sensor shows of a stretch; None where it shows nothing."""
+        return stretch
+
     def _sample(self, time: int) -> None:
         """Measure: the reading has the timestamp of now, and is of some time ago."""
         then = self._host(time) - round(1e9 * self.lab.bench.late)
@@ -168,7 +172,9 @@ class Board(SimulatedBoard):
             stretch = self._block.advance(max(then, self._block.time))
             self.motion.append((then, stretch))
             noise = self.lab.bench.noise * float(self._draw.standard_normal())
-            _board.sample(self._board, time, round(1e6 * REST_LENGTH * (stretch + noise)))
+            shown = self._shown(stretch + noise)
+            if shown is not None:
+                _board.sample(self._board, time, round(1e6 * REST_LENGTH * shown))
         self._next_sample += _PERIOD // 1000
 
 
@@ -182,10 +188,10 @@ class Driver:
         serial_board.monotonic = lambda: 1e-9 * board.now  # type: ignore[assignment]
         hardware = Assembly(
             serial('sim'), coil, SensorScale(rest_length=REST_LENGTH))
-        self._device = HardwareDevice(
+        self.device = HardwareDevice(
             [HardwareJoint(hardware, _LIMIT, Fallback(0.0))], time=board.now, period=5 * _MS,
             clock=board.time_ns)
-        self._device.switch_off(board.now)
+        self.device.switch_off(board.now)
         self.samples_seen: list[tuple[int, float]] = []
         self.changes_seen: list[tuple[int, float]] = []
 
@@ -197,26 +203,26 @@ class Driver:
     @property
     def next_sample(self) -> int:
         """When it is to be advanced next."""
-        return max(self._device.due or 0, self.board.now + _MS // 10)
+        return max(self.device.due or 0, self.board.now + _MS // 10)
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
         """Take a level."""
-        self._device.receive(joint, stamp, level)
+        self.device.receive(joint, stamp, level)
 
     def advance(self, time: int) -> None:
         """Do what is due; that takes time, too."""
         self.board.now = max(self.board.now, time)
-        self._device.advance(self.board.now)
+        self.device.advance(self.board.now)
 
     def changes(self) -> Sequence[tuple[int, int, float]]:
         """Return which levels took effect."""
-        found = [(x.joint, x.stamp, x.level) for x in self._device.changes()]
+        found = [(x.joint, x.stamp, x.level) for x in self.device.changes()]
         self.changes_seen += [x[1:] for x in found]
         return found
 
     def samples(self) -> Sequence[tuple[int, Any, Any, Any]]:
         """Return what was measured."""
-        found = [(x.time, x.stretch, x.rate, x.flux_density) for x in self._device.samples()]
+        found = [(x.time, x.stretch, x.rate, x.flux_density) for x in self.device.samples()]
         self.samples_seen += [(x[0], float(x[1][0])) for x in found]
         return found
 
@@ -261,7 +267,7 @@ class Outcome:
     @property
     def silent(self) -> int:
         """Moves that failed and were said to have arrived."""
-        return sum(x.size > _FAILED and x.verdict == 'arrived' for x in (
+        return sum(x.size > FAILED and x.verdict == 'arrived' for x in (
             *self.before, *self.after, *self.learnt))
 
 
@@ -298,8 +304,10 @@ class Trial:
         targets = (*self.lab.bench.targets, 1.0)
         self.begin = self.request([(x, hold * (i + 1)) for i, x in enumerate(targets)], raw=False)
         segments = self.loop.runtime.group.planners[_JOINT].plan.segments[-len(targets):]
+        # What is planned anew begins later than the first level.
+        first = self._first()
         self.targets = [
-            Target(x, hold * i, hold * (i + 1), 1e-9 * (y.arrival - segments[0].begin))
+            Target(x, hold * i, hold * (i + 1), 1e-9 * (y.arrival - first))
             for i, (x, y) in enumerate(zip(targets, segments, strict=True))]
         return self._left([x.arrival or 0.0 for x in self.targets], [
             self.verdicts.get(i + 1, 'unobserved') for i in range(len(targets))])
@@ -385,10 +393,10 @@ def run(lab: Laboratory) -> Outcome:
         Path(), tuple(((x,), hold) for x in lab.bench.targets), Path(), entries, lambda _: (),
         accept=True)
     belief = read_belief(None, entries)
-    trial = Trial(Driver(Board(lab), sheet), _planner(belief.actuator))
+    trial = Trial(Driver(Board(lab), sheet), planner_of(belief.actuator))
     before = trial.moves(hold)
     if lab.hysteresis:
-        trial = Trial(Driver(Board(lab), calibrated(lab)), _planner(belief.actuator))
+        trial = Trial(Driver(Board(lab), calibrated(lab)), planner_of(belief.actuator))
     trial.request([(1.0, hold)], raw=False)
     begin = trial.request(
         [(y, x) for x, y in excitation(tuning, belief, 1e9 / _PERIOD)], raw=True)
@@ -398,7 +406,7 @@ def run(lab: Laboratory) -> Outcome:
         return Outcome(lab, found.verdict, found.reason, '', before, [], [])
     _, settings = chosen(tuning, belief, found)
     actuator = planned_from(settings)
-    trial = Trial(trial.driver, _planner(
+    trial = Trial(trial.driver, planner_of(
         actuator, shaper=settings['shaper'],
         coil_time_constant=settings.get('coil_time_constant', 0.0)))
     after = trial.moves(hold)
@@ -407,7 +415,8 @@ def run(lab: Laboratory) -> Outcome:
         trial.learnt(actuator) if lab.hysteresis else [])
 
 
-def _planner(actuator: Any, **options: Any) -> Planner:
+def planner_of(actuator: Any, **options: Any) -> Planner:
+    """Return a planner for the amplifier of a laboratory."""
     return Planner(actuator, Options(
         flux_density_min=-_LIMIT, flux_density_max=_LIMIT, lead_time=_LEAD, **options))
 

@@ -17,6 +17,7 @@ from benchmarks import (
     bench_harm,
     bench_judge,
     bench_laboratory,
+    bench_line,
     bench_plant,
     contenders,
 )
@@ -176,6 +177,15 @@ def test_a_laboratory_behind_a_board_is_tuned_to_half_a_percent_of_a_step():
     assert max(x.size for x in found.before) > 0.1
     assert found.last <= bench_laboratory.GOALS[False]
     assert (found.verdict, found.silent) == ('identified', 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('fault', bench_line.FAULTS)
+def test_faults_of_a_line_leave_the_coil_safe_and_the_next_move_arrives(fault):
+    found = bench_line.run_one(bench_line.SEED, fault=fault)
+    assert (found.reported, found.silent) == (True, 0)
+    assert not found.off > 0.51
+    assert found.next.size <= bench_line.GOAL
 
 
 def test_a_laboratory_bounds_what_the_second_move_leaves_by_what_may_be_wrong():
