@@ -149,10 +149,9 @@ class Identification:
 
     @property
     def acceptable(self) -> bool:
-        """Whether what the model lacks has a name, and is small enough to plan with."""
+        """Whether what the model lacks is small enough to plan with."""
         return (
             self.verdict == 'model_rejected' and 0.0 < self.cost <= ACCEPTABLE
-            and any(x.found for x in self.signatures)
             and all(math.isfinite(self.parameters[x].std) for x in self.names))
 
     @property
