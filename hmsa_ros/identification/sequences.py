@@ -11,8 +11,8 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.record import Run
 from hmsa_ros.recordings.setpoints import setpoints_of
 
-# Of the largest level: less than this is none.
-_NONE = 1e-6
+# Of the largest level: less is none, but what hysteresis that is compensated, or a device, leaves.
+_NONE = 1e-3
 
 
 def learn_from(runs: Sequence[Run]) -> tuple[Learnt, list[Target]]:
