@@ -113,7 +113,7 @@ def test_a_core_whose_hysteresis_is_written_is_demagnetised_at_the_end(monkeypat
     Supply.written.clear()
     assert main([
         'calibrate', 'coil', 'bench_under_test:coil', '--probe', 'bench_under_test:Supply',
-        '--limit', '0.1', '--steps', '2', '--settle', '0', '--hysteresis']) == 0
+        '--limit', '0.1', '--steps', '2', '--settle', '0.1', '--hysteresis']) == 0
     core, left = Iron(0.04, 0.6), []
     for current in Supply.written:
         core.turn(current)

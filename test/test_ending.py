@@ -168,7 +168,8 @@ def test_an_interrupt_in_the_first_second_ends_in_order(ros_env, tmp_path, words
 def test_a_computation_is_given_up_in_order(number, status):
     code = AT_IMPORT.replace('entry.{entry}()', "entry.main(['plan', '1.1:10'])")
     done = subprocess.run(
-        [sys.executable, '-c', code.format(module='numpy', number=int(number))],
+        ['env', '--default-signal=INT', sys.executable, '-c', code.format(
+            module='numpy', number=int(number))],
         capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (status, '', '')
 
@@ -180,7 +181,8 @@ def test_an_interrupt_that_python_drops_still_ends_a_computation():
         os.kill(os.getpid(), {number})
 class Sender""")
     done = subprocess.run(
-        [sys.executable, '-c', code.format(module='numpy', number=int(signal.SIGINT))],
+        ['env', '--default-signal=INT', sys.executable, '-c', code.format(
+            module='numpy', number=int(signal.SIGINT))],
         capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
 

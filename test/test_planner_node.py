@@ -547,7 +547,7 @@ REFUSED = (
     ('short_spell', 'ignore', 'expected one of refuse, continue'),
     ('flux_density_max', -0.6, 'expected less than flux_density_max, which is -0.6 T'),
     ('flux_density_min', 0.5, 'flux_density_min is 0.5 T: expected less'),
-    ('flux_density_max', 1e4, 'flux_density_max'),
+    ('flux_density_max', 1e6, 'flux_density_max'),
     ('flux_density_max', math.nan, 'flux_density_max'),
     ('lead_time', -0.1, 'lead_time'),
     ('actuator.density', -1.0, 'actuator.density'),
