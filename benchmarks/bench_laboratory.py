@@ -44,6 +44,7 @@ from hmsa_ros.model.equations import natural_frequency
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Options, Planner
+from hmsa_ros.recordings.levels import ROUNDED
 
 #: Laboratories of each kind, and the seed of the first without and with hysteresis; those before
 #: it are for development.
@@ -57,7 +58,7 @@ FAILED = 0.03
 _MS = 1_000_000
 _PERIOD = _MS  # of samples in ns
 _LEVEL = 0.14  # T, what the largest stretch needs
-_NONE = 1e-3 * _LEVEL  # what hysteresis leaves is no level, as hmsa learn has it
+_NONE = ROUNDED * _LEVEL  # what hysteresis leaves is no level, as hmsa learn has it
 _LIMIT, _LEAD = 0.5, 200 * _MS
 _TRIP = (150_000, 600_000)  # of a request and its answer in ns
 _JOINT = 'actuator'

@@ -8,11 +8,9 @@ import numpy as np
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.learning import learn, Learnt, Target, Trial
 from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.recordings.levels import ROUNDED
 from hmsa_ros.recordings.record import Run
 from hmsa_ros.recordings.setpoints import setpoints_of
-
-# Of the largest level: less is none, but what hysteresis that is compensated, or a device, leaves.
-_NONE = 1e-3
 
 
 def learn_from(runs: Sequence[Run]) -> tuple[Learnt, list[Target]]:
@@ -63,7 +61,8 @@ def _begin(run: Run) -> int:
     largest = max((abs(x.flux_density) for x in run.levels), default=0.0)
     asked = run.requests[0].sent if run.requests else int(run.time[0])
     for x in run.levels:
-        if abs(x.flux_density) > _NONE * largest:
+        # Less is what a device rounds to, or leaves of a core that it compensates.
+        if abs(x.flux_density) > ROUNDED * largest:
             if x.stamp < asked:
                 break
             return x.stamp

@@ -7,7 +7,7 @@ recorder may receive a planner's answer before the request itself.
 """
 
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Container, Iterable, Iterator, Sequence
 from typing import Protocol
 
 from hmsa_ros.model.status import Code
@@ -71,8 +71,7 @@ def answered(
         if verdict.request and (verdict.request not in named or (
                 verdict.sent in new and named[verdict.request].sent not in new)):
             named[verdict.request] = verdict
-    unnamed = {x.sent: x for x in _answers(verdicts, numbered=bool(begun))
-               if not x.request or not begun}
+    unnamed = {x.sent: x for x in _answers(verdicts, new) if not x.request or not begun}
     times = list(unnamed)
     claimed: set[int] = set()
     found: list[tuple[Verdict | None, bool]] = []
@@ -92,20 +91,19 @@ def answered(
     return found, [x for x in begun if x.sent not in claimed and x is not verdicts[0]]
 
 
-def _answers(verdicts: Sequence[Verdict], *, numbered: bool) -> Iterator[Verdict]:
-    """Yield the verdicts that may answer a request, by time; whether they have plans' numbers."""
+def _answers(verdicts: Sequence[Verdict], new: Collection[int]) -> Iterator[Verdict]:
+    """Yield the verdicts that may answer a request; the times of those on new plans are known."""
     before: Verdict | None = None
     for verdict in verdicts:
         fresh = before is None or (verdict.code, verdict.message) != (before.code, before.message)
-        plan = before.plan if before else 0
-        if verdict.plan not in (0, plan) or fresh and (
-                verdict.level == 'error' or verdict.code in _IDLE or not numbered):
+        if verdict.sent in new or fresh and (
+                verdict.level == 'error' or verdict.code in _IDLE or not new):
             yield verdict
         before = verdict
 
 
 def _nearest(
-        times: Sequence[int], time: int, before: int, after: int, without: Iterable[int],
+        times: Sequence[int], time: int, before: int, after: int, without: Container[int],
         ) -> int | None:
     """Return the nearest of some increasing times within a span of another; None if none is."""
     begin, end = bisect_left(times, time - before), bisect_left(times, time + after)
