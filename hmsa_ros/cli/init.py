@@ -127,7 +127,7 @@ def run(arguments: argparse.Namespace) -> int:
     made = _actuator(arguments, given)
     actuator, found = made.block, made.scales
     given.setdefault('shear_modulus', actuator.shear_modulus)
-    doubts = _doubts(given, found)
+    doubts = _doubts(_form(arguments), given, found)
     if guessed:
         doubts.append(
             f'{" and ".join(f"{by_key[x].words} {given[x]:g}" for x in guessed)} '
@@ -283,10 +283,8 @@ def _actuator(
     return Actuator.beam(**values) if form == 'beam' else Actuator(**values)
 
 
-def _doubts(given: Mapping[str, float], found: 'Scales') -> list[str]:
+def _doubts(form: str, given: Mapping[str, float], found: 'Scales') -> list[str]:
     """Return what is implausible, a sentence each."""
-    form = 'beam' if 'length' in given else 'dielectric' if 'voltage_max' in given else 'block'
-    beam = form == 'beam'
     values = {**given, 'zeta': found.zeta, 'damping_ratio': found.zeta / found.critical_zeta}
     doubts = [x for quantity in FORMS[form]
               if quantity.key in values and (x := quantity.doubt(values[quantity.key]))]
@@ -303,7 +301,7 @@ def _doubts(given: Mapping[str, float], found: 'Scales') -> list[str]:
             f'the {drive} only reaches {words} from '
             f'{found.held[0]:.6g} to {found.held[1]:.6g}: a {what} needs about '
             f'{level.format(0.3 * found.flux_density_unit)}')
-    if beam:
+    if form == 'beam':
         # q L^4/(8 E I) of an even load, over L.
         sag = 1.5 * given['density'] * _GRAVITY * given['length'] ** 3 / (
             given['youngs_modulus'] * given['thickness'] ** 2)

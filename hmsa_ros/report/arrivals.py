@@ -135,13 +135,7 @@ def around(part: Part, number: int, curve: Curve) -> tuple[Array, Array]:
     """Return a curve about an arrival: s after the move began, and off target in % of the step."""
     x = part.evaluation.results[number]
     inside = curve.between(x.begin, min(x.end, x.begin + _PANEL_SPAN * max(x.arrival, 1e-9)))
-    return inside.time - x.begin, 100.0 * (inside.stretch - x.stretch) / abs(step_of(part, number))
-
-
-def step_of(part: Part, number: int) -> float:
-    """Return how far a move was to go."""
-    found = part.evaluation.results[number]
-    return found.stretch - found.start
+    return inside.time - x.begin, 100.0 * (inside.stretch - x.stretch) / abs(x.step)
 
 
 def span(parts: Sequence[Part], number: int) -> float:

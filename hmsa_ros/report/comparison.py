@@ -8,7 +8,7 @@ import numpy as np
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.recordings.record import Run
-from hmsa_ros.report.arrivals import around, Part, step_of
+from hmsa_ros.report.arrivals import around, Part
 from hmsa_ros.report.evaluation import judged_from
 from hmsa_ros.table import Column, Table
 
@@ -110,8 +110,8 @@ def _apart(first: Part, part: Part, number: int) -> float:
     for each, place in zip((first, part), places, strict=True):
         time, off = around(each, place or 0, each.evaluation.recorded)
         known = np.isfinite(off)
-        step = step_of(each, place or 0)
-        curves.append((time[known], off[known], each.evaluation.results[place or 0].stretch, step))
+        move = each.evaluation.results[place or 0]
+        curves.append((time[known], off[known], move.stretch, move.step))
     (time, off, target, step), (other, values, its, size) = curves
     if len(other) < 2 or len(time) < 2:
         return math.nan

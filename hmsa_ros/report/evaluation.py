@@ -91,6 +91,11 @@ class MoveResult:
     place: int = 0  #: of the setpoint among all that were requested, from 0
 
     @property
+    def step(self) -> float:
+        """How far it was to go, with its sign."""
+        return self.stretch - self.start
+
+    @property
     def rests(self) -> float:
         """Time of planned rest in s of the run."""
         return self.begin + self.arrival

@@ -15,7 +15,6 @@ from hmsa_ros.report.arrivals import (
     reach,
     results_of,
     span,
-    step_of,
     worst,
 )
 from hmsa_ros.report.charts import commanded, time_unit, TimeUnit
@@ -97,10 +96,9 @@ def _shown_times(parts: Sequence[Part]) -> tuple[float, float]:
         begin, end = float(found.time[0]), float(found.time[-1])
         if found.results:
             last = found.results[-1]
-            step = abs(step_of(part, len(found.results) - 1))
             quiet = max(last.rests, min(last.begin + _REST * last.arrival, end))
             after = found.recorded.between(quiet, end).stretch
-            if len(after) and np.nanmax(np.abs(after - last.stretch)) <= _STILL * step:
+            if len(after) and np.nanmax(np.abs(after - last.stretch)) <= _STILL * abs(last.step):
                 end = quiet
         # The first level is a step, which needs room before it.
         begins.append(max(begin, -0.06 * end) if end > 0.0 else begin)
