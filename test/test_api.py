@@ -149,6 +149,15 @@ def test_what_is_identified_plans_and_is_written_with_its_covariance(tmp_path):
         [(1.1, 1.0)], 'minimax').segments[0].move.duration * 1.5
 
 
+def test_what_cannot_be_identified_says_why(block, tmp_path):
+    motion = block.plan([(1.1, 0.2)]).simulate(noise=3e-3, rate=300)
+    found = hmsa_ros.identify(motion)
+    assert found.verdict == 'not_identifiable'
+    assert found.report()
+    with pytest.raises(hmsa_ros.HmsaError, match='the verdict is not_identifiable'):
+        found.to_yaml(tmp_path / 'found.yaml')
+
+
 @pytest.mark.parametrize(('call', 'said'), [
     (lambda x: hmsa_ros.Actuator(shear_modulus='30kPa'), "shear_modulus is '30kPa': expected"),
     (lambda x: hmsa_ros.Actuator(half_length=-1.0), 'half_length is -1: expected 1e-09 to 1000 m'),
@@ -168,6 +177,13 @@ def test_what_is_identified_plans_and_is_written_with_its_covariance(tmp_path):
     (lambda x: x.plan([(1.1, 0.5)], shaper=3), 'shaper is 3'),
     (lambda x: x.plan([(1.1, 0.5)], limits='0.1 T'), "limit is '0.1 T': expected a number in T"),
     (lambda x: x.plan([(1.1, 0.0005)]), 'takes 0.00165'),
+    (lambda x: x.plan([(1.1, -1)]), 'duration is -1 s'),
+    (lambda x: x.plan([(1.1, np.inf), (1.0, 1)]), 'only that of the last setpoint'),
+    (lambda x: x.plan([(1.1, 1)], 'robust', order=1.5), 'order is 1.5: expected a whole number'),
+    (lambda x: x.plan([(1.1, 1)], period=-1), 'period is -1 s'),
+    (lambda x: x.plan([(1.1, 1)], 'smooth', max_rate=-1), 'max_rate is -1 1/s'),
+    (lambda x: x.flux_density('high'), "stretches are 'high': expected numbers"),
+    (lambda x: x.wave([(0, 1), (1, 1.1), (2, np.nan), (3, 1)], 5, 0.1), 'contain nan'),
     (lambda x: x.plan([(1.1, 0.5)]).simulate(truth=1.1), 'truth is 1.1: expected an Actuator'),
     (lambda x: x.plan([(1.1, 0.5)]).simulate(noise=-1), 'noise is -1'),
     (lambda x: x.plan([(1.1, 0.5)]).currents(0.0), 'expected a finite number above 0 T/A'),

@@ -17,6 +17,7 @@ from hmsa_ros.api.arguments import (
     law_values,
     limits_of,
     number,
+    numbers,
 )
 from hmsa_ros.api.facts import facts
 from hmsa_ros.errors import BadInputError, excerpt
@@ -323,12 +324,13 @@ class Actuator:
 
     def flux_density(self, stretch: ArrayLike) -> Any:
         """Return the flux density in T that holds a stretch, or an array of them."""
-        found = self.model.units.level(elastic_force(stretch, self.model.material))
+        found = self.model.units.level(
+            elastic_force(numbers(stretch, 'stretches'), self.model.material))
         return found if np.ndim(found) else float(found)
 
     def stretch(self, flux_density: ArrayLike) -> Any:
         """Return the stretch that a flux density in T holds, or an array of them."""
-        load = self.model.units.of_level(np.asarray(flux_density, dtype=np.float64))
+        load = self.model.units.of_level(numbers(flux_density, 'flux densities'))
         found = equilibrium_stretch(load, self.model.material)
         return found if np.ndim(found) else float(found)
 
@@ -502,9 +504,17 @@ class Actuator:
         if not isinstance(shaper, str):
             raise BadInputError(f'shaper is {excerpt(shaper)}: expected a name such as two_step')
         stretches, durations = columns_of(setpoints, ('stretch', 'duration'), 'setpoints')
-        for stretch in stretches.tolist():
+        for stretch, duration in zip(stretches.tolist(), durations.tolist(), strict=True):
             if reason := impossible(stretch, model.material.rest):
                 raise BadInputError(reason)
+            if not duration > 0.0:
+                raise BadInputError(
+                    f'duration is {duration:g} s: expected a number greater than 0')
+        if np.any(np.isinf(durations[:-1])):
+            raise BadInputError('duration is inf s: only that of the last setpoint may be')
+        if isinstance(order, bool) or not isinstance(order, (int, np.integer)):
+            raise BadInputError(
+                f'order is {excerpt(order)}: expected a whole number of at least 1')
         if limits is not None:
             low, high = limits_of(limits)
             model = Model(model.actuator, replace(
@@ -517,9 +527,11 @@ class Actuator:
                 model.material,
                 State(model.material.rest if start is None else number(start, 'start')),
                 limits=model.limits, units=model.units, order=order,
-                delivery=replace(model.delivery, period=number(period, 'period', 's') / unit),
+                delivery=replace(model.delivery, period=number(period, 'period', 's', least=0.0) / unit),
                 errors=self._errors(shaper) if errors is None else as_errors(errors),
-                pace=Pace(periods, max_rate * unit)),
+                pace=Pace(number(periods, 'periods'), unit * (
+                    number(max_rate, 'max_rate', '1/s', above=0.0) if max_rate != math.inf
+                    else math.inf))),
             shaper, short_spell)
         return Plan(self, segments, shaper)
 

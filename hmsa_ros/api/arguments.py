@@ -23,7 +23,7 @@ _ALIASES = {'duration': ('span', 'seconds'), 'stretch': ('deflection', 'position
 
 def columns_of(value: Any, names: tuple[str, str], what: str) -> tuple[Array, Array]:
     """
-    Return two columns of finite numbers, each of shape (n,).
+    Return two columns of numbers, each of shape (n,).
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def columns_of(value: Any, names: tuple[str, str], what: str) -> tuple[Array, Ar
     Raises
     ------
     BadInputError
-        If it is none of these, or a number is not finite.
+        If it is none of these.
 
     """
     expected = (
@@ -53,12 +53,13 @@ def columns_of(value: Any, names: tuple[str, str], what: str) -> tuple[Array, Ar
             isinstance(x, np.ndarray) for x in value):
         pair = list(value)
     else:
-        rows = _numbers(value, what, expected)
+        rows = numbers(value, what, expected)
         if rows.ndim != 2 or rows.shape[1] != 2:
             raise BadInputError(
-                f'{what} have the shape {rows.shape}: {expected}, as in [(1.1, 0.5), (1.0, 0.5)]')
+                f'{what} have the shape {rows.shape}: {expected}, as in '
+                f'[({", ".join(names)}), ({", ".join(names)})]')
         pair = [rows[:, 0], rows[:, 1]]
-    one, other = (np.ascontiguousarray(_numbers(x, what, expected)) for x in pair)
+    one, other = (np.ascontiguousarray(numbers(x, what, expected)) for x in pair)
     if one.ndim != 1 or one.shape != other.shape or not len(one):
         raise BadInputError(
             f'{what} have {names[0]} of shape {one.shape} and {names[1]} of shape {other.shape}: '
@@ -74,7 +75,8 @@ def _column(value: Any, name: str, what: str) -> Any:
     return value[found]
 
 
-def _numbers(value: Any, what: str, expected: str) -> Array:
+def numbers(value: Any, what: str, expected: str = 'expected numbers') -> Array:
+    """Return numbers of any shape, or raise `BadInputError`."""
     try:
         found: Array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:

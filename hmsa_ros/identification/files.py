@@ -216,8 +216,10 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
     for key, value in belief.settings.items():
         if key not in written and not key.startswith(PREFIX):
             lines.append(f'    {key}: {yaml_text(value)}')
+    # What the recording does not determine has no covariance.
     lines += known_lines(Known(
-        found.names, tuple(float(found.values[x]) for x in found.names), found.covariance))
+        found.names, tuple(float(found.values[x]) for x in found.names), found.covariance)
+        if np.all(np.isfinite(found.covariance)) else Known())
     return '\n'.join(lines) + '\n'
 
 

@@ -63,6 +63,8 @@ def sampled_shape(times: Array, stretches: Array) -> Shape:
         raise BadInputError(
             f'a wave of {len(times)} samples: expected one period of at least 4 samples at '
             'increasing times')
+    if not np.all(np.isfinite(times)) or not np.all(np.isfinite(stretches)):
+        raise BadInputError('the samples of a wave contain nan or inf: expected finite numbers')
     size = float(np.ptp(stretches))
     if not size > 0.0 or abs(stretches[-1] - stretches[0]) > 1e-6 * size:
         raise BadInputError(
