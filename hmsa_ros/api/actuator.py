@@ -527,7 +527,8 @@ class Actuator:
                 model.material,
                 State(model.material.rest if start is None else number(start, 'start')),
                 limits=model.limits, units=model.units, order=order,
-                delivery=replace(model.delivery, period=number(period, 'period', 's', least=0.0) / unit),
+                delivery=replace(
+                    model.delivery, period=number(period, 'period', 's', least=0.0) / unit),
                 errors=self._errors(shaper) if errors is None else as_errors(errors),
                 pace=Pace(number(periods, 'periods'), unit * (
                     number(max_rate, 'max_rate', '1/s', above=0.0) if max_rate != math.inf
