@@ -89,6 +89,21 @@ def test_a_slow_amplifier_is_planned_through_its_ramps(slew):
         assert move.duration >= (move.levels[-1].load - request.load) / slew
 
 
+@pytest.mark.parametrize(('start', 'target'), [
+    (State(1.0), 1.1), (State(1.0), 0.9), (State(1.1, 2e-14), 1.3)])
+def test_a_slow_amplifier_costs_its_ramp_and_half_a_period_at_most(start, target):
+    ideal = get_shaper('two_step')(Request(start, target, PAPER, WIDE)).duration
+    for slew in np.geomspace(0.05, 50.0, 40).tolist():
+        request = Request(start, target, PAPER, WIDE, Delivery(slew=slew))
+        move, fast = (get_shaper(x)(request) for x in ('two_step', 'minimum_time'))
+        ramp = abs(move.levels[-1].load - request.load) / slew
+        assert fast.duration <= move.duration < ramp + ideal
+        # Fast ramps turn before any level is reached.
+        if ramp < 0.05 * ideal:
+            assert fast.duration < 0.6 * move.duration
+            assert distance_from_rest(fast, request) < AT_REST
+
+
 # A search by SciPy over level and hold had found a plan for each where ours had found none.
 @pytest.mark.parametrize(('state', 'target', 'slew'), [
     (State(1.2595, 0.0085, 0.8159), 0.6331, 0.0694),

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 import math
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -109,6 +110,23 @@ def first_kept(guesses: Iterable[Template], request: 'Request') -> Attempt:
         if found is not None and request.keeps(found[0]):
             return found
     return None
+
+
+def soonest_kept(guesses: Iterable[tuple[float, Template]], request: 'Request') -> Attempt:
+    """
+    Return the solution that is soonest at rest and keeps the load limits, if there is one.
+
+    Guesses come with their durations; those longer than a solution are left out.
+    """
+    best: Attempt = None
+    for duration, guess in sorted(guesses, key=itemgetter(0)):
+        if best is not None and duration >= best[1]:
+            break
+        found = solve(guess, request)
+        if found is not None and request.keeps(found[0]) and (
+                best is None or found[1] < best[1]):
+            best = found
+    return best
 
 
 def approach(

@@ -8,7 +8,7 @@ one ramps without a pause and turns twice.
 """
 
 from collections.abc import Iterator
-from itertools import chain, product
+from itertools import product
 import math
 
 import numpy as np
@@ -17,27 +17,32 @@ from hmsa_ros.model import law
 from hmsa_ros.model.moves import Level, Move
 from hmsa_ros.model.simulation import followed_by
 from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.planning.shooting import Attempt, first_kept, heights, on_time, Template
+from hmsa_ros.planning.shapers.request import AT_REST, Request
+from hmsa_ros.planning.shooting import (
+    Attempt,
+    first_kept,
+    heights,
+    on_time,
+    soonest_kept,
+    Template,
+)
 
 # Lengths of all levels together, in half periods at the target.
 _LENGTHS = (0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0)
 # Ramps to begin the search for two swings with, in quarters of a period.
 _SWINGS = (0.3, 0.1, 0.7, 0.03, 1.2)
-_AT_REST = 1e-9
 _NUMBERS = {2: 'two', 3: 'three'}
 
 
 def at_rest(request: Request) -> bool:
     """Return whether stretch, rate and, where that lags, field are those of the target."""
     state, packed = request.state, request.material.packed
-    if not (abs(state.stretch - request.target) <= _AT_REST
-            and abs(state.rate) <= _AT_REST * request.frequency):
+    if abs(state.stretch - request.target) > AT_REST or not request.still:
         return False
     delivery, holding = request.delivery, request.balance(followed_by(state, request.material))
     stiffness = float(law.elastic_stiffness(request.target, packed))
     return delivery.lag == 0.0 or max(abs(request.field - holding), abs(
-        request.load - holding) * (not math.isinf(delivery.slew))) <= _AT_REST * stiffness
+        request.load - holding) * (not math.isinf(delivery.slew))) <= AT_REST * stiffness
 
 
 def unknowns(request: Request) -> int:
@@ -48,10 +53,10 @@ def unknowns(request: Request) -> int:
 def free_heights(request: Request) -> Attempt:
     """Return the shortest levels of free heights that keep the limits, if there are any."""
     delivery = request.delivery
-    quick = request.state.rate != 0.0 and delivery.period == delivery.lag == 0.0 \
-        and math.isfinite(delivery.slew)
-    found = first_kept(chain(_swings(request) if quick else (), _equal(request)), request)
-    return on_time(found, 2, request) if quick else found
+    if delivery.period > 0.0 or delivery.lag > 0.0 or math.isinf(delivery.slew):
+        return first_kept(_equal(request), request)
+    found = soonest_kept(_swings(request), request) or first_kept(_equal(request), request)
+    return on_time(found, 2, request)
 
 
 def free_levels(request: Request) -> Move:
@@ -107,16 +112,17 @@ def _equal(request: Request) -> Iterator[Template]:
                 *(Level((1 + i) * each, holding) for i in range(count))])
 
 
-def _swings(request: Request) -> Iterator[Template]:
-    """Yield guesses of two levels that ramps only just reach."""
+def _swings(request: Request) -> Iterator[tuple[float, Template]]:
+    """Yield guesses of two levels that ramps only just reach, with their durations."""
     slew, start, holding = request.delivery.slew, request.load, request.holding_load()
     longest = 0.5 * math.pi / request.frequency
     for share, rest, sign in product(_SWINGS, _SWINGS, (1.0, -1.0)):
         turn = share * longest
         high, low = start + sign * slew * turn, holding - sign * slew * rest * longest
         if sign * (high - low) > 0.0:
-            yield Template(
-                np.array([0.0, turn, turn + abs(high - low) / slew]),
+            last = turn + abs(high - low) / slew
+            yield last + rest * longest, Template(
+                np.array([0.0, turn, last]),
                 np.array([high, low, holding]),
                 sign / slew * np.array([[0.0, 0.0], [1.0, 0.0], [2.0, -1.0]]),
                 np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]))

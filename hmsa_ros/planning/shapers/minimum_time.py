@@ -5,6 +5,7 @@ import math
 
 from hmsa_ros.model.moves import Move
 from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.planning.shapers.free import free_levels
 from hmsa_ros.planning.shapers.push_brake import push_brake
 from hmsa_ros.planning.shapers.request import Request, Work
 from hmsa_ros.planning.shapers.two_step import two_step
@@ -17,14 +18,17 @@ def minimum_time(request: Request) -> Move:
     """
     Push with the load limit on one side, brake with the other, then hold.
 
-    On a grid, through ramps and with a field that lags, the two-step command can be sooner at
-    rest, or the only one within the limits: it is used then, and the move's reason says so. Where
-    neither is found: `RefusedError`.
+    Through ramps that do not reach the limits, turn before. On a grid, through ramps and with a
+    field that lags, the two-step command can be sooner at rest, or the only one within the limits:
+    it is used then, and the move's reason says so. Where none is found: `RefusedError`.
     """
     found: list[Move] = []
     refusals: list[RefusedError] = []
     # What the two-step command would find alone, it finds here.
-    for shaper, work in ((push_brake, Work(_PUSHING)), (two_step, request.work)):
+    shapers = [(push_brake, Work(_PUSHING)), (two_step, request.work)]
+    if request.delivery.period == 0.0 and request.delivery.slew < math.inf:
+        shapers.append((free_levels, Work(_PUSHING)))
+    for shaper, work in shapers:
         try:
             found.append(shaper(replace(request, work=work)))
         except RefusedError as error:

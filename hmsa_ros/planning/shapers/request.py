@@ -23,6 +23,8 @@ from hmsa_ros.planning.shapers.pace import PACE, Pace
 ERRORS = (0.1, 0.1, 0.1)
 #: The largest of them.
 LARGEST_ERROR = 0.9
+#: What is as good as at rest: of stretch and load, and of the rate over the frequency.
+AT_REST = 1e-9
 
 
 def as_errors(values: Sequence[float] | Ellipsoid) -> Uncertainty:
@@ -108,6 +110,11 @@ class Request:
     def frequency(self) -> float:
         """Undamped angular frequency of small motion about the target."""
         return float(law.natural_frequency(self.target, self.material.packed))
+
+    @property
+    def still(self) -> bool:
+        """Whether the actuator does not move, though nothing may hold it there."""
+        return abs(self.state.rate) <= AT_REST * self.frequency
 
     def keeps(self, levels: Sequence[Level]) -> bool:
         """Return whether levels are inside the load limits."""

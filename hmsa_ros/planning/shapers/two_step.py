@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product, starmap
 import math
+from operator import itemgetter
 
 import numpy as np
 
@@ -13,7 +14,15 @@ from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.shapers.free import at_rest, free_heights, free_levels, no_single
 from hmsa_ros.planning.shapers.push_brake import push_brake
 from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.planning.shooting import approach, Attempt, first_kept, heights, solve, Template
+from hmsa_ros.planning.shooting import (
+    approach,
+    Attempt,
+    first_kept,
+    heights,
+    solve,
+    soonest_kept,
+    Template,
+)
 from hmsa_ros.planning.two_step import CODES, HOLD_TOLERANCE, plan_two_step, RTOL
 
 # Of the push that settles a lagging field, in time constants: it passes the holding level by as
@@ -61,14 +70,14 @@ def two_step(request: Request) -> Move:
         if found is not None and request.keeps(found[0]):
             sooner = _sooner(request, found[1]) if lags or creeps else None
             return sooner or Move(Code.TWO_STEP, *found)
-    if request.state.rate == 0.0 and not lags and (code is Code.TWO_STEP or not creeps):
+    if request.still and not lags and (code is Code.TWO_STEP or not creeps):
         request.check(levels)
     if at_once and not lags and not creeps:
         return push_brake(request, no_single(request))
     try:
         return free_levels(request)
     except RefusedError:
-        found = first_kept(_held(request), request)
+        found = soonest_kept(_held(request), request)
         if found is None:
             raise
         return Move(Code.TWO_STEP, *found)
@@ -131,10 +140,7 @@ def _delivered(request: Request, levels: tuple[Level, ...]) -> Attempt:
     """Return the command that a grid or ramps make of one at any time and in steps, if any."""
     if request.delivery.period > 0.0:
         return first_kept(_on_grid(request, *levels), request)
-    found = _ramped(request, levels)
-    if (found is None or not request.keeps(found[0])) and request.state.rate == 0.0:
-        return first_kept(_held(request), request)
-    return found
+    return _ramped(request, levels)
 
 
 def _on_grid(request: Request, first: Level, last: Level) -> Iterator[Template]:
@@ -163,12 +169,14 @@ def _ramped(request: Request, ideal: tuple[Level, ...]) -> Attempt:
     Solve for the level between two ramps and for how long it holds, and the push if one settles.
 
     A linear oscillator comes to rest where ramps and hold together span an odd number of half
-    periods. The solution for the first that fits is followed from fast ramps to the real ones,
-    and then from no lag to the lag.
+    periods. The solution for the first that fits is followed from fast ramps to the real ones.
+    Where that takes more than one half period, or is beyond the limits, the soonest of many
+    guesses may be better. What is found is followed from no lag to the lag.
     """
     first, last = ideal
     delivery, start = replace(request.delivery, lag=0.0), request.load
     slew, lag, change = delivery.slew, request.delivery.lag, last.load - start
+    bare = replace(request, delivery=delivery)
 
     def slower(levels: tuple[Level, ...], share: float, aim: float) -> Attempt:
         # The ramps lengthen about their middles, so that the second one begins earlier.
@@ -196,8 +204,15 @@ def _ramped(request: Request, ideal: tuple[Level, ...]) -> Attempt:
     if half_periods > 1:
         ideal = (Level(0.0, start + change / (1.0 + decay ** half_periods)),
                  Level(half_periods * last.time, last.load))
-    found = approach(ideal, slower, _SHORTEST_STRIDE)
-    return approach(found[0], later, _SHORTEST_STRIDE) if found and lag > 0.0 else found
+    tried = [approach(ideal, slower, _SHORTEST_STRIDE)]
+    if request.still and (
+            half_periods > 1 or tried[0] is None or not request.keeps(tried[0][0])):
+        tried.append(soonest_kept(_held(bare), bare))
+    for found in sorted(filter(None, tried), key=itemgetter(1)):
+        late = approach(found[0], later, _SHORTEST_STRIDE) if lag > 0.0 else found
+        if late is not None and request.keeps(late[0]):
+            return late
+    return None
 
 
 def _pushed(first: Level, push: Level, last: float, slew: float, lag: float) -> Template:
@@ -211,8 +226,8 @@ def _pushed(first: Level, push: Level, last: float, slew: float, lag: float) -> 
     return replace(template, d_times=d_times)
 
 
-def _held(request: Request) -> Iterator[Template]:
-    """Yield guesses of a level between ramps and its hold, those that hold shortest first."""
+def _held(request: Request) -> Iterator[tuple[float, Template]]:
+    """Yield guesses of a level between ramps and its hold, with their durations."""
     delivery, start, holding = request.delivery, request.load, request.holding_load()
     slew, eighth = delivery.slew, 0.25 * math.pi / request.frequency
     if delivery.lag > 0.0 or delivery.period > 0.0 or math.isinf(slew) or abs(
@@ -222,10 +237,10 @@ def _held(request: Request) -> Iterator[Template]:
     low = max(request.limits.minimum, min(start, holding) - reach)
     high = min(request.limits.maximum, max(start, holding) + reach)
 
-    def guess(hold: int, height: float) -> Template:
+    def guess(hold: int, height: float) -> tuple[float, Template]:
         level = low + height * (high - low)
-        return Template.of(
-            (Level(0.0, level), Level(abs(level - start) / slew + hold * eighth, holding)),
-            [('load', 0), ('time', 1)])
+        until = abs(level - start) / slew + hold * eighth
+        return until + abs(holding - level) / slew, Template.of(
+            (Level(0.0, level), Level(until, holding)), [('load', 0), ('time', 1)])
 
     yield from starmap(guess, product(range(_LONGEST_HOLD), _HEIGHTS))
