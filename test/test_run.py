@@ -174,3 +174,18 @@ def test_a_simulated_experiment_with_feedback_arrives_and_records_what_is_believ
     with open(file, 'rb') as stream:
         topics = {channel.topic for _, channel, _ in make_reader(stream).iter_messages()}
     assert '/planner/estimate' in topics
+
+
+@pytest.mark.slow
+def test_a_simulated_experiment_never_commands_nodes_that_run_already(start, ros, tmp_path):
+    from hmsa_ros.interfaces import topics
+
+    asked = ros.collect(
+        topics.JOINT_TRAJECTORY.type, 'planner/joint_trajectory', topics.JOINT_TRAJECTORY.qos)
+    start.hmsa('plant')
+    planner = start.hmsa('planner')
+    ros.spin_until(lambda: 'planner' in ros.node.get_node_names() or not planner.alive(), 'it')
+    run = start.hmsa('run', '1.1:0.1', '--simulate', '--out', str(tmp_path / 'out'))
+    assert run.wait(RUN_SECONDS) == 1
+    assert 'another planner, plant or driver is running' in run.stderr
+    assert not asked

@@ -37,6 +37,11 @@ _GONE_SECONDS = 3.0
 _SETTLED_SECONDS = 1.0
 # Until all nodes of the host are seen.
 _DISCOVERY_SECONDS = 0.6
+_OTHERS = (
+    'another planner, plant or driver is running, which a simulated run must not command: stop '
+    'it, or set another ROS_DOMAIN_ID')
+# Nodes that were killed have left the graph after this time.
+_FORGOTTEN_SECONDS = 22.0
 # Whoever carries out commands may not have been found yet.
 _UNHEARD_SECONDS = 3.0
 
@@ -114,9 +119,15 @@ class PlannerClient(Visitor):
         return (topics.PLANNER, f'/{self._namespace.strip("/")}') in (
             self.node.get_node_names_and_namespaces())
 
-    def check_alone(self) -> None:
+    def check_alone(self, *, own: bool = False) -> None:
         """
         Make sure that there are no two planners, plants or drivers, as far as can be seen.
+
+        Parameters
+        ----------
+        own : bool
+            Whether those that are there should be ours: a request for simulated ones must never
+            reach others. Then none may be seen beside them.
 
         Raises
         ------
@@ -127,13 +138,15 @@ class PlannerClient(Visitor):
         self.pass_time(self._begin + _DISCOVERY_SECONDS - monotonic())
         presence = Presence(self.node)
         try:
-            end = monotonic() + LATELY_SECONDS
+            end = monotonic() + (_FORGOTTEN_SECONDS if own else LATELY_SECONDS)
             # Killed ones are still seen, but not heard.
             while presence.crowded(self._joints, topics.PLANNER) and monotonic() < end:
                 presence.look()
                 if found := presence.planners(topics.PLANNER) or presence.devices(self._joints):
-                    raise HmsaError(found)
+                    raise HmsaError(_OTHERS if own else found)
                 self.pass_time(SLICE_SECONDS)
+            if own and presence.crowded(self._joints, topics.PLANNER):
+                raise HmsaError(_OTHERS)
         finally:
             presence.close()
 

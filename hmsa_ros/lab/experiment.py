@@ -199,14 +199,15 @@ def _begin(experiment: Experiment, session: Session, watch: 'Watch') -> None:
     """Check what runs, and wait for the recorder."""
     watch.client.find_planner(session.check)
     watch.read_parameters()
-    watch.client.check_alone()
     if not experiment.nodes:
+        watch.client.check_alone()
         watch.check()
         session.start(recorder_of(experiment, bool(watch.parameter('planner.use_sim_time'))))
     watch.client.spin_until(
         lambda: watch.recorder_ready,
         f'the recorder is not ready: {session.last_words(topics.RECORDER)}', session.check)
     if experiment.nodes:
+        watch.client.check_alone(own=True)
         watch.unpause()
 
 
