@@ -316,6 +316,7 @@ def test_a_law_is_chosen_by_option(files, capsys):
     (['plan', '1.1:0.5'], 'if seconds were meant, name the actuator with --params-file'),
     (['plan', '1.1:10', '--law', 'rubber'], 'expected one of gent'),
     (['plan', '1.1:10', '--law', 'yeoh:c10'], 'expected KEY=VALUE'),
+    (['plan', '1.1:10', '--law', 'yeoh'], 'as in --law yeoh:c10=VALUE'),
     (['plan', '1.1:10', '--law', 'gent', '--params-file', 'actuator.yaml'], 'both --params-file'),
     (['plan', '1.1:10', '--amplifier'], 'expected --params-file with it'),
     (['plan', '1.1:1', '--inductance', '-5mH'], 'expected more than 0 H'),

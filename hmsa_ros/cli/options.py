@@ -48,6 +48,11 @@ def law_of(text: str) -> tuple[str, dict[str, Any]]:
         constants[key] = value if kind is str else [
             number_of(x, unit, key) for x in value.split('/')] if kind is list else number_of(
                 value, unit, key)
+    # Where there are others, as of a beam, a parameter file has them.
+    if known and not constants and {x.unit for x in known.values()} <= {'Pa', ''}:
+        raise BadInputError(
+            f'--law {name} has no constants: expected {", ".join(known)}, as in --law '
+            f'{name}:{next(iter(known))}=VALUE')
     return name, constants
 
 
