@@ -27,7 +27,7 @@ def add_parser(subparsers: Any) -> None:
     parser = add_command(subparsers, __name__, __doc__)
     parser.add_argument(
         'hardware', metavar='MODULE:NAME',
-        help='as in the parameter hardware of hmsa driver, or serial_board')
+        help='as in the parameter hardware of hmsa driver, such as serial_board')
     add_options(
         parser,
         ('--joint', 'NAME', str, 'name of the joint (default actuator)', {'default': 'actuator'}),

@@ -363,7 +363,9 @@ class Trial:
         busy = float(np.quantile(host, _MOST))
         for name, found in durations.items():
             self._note(
-                f'{name}_time', max(float(np.quantile(found, _MOST)) - busy, 0.0), 's', _CALL,
+                f'{name}_time', max(float(np.quantile(found, _MOST)) - busy, 0.0), 's',
+                # What waits at the end delays no level.
+                _END if name == 'close' else _CALL,
                 f'{name} takes {np.median(found) * 1e3:.3g} ms (at most {found.max() * 1e3:.3g})',
                 'give calls a time limit of their own; nothing else is written meanwhile')
 
