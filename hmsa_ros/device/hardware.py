@@ -22,7 +22,8 @@ from hmsa_ros.model.units import NANOSECONDS
 #: Hardware of this package, by the short names that `load` takes, too.
 SHIPPED = {
     'serial_board': 'hmsa_ros.device.serial_board:SerialBoard',
-    'scpi_supply': 'hmsa_ros.device.scpi_supply:ScpiSupply'}
+    'scpi_supply': 'hmsa_ros.device.scpi_supply:ScpiSupply',
+    'topic': 'hmsa_ros.nodes.topic_coil:TopicCoil'}
 # What its methods take; all but the first two are optional.
 _TAKES: dict[str, tuple[str, ...]] = {
     'write': ('level', 'now'), 'read': ('now',), 'open': (), 'close': (),

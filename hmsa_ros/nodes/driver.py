@@ -50,10 +50,11 @@ OWN = (
 HARDWARE = ParameterSpec(
     'hardware.name', '',
     'What writes and reads: serial_board (a board on a serial port), scpi_supply (a bench '
-    'supply), or MODULE:NAME. Called with the name of a joint, NAME returns an object with the '
-    'methods write and read. MODULE is found as an import finds it, or in the working directory. '
-    '`hardware` alone is short for it. Other parameters hardware.* are given to it as keyword '
-    'arguments, those of a joint (left.hardware.*) before those for all.')
+    'supply), topic (a topic of another node), or MODULE:NAME. Called with the name of a joint, '
+    'NAME returns an object with the methods write and read. MODULE is found as an import finds '
+    'it, or in the working directory. `hardware` alone is short for it. Other parameters '
+    'hardware.* are given to it as keyword arguments, those of a joint (left.hardware.*) before '
+    'those for all.')
 
 TIMEOUT = ParameterSpec(
     'hardware.timeout', 1.0,

@@ -1,16 +1,14 @@
 """Sense node: publishes the stretch that sensors of other packages see, as joint_states."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import fields
+import dataclasses
 from functools import partial
 import math
-import re
 from time import monotonic_ns
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
-import numpy as np
 from rclpy.expand_topic_name import expand_topic_name
 from sensor_msgs.msg import JointState
 
@@ -21,27 +19,11 @@ from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.parameters import JOINT, ParameterSpec
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import endpoints, fields
 from hmsa_ros.nodes.conversions import from_time, to_status, to_time
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare
 from hmsa_ros.nodes.runner import run
-
-#: By type, the field that is read unless another is named.
-USUAL = {
-    'geometry_msgs/msg/PoseStamped': 'pose.position',
-    'geometry_msgs/msg/PoseWithCovarianceStamped': 'pose.pose.position',
-    'geometry_msgs/msg/PointStamped': 'point',
-    'geometry_msgs/msg/TransformStamped': 'transform.translation',
-    'geometry_msgs/msg/Vector3Stamped': 'vector',
-    'sensor_msgs/msg/JointState': 'position',
-    'sensor_msgs/msg/Range': 'range',
-    'std_msgs/msg/Float32': 'data',
-    'std_msgs/msg/Float64': 'data',
-    'tf2_msgs/msg/TFMessage': 'transform.translation',
-}
-_STEP = re.compile(r'([a-z]\w*)((?:\[\d+\])*)$')
-_AXES = ('x', 'y', 'z')
 
 
 def reader(type_name: str, kind: type[Any], path: str, element: str) -> Callable[[Any], Any]:
@@ -56,7 +38,7 @@ def reader(type_name: str, kind: type[Any], path: str, element: str) -> Callable
         The class of the messages.
     path : str
         Of the field, such as ``'pose.position.z'`` or ``'data[2]'``; a point or a vector is read
-        whole. Empty: the one in `USUAL`.
+        whole. Empty: the one in `fields.USUAL`.
     element : str
         Name of the joint or of the frame, for messages of several.
 
@@ -72,7 +54,7 @@ def reader(type_name: str, kind: type[Any], path: str, element: str) -> Callable
         If there is no such field, it is no number, or an element is needed or not.
 
     """
-    path = path or USUAL.get(type_name, '')
+    path = path or fields.USUAL.get(type_name, '')
     if not path:
         raise BadInputError(
             f'parameter field is empty: expected the field of {type_name} to read, such as '
@@ -82,8 +64,13 @@ def reader(type_name: str, kind: type[Any], path: str, element: str) -> Callable
         raise BadInputError(f'parameter element is {element!r}: expected ' + (
             f'none, since a {type_name} has one reading' if element else
             f'the name of the joint or frame to read in a {type_name}'))
-    steps = _steps(path)
-    _check(type_name, TransformStamped() if find is _of_frame else kind(), steps, path)
+    steps = fields.steps(path)
+    end = fields.end(type_name, TransformStamped() if find is _of_frame else kind(), steps, path)
+    if isinstance(end, (bool, str)) or not (
+            isinstance(end, (int, float)) or hasattr(end, '__len__') or fields.is_point(end)):
+        raise BadInputError(
+            f'parameter field is {path!r}, of a {type_name} a {type(end).__name__}: expected a '
+            'number, a point or a vector')
 
     def read(message: Any) -> tuple[Any, Array] | None:
         part, place = (message, None) if find is None else find(message, element)
@@ -93,7 +80,7 @@ def reader(type_name: str, kind: type[Any], path: str, element: str) -> Callable
         for step in steps:
             value = value[step] if isinstance(step, int) else getattr(value, step)
         header = getattr(part, 'header', None)
-        return None if header is None else header.stamp, _numbers(
+        return None if header is None else header.stamp, fields.numbers(
             value if place is None else value[place])
 
     return read
@@ -113,48 +100,6 @@ def _of_frame(message: Any, element: str) -> tuple[Any, None]:
 # What finds an element in messages that contain several.
 _FIND: dict[str, Callable[[Any, str], tuple[Any, int | None]]] = {
     'sensor_msgs/msg/JointState': _of_joint, 'tf2_msgs/msg/TFMessage': _of_frame}
-
-
-def _steps(path: str) -> list[str | int]:
-    """Return the names and indices of a path."""
-    found: list[str | int] = []
-    for word in path.split('.'):
-        match = _STEP.match(word)
-        if match is None:
-            raise BadInputError(
-                f'parameter field is {path!r}: expected names of fields with dots between them, '
-                'such as pose.position.z or data[2]')
-        found += [match[1], *map(int, re.findall(r'\d+', match[2]))]
-    return found
-
-
-def _check(type_name: str, value: Any, steps: list[str | int], path: str) -> None:
-    """Refuse a path that an empty message does not have, as far as that shows."""
-    for step in steps:
-        if isinstance(step, int):
-            # An empty message may have none of them.
-            return
-        names = [*getattr(value, 'get_fields_and_field_types', dict)()]
-        if step not in names:
-            raise BadInputError(
-                f'parameter field is {path!r}, and a {type_name} has no {step} there: expected '
-                f'one of {", ".join(names)}' if names else
-                f'parameter field is {path!r}: expected nothing after a number')
-        value = getattr(value, step)
-    if isinstance(value, (bool, str)) or not (
-            isinstance(value, (int, float)) or hasattr(value, '__len__') or _is_point(value)):
-        raise BadInputError(
-            f'parameter field is {path!r}, of a {type_name} a {type(value).__name__}: expected a '
-            'number, a point or a vector')
-
-
-def _is_point(value: Any) -> bool:
-    return all(hasattr(value, x) for x in _AXES) and not hasattr(value, 'w')
-
-
-def _numbers(value: Any) -> Array:
-    numbers = [getattr(value, x) for x in _AXES] if _is_point(value) else [value]
-    return np.array(numbers, dtype=float)
 
 
 # How often publishers of an unknown type are looked for, in s, and without a reading from when on
@@ -227,7 +172,7 @@ class SenseNode(ManagedNode):
                 'parameter topic is empty: expected the topic of a sensor, for example -p '
                 'topic:=/block/pose')
         self._scale = SensorScale(**{
-            x.name: values[f'sensor.{x.name}'] for x in fields(SensorScale)})
+            x.name: values[f'sensor.{x.name}'] for x in dataclasses.fields(SensorScale)})
         has_reference = bool(values['reference.topic'] or values['reference.element'])
         self._readings = Readings(
             round(values['reorder_time'] * NANOSECONDS), reference=has_reference)

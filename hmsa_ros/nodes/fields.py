@@ -1,0 +1,85 @@
+"""Fields of messages by their paths, such as ``pose.position.z`` or ``data[2]``."""
+
+from collections.abc import Sequence
+import re
+from typing import Any
+
+import numpy as np
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.equations import Array
+
+#: By type, the field that is meant unless another is named.
+USUAL = {
+    'geometry_msgs/msg/PoseStamped': 'pose.position',
+    'geometry_msgs/msg/PoseWithCovarianceStamped': 'pose.pose.position',
+    'geometry_msgs/msg/PointStamped': 'point',
+    'geometry_msgs/msg/TransformStamped': 'transform.translation',
+    'geometry_msgs/msg/Vector3Stamped': 'vector',
+    'sensor_msgs/msg/JointState': 'position',
+    'sensor_msgs/msg/MagneticField': 'magnetic_field',
+    'sensor_msgs/msg/Range': 'range',
+    'std_msgs/msg/Float32': 'data',
+    'std_msgs/msg/Float32MultiArray': 'data[0]',
+    'std_msgs/msg/Float64': 'data',
+    'std_msgs/msg/Float64MultiArray': 'data[0]',
+    'tf2_msgs/msg/TFMessage': 'transform.translation',
+}
+AXES = ('x', 'y', 'z')
+_STEP = re.compile(r'([a-z]\w*)((?:\[\d+\])*)$')
+
+
+def steps(path: str) -> list[str | int]:
+    """
+    Return the names and indices of a path.
+
+    Raises
+    ------
+    BadInputError
+        If it is no path.
+
+    """
+    found: list[str | int] = []
+    for word in path.split('.'):
+        match = _STEP.match(word)
+        if match is None:
+            raise BadInputError(
+                f'parameter field is {path!r}: expected names of fields with dots between them, '
+                'such as pose.position.z or data[2]')
+        found += [match[1], *map(int, re.findall(r'\d+', match[2]))]
+    return found
+
+
+def end(type_name: str, value: Any, way: Sequence[str | int], path: str) -> Any:
+    """
+    Return what an empty message has at the steps of a path, or the array before an index.
+
+    Raises
+    ------
+    BadInputError
+        If the message does not have them, as far as an empty one shows that.
+
+    """
+    for step in way:
+        if isinstance(step, int):
+            # An empty message may have none of them.
+            break
+        names = [*getattr(value, 'get_fields_and_field_types', dict)()]
+        if step not in names:
+            raise BadInputError(
+                f'parameter field is {path!r}, and a {type_name} has no {step} there: expected '
+                f'one of {", ".join(names)}' if names else
+                f'parameter field is {path!r}: expected nothing after a number')
+        value = getattr(value, step)
+    return value
+
+
+def is_point(value: Any) -> bool:
+    """Return whether it has three coordinates and no fourth one."""
+    return all(hasattr(value, x) for x in AXES) and not hasattr(value, 'w')
+
+
+def numbers(value: Any) -> Array:
+    """Return a number as an array of one, or a point or vector as one of three."""
+    return np.array(
+        [getattr(value, x) for x in AXES] if is_point(value) else [value], dtype=float)

@@ -1,0 +1,244 @@
+"""
+Coils that another node serves: levels as numbers, array elements or vectors on its topic.
+
+The joints of a driver may share a message. Vectors that share a field add up.
+"""
+
+from array import array
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+from time import monotonic, sleep
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+from rclpy.duration import Duration
+
+from hmsa_ros.device.assembly import Assembly, parts
+from hmsa_ros.device.hardware import is_number
+from hmsa_ros.errors import BadInputError, excerpt, HmsaError
+from hmsa_ros.interfaces import topics
+from hmsa_ros.nodes import endpoints, fields
+from hmsa_ros.nodes.conversions import to_time
+from hmsa_ros.nodes.visitor import leave, visit
+
+# In s: waiting for a subscriber at the start, between looks, and for the last message's receipt.
+_PATIENCE, _LOOK, _LAST = 8.0, 0.02, 0.3
+# By how much the length of a direction may differ from 1, and how long an array may be.
+_ROUNDED, _LONGEST = 1e-3, 4096
+
+
+class TopicError(HmsaError):
+    """A topic that no node subscribes to."""
+
+
+@dataclass
+class _Part:
+    """A level, and where it is in a message: as a number, or along a direction."""
+
+    way: Sequence[str | int]
+    direction: Sequence[float]  # empty for a number
+    size: int
+    level: float = 0.0
+
+    def put(self, message: Any) -> None:
+        """Add the level to a message."""
+        *inner, last = self.way
+        holder = message
+        for step in inner:
+            holder = getattr(holder, str(step))
+        if isinstance(last, int):
+            if isinstance(holder, array):
+                holder.extend([0.0] * (max(self.size, last + 1) - len(holder)))
+            holder[last] += self.level
+            return
+        point = getattr(holder, last) if self.direction else holder
+        for name, x in zip(
+                fields.AXES if self.direction else [last], self.direction or [1.0], strict=True):
+            setattr(point, name, getattr(point, name) + self.level * x)
+
+
+class _Topic:
+    """A topic whose subscriber is waited for, and what the joints put into its message."""
+
+    def __init__(self, name: str, type_name: str) -> None:
+        own = f'topic_coil_{uuid4().hex[:8]}'
+        # The name that a process is given is its driver's.
+        self._node = visit(
+            own, '', start_parameter_services=False, enable_rosout=False,
+            cli_args=['--ros-args', '-r', f'__node:={own}'])
+        self.parts: dict[str, _Part] = {}
+        self._publisher: Any = None
+        try:
+            self.name = self._node.resolve_topic_name(name)
+            until = monotonic() + _PATIENCE
+            while not self.heard and monotonic() < until:
+                sleep(_LOOK)
+                if not type_name:
+                    found = self._node.get_subscriptions_info_by_topic(self.name)
+                    type_name = found[0].topic_type if found else ''
+                if type_name and self._publisher is None:
+                    self.kind = endpoints.interface_class(type_name)
+                    self._publisher = endpoints.publisher(
+                        self._node, topics.Topic(self.name, type_name, topics.RELIABLE))
+            self.type = type_name
+            self._require_subscriber()
+        except BaseException:
+            leave(self._node)
+            raise
+
+    @property
+    def heard(self) -> bool:
+        """Whether a subscriber is there."""
+        return self._publisher is not None and bool(self._publisher.get_subscription_count())
+
+    def _require_subscriber(self) -> None:
+        if not self.heard:
+            raise TopicError(
+                f'no node subscribes to {self.name}{f" ({self.type})" if self.type else ""}: '
+                'start the node that serves the coil, or compare hardware.topic and hardware.type '
+                'with ros2 topic info --verbose')
+
+    def publish(self, now: int) -> None:
+        """Publish what all joints have put in, at a time in ns."""
+        self._require_subscriber()
+        message = self.kind()
+        for part in self.parts.values():
+            part.put(message)
+        if hasattr(message, 'header'):
+            message.header.stamp = to_time(now)
+        self._publisher.publish(message)
+
+    def close(self) -> None:
+        """End once the last message has come."""
+        if self.heard:
+            self._publisher.wait_for_all_acked(Duration(seconds=_LAST))
+        leave(self._node)
+
+
+# The topics in use, by their names and types as given.
+_SHARED: dict[tuple[str, str], _Topic] = {}
+
+
+class Field:
+    """
+    A part of the messages on a topic, as the source of a coil.
+
+    Parameters
+    ----------
+    joint : str
+        Whose coil it is.
+    topic, type_name : str
+        The topic, and the type of its messages; empty for that of its subscriber.
+    path : str
+        Of a number, an element of an array or a vector; empty for the one in `fields.USUAL`.
+    direction : sequence of float
+        Of a vector: x, y and z of a unit vector; empty for z.
+    size : int
+        Length of an array, 0 to 4096; it is longer if a joint's element lies beyond it.
+
+    Raises
+    ------
+    BadInputError
+        If a value is out of range, or messages have no such field.
+    TopicError
+        If no node subscribes.
+
+    """
+
+    def __init__(
+            self, joint: str, topic: Any, type_name: Any, path: Any, direction: Any,
+            size: Any) -> None:
+        for name, text in (('topic', topic), ('type', type_name), ('field', path)):
+            if not isinstance(text, str) or not (text or name != 'topic'):
+                raise BadInputError(
+                    f'hardware.{name} is {excerpt(text)}: expected text, as in '
+                    'hardware.topic:=/coils')
+        if not is_number(size) or not 0 <= size <= _LONGEST or size % 1:
+            raise BadInputError(
+                f'hardware.size is {excerpt(size)}: expected a whole number, 0 to {_LONGEST}')
+        self._joint, self._key = joint, (topic, type_name)
+        shared = _SHARED.get(self._key)
+        self._topic = _Topic(topic, type_name) if shared is None else shared
+        try:
+            self._part = self._made(path, direction, int(size))
+        except BaseException:
+            if shared is None:
+                self._topic.close()
+            raise
+        _SHARED[self._key] = self._topic
+        self._topic.parts[joint] = self._part
+        self.description = f'{path or self._path} of {self._topic.name} ({self._topic.type})'
+
+    def _made(self, path: str, direction: Any, size: int) -> _Part:
+        type_name, kind = self._topic.type, self._topic.kind
+        self._path = path or fields.USUAL.get(type_name, '')
+        if not self._path:
+            raise BadInputError(
+                f'hardware.field is empty: expected the field of {type_name} to set, such as '
+                'data[0]')
+        way = fields.steps(self._path)
+        end, last = fields.end(type_name, kind(), way, self._path), way[-1]
+        number = isinstance(end, float) or (
+            isinstance(last, int) and last < _LONGEST and not any(
+                isinstance(x, int) for x in way[:-1])
+            and (isinstance(end, array) and end.typecode in 'df' or isinstance(
+                end, np.ndarray) and end.dtype.kind == 'f' and last < len(end)))
+        if not number and not fields.is_point(end):
+            raise BadInputError(
+                f'hardware.field is {self._path!r}, of a {type_name} no field that takes a level: '
+                'expected a floating-point number, an element of an array of those, or a vector')
+        if number and (other := next(
+                (x for x, part in self._topic.parts.items() if part.way == way), None)):
+            raise BadInputError(
+                f'hardware.field is {self._path!r} for joints {other} and {self._joint}: expected '
+                f'a field for each, as in {self._joint}.hardware.field')
+        return _Part(way, _unit(direction, number=number), size)
+
+    def write(self, level: float, now: int) -> None:
+        """Publish a level in the unit of the topic, with other joints', at a time in ns."""
+        self._part.level = level
+        self._topic.publish(now)
+
+    def close(self) -> None:
+        """Leave the topic."""
+        if self._topic.parts.pop(self._joint, None) is not None and not self._topic.parts:
+            del _SHARED[self._key]
+            self._topic.close()
+
+
+def _unit(direction: Any, *, number: bool) -> tuple[float, ...]:
+    """Return the direction of a vector with length 1, or none for a number."""
+    try:
+        given = [*direction]
+    except TypeError:
+        given = [direction]
+    if not given:
+        return () if number else (0.0, 0.0, 1.0)
+    if number:
+        raise BadInputError(
+            f'hardware.direction is {excerpt(given)}, and hardware.field is a number: expected a '
+            'direction only for a vector')
+    length = math.hypot(*given) if all(map(is_number, given)) else 0.0
+    if len(given) != len(fields.AXES) or not abs(length - 1.0) <= _ROUNDED:
+        mend = f', such as {[round(x / length, 6) for x in given]}' if (
+            len(given) == len(fields.AXES) and 0.0 < length < math.inf) else ''
+        raise BadInputError(
+            f'hardware.direction is {excerpt(given)}: expected x, y and z of a vector of length '
+            f'1{mend}')
+    return tuple(x / length for x in given)
+
+
+class TopicCoil(Assembly):
+    """A field of a topic and its coil, as ``hardware:=topic``."""
+
+    def __init__(
+            self, joint: str, topic: Any = '', field: Any = '', direction: Any = (),
+            size: Any = 0, **settings: Any) -> None:
+        kind = settings.pop('type', '')
+        if not settings.get('coil.file'):
+            # A topic in tesla.
+            settings.setdefault('coil.tesla_per_ampere', 1.0)
+        coil, scale = parts(settings)
+        super().__init__(Field(joint, topic, kind, field, direction, size), coil, scale)
