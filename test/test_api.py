@@ -180,6 +180,7 @@ def test_what_cannot_be_identified_says_why(block, tmp_path):
     (lambda x: x.plan([(1.1, -1)]), 'duration is -1 s'),
     (lambda x: x.plan([(1.1, np.inf), (1.0, 1)]), 'only that of the last setpoint'),
     (lambda x: x.plan([(1.1, 1)], 'robust', order=1.5), 'order is 1.5: expected a whole number'),
+    (lambda x: x.plan([(1.1, 1)], 'minimax', order=17), 'order is 17: expected 1 to 16'),
     (lambda x: x.plan([(1.1, 1)], period=-1), 'period is -1 s'),
     (lambda x: x.plan([(1.1, 1)], 'smooth', max_rate=-1), 'max_rate is -1 1/s'),
     (lambda x: x.flux_density('high'), "stretches are 'high': expected numbers"),

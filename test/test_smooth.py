@@ -106,8 +106,10 @@ def left(move, request, force=gent):
     (State(1.0), 0.6, Delivery(0.27)),
     (State(1.2, 0.4, 0.8), 1.4, Delivery(slew=3.0)),
     (State(1.2, -0.4, 0.8, 0.5), 0.9, Delivery(0.1, lag=0.115)),
-    (State(1.0), 1.3, Delivery(slew=1.0, lag=0.115))], ids=[
-        'any time', 'grid', 'ramps, moving', 'grid and lag, moving', 'ramps and lag'])
+    (State(1.0), 1.3, Delivery(slew=1.0, lag=0.115)),
+    (State(1.0), 0.6, Delivery(0.13, slew=0.06))], ids=[
+        'any time', 'grid', 'ramps, moving', 'grid and lag, moving', 'ramps and lag',
+        'grid and slow ramps'])
 def test_the_block_is_at_rest_after_a_move_without_a_step_of_the_level(
         state, target, delivery, material, force):
     request = Request(state, target, material, WIDE, delivery)

@@ -465,7 +465,7 @@ class Actuator:
         start : float, optional
             Stretch at rest before; default without a field.
         order : int
-            Of the shapers robust and minimax, at least 1.
+            Of the shapers robust and minimax, 1 to 16.
         errors : (float, float, float), optional
             Relative errors of shear modulus, damping and J_lim that minimax must tolerate; default
             what the parameter file contains of them, else 0.1 each.
@@ -514,7 +514,7 @@ class Actuator:
             raise BadInputError('duration is inf s: only that of the last setpoint may be')
         if isinstance(order, bool) or not isinstance(order, (int, np.integer)):
             raise BadInputError(
-                f'order is {excerpt(order)}: expected a whole number of at least 1')
+                f'order is {excerpt(order)}: expected a whole number')
         if limits is not None:
             low, high = limits_of(limits)
             model = Model(model.actuator, replace(

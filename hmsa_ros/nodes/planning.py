@@ -24,7 +24,7 @@ from hmsa_ros.planning.planner import Options, Planner
 from hmsa_ros.planning.sequence import SHORT_SPELL
 from hmsa_ros.planning.shapers import SHAPERS
 from hmsa_ros.planning.shapers.pace import LEAST_PERIODS, MOST_PERIODS, Pace
-from hmsa_ros.planning.shapers.request import ERRORS, LARGEST_ERROR
+from hmsa_ros.planning.shapers.request import ERRORS, LARGEST_ERROR, MOST_ORDER
 from hmsa_ros.planning.timeline import Model
 
 _OPTIONS = Options()
@@ -39,7 +39,7 @@ OWN = (
         read_only=False),
     ParameterSpec(
         'robust_order', 2, 'Number of two-step commands that the shaper robust cascades.', '',
-        1, 16, read_only=False),
+        1, MOST_ORDER, read_only=False),
     ParameterSpec(
         'minimax_errors', list(ERRORS),
         'Relative errors in shear modulus, damping coefficient and J_lim for which the shaper '

@@ -23,6 +23,8 @@ from hmsa_ros.planning.shapers.pace import PACE, Pace
 ERRORS = (0.1, 0.1, 0.1)
 #: The largest of them.
 LARGEST_ERROR = 0.9
+#: Chained two-step commands of robust at the most.
+MOST_ORDER = 16
 #: What is as good as at rest: of stretch and load, and of the rate over the frequency.
 AT_REST = 1e-9
 
@@ -63,7 +65,7 @@ class Request:
     material: NondimensionalParameters
     limits: Limits = field(default_factory=Limits)
     delivery: Delivery = IDEAL
-    order: int = 2  #: chained two-step commands of robust, at least 1; minimax takes as long
+    order: int = 2  #: chained two-step commands of robust; minimax takes as long
     units: Units = field(default_factory=Units)  #: for the messages
     #: Of G, damping coefficient and J_lim, as `as_errors` returns them, for minimax.
     errors: Uncertainty = ERRORS

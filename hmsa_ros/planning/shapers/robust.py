@@ -17,7 +17,7 @@ from hmsa_ros.model.delivery import IDEAL
 from hmsa_ros.model.moves import Level, Move, State
 from hmsa_ros.model.status import Code
 from hmsa_ros.planning.shapers.creeping import arrival
-from hmsa_ros.planning.shapers.request import Request
+from hmsa_ros.planning.shapers.request import MOST_ORDER, Request
 from hmsa_ros.planning.shapers.two_step import two_step
 
 # Of times, as a share.
@@ -30,10 +30,10 @@ def robust(request: Request) -> Move:
 
     It has ``order + 1`` levels on ideal hardware, and takes about ``order`` times as long as the
     two-step command, which is that of order 1. Where there is no chain, it is what `two_step`
-    answers. An order below 1 is a `BadInputError`.
+    answers. An order that is not 1 to `MOST_ORDER` is a `BadInputError`.
     """
-    if request.order < 1:
-        raise BadInputError(f'order is {request.order}: expected at least 1')
+    if not 1 <= request.order <= MOST_ORDER:
+        raise BadInputError(f'order is {request.order}: expected 1 to {MOST_ORDER}')
     move = two_step(request)
     if request.order == 1 or move.code is not Code.TWO_STEP:
         return move

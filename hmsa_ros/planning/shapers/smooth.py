@@ -190,7 +190,9 @@ def _delivered(request: Request, path: _Path, holding: float, period: float) -> 
     count = min(max(math.ceil(_OF_EACH * path.duration / period), _FEWEST), _MOST)
     each = path.duration / count
     if delivery.period > 0.0:
-        each = delivery.period * max(1, math.floor(each / delivery.period + 1e-9))
+        each = delivery.period * max(
+            1, math.floor(each / delivery.period + 1e-9),
+            math.ceil(path.duration / (_MOST * delivery.period) - 1e-9))
         count = max(math.ceil(path.duration / each - 1e-9), 3 + (delivery.lag > 0.0))
     times = each * np.arange(count + 1)
     # Ramps to a level make it late: the more, the longer they take.
