@@ -117,12 +117,12 @@ def left(block):
 
 @pytest.mark.parametrize('factor', [0.8, 1.2])
 def test_a_block_that_is_a_fifth_softer_or_stiffer_than_known_comes_to_rest_at_its_target(factor):
-    block = closed_loop(factor)
+    blocks = [closed_loop(factor, seed=x) for x in range(3)]
     # Open loop leaves 17 to 26 % of both.
-    vibration, offset = left(block)
+    vibration, offset = np.median(np.abs([left(x) for x in blocks]), axis=0)
     assert vibration < 1.5e-3
-    assert abs(offset) < 1.5e-3
-    assert all(abs(level) <= 0.25 for _, level in block.levels)
+    assert offset < 1.5e-3
+    assert all(abs(level) <= 0.25 for x in blocks for _, level in x.levels)
 
 
 def test_a_block_that_is_known_exactly_is_left_alone():

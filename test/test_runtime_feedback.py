@@ -173,40 +173,21 @@ def test_an_actuator_that_was_identified_is_not_moved_with_caution():
     assert (first.arrival - first.begin) / MS == pytest.approx(59.4, abs=1)
 
 
-@pytest.mark.parametrize('bound', [0.0, 4e-4, 0.02])
-def test_a_holding_level_is_trimmed_against_a_constant_force_slowly_and_within_its_bound(bound):
+@pytest.mark.parametrize(('named', 'bound'), [(False, 0.0), (True, 0.0), (True, 0.02)])
+def test_moves_make_up_for_a_constant_force_once_samples_show_it(named, bound):
+    given = ('shear_modulus', 'damping_coefficient', 'stretch_bias')
     loop = Loop(
         1.0, 2e-4, delay=2 * MS, heartbeat_period=0, feedback='adapt', feedback_trim=bound,
-        feedback_parameters=(
-            'shear_modulus', 'damping_coefficient', 'stretch_bias', 'constant_force'))
+        feedback_parameters=(*given, *['constant_force'] * named))
     loop.device.push(0, 0, 0.04)
     loop.now += 400 * MS
     loop.device.advance(loop.now)
-    begin, _ = loop.now, list(loop.device.samples())
-    truth = loop.run((1.4, 500 * MS), (1.1, 1500 * MS))
-    assert 'cannot be told apart until two targets' in estimates(loop)[0].message
-    found = [x for x in commands(loop) if x[0] > begin + 650 * MS]
-    # A level before the first trim: that which holds 1.1 without the force.
-    holding = loop.runtime.group.planners['a'].model.holding(1.1) * paper_actuator(
-        ).flux_density_unit
-    seen = truth[truth[:, 0] > begin + 2500 * MS, 1]
-    # G is learnt on meanwhile, and with it what the level is held against.
-    assert np.ptp(seen) < 1e-4
-    if not bound:
-        assert found == []
-        assert seen[-1] - 1.1 == pytest.approx(4e-3, abs=1e-3)
-        return
-    assert 0 < len(found) <= 10
-    assert max(abs(x[1] - holding) for x in found[1::2]) < bound * 1.1
-    if bound > 1e-2:
-        assert abs(seen[-1] - 1.1) < 3e-4
-        # Nothing rings after the move of a few milliseconds.
-        after = truth[(truth[:, 0] > found[1][0] + MS) & (
-            truth[:, 0] < found[1][0] + 30 * MS), 1]
-        assert np.ptp(after) < 2e-4
-    else:
-        assert len(found) >= 8
-        assert 2e-3 < seen[-1] - 1.1 < 3.5e-3
+    list(loop.device.samples())
+    truth = loop.run((1.4, 500 * MS), (1.1, 500 * MS), (1.3, 1500 * MS))
+    # Open loop rests 4e-3 beside each of them.
+    assert abs(truth[-1, 1] - 1.3) < 5e-4
+    assert np.ptp(truth[-1000:, 1]) < 5e-4
+    assert 'constant force about 0.03' in estimates(loop)[-1].message
 
 
 def test_an_actuator_that_is_as_known_is_left_alone():

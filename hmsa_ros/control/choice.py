@@ -11,18 +11,20 @@ from dataclasses import replace
 import math
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.estimation import Estimate
-from hmsa_ros.estimation.correction import Course, expect, Outcome, worthwhile
+from hmsa_ros.estimation.correction import AT_REST, Course, expect, Outcome, worthwhile
 from hmsa_ros.estimation.motion import rest
 from hmsa_ros.planning.planner import Planner
 from hmsa_ros.planning.timeline import Model
 
 # Other parameters are to leave less by this share of the step.
 _LEAST = 3e-4
-# Share of the step up to which a change is little; none is where the given ones are in use.
-_LITTLE = 0.015
+# Share of the step up to which a change is little; none is where the given ones are in use, and
+# others are to leave at most this share of what these leave.
+_LITTLE, _CLEARLY = 0.015, 0.25
 # Smaller steps are tried as this one.
 _STEP = 0.15
 
@@ -53,13 +55,14 @@ def clearly_better(
     if not pairs:
         return False
     before, after = (_together([x[i] for x in pairs]) for i in (0, 1))
-    return worthwhile(before, after, _LEAST, little=0.0 if given else _LITTLE, resting=True)
+    return worthwhile(
+        before, after, _LEAST, little=0.0 if given else _LITTLE,
+        share=_CLEARLY if given else AT_REST)
 
 
 def _shared(left: Outcome, step: float) -> Outcome:
     """Return what a move leaves as shares of its step."""
-    return Outcome(
-        left.misses / step, left.variance / step ** 2, left.considered / step ** 2)
+    return Outcome(left.misses / step, left.covariance / step ** 2)
 
 
 def _together(outcomes: Sequence[Outcome]) -> Outcome:
@@ -67,7 +70,7 @@ def _together(outcomes: Sequence[Outcome]) -> Outcome:
     count = len(outcomes)
     return Outcome(
         np.concatenate([x.misses for x in outcomes]) / math.sqrt(count),
-        sum(x.variance for x in outcomes) / count, sum(x.considered for x in outcomes) / count)
+        block_diag(*(x.covariance for x in outcomes)) / count)
 
 
 def _planned(model: Model, start: float, target: float) -> Course | None:
@@ -83,7 +86,7 @@ def _planned(model: Model, start: float, target: float) -> Course | None:
         return None
     return Course(
         tuple((x.stamp, x.flux_density) for x in plan.levels if x.stamp >= 0), arrival, target,
-        float(model.units.level(model.holding(start))))
+        model.flux_density(model.holding(start)))
 
 
 def _left(estimate: Estimate, course: Course | None, slew_limit: float) -> Outcome | None:
@@ -107,4 +110,4 @@ def _at_rest(estimate: Estimate, level: float) -> Estimate | None:
     known = estimate.covariance[:count, :count]
     return replace(
         estimate, time=0, stretch=at[0], rate=0.0, values=values,
-        covariance=change @ known @ change.T)
+        covariance=change @ known @ change.T, off=change @ estimate.off[:count])

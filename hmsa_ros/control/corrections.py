@@ -10,7 +10,15 @@ from hmsa_ros.control.records import Severity, Verdict
 from hmsa_ros.control.slices import Clock, in_time, Work
 from hmsa_ros.control.trimming import trimmed
 from hmsa_ros.estimation import Estimate
-from hmsa_ros.estimation.correction import caution, Course, expect, LITTLE, worthwhile
+from hmsa_ros.estimation.correction import (
+    AT_REST,
+    caution,
+    Course,
+    expect,
+    LITTLE,
+    SHARE,
+    worthwhile,
+)
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.drafting import Steps
@@ -110,7 +118,7 @@ class Corrections:
             draft = yield from planner.draft_resumption(now)
             return {} if draft is None or draft.missed else {name: draft}
         model, level = planner.model, plan.levels[-1].flux_density
-        holding = float(model.units.level(model.holding(segment.stretch)))
+        holding = model.flux_density(model.holding(segment.stretch))
         return {} if abs(holding - level) < _SAME * model.units.load else {
             name: (yield from planner.draft_trim(now, holding))}
 
@@ -153,7 +161,7 @@ class Corrections:
         after = expect(estimate, _drafted(draft, planner.plan), slew)
         if not worthwhile(
                 before, after, max(gain, _NOISE * estimate.noise), little=LITTLE * step,
-                resting=not arrival):
+                share=SHARE if arrival else AT_REST):
             return {}
         self._after[name] = after.size
         return {name: draft}
@@ -181,8 +189,7 @@ def _drafted(draft: Draft, plan: Plan) -> Course:
 
 def _relaxed(model: Model, stretch: float) -> float:
     """Return the level in T where a tail leads that the next setpoint cuts; NaN without creep."""
-    return float(
-        model.units.level(model.holding(stretch))) if model.material.creep else math.nan
+    return model.flux_density(model.holding(stretch)) if model.material.creep else math.nan
 
 
 def _course(plan: Plan, begin: int, gain: float) -> tuple[Course, float]:

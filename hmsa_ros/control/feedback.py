@@ -18,10 +18,11 @@ from hmsa_ros.control.tracked import Joint
 from hmsa_ros.control.trust import Trust
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.estimation import Estimate, Estimator, Options, Prior
-from hmsa_ros.estimation.motion import followed
+from hmsa_ros.estimation.motion import followed, rest
 from hmsa_ros.estimation.words import differences
 from hmsa_ros.identification.known import Known
 from hmsa_ros.judge import Sensor
+from hmsa_ros.model.equations import equilibrium_stretch
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Planner
@@ -107,8 +108,7 @@ class Feedback:
         same = settings.feedback_parameters == self._settings.feedback_parameters and (
             (settings.feedback == 'off') is not self.on) and all(
                 model.actuator == self._nominal[name].actuator
-                and model.options.coil_time_constant
-                == self._nominal[name].options.coil_time_constant
+                and model.others == self._nominal[name].others
                 for name, model in models.items())
         self._settings = settings
         self._nominal.update(models)
@@ -123,8 +123,8 @@ class Feedback:
 
     def _prior(self, name: str, model: Model) -> Prior:
         return Prior.nominal(
-            model.actuator, self._settings.feedback_parameters, suspects=True, others={
-                'coil_time_constant': model.options.coil_time_constant}).informed(
+            model.actuator, self._settings.feedback_parameters, suspects=True,
+            others=model.others).informed(
                 self._settings.known.get(name, Known()))
 
     def _learnt(self, name: str, model: Model) -> Model:
@@ -134,8 +134,8 @@ class Feedback:
             return learnt_model(
                 model, joint.latest, self._group.planners[name].plan.levels[-1].stretch)
         confirmed = joint.trust.confirmed
-        return model if confirmed is None else Model(confirmed.actuator, replace(
-            model.options, coil_time_constant=confirmed.options.coil_time_constant))
+        return model if confirmed is None else Model(
+            confirmed.actuator, replace(model.options, **confirmed.others))
 
     def latest(self, name: str) -> Estimate | None:
         """Return what is believed of a joint, where a whole move has shown that samples fit."""
@@ -266,8 +266,15 @@ class Feedback:
             return None
         if found is None:
             return None
+        # What the model in use does not know shifts its rest: a plan keeps to its own stretches.
+        planner = self._group.planners[name]
+        level, model = planner.plan.levels[-1].flux_density, planner.model
+        at = rest(found.values, (), level)
+        if at is None:
+            return None
+        shift = float(equilibrium_stretch(model.load(level), model.material)) - at[0]
         # Plans ignore a branch that is only suspected.
-        return found.stretch, found.rate, (
+        return found.stretch + shift, found.rate, (
             followed(found.values, found.stretch) if found.actuator.creep else ())
 
     def state(self, name: str, time: int) -> Estimate | None:
@@ -310,7 +317,7 @@ class Feedback:
         if found is None:
             return Sensor()
         prior = np.diag(self._joints[name].estimator.prior.covariance)
-        sure = np.diag(found.sure_of(len(found.free) - found.considered).covariance)
+        sure = np.diag(found.covariance)
         known = [x for i, x in enumerate(found.free) if x in _SENSOR and (
             sure[i] < _FOUND**2 * prior[i]) and (
             x != 'stretch_bias' or abs(found.values[x]) > _SHOWS * math.sqrt(sure[i]))]
@@ -402,8 +409,11 @@ class Feedback:
 
     def _may_choose(self, name: str, joint: Joint, latest: Estimate) -> bool:
         """Return whether the parameters to plan with are to be chosen by an estimate."""
-        return not joint.chosen and bool(self._group.planners[name].plan.segments) and (
-            latest.time < joint.waits or latest.time >= joint.next_choice)
+        plan = self._group.planners[name].plan
+        place = plan.under_way(latest.time)
+        # A plan that other parameters take over on the way begins from what it does not know.
+        return not joint.chosen and place >= 0 and (latest.time < joint.waits or (
+            latest.time >= max(joint.next_choice, plan.segments[place].arrival or 0)))
 
     def start(self, name: str) -> float:
         """Return the stretch from which the setpoint under way of a joint began, uncorrected."""

@@ -50,9 +50,7 @@ def differs(model: Model, estimate: Estimate) -> bool:
 
 def alike(model: Model, other: Model) -> bool:
     """Return whether two models are of the same actuator but for what is no news."""
-    one, two = (
-        values_of(x.actuator, {'coil_time_constant': x.options.coil_time_constant})
-        for x in (model, other))
+    one, two = (values_of(x.actuator, x.others) for x in (model, other))
     return model.actuator.creep == other.actuator.creep and all(
         math.isclose(one[x], two[x], rel_tol=_NEWS) if isinstance(one[x], float)
         else one[x] == two[x] for x in one)

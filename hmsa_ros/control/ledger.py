@@ -77,7 +77,7 @@ class Ledger:
             self, found: Finding, setpoint: Setpoint, given: Model, level: float,
             expected: float) -> str:
         """Return what open loop would have left less of; empty if nothing."""
-        rest = float(equilibrium_stretch(given.units.of_level(level), given.material))
+        rest = float(equilibrium_stretch(given.load(level), given.material))
         without = abs(found.offset - (rest - setpoint.target))
         more, variance = abs(found.offset) - without, found.offset_std**2
         if math.isfinite(found.vibration):

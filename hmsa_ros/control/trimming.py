@@ -42,7 +42,7 @@ def trimmed(planner: Planner, estimate: Estimate, bound: float) -> float | None:
         return None
     share = _SHARE * bound
     wanted = level - min(max(off * small / (above[0] - at[0]), -share), share)
-    holding = float(model.units.level(model.holding(segment.stretch)))
+    holding = model.flux_density(model.holding(segment.stretch))
     options = model.options
     wanted = min(max(wanted, holding - bound, options.flux_density_min),
                  holding + bound, options.flux_density_max)

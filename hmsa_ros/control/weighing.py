@@ -96,8 +96,8 @@ def _left(
     times = np.maximum.accumulate(np.maximum(stamps, begin)).tolist()
     looks = list(_looks(levels, times, wanted, begin))
     end = max(looks)
-    course = [Level(0.0, start.load), *(
-        Level(model.time(x - begin), model.units.of_level(level.flux_density))
+    course = [Level(0.0, model.load(start.flux_density)), *(
+        Level(model.time(x - begin), model.load(level.flux_density))
         for x, level in zip(times, levels, strict=True) if x < end)]
     # Of commands that come at once the last one counts.
     course = [one for one, other in pairwise([*course, Level(math.inf, 0.0)])

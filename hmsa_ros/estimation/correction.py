@@ -8,7 +8,7 @@ in a move, when little is known, a course that forgives errors so wins against o
 for parameters which are a guess.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -20,13 +20,11 @@ from hmsa_ros.model.units import NANOSECONDS
 
 #: A move that is expected to leave more than this share of its step is given more time.
 TOLERANCE = 5e-3
-# A correction leaves at most this share of what the course in force leaves, while there is time
-# for more of them and at rest.
-_SHARE, _AT_REST = 0.9, 0.5
-#: Share of the step up to which what a correction changes is little, and how much of that a course
-#: may be expected to leave for another one to do little harm.
-LITTLE = 4.5e-3
-_HARMLESS = 0.67
+#: A correction leaves at most this share of what the course in force leaves, while there is time
+#: for more of them, and at rest.
+SHARE, AT_REST = 0.9, 0.5
+#: Share of the step up to which what a correction changes is little.
+LITTLE = 2.5e-3
 # How long in ns a level has been in force that a field has followed.
 _LONG = 1000 * NANOSECONDS
 # Time constants of a coil after which it has followed.
@@ -67,19 +65,13 @@ class Course:
 class Outcome:
     """What a course is expected to leave."""
 
-    misses: Array  # by the most probable motion: of stretch, of rate, and of the target
-    variance: float  # what is not known of these, in sum
-    considered: float  # how much of that is by what is only considered
-
-    @property
-    def sure(self) -> 'Outcome':
-        """The same, were what is only considered known."""
-        return replace(self, variance=self.variance - self.considered, considered=0.0)
+    misses: Array  # as expected: of stretch, of rate, and of the target
+    covariance: Array  # what is not known of these
 
     @property
     def size(self) -> float:
         """Root of the expected square of vibration and distance from the target together."""
-        return math.sqrt(float(self.misses @ self.misses) + max(self.variance, 0.0))
+        return math.sqrt(float(self.misses @ self.misses) + float(np.trace(self.covariance)))
 
     def apart(self, other: 'Outcome') -> float:
         """Return how far what another course leaves is from it."""
@@ -87,7 +79,7 @@ class Outcome:
 
 
 #: What a motion leaves that cannot be followed.
-_NOWHERE = Outcome(np.full(3, math.inf), 0.0, 0.0)
+_NOWHERE = Outcome(np.full(3, math.inf), np.zeros((3, 3)))
 
 
 def expect(
@@ -123,34 +115,29 @@ def expect(
     rows[0, :-2] -= by
     rows[1] = motion.rate_by[0] / frequency
     rows[2, :-2] = by
-    misses = np.array([
-        motion.stretch[0] - stretch, motion.rate[0] / frequency, stretch - course.target])
-    spread = float(np.sum(rows @ estimate.covariance * rows))
-    rows[:, len(estimate.free) - estimate.considered:-2] = 0.0
-    return Outcome(
-        misses, spread, spread - float(np.sum(rows @ estimate.covariance * rows)))
+    misses, off = np.array([
+        motion.stretch[0] - stretch, motion.rate[0] / frequency, stretch - course.target
+    ]), rows @ estimate.off
+    return Outcome(misses + off, rows @ estimate.covariance @ rows.T - np.outer(off, off))
 
 
 def worthwhile(
         before: Outcome, after: Outcome, least: float = 0.0, *, little: float,
-        resting: bool = False) -> bool:
+        share: float = SHARE) -> bool:
     """
     Return whether another course leaves enough less, and that by the least gain.
 
-    At rest it has to leave much less. What is only considered blurs all courses alike: one that
-    changes little, in units of stretch, can do little harm, and one that changes much has to be
-    better with that too.
+    Both are compared along the direction by which what they leave differs: what they leave alike
+    besides is no reason to choose. The other one has to leave at most a share; one that changes
+    little, in units of stretch, can do little harm, and only has to leave less.
     """
-    return _less(before.sure, after.sure, least, little, resting=resting) and (
-        before.sure.size < _HARMLESS * little
-        or _less(before, after, least, little, resting=resting))
-
-
-def _less(
-        before: Outcome, after: Outcome, least: float, little: float, *, resting: bool) -> bool:
-    """Return as `worthwhile`; where little changes, what is known of neither does not count."""
-    share = _AT_REST if resting else _SHARE
-    if after.apart(before) < little:
-        share, both = _SHARE, min(before.variance, after.variance)
-        before, after = (replace(x, variance=x.variance - both) for x in (before, after))
-    return after.size < min(share * before.size, before.size - least)
+    if not math.isfinite(before.size + after.size):
+        return after.size < before.size
+    apart = before.apart(after)
+    share = SHARE if apart < little else share
+    way = (before.misses - after.misses) / apart if apart else np.zeros(len(before.misses))
+    square = [float((x.misses @ way) ** 2 + way @ x.covariance @ way) for x in (before, after)]
+    beside = [float(np.trace(x.covariance) - way @ x.covariance @ way) for x in (before, after)]
+    one, other = (math.sqrt(max(x + y - min(beside), 0.0)) for x, y in zip(
+        square, beside, strict=True))
+    return other < min(share * one, one - least)

@@ -21,7 +21,7 @@ from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.planning.timeline import Model
+from hmsa_ros.planning.timeline import ESTIMATED, Model
 from hmsa_ros.planning.timeline import Options as PlannerOptions
 
 # Until the scatter is seen.
@@ -44,7 +44,7 @@ _CALM = 12.0
 # So many windows of samples wait at most for an update.
 _WAITING = 10
 # Deviations from which on a suspected branch of creep is one.
-_CREEPS = 5.0
+_CREEPS = 2.0
 # Window, as a share, that is left when it moves on, its longest span in units of time, and the
 # samples from which on that counts.
 _KEPT, _LONGEST, _FEWEST = 0.5, 200.0, 20
@@ -78,11 +78,11 @@ class Estimate:
     values: dict[str, Any]
     free: tuple[str, ...]  # those that are tracked
     deviations: dict[str, float]  # standard ones of these, in SI
-    covariance: Array  # of the coordinates of these, of stretch and of rate
+    covariance: Array  # of the coordinates of these, of stretch and of rate, about the values
+    off: Array  # how far what is expected of them is from the values
     noise: float  # standard deviation of a sample
     trusted: bool  # whether it may be acted upon
     trouble: str  # why not; empty if it may
-    considered: int = 0  # how many of those tracked, from the last on, keep their values
 
     @property
     def actuator(self) -> ActuatorParameters:
@@ -100,12 +100,11 @@ class Estimate:
         left = covariance - cross @ np.linalg.pinv(
             covariance[known, known], hermitian=True) @ cross.T
         left[known], left[:, known] = 0.0, 0.0
-        return replace(self, covariance=left)
+        return replace(self, covariance=left, off=np.zeros_like(self.off))
 
     def model(self, options: PlannerOptions) -> Model:
         """Return the model to plan with; the estimated lag takes the place of the options'."""
-        return Model(self.actuator, replace(
-            options, coil_time_constant=self.values['coil_time_constant']))
+        return Model(self.actuator, replace(options, **{x: self.values[x] for x in ESTIMATED}))
 
 
 class Estimator:
@@ -278,7 +277,7 @@ class Estimator:
             dict(prior.values), prior.free, np.append(mean, [stretch, 0.0]), covariance,
             _bounds(self.prior), 0.0, np.zeros(0), np.zeros(0), Suspects(
                 prior.free, coordinates(self.prior.values, self.prior.free)[first:],
-                1.0 / np.diag(self.prior.covariance)[first:], prior.considered),
+                1.0 / np.diag(self.prior.covariance)[first:]),
             self._window.suspected if self._window else ())
 
     def _take(self, window: Window, levels: Levels, until: float) -> Trial | None:
@@ -317,19 +316,24 @@ class Estimator:
             (1.0 - gain) * math.log(self.noise) + gain * math.log(seen))
 
     def _estimate(self, time: int, found: Solution, window: Window) -> Estimate:
-        state, covariance = found.at_end()
+        state, covariance, off = found.at_end()
         values = found.values
         if found.motion.behind:
             values = {**values, 'behind': found.motion.behind}
+        # A bias may be a force as well.
+        variances = np.where(
+            [x == 'stretch_bias' for x in (*self.prior.free, '', '')],
+            np.maximum(np.diag(covariance), found.variances), np.diag(covariance))
         if self._fixed is not None:
-            covariance[:-2, :-2] = self._fixed
+            covariance[:-2, :-2], off = self._fixed, np.zeros_like(off)
+            variances = np.diag(covariance)
         deviations = {
-            name: abs(derivative(name, found.values[name])) * math.sqrt(covariance[i, i])
+            name: abs(derivative(name, found.values[name])) * math.sqrt(variances[i])
             for i, name in enumerate(self.prior.free)}
         trouble = self.screening.trouble or self._strange(found.z)
         return Estimate(
             time, float(state[-2]), float(state[-1]), values, self.prior.free, deviations,
-            covariance, self.noise, not trouble, trouble, self.prior.considered)
+            covariance, off, self.noise, not trouble, trouble)
 
     def _strange(self, z: Array) -> str:
         """Say what would have to be implausibly far off for samples to fit; empty for nothing."""
@@ -380,7 +384,7 @@ class Estimator:
         self._window = moved
         self._solution = replace(found, z=np.append(
             found.z[:-2], [found.motion.stretch[place], found.motion.rate[place]]),
-            covariance=moved.covariance)
+            covariance=moved.covariance, off=np.zeros_like(found.off))
         first = bisect_right(self._levels, self._origin, key=lambda x: x[0]) - 1
         # The field of a coil that lags remembers some levels more.
         del self._levels[:max(first - 8, 0)]

@@ -25,7 +25,7 @@ from hmsa_ros.model.parameters import ActuatorParameters
 #: share of the value.
 DEVIATIONS = {
     'shear_modulus': 0.15, 'density': 0.1, 'remanence': 0.1, 'time_unit': 0.1,
-    'chain_limit': 0.1, 'damping_coefficient': 0.25, 'stretch_bias': 5e-3,
+    'chain_limit': 0.1, 'damping_coefficient': 0.25, 'stretch_bias': 3e-3,
     'stretch_gain': 0.02, 'sensor_latency': 0.05, 'coil_time_constant': 0.05,
     'constant_force': 0.007, 'viscoelastic_ratio': 0.03, 'viscoelastic_time': 1.0}
 # Where there is none, the deviation is a share of that of a usual block.
@@ -41,10 +41,7 @@ TRACKED = ('shear_modulus', 'damping_coefficient', 'stretch_bias')
 #: The gain of the sensor is none: it looks like another remanence and chain limit.
 SUSPECTS = (
     'remanence', 'chain_limit', 'coil_time_constant', 'sensor_latency', 'viscoelastic_ratio',
-    'viscoelastic_time')
-#: What is not estimated unless it is named, since it looks like a bias: it keeps its value, and
-#: makes all that depends on it less sure.
-CONSIDERED = ('constant_force',)
+    'viscoelastic_time', 'constant_force')
 # Relaxation time of a suspected branch in units of time.
 _RELAXATION = 2.0
 
@@ -60,8 +57,7 @@ class Prior:
     # Deviations of the coordinates of a block that was never identified, shape (p,); they bound
     # how far an estimate may go, and how fast, since a block changes after its identification.
     spread: Array
-    considered: int = 0  # how many of what is tracked, from the last on, keep their values
-    suspects: int = 0  # how many, from the last on, are only suspected, and those among them
+    suspects: int = 0  # how many, from the last on, are only suspected
 
     @classmethod
     def nominal(
@@ -81,10 +77,9 @@ class Prior:
             raise BadInputError(
                 f'{", ".join(wrong)} cannot be tracked: expected some of '
                 + ', '.join(x for x in DEVIATIONS if x not in _NOT_TRACKED))
-        considered = [x for x in CONSIDERED if suspects and x not in free]
         named = len(free)
         if suspects:
-            free = (*_with_suspects(free, actuator), *considered)
+            free = _with_suspects(free, actuator)
         values: dict[str, Any] = complete(values_of(actuator, others), free)
         values['viscoelastic_time'] = _RELAXATION * actuator.time_unit
         if actuator.creep:
@@ -109,8 +104,7 @@ class Prior:
                     f'the deviation of {name} is {deviation:g}: expected a number above 0')
             size.append(deviation)
         return cls(
-            values, free, np.diag(np.square(size)), np.array(size), len(considered),
-            len(free) - named)
+            values, free, np.diag(np.square(size)), np.array(size), len(free) - named)
 
     @property
     def coordinate(self) -> Coordinate:

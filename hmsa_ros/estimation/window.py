@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa_ros.estimation.motion import follow, Levels, Motion
-from hmsa_ros.estimation.suspects import inverse, Look, optimum, Suspects
+from hmsa_ros.estimation.suspects import inverse, Look, optimum, Others, Suspects
 from hmsa_ros.identification.fit import loss, weights_of
 from hmsa_ros.identification.quantities import from_coordinate, QUANTITIES, to_coordinate
 from hmsa_ros.identification.response import clip, complete
@@ -72,14 +72,16 @@ class Solution:
     by: Array  # derivatives of what the sensor shows by z, shape (n, q)
     residual: Array  # measured less simulated, shape (n,)
     weights: Array  # how far each counts, 0 to 1
-    covariance: Array  # of z
+    covariance: Array  # of z, about itself
+    off: Array  # how far what is expected is from z, shape (q,)
+    variances: Array  # of z, where a constant force may be anything
 
-    def at_end(self) -> tuple[Array, Array]:
-        """Return coordinates, stretch and rate at the time asked for, and their covariance."""
+    def at_end(self) -> tuple[Array, Array, Array]:
+        """Return coordinates and state at the time asked for, their covariance, how far off."""
         change = transport(self.motion, len(self.residual))
         state = np.append(
             self.z[:-2], [self.motion.stretch[-1], self.motion.rate[-1]])
-        return state, change @ self.covariance @ change.T
+        return state, change @ self.covariance @ change.T, change @ self.off
 
 
 def transport(motion: Motion, place: int) -> Array:
@@ -105,8 +107,7 @@ class Window:
     suspects: Suspects
     suspected: tuple[int, ...] = ()  # places of suspects that are sought
     weighed: int = 0  # samples there were when these were chosen
-    # How probable these are, and what others add to the covariance, shape (q, q).
-    spread: tuple[float, Array] = (1.0, np.zeros(()))
+    others: Others = Others(1.0, np.zeros(()), np.zeros(()))  # than these
 
     def values_at(self, z: Array) -> dict[str, Any]:
         """Return the values of all quantities for coordinates."""
@@ -136,21 +137,21 @@ class Window:
             found = self._look(found, descend)
             if self._is_poor(found, noise):
                 # There may be another valley.
-                before = self.suspected, self.spread
+                before = self.suspected, self.others
                 self.suspected = self.suspects.places
                 other = descend(self._at_ease(self.mean))
                 other = other and self._look(other, descend)
                 if other is not None and other.here.cost < found.here.cost:
                     found = other
                 else:
-                    self.suspected, self.spread = before
-        covariance = self.suspects.considering(
-            inverse(found.matrix, found.loose), found.matrix, self.covariance)
-        sure, others = self.spread
+                    self.suspected, self.others = before
+        sure, off, square = self.others
         _, motion, residual, by, weights, _ = found.here
+        covariance = inverse(found.matrix, found.loose)
         return Solution(
             found.z, found.here.values, motion, by, residual, weights,
-            sure * covariance + others)
+            sure * covariance + square, np.broadcast_to(off, z.shape),
+            np.diag(covariance) + self.suspects.forced(covariance @ found.matrix))
 
     def _is_poor(self, found: Found, noise: float) -> bool:
         """Return whether what is sought explains samples poorly."""
@@ -159,9 +160,9 @@ class Window:
     def _look(self, found: Found, descend: Callable[[Array], Found | None]) -> Found:
         """Choose the suspects to be sought, and return the most probable coordinates then."""
         self.weighed, before = len(self.time), self.suspected
-        self.suspected, self.spread = Look(
-            self.suspects, found.z, found.matrix, found.gradient, *self._room(found.z),
-            self.covariance).choose(before)
+        self.suspected, self.others = Look(
+            self.suspects, found.z, found.matrix, found.gradient,
+            *self._room(found.z)).choose(before)
         if self.suspected == before:
             return found
         return descend(self._at_ease(found.z)) or found
@@ -259,9 +260,8 @@ class Window:
         matrix = prior + by.T @ (weights * by) / noise ** 2
         gradient = by.T @ (solution.weights[:count] * solution.residual[:count]) / noise ** 2
         gradient = gradient + prior @ (self.mean - solution.z)
-        inner = inverse(matrix, self.suspects.sought(len(self.mean), self.suspects.places))
-        covariance = self.suspects.considering(inner, matrix, self.covariance)
-        step = inner @ gradient
+        covariance = inverse(matrix, self.suspects.sought(len(self.mean), self.suspects.places))
+        step = covariance @ gradient
         change = transport(solution.motion, count)
         here = np.append(
             solution.z[:-2], [solution.motion.stretch[count], solution.motion.rate[count]])

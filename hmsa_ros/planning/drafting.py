@@ -393,7 +393,7 @@ def _placed(
             state = model.follow(state, segment.move.levels[number - 1].load, level.time - time)
         time = level.time
         levels.append(PlannedLevel(
-            start + model.ns(time), float(model.units.level(level.load)), state, model))
+            start + model.ns(time), model.flux_density(level.load), state, model))
         if number % _CHECKED == _CHECKED - 1:
             yield
     duration = segment.move.duration

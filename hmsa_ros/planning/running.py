@@ -53,7 +53,7 @@ class RunningPlan:
         model, stretch = self.model, self._initial
         load = model.holding(stretch)
         self._begin_with(PlannedLevel(
-            ALWAYS, float(model.units.level(load)), State(stretch, 0.0, load), model))
+            ALWAYS, model.flux_density(load), State(stretch, 0.0, load), model))
 
     def clock_set(self, by: int) -> None:
         """Take in that the clock was set ahead by some ns: what is planned goes on as before."""
@@ -88,7 +88,7 @@ class RunningPlan:
                 f'state in force is rate {rate:g} 1/s, {units.drive.name} {in_force:g}'
                 f'{units.load_name}: expected finite numbers')
         begin = PlannedLevel(stamp, level, State(
-            stretch, rate * units.time, units.of_level(in_force)), model)
+            stretch, rate * units.time, model.load(in_force)), model)
         held = float(equilibrium_stretch(begin.load, model.material))
         at_rest = abs(begin.state.rate) <= _SAMPLED_AT_REST * model.frequency(stretch)
         if at_rest and level == in_force:

@@ -10,6 +10,7 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import math
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,8 @@ from hmsa_ros.planning.shapers import creeping, get_shaper
 from hmsa_ros.planning.shapers.pace import PACE, Pace
 from hmsa_ros.planning.shapers.request import as_errors, ERRORS
 
+#: Options that are of coil and block, and can be estimated.
+ESTIMATED = ('coil_time_constant', 'constant_force')
 #: Stamp of a level that has been in force at rest for ever.
 ALWAYS = -2**62
 
@@ -44,6 +47,7 @@ class Options:
     slew_limit: float = math.inf  #: in T/s; infinite for steps
     order: int = 2  #: of the shapers robust and minimax
     coil_time_constant: float = 0.0  #: in s, of a lag of first order; 0 for at once
+    constant_force: float = 0.0  #: in N, which acts beside the field
     #: Vibration that levels which follow creep may leave, as a share of the move.
     creep_tolerance: float = IDEAL.ripple
     #: Deviation from a path that levels may leave, as a share of its range.
@@ -64,6 +68,7 @@ class Model:
     limits: Limits = field(init=False)
     delivery: Delivery = field(init=False)  #: nondimensional, as limits and pace are
     pace: Pace = field(init=False)
+    pull: float = field(init=False)  #: load of the constant force
 
     def __post_init__(self) -> None:
         """Work out the nondimensional side."""
@@ -78,20 +83,27 @@ class Model:
             raise BadInputError(
                 f'lead_time is {options.lead_time / NANOSECONDS:g} s: expected at least 0 s')
         actuator.check_drive(options.slew_limit, options.coil_time_constant)
-        units = actuator.units
+        units, pull = actuator.units, options.constant_force * actuator.load_per_newton
         time, load = units.time, units.load
+        least, largest = units.range(options.flux_density_min, options.flux_density_max)
         worked_out = {
             'material': actuator.nondimensional,
             'units': units,
-            'limits': Limits(*units.range(options.flux_density_min, options.flux_density_max)),
+            'limits': Limits(least + pull, largest + pull),
             'delivery': Delivery(
                 options.period / NANOSECONDS / time, options.slew_limit / load * time,
                 1.0 / NANOSECONDS / time, options.coil_time_constant / time,
                 options.creep_tolerance),
             'pace': replace(options.pace, rate=options.pace.rate * time),
+            'pull': pull,
         }
         for name, value in worked_out.items():
             object.__setattr__(self, name, value)
+
+    @property
+    def others(self) -> dict[str, Any]:
+        """What can be estimated besides parameters of the block, by name."""
+        return {x: getattr(self.options, x) for x in ESTIMATED}
 
     def ns(self, time: float) -> int:
         """Return a nondimensional time in ns."""
@@ -100,6 +112,14 @@ class Model:
     def time(self, ns: int) -> float:
         """Return a time in ns without a dimension."""
         return ns / NANOSECONDS / self.units.time
+
+    def load(self, flux_density: float) -> float:
+        """Return the load of a flux density in T, with that of the constant force."""
+        return float(self.units.of_level(flux_density)) + self.pull
+
+    def flux_density(self, load: float) -> float:
+        """Return the flux density in T of a load."""
+        return float(self.units.level(load - self.pull))
 
     def holding(self, stretch: float) -> float:
         """Return the load that holds a stretch."""
@@ -126,9 +146,13 @@ class Model:
         if other is self:
             return state
         loads = self.units.of_level(other.units.load)
+
+        def taken(load: float) -> float:
+            return (load - other.pull) * loads + self.pull
+
         return State(
-            state.stretch, state.rate / other.units.time * self.units.time, state.load * loads,
-            None if state.amplifier is None else state.amplifier * loads,
+            state.stretch, state.rate / other.units.time * self.units.time, taken(state.load),
+            None if state.amplifier is None else taken(state.amplifier),
             creeping.carried(state, other.material, self.material))
 
 
@@ -156,12 +180,12 @@ class PlannedLevel:
     @property
     def in_force(self) -> float:
         """Flux density in T at the stamp, from which a slew limit ramps to the level."""
-        return float(self.model.units.level(self.state.load))
+        return self.model.flux_density(self.state.load)
 
     @property
     def load(self) -> float:
         """The level without a dimension."""
-        return float(self.model.units.of_level(self.flux_density))
+        return self.model.load(self.flux_density)
 
     @property
     def due(self) -> int:
