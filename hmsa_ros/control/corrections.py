@@ -27,8 +27,9 @@ from hmsa_ros.planning.planner import Planner
 from hmsa_ros.planning.timeline import Draft, Model, Plan
 
 # A correction gains at least this share of the step, less while a move has time for corrections:
-# what rests is not to be moved for little.
-_GAIN, _LITTLE = 5e-4, 5e-5
+# what rests is not to be moved for little. Before samples have shown an arrival, only what is
+# expected to leave much is corrected.
+_GAIN, _LITTLE, _MUCH = 5e-4, 5e-5, 0.05
 # And this share of the noise of a sample.
 _NOISE = 0.02
 # Units of time before its end from which on a move is not corrected any more.
@@ -96,7 +97,7 @@ class Corrections:
             if level is not None:
                 steps = partial(self._trim, name, level)
             elif self._feedback.adapted(name) and self._worthwhile(
-                    estimate, planner, self._arrival(name, now)):
+                    name, estimate, planner, now):
                 steps = partial(self._correct, name)
             else:
                 continue
@@ -132,9 +133,11 @@ class Corrections:
         left = arrival - planner.soonest(now)
         return arrival if left >= _SHORTEST * planner.model.units.time * NANOSECONDS else 0
 
-    def _worthwhile(self, estimate: Estimate, planner: Planner, arrival: int) -> bool:
+    def _worthwhile(self, name: str, estimate: Estimate, planner: Planner, now: int) -> bool:
         """Return whether a plan is expected to leave more than it must."""
-        course, gain = _course(planner.plan, estimate.time, _LITTLE if arrival else _GAIN)
+        share = _LITTLE if self._arrival(name, now) else (
+            _GAIN if self._feedback.shown(name, now) else _MUCH)
+        course, gain = _course(planner.plan, estimate.time, share)
         return expect(estimate, course, planner.options.slew_limit).size > gain
 
     def _correct(self, name: str, now: int) -> Steps[Mapping[str, Draft]]:

@@ -35,6 +35,8 @@ MODES = ('off', 'observe', 'adapt')
 _UPDATE, _OFTEN, _RESTING, _TELL = 20_000_000, 0.45, 200_000_000, 200_000_000
 # Units of time from one choice of the parameters to plan with to the next.
 _CHOICE = 3.0
+# Units of time after an arrival that show it.
+_LOOK = 3.0
 # How many times as seldom where a joint rings after its last change of level.
 _RINGING = 4
 # How many times as long as the last look took the next one is later, at least.
@@ -273,9 +275,8 @@ class Feedback:
         if at is None:
             return None
         shift = float(equilibrium_stretch(model.load(level), model.material)) - at[0]
-        # Plans ignore a branch that is only suspected.
         return found.stretch + shift, found.rate, (
-            followed(found.values, found.stretch) if found.actuator.creep else ())
+            followed(found.values, found.stretch) if model.material.creep else ())
 
     def state(self, name: str, time: int) -> Estimate | None:
         """Return what plans may begin from at a time in ns; None where predictions count."""
@@ -409,11 +410,18 @@ class Feedback:
 
     def _may_choose(self, name: str, joint: Joint, latest: Estimate) -> bool:
         """Return whether the parameters to plan with are to be chosen by an estimate."""
-        plan = self._group.planners[name].plan
-        place = plan.under_way(latest.time)
         # A plan that other parameters take over on the way begins from what it does not know.
-        return not joint.chosen and place >= 0 and (latest.time < joint.waits or (
-            latest.time >= max(joint.next_choice, plan.segments[place].arrival or 0)))
+        return not joint.chosen and bool(self._group.planners[name].plan.segments) and (
+            latest.time < joint.waits
+            or latest.time >= joint.next_choice and self.shown(name, latest.time))
+
+    def shown(self, name: str, time: int) -> bool:
+        """Return whether samples until a time in ns show how a joint has arrived."""
+        planner = self._group.planners[name]
+        plan = planner.plan
+        place = plan.under_way(planner.soonest(time))
+        look = round(_LOOK * self._joints[name].unit * NANOSECONDS)
+        return place >= 0 and time >= (plan.segments[place].arrival or 0) + look
 
     def start(self, name: str) -> float:
         """Return the stretch from which the setpoint under way of a joint began, uncorrected."""

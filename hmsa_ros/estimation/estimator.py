@@ -41,6 +41,8 @@ _FIXED = 1e-12
 _AT_REST, _ANYWHERE, _SETTLED = 2e-6, 0.3, 25.0
 # Units of time between changes of level from which on the later one begins another move.
 _CALM = 12.0
+# Share of the largest level up to which a change of it corrects a move.
+_CORRECTS = 0.1
 # So many windows of samples wait at most for an update.
 _WAITING = 10
 # Deviations from which on a suspected branch of creep is one.
@@ -423,8 +425,9 @@ class Estimator:
     def _move_begins(self, until: float) -> int:
         """Return when in ns, until a time in s, a level changed last that was long in force."""
         calm = round(_CALM * self.prior.values['time_unit'] * NANOSECONDS)
-        changes = [y[0] for x, y in itertools.pairwise(self._levels) if x[1] != y[1]
-                   and self._seconds(y[0]) <= until]
+        most = max((abs(x) for _, x in self._levels), default=0.0)
+        changes = [y[0] for x, y in itertools.pairwise(self._levels)
+                   if abs(x[1] - y[1]) > _CORRECTS * most and self._seconds(y[0]) <= until]
         return max((
             y for x, y in itertools.pairwise([-10**19, *changes]) if y - x > calm),
             default=self._origin)
