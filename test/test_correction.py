@@ -121,7 +121,7 @@ def test_a_block_that_is_a_fifth_softer_or_stiffer_than_known_comes_to_rest_at_i
     # Open loop leaves 17 to 26 % of both.
     vibration, offset = np.median(np.abs([left(x) for x in blocks]), axis=0)
     assert vibration < 1.5e-3
-    assert offset < 1.5e-3
+    assert offset < 2.5e-3
     assert all(abs(level) <= 0.25 for x in blocks for _, level in x.levels)
 
 

@@ -85,9 +85,8 @@ def check_harmless(slow, plant, factors, late, word):
         it.sense = lambda time, x: [(time + late * MS, x)]
         left[mode] = moves(it, MOVES[:3])
     assert np.all(np.abs(left['adapt']) < np.abs(left['off']) + 0.5)
-    # A lag that is small beside the unit of time looks like late timestamps.
-    assert slow or (word in it.message and (
-        'plans use it' in it.message or '~/reset_estimate' in it.message))
+    assert word in it.message
+    assert 'plans use it' in it.message or '~/reset_estimate' in it.message
 
 
 @NOT_NAMED
@@ -118,7 +117,7 @@ def test_with_a_gain_of_the_sensor_moves_rest_where_it_shows_the_target():
     targets = np.array(MOVES)
     steps = np.abs(np.diff(targets, prepend=1.0))
     shown = 1.0 + gain * (targets + 0.01 * offset * steps - 1.0) - targets
-    assert np.max(np.abs(vibration[1:])) < 1.0
+    assert np.max(np.abs(vibration[1:])) < 0.5
     assert np.max(np.abs(shown / steps)[1:]) < 0.005
 
 
@@ -131,7 +130,7 @@ def test_moves_that_get_worse_end_feedback_and_what_it_did_is_taken_back(monkeyp
     for name, other in (
             ('clearly_better', chosen), ('differs', lambda *_: True),
             ('learnt_model', lambda model, *_: replace(model, actuator=replace(
-                model.actuator, shear_modulus=1.2e4)))):
+                model.actuator, shear_modulus=1.1e4)))):
         monkeypatch.setattr(feedback, name, other)
     it = bench(False, 1e-3)
     left = np.sum(np.abs(moves(it)), axis=1)

@@ -11,7 +11,6 @@ from dataclasses import replace
 import math
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.estimation import Estimate
@@ -68,9 +67,13 @@ def _shared(left: Outcome, step: float) -> Outcome:
 def _together(outcomes: Sequence[Outcome]) -> Outcome:
     """Return what moves leave on average."""
     count = len(outcomes)
+    size = len(outcomes[0].misses)
+    covariance = np.zeros((count, size, count, size))
+    for i, each in enumerate(outcomes):
+        covariance[i, :, i] = each.covariance / count
     return Outcome(
         np.concatenate([x.misses for x in outcomes]) / math.sqrt(count),
-        block_diag(*(x.covariance for x in outcomes)) / count)
+        covariance.reshape(count * size, -1))
 
 
 def _planned(model: Model, start: float, target: float) -> Course | None:
