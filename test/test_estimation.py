@@ -258,3 +258,12 @@ def test_a_bias_and_a_constant_force_are_said_to_be_confounded_until_two_targets
     assert said == [True, False]
     assert found.values['constant_force'] == pytest.approx(
         0.03, abs=4.0 * found.deviations['constant_force'])
+
+
+@pytest.mark.parametrize('gain', [0.98, 1.02])
+def test_a_bias_is_known_no_better_than_the_gain_of_the_sensor_lets_tell_it_from_a_force(gain):
+    # The gain is about rest: what it shows of a stretch of 1 is right.
+    extras = oracle.Extras(bias=1.0 - gain, force=0.03, gain=gain)
+    samples = measured(oracle.BLOCK, extras, noise=1e-4)
+    _, found = run(samples, prior=Prior.nominal(oracle.BLOCK, suspects=True))
+    assert abs(found.values['stretch_bias']) < 3.0 * found.deviations['stretch_bias']

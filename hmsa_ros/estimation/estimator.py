@@ -322,7 +322,7 @@ class Estimator:
         values = found.values
         if found.motion.behind:
             values = {**values, 'behind': found.motion.behind}
-        # A bias may be a force as well.
+        # A bias may be a force as well, or told from one by the gain of the sensor alone.
         variances = np.where(
             [x == 'stretch_bias' for x in (*self.prior.free, '', '')],
             np.maximum(np.diag(covariance), found.variances), np.diag(covariance))

@@ -9,7 +9,7 @@ along with the motion (C. V. Rao, J. B. Rawlings and D. Q. Mayne, IEEE Trans. Au
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 import math
 from typing import Any, NamedTuple
 
@@ -17,11 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa_ros.estimation.motion import follow, Levels, Motion
+from hmsa_ros.estimation.prior import DEVIATIONS
 from hmsa_ros.estimation.suspects import inverse, Look, optimum, Others, Suspects
 from hmsa_ros.identification.fit import loss, weights_of
 from hmsa_ros.identification.quantities import from_coordinate, QUANTITIES, to_coordinate
 from hmsa_ros.identification.response import clip, complete
 from hmsa_ros.model.equations import Array
+from hmsa_ros.model.laws.coordinate import coordinate_of
 
 # Steps of Gauss and Newton at most, halvings of each, and the step, in deviations, that is small.
 _PASSES, _HALVINGS, _SMALL = 4, 4, 0.1
@@ -74,7 +76,7 @@ class Solution:
     weights: Array  # how far each counts, 0 to 1
     covariance: Array  # of z, about itself
     off: Array  # how far what is expected is from z, shape (q,)
-    variances: Array  # of z, where a constant force may be anything
+    variances: Array  # of z, where a constant force and the gain of the sensor may be anything
 
     def at_end(self) -> tuple[Array, Array, Array]:
         """Return coordinates and state at the time asked for, their covariance, how far off."""
@@ -108,6 +110,7 @@ class Window:
     suspected: tuple[int, ...] = ()  # places of suspects that are sought
     weighed: int = 0  # samples there were when these were chosen
     others: Others = Others(1.0, np.zeros(()), np.zeros(()))  # than these
+    leans: Array = field(default_factory=lambda: np.zeros(()))  # of the mean, by a gain
 
     def values_at(self, z: Array) -> dict[str, Any]:
         """Return the values of all quantities for coordinates."""
@@ -151,7 +154,38 @@ class Window:
         return Solution(
             found.z, found.here.values, motion, by, residual, weights,
             sure * covariance + square, np.broadcast_to(off, z.shape),
-            np.diag(covariance) + self.suspects.forced(covariance @ found.matrix))
+            np.diag(covariance) + self.suspects.forced(covariance @ found.matrix)
+            + self._by_gain(found, prior, noise))
+
+    def _more(self, here: 'Trial | Solution', count: int) -> Array:
+        """Return what a usual error of the gain about rest shows more, shape (n,); 0 if sought."""
+        if 'stretch_gain' in self.free:
+            return np.zeros(count)
+        found: Array = DEVIATIONS['stretch_gain'] * (
+            here.motion.stretch[:count] - coordinate_of(self.values['law']).rest)
+        return found
+
+    def _leaning(
+            self, matrix: Array, loose: NDArray[np.bool_], prior: Array,
+            here: 'Trial | Solution', noise: float, count: int) -> Array:
+        """Return how far such an error would shift coordinates by samples, shape (q,)."""
+        pull = prior @ np.broadcast_to(self.leans, self.mean.shape) - here.by[:count].T @ (
+            here.weights[:count] * self._more(here, count)) / noise ** 2
+        # Rounding would be large in units of the coordinates.
+        size, found = np.sqrt(np.diag(matrix)[loose]), np.zeros(len(self.mean))
+        found[loose] = np.linalg.solve(
+            matrix[np.ix_(loose, loose)] / np.outer(size, size), pull[loose] / size) / size
+        return found
+
+    def _by_gain(self, found: Found, prior: Array, noise: float) -> Array:
+        """Return what the gain of the sensor adds to variances, unless samples exclude it."""
+        here = found.here
+        leans = self._leaning(
+            found.matrix, found.loose, prior, here, noise, len(here.residual))
+        left = self._more(here, len(here.residual)) + here.by @ leans
+        variances: Array = np.square(leans) / (
+            1.0 + float(here.weights @ np.square(left)) / noise ** 2)
+        return variances
 
     def _is_poor(self, found: Found, noise: float) -> bool:
         """Return whether what is sought explains samples poorly."""
@@ -260,7 +294,8 @@ class Window:
         matrix = prior + by.T @ (weights * by) / noise ** 2
         gradient = by.T @ (solution.weights[:count] * solution.residual[:count]) / noise ** 2
         gradient = gradient + prior @ (self.mean - solution.z)
-        covariance = inverse(matrix, self.suspects.sought(len(self.mean), self.suspects.places))
+        every = np.ones(len(self.mean), dtype=np.bool_)
+        covariance = inverse(matrix, every)
         step = covariance @ gradient
         change = transport(solution.motion, count)
         here = np.append(
@@ -269,7 +304,8 @@ class Window:
         return Window(
             self.values, self.free, here + change @ step,
             0.5 * (covariance + covariance.T), self.bounds, begin,
-            self.time[count:], self.stretch[count:], self.suspects, self.suspected)
+            self.time[count:], self.stretch[count:], self.suspects, self.suspected,
+            leans=change @ self._leaning(matrix, every, prior, solution, noise, count))
 
 
 def coordinates(values: Mapping[str, float], free: Sequence[str]) -> Array:
