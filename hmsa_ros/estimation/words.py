@@ -4,6 +4,8 @@ from collections.abc import Mapping
 import math
 from typing import Any
 
+import numpy as np
+
 from hmsa_ros.estimation.estimator import Estimate
 from hmsa_ros.estimation.motion import held
 from hmsa_ros.identification.quantities import modulus_of
@@ -15,6 +17,8 @@ _OFFSET, _RINGING = 0.01, 0.01
 # A bias and a force that hide each other by this correlation, while where the block rests is known
 # no better than this.
 _PAIR, _HIDDEN, _UNKNOWN = ('stretch_bias', 'constant_force'), 0.9, 1e-3
+# They shift what samples show alike, unless the block is fast.
+_LATER = ('sensor_latency', 'coil_time_constant')
 # Share of the step that a bias is to be known to.
 _BIASED = 0.01
 # Smaller steps have no percentage.
@@ -46,7 +50,7 @@ def confounded(estimate: Estimate, least: float = _UNKNOWN) -> bool:
     if scale == 0.0:
         return False
     together = covariance[i, j] / scale
-    return abs(together) > _HIDDEN and estimate.deviations[_PAIR[0]] > least
+    return abs(together) > _HIDDEN and math.sqrt(covariance[i, i]) > least
 
 
 def differences(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
@@ -67,7 +71,20 @@ def differences(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
         elif before and abs(change / before) > _MATTERS:
             label = modulus_of(nominal['law'])[0] if name == 'shear_modulus' else name
             found.append(f'{_NAMES[label]} about {100.0 * change / before:+.0f} %')
-    return found
+    return found + _later(estimate, nominal)
+
+
+def _later(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
+    """Return what is known of latency and lag together, where it is not known which it is."""
+    apart = {x: estimate.values[x] - nominal[x] for x in _LATER if x in estimate.free}
+    if any(abs(y) > _SURE * estimate.deviations[x] for x, y in apart.items()):
+        return []
+    places = [estimate.free.index(x) for x in apart]
+    both = sum(apart.values())
+    if abs(both) <= _SURE * math.sqrt(estimate.covariance[np.ix_(places, places)].sum()):
+        return []
+    label, unit, factor = _ABSOLUTE[_LATER[1]]
+    return [f'{_ABSOLUTE[_LATER[0]][0]} or {label} about {factor * both:.2g} {unit}']
 
 
 def sentence(
