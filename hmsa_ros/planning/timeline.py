@@ -145,7 +145,7 @@ class Model:
         """Return a state of another model in the units of this one."""
         if other is self:
             return state
-        loads = self.units.of_level(other.units.load)
+        loads = float(self.units.of_level(other.units.load))
 
         def taken(load: float) -> float:
             return (load - other.pull) * loads + self.pull
