@@ -14,7 +14,7 @@ import numpy as np
 
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.estimation import Estimate
-from hmsa_ros.estimation.correction import AT_REST, Course, expect, Outcome, worthwhile
+from hmsa_ros.estimation.correction import AT_REST, Course, expect, MUCH, Outcome, worthwhile
 from hmsa_ros.estimation.motion import rest
 from hmsa_ros.planning.planner import Planner
 from hmsa_ros.planning.timeline import Model
@@ -30,12 +30,13 @@ _STEP = 0.15
 
 def clearly_better(
         estimate: Estimate, model: Model, used: Model, start: float, target: float, *,
-        given: bool) -> Generator[None, None, bool]:
+        given: bool, shown: bool) -> Generator[None, None, bool]:
     """
     Return whether moves planned with a model are expected to leave clearly less than with another.
 
     The joint went from the start to the target, and is tried on the way back and further on. What
-    is given may be right: it is left for what is clearly better alone. Pauses after each piece.
+    is given may be right: it is left for what is clearly better alone, and for what is much better
+    unless samples have shown an arrival. Pauses after each piece.
     """
     step = math.copysign(max(abs(target - start), _STEP), target - start)
     pairs: list[list[Outcome]] = []
@@ -55,8 +56,8 @@ def clearly_better(
         return False
     before, after = (_together([x[i] for x in pairs]) for i in (0, 1))
     return worthwhile(
-        before, after, _LEAST, little=0.0 if given else _LITTLE,
-        share=_CLEARLY if given else AT_REST)
+        before, after, MUCH if given and not shown else _LEAST,
+        little=0.0 if given else _LITTLE, share=_CLEARLY if given else AT_REST)
 
 
 def _shared(left: Outcome, step: float) -> Outcome:

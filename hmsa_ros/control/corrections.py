@@ -16,6 +16,7 @@ from hmsa_ros.estimation.correction import (
     Course,
     expect,
     LITTLE,
+    MUCH,
     SHARE,
     worthwhile,
 )
@@ -27,9 +28,8 @@ from hmsa_ros.planning.planner import Planner
 from hmsa_ros.planning.timeline import Draft, Model, Plan
 
 # A correction gains at least this share of the step, less while a move has time for corrections:
-# what rests is not to be moved for little. Before samples have shown an arrival, only what is
-# expected to leave much is corrected.
-_GAIN, _LITTLE, _MUCH = 5e-4, 5e-5, 0.05
+# what rests is not to be moved for little.
+_GAIN, _LITTLE = 5e-4, 5e-5
 # And this share of the noise of a sample.
 _NOISE = 0.02
 # Units of time before its end from which on a move is not corrected any more.
@@ -136,7 +136,7 @@ class Corrections:
     def _worthwhile(self, name: str, estimate: Estimate, planner: Planner, now: int) -> bool:
         """Return whether a plan is expected to leave more than it must."""
         share = _LITTLE if self._arrival(name, now) else (
-            _GAIN if self._feedback.shown(name, now) else _MUCH)
+            _GAIN if self._feedback.shown(name, now) else MUCH)
         course, gain = _course(planner.plan, estimate.time, share)
         return expect(estimate, course, planner.options.slew_limit).size > gain
 

@@ -399,7 +399,7 @@ class Feedback:
             learnt = self._learnt(name, used)
             if (yield from clearly_better(
                     latest, learnt, used, joint.start, segments[-1].stretch,
-                    given=used == self._nominal[name])):
+                    given=used == self._nominal[name], shown=not waits)):
                 model = learnt
         if not joint.acts:
             return

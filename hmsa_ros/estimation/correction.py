@@ -23,6 +23,8 @@ TOLERANCE = 5e-3
 #: A correction leaves at most this share of what the course in force leaves, while there is time
 #: for more of them, and at rest.
 SHARE, AT_REST = 0.9, 0.5
+#: Share of the step that is to be gained before samples have shown an arrival.
+MUCH = 0.05
 #: Share of the step up to which what a correction changes is little.
 LITTLE = 2.5e-3
 # How long in ns a level has been in force that a field has followed.
