@@ -88,6 +88,7 @@ def test_modulus_damping_remanence_and_bias_are_found_within_their_deviations():
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize(('every', 'noise'), [(1, 1e-3), (3, 5e-3)])
 def test_errors_of_many_runs_are_as_large_as_the_deviations_say(every, noise):
     runs = [identify(of_beam(TIMES[::every], seen(noise, seed)[::every]), actuator=START)

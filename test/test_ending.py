@@ -160,7 +160,7 @@ def test_an_interrupt_in_the_first_second_ends_in_order(ros_env, tmp_path, words
             out, err = process.communicate(timeout=60)
         assert b'Traceback' not in out + err, err.decode()
         assert process.returncode in statuses, err.decode()
-        assert not (words == ['planner'] and err), err.decode()
+        assert words != ['planner'] or all(b'[INFO]' in x for x in err.splitlines()), err.decode()
 
 
 @pytest.mark.parametrize(('number', 'status'), [

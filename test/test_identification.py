@@ -310,6 +310,7 @@ def test_even_stamps_that_jitter_are_weighed_and_said():
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_foreign_motion_is_rejected_without_a_number():
     recording = recorded()
     found = identify(replace(recording, stretch=recording.stretch[::-1].copy()))

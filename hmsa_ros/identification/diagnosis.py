@@ -321,7 +321,8 @@ def considered(
     """
     found = []
     for name, way in moves.items():
-        ratio = np.abs(way) / std
+        # What is not determined has no deviation.
+        ratio = np.divide(np.abs(way), std, out=np.zeros(len(std)), where=np.isfinite(std))
         place = int(np.argmax(ratio))
         if ratio[place] > _WORTH_SAYING:
             found.append(
