@@ -668,6 +668,57 @@ def test_whatever_hardware_raises_ends_the_worker_with_all_coils_switched_off(me
     worker.close()
 
 
+class Warm(Bench):
+    degrees = 20.0
+
+    def temperature(self):
+        return self.degrees
+
+
+def test_a_coil_that_is_too_warm_goes_off_and_is_obeyed_again_once_it_has_cooled():
+    bench, device = driver(bench=Warm(), temperature_limit=80.0)
+    second = 1000 * MS
+
+    def go_on(until):
+        for time in range(device.time, until, 10 * MS):
+            device.advance(time)
+    device.receive(0, START + MS, 0.1)
+    device.receive(0, START + 3 * second, 0.2)
+    go_on(START + second // 2)
+    assert bench.levels[-1] == 0.1
+    assert (device.temperatures, device.too_warm) == ({'actuator': 20.0}, '')
+    for degrees, said in ((80.1, 'is at 80.1 degrees Celsius: expected at most 75'),
+                          # The limit of before does not do.
+                          (79.0, 'expected at most 75 .temperature_limit 80'),
+                          (math.nan, 'is at nan degrees')):
+        bench.degrees = degrees
+        go_on(device.time + second // 2)
+        assert bench.levels[-1] == 0.0
+        assert device.levels == [0.0]
+        with pytest.raises(BadInputError, match=said):
+            device.receive(0, 0, 0.1)
+        device.receive(0, 0, 0.0)
+    assert [x.kind for x in device.notices()].count(Kind.LOST) == 1
+    bench.degrees = 75.0
+    go_on(START + 4 * second)
+    # What was ahead is forgotten.
+    assert (bench.levels[-1], device.too_warm) == (0.0, '')
+    device.receive(0, 0, 0.15)
+    go_on(device.time + second)
+    assert bench.levels[-1] == 0.15
+
+
+def test_a_temperature_that_is_none_and_a_limit_without_one_are_refused():
+    with pytest.raises(BadInputError, match='Bench reports no temperature: expected 0 for no'):
+        driver(temperature_limit=80.0)
+    with pytest.raises(BadInputError, match='temperature_limit is nan'):
+        driver(temperature_limit=math.nan)
+    bench = Warm()
+    bench.degrees = 'hot'
+    with pytest.raises(HmsaError, match="Warm.temperature of joint actuator returned 'hot'"):
+        driver(bench=bench)
+
+
 class Cable(Bench):
     """Can be pulled out; a new connection works once it is in again."""
 

@@ -72,6 +72,22 @@ def test_a_board_keeps_no_more_than_it_has_room_for_and_tells_what_it_still_has(
     assert ask(board, '2 7 M 161') == '2 7 M 161'
 
 
+def test_a_board_tells_the_temperature_of_its_coil_if_it_measures_one(line):
+    board = _board.make(1000, 1)
+    ask(board, '1 0 H 7 1000000')
+    # As firmware from before answers what it does not know.
+    assert ask(board, '2 7 C') == '2 7 C'
+    _board.warm(board, -1_500_000)
+    assert ask(board, '2 7 C') == '2 7 C -1500000'
+    without = Board(str(line.path))
+    assert not hasattr(without, 'temperature')
+    without.close()
+    line.board.temperature = 41.25
+    device = driver(line)
+    assert device.temperatures == {'actuator': 41.25}
+    assert device.close() == ''
+
+
 def test_what_is_no_request_puts_no_level_out():
     board, random = _board.make(1000, 1), Random(3)
     ask(board, '1 0 H 7 1000000')

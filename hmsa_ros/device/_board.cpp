@@ -79,6 +79,20 @@ PyObject *sample(PyObject *, PyObject *arguments) {
     Py_RETURN_NONE;
 }
 
+PyObject *warm(PyObject *, PyObject *arguments) {
+    PyObject *state;
+    int temperature;
+    if (!PyArg_ParseTuple(arguments, "Oi", &state, &temperature)) {
+        return nullptr;
+    }
+    Board *board = board_in(state);
+    if (!board) {
+        return nullptr;
+    }
+    board->warm(temperature);
+    Py_RETURN_NONE;
+}
+
 PyObject *due(PyObject *, PyObject *state) {
     Board *board = board_in(state);
     return board ? PyLong_FromLongLong(board->due()) : nullptr;
@@ -89,6 +103,7 @@ PyMethodDef methods[] = {
     {"receive", receive, METH_VARARGS, "receive(state, bytes, now): what it answers at once."},
     {"advance", advance, METH_VARARGS, "advance(state, now): the level that it puts out."},
     {"sample", sample, METH_VARARGS, "sample(state, time, reading): have it keep a sample."},
+    {"warm", warm, METH_VARARGS, "warm(state, temperature): have it know that of its coil."},
     {"due", due, METH_O, "due(state): when to advance it next, -1 for never."},
     {nullptr, nullptr, 0, nullptr}};
 

@@ -26,7 +26,7 @@ from hmsa_ros.model.units import NANOSECONDS
 _COOL = 0.9
 # The share of its saturation that a coil can reach.
 _SATURATED = 0.99
-_MEMBERS = ('open', 'clock', 'capacity', 'description', 'arm', 'disarm')
+_MEMBERS = ('open', 'clock', 'capacity', 'description', 'arm', 'disarm', 'temperature')
 
 
 @dataclass(frozen=True)

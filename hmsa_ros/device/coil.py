@@ -7,13 +7,16 @@ import math
 
 from hmsa_ros.device.clock_map import ENOUGH
 from hmsa_ros.device.hardware import Calls, Hardware, HardwareError, Instrument
+from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.schedule import CommandSchedule
 from hmsa_ros.model.units import NANOSECONDS
 
 # Of the levels that took effect last, which tell at what level an older sample was taken.
 _REMEMBERED = 64
-# In ns: between questions for the time of a device, and for what it has applied.
+# In ns: between questions for the time and temperature of a device, and for what it has applied.
 _ASK, _POLL = NANOSECONDS // 4, NANOSECONDS // 200
+# By how many degrees a coil that was too warm must be below its limit.
+_COOLER = 5.0
 
 
 class Coil:
@@ -32,11 +35,13 @@ class Coil:
         What is told of each call.
     clock : callable
         Returns the time of this host in ns.
+    hottest : float
+        Temperature in degrees Celsius above which the coil is to be off.
 
     Raises
     ------
     BadInputError
-        If the hardware is not as `Hardware` says.
+        If the hardware is not as `Hardware` says, or has no temperature to be limited.
     HardwareError
         If it does not answer what time it has.
 
@@ -44,9 +49,15 @@ class Coil:
 
     def __init__(
             self, hardware: Hardware, name: str, limit: float, calls: Calls,
-            clock: Callable[[], int]) -> None:
+            clock: Callable[[], int], hottest: float = math.inf) -> None:
         self.name = name
         self.instrument = Instrument(hardware, name, calls)
+        if hottest != math.inf and not self.instrument.has('temperature'):
+            raise BadInputError(
+                f'temperature_limit of joint {name} is {hottest:g}, and {self.instrument.name} '
+                'reports no temperature: expected 0 for no limit, or a class with temperature()')
+        self.temperature, self._hottest = math.nan, hottest
+        self.too_warm = ''  # why the coil is to be off
         self.limit = min(limit, self.instrument.limit or math.inf)
         self.tolerance = self.instrument.tolerance(self.limit)
         self.heard: int | None = None  # when, in ns, since the watchdog was last looked at
@@ -253,11 +264,22 @@ class Coil:
             self.instrument.forget_clock()
             for _ in range(ENOUGH):
                 self.instrument.ask_clock(self._clock)
+        self._feel()
+        if self.instrument.clock_map is not None or self.instrument.has('temperature'):
             self._next_question = self._clock() + _ASK
 
-    def ask_clock(self, now: int) -> bool:
+    def _feel(self) -> None:
+        """See whether the coil is too warm, or was and is not yet cool enough."""
+        self.temperature = self.instrument.temperature()
+        limit = self._hottest - (_COOLER if self.too_warm else 0.0)
+        # One that is not known is none to go on with.
+        self.too_warm = '' if self._hottest == math.inf or self.temperature <= limit else (
+            f'the coil is at {self.temperature:.1f} degrees Celsius: expected at most '
+            f'{limit:g} (temperature_limit {self._hottest:g}); let it cool')
+
+    def ask(self, now: int) -> bool:
         """
-        Ask the device for its time if that is due; return whether its clock is the same.
+        Ask for time and temperature if that is due; return whether the clock is the same.
 
         Raises
         ------
@@ -271,4 +293,5 @@ class Coil:
         if now < self._next_question <= now + _ASK:
             return True
         self._next_question = now + _ASK
+        self._feel()
         return self.instrument.ask_clock(self._clock)

@@ -32,6 +32,8 @@ _TIMED, _APART, _TRIES = 30, 0.03, 4
 # Limits: of a call in s, of the lateness of the median level in s, of the age of a sample in s, of
 # the error of a clock in s, of samples that repeat the one before.
 _CALL, _LATE, _CLOCK, _REPEATED = 0.02, 2e-3, 1e-3, 0.6
+# Of a coil after levels that are small, in degrees Celsius.
+_HOTTEST = 150.0
 # The share of calls that must keep their limit.
 _MOST = 0.95
 # How many deviations of its mean a response must be to be seen.
@@ -189,6 +191,7 @@ class Trial:
         durations = {x: np.array(y) for x, y in bench.probe.durations.items()}
         self._check_calls(durations, bench.slept)
         self._check_clock(bench)
+        self._check_temperature(bench)
         self._check_exception()
         progress('SIGTERM', 0.8)
         self._check_sigterm()
@@ -376,6 +379,16 @@ class Trial:
                 'clock', known.error, 's', _CLOCK,
                 f'its clock is known to {known.error * 1e6:.3g} us, and drifts by '
                 f'{known.drift * 1e6:.3g} ppm', 'clock() must answer at once')
+
+
+    def _check_temperature(self, bench: _ProbedBench) -> None:
+        device = bench.worker.device
+        if device.instruments[0].has('temperature'):
+            found = next(iter(device.temperatures.values()), math.nan)
+            self._note(
+                'temperature', abs(found), 'deg C', _HOTTEST,
+                f'the coil is at {found:g} degrees Celsius',
+                'return the temperature of the coil in degrees Celsius')
 
 
 def _lateness(seen: Seen) -> list[float]:

@@ -36,10 +36,15 @@ class HardwareJoint:
     #: what to do after a silence
     fallback: Fallback = field(default_factory=lambda: Fallback(safe_flux='zero'))
     name: str = 'actuator'  #: for sentences
+    #: of the coil in degrees Celsius, above 0; it is off while it is warmer
+    temperature_limit: float = math.inf
 
     def __post_init__(self) -> None:
         if not 0.0 < self.limit < math.inf:
             raise BadInputError(f'limit is {self.limit:g} T: expected a number above 0')
+        if not self.temperature_limit > 0.0:
+            raise BadInputError(
+                f'temperature_limit is {self.temperature_limit:g}: expected a number above 0')
 
 
 class HardwareDevice(Device):
@@ -76,7 +81,9 @@ class HardwareDevice(Device):
         self._time = time
         self._period = period
         self._next_sample = time
-        self._coils = [Coil(x.hardware, x.name, x.limit, self.calls, clock) for x in joints]
+        self._coils = [
+            Coil(x.hardware, x.name, x.limit, self.calls, clock, x.temperature_limit)
+            for x in joints]
 
     @property
     def time(self) -> int:
@@ -128,11 +135,23 @@ class HardwareDevice(Device):
                           f'clock of {x.name}: drift in ppm': f'{known.drift * 1e6:.2f}'}
         return found
 
+    @property
+    def temperatures(self) -> dict[str, float]:
+        """Temperatures of coils in degrees Celsius by joint, where they are known."""
+        return {x.name: x.temperature for x in self._coils if not math.isnan(x.temperature)}
+
+    @property
+    def too_warm(self) -> str:
+        """Which coils are too warm, in words; empty if none is."""
+        return '; '.join(f'joint {x.name}: {x.too_warm}' for x in self._coils if x.too_warm)
+
     # -- commands ------------------------------------------------------------------------------
 
     def check(self, joint: int, stamp: int, level: float) -> None:
         """
         Refuse a level in T beyond the limit, a stamp in ns of another clock, and any while locked.
+
+        A coil that is too warm takes 0 T only.
 
         Raises
         ------
@@ -146,6 +165,8 @@ class HardwareDevice(Device):
         if self.locked:
             raise BadInputError(
                 f'the interlock is open ({self.locked}): close it, then send a new request')
+        if level and (why := self._coils[joint].too_warm):
+            raise BadInputError(f'flux density is {level:g} T, and {why}')
         self._check_clock(stamp)
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
@@ -237,8 +258,10 @@ class HardwareDevice(Device):
                 coil.repeat = False
             else:
                 self._write(i, level)
-        if not coil.ask_clock(self._time):
+        if not coil.ask(self._time):
             raise StateLostError('its clock is another one')
+        if coil.too_warm and coil.wanted:
+            raise StateLostError(coil.too_warm)
 
     def _watch(self, i: int) -> None:
         coil = self._coils[i]

@@ -27,7 +27,8 @@ SHIPPED = {
 # What its methods take; all but the first two are optional.
 _TAKES: dict[str, tuple[str, ...]] = {
     'write': ('level', 'now'), 'read': ('now',), 'open': (), 'close': (),
-    'schedule': ('levels',), 'applied': (), 'clock': (), 'arm': (), 'disarm': ()}
+    'schedule': ('levels',), 'applied': (), 'clock': (), 'arm': (), 'disarm': (),
+    'temperature': ()}
 OPTIONAL = tuple(_TAKES)[2:]
 # In ns from now, besides the longest call: what cannot be the time of anything that has happened.
 _ABSURD = 10 * NANOSECONDS
@@ -56,6 +57,8 @@ class Hardware(Protocol):
     #
     # `arm()` comes before the first level but 0 T, and `disarm()` once the coil is off at the end,
     # on deactivation, and while an interlock is open.
+    #
+    # `temperature()` returns that of the coil in degrees Celsius, NaN if it is not known.
     #
     # With `clock()`, its own time in ns, all times that it takes and returns are of that clock.
 
@@ -457,6 +460,25 @@ class Instrument:
             raise HardwareError(
                 f'{self._names["clock"]} returned {excerpt(answer)}: expected its time in ns')
         return self.clock_map.add(before, int(answer), after)
+
+    def temperature(self) -> float:
+        """
+        Return the temperature of its coil in degrees Celsius; NaN if it is not known.
+
+        Raises
+        ------
+        HardwareError
+            If it fails, or answers none.
+        StateLostError
+            If the hardware says so.
+
+        """
+        answer = self._call('temperature') if self.has('temperature') else math.nan
+        if not is_number(answer, finite=False):
+            raise HardwareError(
+                f'{self._names["temperature"]} returned {excerpt(answer)}: expected degrees '
+                'Celsius, NaN if they are not known')
+        return float(answer)
 
     def arm(self) -> None:
         """

@@ -41,7 +41,7 @@ def judge_commands(
 
 
 def judge_hardware(trouble: str, *, saturated: int, state_lost: int) -> tuple[int, str]:
-    """Return the verdict on hardware, of what keeps it from obeying and of counts."""
+    """Return the verdict on hardware, of what keeps a coil off and of counts."""
     if trouble:
         return _ERROR, trouble
     notes = [text for count, text in (

@@ -6,7 +6,7 @@ again: a line that was lost or damaged costs an attempt.
 """
 
 from binascii import crc_hqx
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 import math
 from secrets import randbelow
 from time import monotonic
@@ -82,6 +82,12 @@ class Board(OnLine):
         self._number = self._session = 0
         self._lost = False
         self._begin(_BOOT)
+        if self._ask('C'):
+            self.temperature: Callable[[], float] = self._temperature
+
+    def _temperature(self) -> float:
+        """Return that of the coil in degrees Celsius."""
+        return self._ask('C', count=1)[0] / _MILLION
 
     def open(self) -> None:
         """Connect again, without a board that restarts if its port is still open."""

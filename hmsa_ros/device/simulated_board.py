@@ -44,6 +44,8 @@ class SimulatedBoard(SimulatedLine):
 
     #: by how much its clock is fast, and the field of the coil
     fast, tesla_per_ampere = 40e-6, TESLA_PER_AMPERE
+    #: of the coil in degrees Celsius; NaN is not measured
+    temperature = math.nan
 
     def __init__(self, truth: str = '', clock: Callable[[], int] = monotonic_ns) -> None:
         super().__init__()
@@ -108,6 +110,8 @@ class SimulatedBoard(SimulatedLine):
 
     def write(self, text: bytes) -> None:
         """Take bytes from the host."""
+        if not math.isnan(self.temperature):
+            _board.warm(self._board, round(1e6 * self.temperature))
         self._answer += _board.receive(self._board, text, self.advance())
 
     def close(self) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
+import math
 from time import monotonic_ns, time_ns
 from typing import Any
 
@@ -43,6 +44,11 @@ OWN = (
         'flux_density_limit', 0.5,
         'Largest flux density, of either sign, that is written; commands beyond it are refused.',
         'T', 1e-9, 1e3),
+    ParameterSpec(
+        'temperature_limit', 0.0,
+        'Temperature of the coil, where the hardware reports it, above which the coil is switched '
+        'off and commands are refused, until it is 5 degrees cooler; 0 for no limit.',
+        'deg C', 0.0, 1e3),
     # A real coil is not left on.
     *(replace(x, default='zero') if x.name == 'safe_flux' else x for x in FALLBACK),
 )
@@ -203,10 +209,13 @@ class DriverNode(DeviceNode):
             *judge_interlock(self._interlock.why),
             {'required': self._interlock.required, 'openings': self._interlock.openings})
         device = self.device.device
-        level, message = judge_hardware(self.device.trouble, **device.counts)
+        level, message = judge_hardware(
+            self.device.trouble or device.too_warm, **device.counts)
         yield conversions.to_status(
             f'{self.get_name()}: hardware', ', '.join(self.values.names), level, message,
             {**device.counts, **device.clocks, **{
+                f'temperature of {name} in deg C': f'{x:.1f}'
+                for name, x in device.temperatures.items()}, **{
                 f'longest {name} in ms': f'{seconds * 1e3:.3f}'
                 for name, seconds in [*device.calls.longest.items()]}})
 
@@ -219,7 +228,8 @@ def _make_device(
     rate = values[PUBLISH_RATE.name]
     return HardwareDevice(
         [HardwareJoint(
-            make(joint, settings[joint]), own['flux_density_limit'], fallback_from(own), joint)
+            make(joint, settings[joint]), own['flux_density_limit'], fallback_from(own), joint,
+            own['temperature_limit'] or math.inf)
          for joint, own in ((x, values.of(x)) for x in values.names)],
         time=time_ns(), period=max(round(NANOSECONDS / rate), 1) if rate else 0,
         calls=Calls(values[TIMEOUT.name], Deadline()))

@@ -18,6 +18,8 @@ does and answers is the same.
     A NUMBER              -> A FIRST TIME LEVEL ...: levels that took effect, numbered from FIRST on
     M NUMBER              -> M FIRST TIME READING ...: the same of samples
     K                     -> K: a sign of life
+    C                     -> C TEMPERATURE of the coil, in millionths of a degree Celsius; C alone
+                             where it is not measured, as all verbs that the board does not know
 
 From the second on, a TIME in an answer to A and M is the time since the one before. Without a
 session, or in that of another host, all but H are answered with L alone.
@@ -107,6 +109,12 @@ class Board {
 
     void sample(int64_t when, int32_t reading) { samples_.add(when, reading); }
 
+    // Optional: the temperature of the coil, in millionths of a degree Celsius.
+    void warm(int32_t temperature) {
+        temperature_ = temperature;
+        measures_warmth_ = true;
+    }
+
     // The next byte for the line, if there is one.
     bool send(char &byte) {
         if (sent_ == filled_) {
@@ -123,7 +131,8 @@ class Board {
     }
 
   private:
-    int32_t limit_, resolution_, level_;
+    int32_t limit_, resolution_, level_, temperature_;
+    bool measures_warmth_;
     int64_t session_, watchdog_, heard_;
     // Levels ahead: a ring, rising in time.
     int64_t time_[KEPT];
@@ -233,6 +242,8 @@ class Board {
                 put(events_.count);
                 put(samples_.count);
                 put(before);
+            } else if (verb == 'C' && measures_warmth_) {
+                put(temperature_);
             }
         }
     }
