@@ -49,12 +49,12 @@ def driver(period=0, bench=None, **settings):
     return bench, device
 
 
-def serve(*benches, period=0, **calls):
+def serve(*benches, period=0, reconnect=False, **calls):
     """Return a worker that has started."""
     worker = HardwareWorker(lambda: HardwareDevice(
         [HardwareJoint(x, 0.5, name=f'joint_{i}') for i, x in enumerate(benches)],
         time=monotonic_ns(), period=period, calls=Calls(**{'limit': 60.0, **calls})),
-        monotonic_ns)
+        monotonic_ns, reconnect=reconnect)
     assert worker.started(60.0)
     return worker
 
@@ -763,6 +763,56 @@ def test_a_coil_that_could_not_be_switched_off_is_said_to_be_and_tried_until_it_
     assert 'the coil is switched off at last, after' in str(worker.failure)
     assert [x.level for x in worker.changes()] == [0.0]
     assert cable.levels == [0.0, 0.1, 0.0]
+
+
+def test_a_worker_that_is_to_reconnect_goes_on_from_zero_once_the_cable_is_in_again():
+    cable, other = Cable(), Bench()
+    worker = serve(cable, other, reconnect=True)
+    worker.receive(0, 0, 0.1)
+    worker.receive(1, 0, 0.2)
+    worker.receive(1, monotonic_ns() + 3600 * 1000 * MS, 0.3)
+    wait_until(lambda: cable.levels[-1] == 0.1 and other.levels[-1] == 0.2, 'the levels')
+    for _ in range(2):
+        cable.out = cable.cut = True
+        worker.receive(0, 0, 0.15)
+        wait_until(lambda: 'could NOT be switched off' in worker.trouble, 'the trouble')
+        assert other.levels[-1] == 0.0
+        with pytest.raises(BadInputError, match='no device'):
+            worker.receive(1, 0, 0.2)
+        cable.out = False
+        wait_until(lambda: 'the coil is switched off, and what was' in worker.trouble, 'the off')
+        # Time enough for a planner to hear of it; then 0 T comes first.
+        wait_until(lambda: worker.look_after() or not worker.trouble, 'the end of it')
+        assert worker.cut_offs == [0, 1]
+        for level in (0.15, 0.0, 0.12):
+            worker.receive(0, 0, level)
+        wait_until(lambda: cable.levels[-1] == 0.12, 'a new level')
+        assert 0.15 not in cable.levels
+    assert other.levels[-1] == 0.0
+    worker.close()
+    assert worker.failure is None
+    assert (cable.levels[-1], other.levels[-1]) == (0.0, 0.0)
+
+
+def test_a_worker_that_is_to_reconnect_ends_by_itself_only_for_errors_of_its_own(monkeypatch):
+    bench = Bench()
+    worker = serve(bench, period=5 * MS, reconnect=True)
+
+    def fail(now):
+        raise OSError('broken')
+    monkeypatch.setattr(bench, 'read', fail)
+    wait_until(lambda: 'broken' in worker.trouble, 'the trouble')
+    count = len(bench.levels)
+    wait_until(lambda: len(bench.levels) > count + 4, 'more attempts')
+    assert not any(bench.levels)
+    # An end is heard meanwhile.
+    worker.close()
+    assert worker.failure is None
+    worker = serve(Bench(), reconnect=True)
+    monkeypatch.setattr(worker.device, 'advance', lambda now: 1 / 0)
+    worker.receive(0, 0, 0.1)
+    wait_until(lambda: worker.failure is not None, 'the end')
+    worker.close()
 
 
 def test_a_worker_that_is_ended_meanwhile_says_that_the_coil_was_not_switched_off():

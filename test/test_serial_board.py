@@ -14,6 +14,7 @@ import tty
 from conftest import wait_until
 import numpy as np
 import pytest
+from std_msgs.msg import Float64
 
 from hmsa_ros.cli import main
 from hmsa_ros.device import _board
@@ -250,6 +251,52 @@ def test_a_board_whose_cable_is_pulled_switches_off_and_is_found_again(line):
     assert device.switch_off(time_ns()) == ''
     assert device.counts['state_lost'] == 1
     assert device.close() == ''
+
+
+@pytest.mark.ros
+def test_a_driver_goes_on_after_a_pulled_cable_when_it_is_asked_to(start, ros, line):
+    applied = ros.collect(
+        topics.FLUX_DENSITY_APPLIED.type, topics.FLUX_DENSITY_APPLIED.name,
+        topics.FLUX_DENSITY_APPLIED.qos)
+    status = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
+    health = ros.collect(topics.DIAGNOSTICS.type, topics.DIAGNOSTICS.name)
+    driver = start.hmsa('driver', '--ros-args', *(word for x in (
+        'hardware:=serial_board', f'hardware.port:={line.path}', 'hardware.reconnect:=true',
+        'publish_rate:=50.0', *(f'hardware.{key}:={x}' for key, x in SETTINGS.items()))
+        for word in ('-p', x)))
+    start.hmsa('planner')
+    setpoint = ros.publisher(topics.SETPOINT.type, 'planner/setpoint', topics.SETPOINT.qos)
+
+    def ask(stretch, *expected):
+        begin = len(status)
+        again = ros.node.create_timer(0.5, lambda: setpoint.publish(Float64(data=stretch)))
+        ros.spin_until(lambda: any(
+            x.value in expected for y in status[begin:] for x in y.values), expected)
+        again.cancel()
+
+    def level():
+        return applied[-1].magnetic_field.z if applied else math.nan
+
+    def says(severity):
+        return any(x.level == severity for y in health[-3:] for x in y.status
+                   if x.name == 'driver: hardware')
+    ros.spin_until(lambda: level() == 0.0, 'the level at the start')
+    ask(1.1, 'accepted', 'unchanged')
+    ros.spin_until(lambda: level() > 0.01, 'the coil on')
+    line.unplug()
+    ros.spin_until(lambda: line.board._level == 0, 'the watchdog of the board')
+    ros.spin_until(lambda: says(b'\2'), 'the error')
+    ask(1.2, 'interlock')
+    assert math.isnan(level())
+    line.plug()
+    driver.wait_for_output('the hardware obeys again: a new request is obeyed')
+    ros.spin_until(lambda: level() == 0.0, 'the coil off')
+    count = len(applied)
+    ask(1.2, 'accepted', 'unchanged')
+    ros.spin_until(lambda: level() > 0.01, 'the coil on again')
+    assert applied[count - 1].magnetic_field.z == 0.0
+    assert driver.stop() == 0, driver.output
+    assert line.board._level == 0
 
 
 def test_a_board_without_room_and_one_that_is_none_are_said(line, monkeypatch):

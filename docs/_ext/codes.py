@@ -103,9 +103,10 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'Send the request again: it starts from the current state. With after_cut_off resume the '
         'planner continues by itself.'),
     Code.INTERLOCK: (
-        'The interlock of the driver is open: the coil is off, and the rest of the sequence was '
-        'dropped.',
-        'Close the interlock, then send the request again. Nothing continues by itself.'),
+        'The interlock of the driver is open, or its hardware out of reach '
+        '(`hardware.reconnect`): the coil is off, and the rest of the sequence was dropped.',
+        'Close the interlock or plug the cable in, then send the request again. Nothing continues '
+        'by itself.'),
     Code.NONE: ('No request has come yet.', ''),
     Code.WAITING: (
         'The request is accepted and starts as soon as the current state is known.', ''),

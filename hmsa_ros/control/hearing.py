@@ -147,8 +147,9 @@ class Hearing:
     def interlock(self, joint: str) -> RefusedError:
         """Return why nothing is done with a joint that is locked."""
         return RefusedError(
-            Code.INTERLOCK, f'the interlock of the driver of joint {joint} is open and its coil '
-            'off; close it (~/interlock of the driver), then send a new request')
+            Code.INTERLOCK, f'the interlock of the driver of joint {joint} is open, or its '
+            'hardware out of reach (/diagnostics), and its coil off; close it (~/interlock of the '
+            'driver), then send a new request')
 
     def check_interlock(self, joints: Iterable[str]) -> None:
         """Raise `RefusedError` if one of some joints is locked."""

@@ -13,7 +13,7 @@ from time import monotonic, monotonic_ns, time_ns
 from typing import NamedTuple, TypeVar
 
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
-from hmsa_ros.device.hardware import Calls, Hardware, told
+from hmsa_ros.device.hardware import Calls, Hardware, HardwareError, told
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.device.watchdog import Fallback
 from hmsa_ros.errors import BadInputError, HmsaError
@@ -30,6 +30,9 @@ _PAUSE, _LONGEST_PAUSE, _LAST_ATTEMPTS = 0.05, 1.0, 0.7
 # In s, of an end with a call that does not return: waiting for it, for each call past it, and
 # for all that follows.
 _PATIENCE, _PAST, _HANGING = 0.8, 0.4, 2.5
+# After hardware has failed and obeys again, in s: a pause, and for how long commands are refused
+# then, so that planners hear of it.
+_BREATH, _AWAY = 0.2, 1.0
 # Longest start of a lone coil, in s.
 _START = 10.0
 _MEND = 'correct it, then start the driver again'
@@ -51,14 +54,20 @@ class HardwareWorker:
     ``make`` is called in its thread, as all of the hardware is. ``failure`` says why it has ended
     by itself, and ``trouble`` what keeps it from obeying: an error, while it goes on trying to
     switch off. That other thread calls `look_after` at times, and may look at the ``device``.
+
+    If it is to ``reconnect``, an error of hardware ends nothing: once the coils are off, it goes
+    on as after an interlock.
     """
 
     device: HardwareDevice  # since it has `started`
 
     def __init__(
             self, make: Callable[[], HardwareDevice], clock: Callable[[], int],
-            steady: Callable[[], int] = monotonic_ns) -> None:
+            steady: Callable[[], int] = monotonic_ns, *, reconnect: bool = False) -> None:
         self._make, self._clock, self._steady = make, clock, steady
+        self._reconnect = reconnect
+        self._away = ''  # why it has failed, before it goes on
+        self._resumes = 0.0  # until when commands are refused after that, by the monotonic clock
         self._steps = StepWatch()
         self._turn = Condition()
         self._ready = Event()
@@ -164,6 +173,9 @@ class HardwareWorker:
         """See whether the thread lives and its calls return; if not, switch off without it."""
         if self.failure is not None or self._saver is not None:
             return
+        if self._resumes and monotonic() >= self._resumes:
+            with self._turn:
+                self._turn.notify()
         if not self._thread.is_alive():
             self._save('the thread that serves the hardware has ended')
         elif overdue := self.device.calls.overdue():
@@ -198,18 +210,37 @@ class HardwareWorker:
             return
         finally:
             self._ready.set()
+        while self._serve():
+            pass
+
+    def _serve(self) -> bool:
+        """Look after the hardware; return whether to do so again after an error."""
         try:
+            if self._away:
+                self._come_back()
             while not self._ended:
+                if self._resumes and monotonic() >= self._resumes:
+                    self._resumes = 0.0
+                    self.device.lock(self._locked, self._clock())
+                    self.trouble = ''
                 self._see_clock()
                 self._hear()
                 self.device.advance(self._clock())
                 self._hand_over()
                 self._wait()
         except BaseException as error:
-            self._end(str(error) if isinstance(error, HmsaError) else
-                      f'the driver failed ({told(error)})')
-        else:
-            self._end('')
+            return self._end(
+                str(error) if isinstance(error, HmsaError) else
+                f'the driver failed ({told(error)})',
+                again=self._reconnect and isinstance(error, HardwareError))
+        return self._end('', again=False)
+
+    def _come_back(self) -> None:
+        """Begin to go on: all is off and locked for a while."""
+        self.trouble, self._away = (
+            f'{self._away}: the coil is switched off, and what was commanded is forgotten', '')
+        self.device.lock(self.trouble, self._clock())
+        self._resumes = monotonic() + _AWAY
 
     def _see_clock(self) -> None:
         """Look whether the clock was set, which nobody has been silent for."""
@@ -228,7 +259,7 @@ class HardwareWorker:
                 except BadInputError as error:
                     self._notices.append(Notice(Kind.REFUSED, command.joint, str(error)))
             elif left := self.device.switch_off(self._clock()):
-                raise HmsaError(left)
+                raise HardwareError(left)
 
     def _hand_over(self) -> None:
         self._notices.extend(self.device.notices())
@@ -255,12 +286,18 @@ class HardwareWorker:
                 left -= _WATCHED
             self._turn.wait(None if due is None else max(left, 0) / NANOSECONDS)
 
-    def _end(self, why: str) -> None:
-        """Switch off and close; go on trying where that fails, until the end is asked for."""
+    def _end(self, why: str, *, again: bool) -> bool:
+        """
+        Switch off and close; go on trying where that fails, until the end is asked for.
+
+        If it is to serve again, return whether it is to, and close nothing.
+        """
         begun, pause = monotonic(), _PAUSE
-        last = None
+        last, said = None, False
+        self._resumes = 0.0
         while left := self.device.switch_off(self._clock()):
-            if not self.trouble:
+            if not said:
+                said = True
                 self.trouble = (
                     f'{why or left}: the coil could NOT be switched off and may be on'
                     f'{f" ({left})" if why and left != why else ""}; cut the power of the '
@@ -275,14 +312,23 @@ class HardwareWorker:
             pause = min(2.0 * pause, _LONGEST_PAUSE)
             self.device.open()
         self._hand_over()
+        if again and not self._ended:
+            with self._turn:
+                # What fails again at once keeps nobody busy.
+                self._turn.wait_for(lambda: self._ended, _BREATH)
+            if not said:
+                self.device.open()
+            self._away = why
+            return True
         closed = '' if left else self.device.close()
-        if self._saver is not None or not (why or left or closed or self.trouble):
-            return
-        after = f' at last, after {monotonic() - begun:.1f} s' if self.trouble else ''
+        if self._saver is not None or not (why or left or closed or said):
+            return False
+        after = f' at last, after {monotonic() - begun:.1f} s' if said else ''
         self.failure = HmsaError(
             f'{why or left}: the coil was NOT switched off and may be on; cut the power of the '
             'amplifier' if left else
             f'{why or closed or "the hardware failed"}: the coil is switched off{after}; {_MEND}')
+        return False
 
     # -- without its own thread ----------------------------------------------------------------
 

@@ -172,7 +172,7 @@ PUBLISH_SCALARS = ParameterSpec(
 COMMON = (JOINT, JOINTS, COMMAND_SOURCE, PUBLISH_SCALARS)
 #: How often the time is looked at.
 TICK_SECONDS = 0.001
-# What a refused command leaves in force, and what while an interlock is open.
+# What a refused command leaves in force, and what while none is obeyed.
 _STAYS = ('the previous one stays in force', 'the coil is off')
 # Receipts of a joint, in ns: apart at least where commands come, and at most where none do.
 _RECEIPTS, _SIGNS_OF_LIFE = 20_000_000, 200_000_000
@@ -228,7 +228,7 @@ class DeviceJoint:
     @property
     def refuses(self) -> str:
         """What keeps commands from being obeyed, as in a receipt."""
-        if self._device.locked:
+        if self._device.locked or self._node.away:
             return conversions.INTERLOCK
         return conversions.CUT_OFF if self._number in self._device.cut_offs else ''
 
@@ -274,8 +274,8 @@ class DeviceJoint:
     def _refuse(self, why: str) -> None:
         self.refused += 1
         if self._tell_refused():
-            self._node.get_logger().error(
-                f'{self._of_me}command refused, {_STAYS[bool(self._device.locked)]}: {why}')
+            stays = _STAYS[self.refuses == conversions.INTERLOCK]
+            self._node.get_logger().error(f'{self._of_me}command refused, {stays}: {why}')
 
     def crowded(self) -> bool:
         """Return whether several publishers command this joint, and log it once."""
@@ -297,7 +297,8 @@ class DeviceNode(ManagedNode):
     """
 
     companion = ''
-    trouble = ''  # why no command is obeyed
+    trouble = ''  # why no command is obeyed any more
+    away = ''  # why none is at present
     values: JointParameters
     device: Any
     _joints: Sequence[DeviceJoint] = ()

@@ -67,6 +67,11 @@ TIMEOUT = ParameterSpec(
     'Longest time that a call of the hardware may take; past it the driver tries to switch off '
     'from another thread, and ends.', 's', 0.01, 1e3)
 
+RECONNECT = ParameterSpec(
+    'hardware.reconnect', False,
+    'Whether to go on once hardware that has failed, as by a pulled cable, obeys again: with the '
+    'coil off, after a new request, as after an open interlock. Otherwise the driver ends.')
+
 INTERLOCK = (
     ParameterSpec(
         'interlock_required', False,
@@ -78,6 +83,8 @@ INTERLOCK = (
         'Longest silence of a publisher that closed a required ~/interlock.', 's', 0.01, 1e3),
 )
 
+# What begins like a setting of a class, and is none.
+_NOT_ITS_OWN = (HARDWARE.name, TIMEOUT.name, RECONNECT.name)
 #: What a start value of `HARDWARE` may be called as well.
 SHORT = 'hardware'
 
@@ -85,6 +92,7 @@ PARAMETERS = (
     AUTOSTART,
     HARDWARE,
     TIMEOUT,
+    RECONNECT,
     *INTERLOCK,
     *OWN,
     *COMMON,
@@ -118,7 +126,7 @@ class DriverNode(DeviceNode):
         found = {}
         for prefix in ('hardware.', f'{joint}.hardware.'):
             for name, parameter in self._parameter_overrides.items():
-                if name.startswith(prefix) and name not in (HARDWARE.name, TIMEOUT.name):
+                if name.startswith(prefix) and name not in _NOT_ITS_OWN:
                     if not self.has_parameter(name):
                         self.declare_parameter(
                             name, parameter.value, ParameterDescriptor(read_only=True))
@@ -139,11 +147,12 @@ class DriverNode(DeviceNode):
             raise BadInputError(
                 'use_sim_time is true: expected false, hardware follows the clock of the machine')
         name = self.values[HARDWARE.name]
-        self.trouble = ''
+        self.trouble = self.away = ''
         ENDING.go_on()
         with ENDING.by_default():
             self.device = HardwareWorker(
-                partial(_make_device, name, self.values, self._settings), time_ns)
+                partial(_make_device, name, self.values, self._settings), time_ns,
+                reconnect=self.values[RECONNECT.name])
             while not self.device.started(_PATIENCE):
                 self.get_logger().warning(
                     f'waiting for {name}: it has not started yet, or its first write not returned')
@@ -192,12 +201,19 @@ class DriverNode(DeviceNode):
     def _go_on(self) -> None:
         self._mind_interlock()
         self.device.look_after()
-        if self.device.trouble != self.trouble:
-            self.trouble = self.device.trouble
-            self.get_logger().error(self.trouble)
-            for joint in self._joints:
-                # Nobody takes commands any more, and planners can see that.
-                joint.commands.close()
+        trouble = self.device.trouble
+        if trouble != (self.trouble or self.away):
+            if trouble:
+                self.get_logger().error(trouble)
+            else:
+                self.get_logger().info('the hardware obeys again: a new request is obeyed')
+            if self.values[RECONNECT.name]:
+                self.away = trouble
+            else:
+                self.trouble = trouble
+                for joint in self._joints:
+                    # Nobody takes commands any more, and planners can see that.
+                    joint.commands.close()
             self._diagnose()
         if self.device.failure is not None:
             self.failure, self.finished = self.device.failure, True
