@@ -24,6 +24,7 @@ from hmsa_ros.bag.definitions import message_definition
 from hmsa_ros.bag.writer import BagWriter, Topic
 from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.runs import recording_of
 from hmsa_ros.interfaces.actuator import parameters_of
 from hmsa_ros.interfaces.parameters import ACTUATOR_FIELDS
 from hmsa_ros.model.creep import Creep
@@ -616,6 +617,20 @@ def test_a_recording_that_begins_while_the_field_is_on_is_verified(tmp_path):
     assert found.largest_difference < SAME
     assert found.unapplied_count == 0
     assert level_results(read_runs(tmp_path / 'bag')[0])[0].duration < 1.0
+
+
+def test_levels_that_the_recorder_lost_are_those_of_the_commands(tmp_path):
+    messages = simulated()
+    reported = applied(messages, 0)
+    del reported[3:5]
+    part = one(
+        tmp_path / 'bag', messages + reported, lost=json.dumps({'/flux_density_applied': 2}),
+        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert [(x.stamp, x.flux_density) for x in part.run.levels] == [
+        (x.stamp, x.flux_density) for x in part.run.commands]
+    assert 'lost 2 of /flux_density_applied' in ' '.join(part.run.notes)
+    recording, _, _ = recording_of(part.run)
+    assert len(recording.levels) == len(part.run.commands) + 1
 
 
 def test_the_field_of_a_driver_that_measures_none_is_what_it_applied(tmp_path):

@@ -12,6 +12,7 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.bags import read_run
 from hmsa_ros.recordings.levels import in_force, without_repeats
 from hmsa_ros.recordings.record import Run
+from hmsa_ros.recordings.topics import APPLIED
 
 
 def read_bag(
@@ -33,7 +34,8 @@ def recording_of(
     """Return the recording that a run is, as `read_bag`; no level is a `BadInputError`."""
     block = actuator or run.planner
     # A recorder gets the latched changes of before after the first new one.
-    levels = sorted(run.applied, key=lambda x: x.stamp) or in_force(
+    whole = run.applied and not (run.commands and run.lost(APPLIED))
+    levels = run.levels if whole else in_force(
         (x,) for x in without_repeats(run.commands)[0])
     if not levels:
         raise BadInputError(

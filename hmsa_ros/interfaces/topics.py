@@ -27,8 +27,8 @@ SAMPLES = Quality(5000)
 LATCHED = Quality(1, latched=True)
 # News that is of no use any more when it is late.
 NEWEST = Quality(1, reliable=False)
-# The changes of level that took effect last, for late subscribers.
-CHANGES = Quality(100, latched=True)
+# The changes of level that took effect last, for late subscribers, and for a recorder that pauses.
+CHANGES = Quality(1000, latched=True)
 CLOCK = Quality(1, reliable=False)
 
 

@@ -372,7 +372,7 @@ class _Collected:
             notes.append(
                 f'{refused} commands are not finite or not along z: left out, as the plant '
                 'does.')
-        return Run(
+        run = Run(
             label, named, reader.path, samples.time, samples.logged, samples.stretch, samples.rate,
             samples.flux_density, tuple(self.commands.get(key, ())),
             _begun(self.applied.get(key, ()), int(samples.time[0])),
@@ -383,6 +383,11 @@ class _Collected:
                 {y for y, _ in self.sensors}) == 1), {**parameters, **given},
             plant, planner, known, self.left_out + refused + samples.left_out,
             (*notes, *samples.notes, *more), topics, summary)
+        if not (lost := run.lost(roles.COMMAND, roles.APPLIED)):
+            return run
+        return replace(run, notes=(
+            *run.notes, f'The recorder lost {" and ".join(lost)}, levels that are missing here: '
+            'record on a machine that is less busy.'))
 
 
 def _begun(levels: Sequence[Level], first: int) -> tuple[Level, ...]:

@@ -15,6 +15,7 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.recordings.levels import in_force, Level
 from hmsa_ros.recordings.parameters import number_of, of_joint
+from hmsa_ros.recordings.topics import APPLIED
 
 if TYPE_CHECKING:
     from hmsa_ros.bag.info import BagSummary
@@ -99,6 +100,12 @@ class Run:
                 f'the samples of {self.label} have shapes {sorted(shapes)}: expected one shape, '
                 'at least one sample, and increasing times')
 
+    def lost(self, *names: str) -> list[str]:
+        """Return how many messages of roles the recorder lost, as ``'3 of /name'``."""
+        counts = {} if self.summary is None else {x.name: x.lost for x in self.summary.topics}
+        return [f'{count} of {name}' for x in names
+                if (name := self.topics.get(x)) and (count := counts.get(name))]
+
     def number(self, name: str) -> float:
         """Return a number like ``'planner.slew_limit'``; 0 if unknown, negative or not finite."""
         value = number_of(of_joint(self.parameters, self.joint, name))
@@ -109,10 +116,10 @@ class Run:
         """
         Changes of the field in force, by stamp.
 
-        What the plant reported as applied; else the commands that were not superseded; else
-        changes of the measured flux density, known to one sample.
+        What the plant reported as applied; else, or where some of that was lost, the commands that
+        were not superseded; else changes of the measured flux density, known to one sample.
         """
-        if self.applied:
+        if self.applied and not (self.commands and self.lost(APPLIED)):
             return tuple(sorted(self.applied, key=lambda x: x.stamp))
         if self.commands:
             return in_force((x,) for x in self.commands)

@@ -208,9 +208,7 @@ def _unapplied(run: Run) -> int:
 
 def _notes(run: Run, left_out: int, unapplied: int) -> Iterator[str]:
     """Return what makes the recorded samples differ from the motion, or is lost."""
-    counts = {} if run.summary is None else {x.name: x.lost for x in run.summary.topics}
-    lost = [f'{count} of {name}' for role in (COMMAND, APPLIED, FORCE)
-            if (name := run.topics.get(role)) and (count := counts.get(name))]
+    lost = run.lost(COMMAND, APPLIED, FORCE)
     if lost:
         yield (f'the recorder lost messages, {" and ".join(lost)}: expected differences from '
                'there on')
