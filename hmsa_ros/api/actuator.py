@@ -634,7 +634,7 @@ class Actuator:
         ['arrived']
 
         """
-        from hmsa_ros.api.paths import along_wave, wave_of
+        from hmsa_ros.api.paths import segments_along, wave_of, wave_path
         from hmsa_ros.api.plan import Plan
 
         if isinstance(shape, str) and shape == 'square':
@@ -643,9 +643,11 @@ class Actuator:
             count = round(number(cycles, 'cycles', least=1.0, most=1e5))
             return self.plan([(wave.mean + amplitude, half), (
                 wave.mean - amplitude, half)] * count + [(self.block.rest, half)])
-        return Plan(self, along_wave(
+        path = wave_path(
             self, wave_of(self, shape, amplitude, offset),
-            (frequency, frequency if last is None else last), cycles, tolerance), 'path')
+            (frequency, frequency if last is None else last), cycles)
+        return Plan(self, segments_along(
+            self, path, (self.block.rest,) * 2, tolerance, 0.0), 'path')
 
     def wave_bands(self, shape: Any, amplitude: float, offset: float | None = None) -> Array:
         """

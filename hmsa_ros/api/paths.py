@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 # Shapes of waves that are followed as paths.
 SHAPES: dict[str, Shape] = {'sine': sine, 'triangle': triangle}
+# Points between two breaks of a wave.
+_OF_EACH = 8
 # Frequencies at which a sweep is held against the limits.
 _SWEPT = 50
 
@@ -122,11 +124,10 @@ def bands(actuator: 'Actuator', shape: Any, amplitude: float, offset: float | No
     return found
 
 
-def along_wave(
-        actuator: 'Actuator', wave: Wave, sweep: tuple[float, float], cycles: float,
-        tolerance: float) -> 'tuple[Segment, ...]':
+def wave_path(
+        actuator: 'Actuator', wave: Wave, sweep: tuple[float, float], cycles: float) -> Path:
     """
-    Plan a wave between two rests without a field, from a frequency in Hz to another.
+    Return the path of a wave between two rests without a field, from a frequency in Hz to another.
 
     Frequencies that limits do not allow are a `RefusedError`, others out of range `BadInputError`.
     """
@@ -142,8 +143,29 @@ def along_wave(
             f'an amplitude of {wave.amplitude:g} about {wave.mean:g} needs more than '
             f'{model.units.drive.name} and slew limits allow at {sweep[0]:g}'
             + (f' to {sweep[1]:g}' if last != first else '') + f' Hz: expected {reach or "less"}')
-    path = wave.path(frame, first, last, cycles)
-    return segments_along(actuator, path, (model.material.rest,) * 2, tolerance, 0.0)
+    return wave.path(frame, first, last, cycles)
+
+
+def wave_points(path: Path, unit: float) -> Array:
+    """Return times in s and stretches of a wave's path, by the unit of time, shape (n, 2)."""
+    count = len(path.breaks) - 1
+    times = np.interp(
+        np.arange(_OF_EACH * count + 1) / _OF_EACH, np.arange(count + 1), path.breaks)
+    return np.column_stack([times * unit, path.course(times)[0]])
+
+
+def smooth_points(times: Array, stretches: Array) -> Array:
+    """
+    Return time, stretch, rate and acceleration of the smooth path through points, shape (n, 4).
+
+    Points that are no path are a `BadInputError`.
+    """
+    times, stretches = _column(times), _column(stretches)
+    if len(times) < 2 or np.any(np.diff(times) <= 0.0):
+        raise BadInputError(
+            f'the path has {len(times)} points: expected at least 2, at increasing times')
+    since = times - times[0]
+    return np.column_stack([since, *Path.smooth(since, stretches).course(since)])
 
 
 def _frame(actuator: 'Actuator') -> Request:

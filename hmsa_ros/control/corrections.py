@@ -1,22 +1,29 @@
 """Plans that are corrected from what feedback has seen."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 import math
 
+import numpy as np
+
 from hmsa_ros.control.feedback import Feedback
+from hmsa_ros.control.learnt import believed, learnt_model
 from hmsa_ros.control.records import Severity, Verdict
 from hmsa_ros.control.slices import Clock, in_time, Work
 from hmsa_ros.control.trimming import trimmed
 from hmsa_ros.estimation import Estimate
 from hmsa_ros.estimation.correction import (
+    Ahead,
     AT_REST,
     caution,
+    CLEARLY,
     Course,
     expect,
+    expect_along,
     LITTLE,
     MUCH,
+    Outcome,
     SHARE,
     worthwhile,
 )
@@ -25,7 +32,7 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.drafting import Steps
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Planner
-from hmsa_ros.planning.timeline import Draft, Model, Plan
+from hmsa_ros.planning.timeline import Draft, Model, Plan, PlannedLevel
 
 # A correction gains at least this share of the step, less while a move has time for corrections:
 # what rests is not to be moved for little.
@@ -36,6 +43,12 @@ _NOISE = 0.02
 _SHORTEST = 0.3
 # Levels that differ by less, in units of load, are the same.
 _SAME = 1e-5
+# Natural periods after which a path that was joined is looked at again, and at least as many times
+# as long as planning took; periods and samples it is looked ahead for; levels before that count.
+_JOINED, _IDLE, _PERIODS, _SAMPLES, _BEFORE = 2, 4, 3, 61, 8
+# Deviations by which creep is known that a path takes into account: of what samples cannot tell
+# apart the sum counts.
+_CREEPS = 1.0
 # A step that is smaller counts as this one.
 _LEAST_STEP = 0.1
 
@@ -47,6 +60,9 @@ class Corrections:
         self._group, self._feedback, self._clock = group, feedback, clock
         # Times in ns at which moves that take longer are at rest.
         self._arrivals: dict[str, int] = {}
+        # Times in ns from which on paths are looked at again, and that planning one took.
+        self._looks: dict[str, int] = {}
+        self._spent: dict[str, int] = {}
         # What corrections that have been worked out are expected to leave.
         self._after: dict[str, float] = {}
 
@@ -88,7 +104,11 @@ class Corrections:
         for name in self._feedback.taken_back():
             yield self._work(name, partial(self._take_back, name))
         for name, planner in self._feedback.news():
-            if not planner.plan.segments or planner.as_sent(planner.soonest(now)):
+            if not planner.plan.segments:
+                continue
+            if planner.as_sent(planner.soonest(now)):
+                if self._leaves_path(name, now):
+                    yield self._work(name, partial(self._rejoin, name))
                 continue
             estimate = self._feedback.state(name, planner.soonest(now))
             if estimate is None:
@@ -112,9 +132,12 @@ class Corrections:
         planner = self._group.planners[name]
         plan, soonest = planner.plan, planner.soonest(now)
         place = plan.under_way(soonest)
-        if place < 0 or planner.as_sent(soonest):
+        if place < 0:
             return {}
         segment = plan.segments[place]
+        if planner.as_sent(soonest):
+            return {} if _ahead(planner, soonest) is None else {
+                name: (yield from planner.draft_path_anew(soonest, planner.model, None))}
         if place + 1 < len(plan.segments) or segment.arrival is None or segment.arrival > soonest:
             draft = yield from planner.draft_resumption(now)
             return {} if draft is None or draft.missed else {name: draft}
@@ -169,6 +192,62 @@ class Corrections:
         self._after[name] = after.size
         return {name: draft}
 
+    def _leaves_path(self, name: str, now: int) -> bool:
+        """Return whether a path under way may be expected to be left, every natural period."""
+        planner = self._group.planners[name]
+        begin = planner.soonest(now + self._spent.get(name, 0))
+        ahead = _ahead(planner, begin) if begin >= self._looks.get(name, 0) else None
+        estimate = None if ahead is None else self._feedback.state(name, begin)
+        if ahead is None or estimate is None:
+            return False
+        self._looks[name] = begin + _period(planner)
+        left = self._leaves(estimate, planner, planner.plan.levels, ahead)
+        # At best nothing but what is not known.
+        return self._nearer(name, left, replace(left, misses=0.0 * left.misses), estimate)
+
+    def _leaves(
+            self, estimate: Estimate, planner: Planner, levels: Sequence[PlannedLevel],
+            ahead: Ahead) -> Outcome:
+        """Return how far levels from the time of an estimate on lead off a path."""
+        first, begin = planner.plan.place(estimate.time - 1), estimate.time
+        end = begin + round(ahead.times[-1] * NANOSECONDS)
+        course = (*planner.plan.levels[max(first - _BEFORE, 0):first + 1],
+                  *(x for x in levels if begin <= x.stamp <= end))
+        return expect_along(
+            estimate, [(x.stamp, x.flux_density) for x in course], ahead,
+            planner.options.slew_limit)
+
+    def _nearer(self, name: str, before: Outcome, after: Outcome, estimate: Estimate) -> bool:
+        """Return whether another course of a path is to take the place of that in force."""
+        planner = self._group.planners[name]
+        model = planner.plan.level(estimate.time).model
+        return worthwhile(
+            before, after, max(_GAIN * _range(planner, estimate.time), _NOISE * estimate.noise),
+            little=0.0, share=SHARE if self._feedback.adapted(name, model) else CLEARLY)
+
+    def _rejoin(self, name: str, now: int) -> Steps[Mapping[str, Draft]]:
+        """Plan the rest of a path anew by what is known now, if that stays nearer to it."""
+        planner, begun = self._group.planners[name], self._clock()
+        begin = planner.soonest(now + self._spent.get(name, 0))
+        estimate = self._feedback.state(name, begin)
+        ahead = _ahead(planner, begin)
+        if estimate is None or ahead is None:
+            return {}
+        model = learnt_model(
+            planner.model, estimate, planner.plan.segments[-1].stretch, _CREEPS)
+        draft = yield from planner.draft_path_anew(
+            begin, model, believed(estimate, creeps=bool(model.actuator.creep)))
+        spent = self._clock() - begun
+        self._spent[name] = spent + spent // 2
+        self._looks[name] = begin + max(_JOINED * _period(planner), _IDLE * spent)
+        before, after = (self._leaves(estimate, planner, x, ahead)
+                         for x in (planner.plan.levels, draft.levels))
+        if max(abs(x.flux_density) for x in draft.levels) > self._feedback.possible(
+                name) or not self._nearer(name, before, after, estimate):
+            return {}
+        self._after[name] = after.size
+        return {name: draft}
+
     def take(self, drafts: Mapping[str, Draft], now: int, request: str) -> Verdict | None:
         """Take a correction worked out for a time in ns; None where nothing changes."""
         for name, draft in drafts.items():
@@ -208,3 +287,30 @@ def _course(plan: Plan, begin: int, gain: float) -> tuple[Course, float]:
         segment.arrival or kept[-1].stamp, segment.stretch, levels[max(first - 1, 0)].flux_density,
         math.nan if end is None else _relaxed(kept[-1].model, segment.stretch)), max(
             gain * abs(segment.stretch - start), gain * _LEAST_STEP, segment.vibration)
+
+
+def _period(planner: Planner) -> int:
+    """Return the natural period about the end of the plan in ns."""
+    model = planner.model
+    return model.ns(2.0 * math.pi / model.frequency(planner.plan.segments[-1].stretch))
+
+
+def _ahead(planner: Planner, begin: int) -> Ahead | None:
+    """Return the next part of the path under way at a time in ns; None where little is left."""
+    plan = planner.plan
+    segment, period = plan.segments[plan.under_way(begin)], _period(planner)
+    if segment.path is None or segment is not plan.segments[-1]:
+        return None
+    since = (begin - segment.since) / NANOSECONDS
+    left = segment.path.breaks[-1] - since
+    if left * NANOSECONDS < _JOINED * period:
+        return None
+    # Not the way back to it.
+    times = np.linspace(period, min(_PERIODS * period, left * NANOSECONDS), _SAMPLES) / NANOSECONDS
+    return Ahead(times, segment.path.course(times + since)[0])
+
+
+def _range(planner: Planner, time: int) -> float:
+    """Return the range of the path under way at a time in ns."""
+    path = planner.plan.segments[planner.plan.under_way(time)].path
+    return 0.0 if path is None else float(np.ptp(path.course(path.breaks)[0]))

@@ -25,7 +25,7 @@ from hmsa_ros.judge import Sensor
 from hmsa_ros.model.equations import equilibrium_stretch
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Planner
+from hmsa_ros.planning.planner import Believed, Planner
 from hmsa_ros.planning.timeline import Model
 
 #: What the parameter `feedback` can be.
@@ -259,8 +259,7 @@ class Feedback:
         return self._joints[name].words(
             self._group.planners[name].plan, now, adapting=self.mode == 'adapt')
 
-    def _believed(
-            self, name: str, time: int) -> tuple[float, float, tuple[float, ...]] | None:
+    def _believed(self, name: str, time: int) -> Believed | None:
         """Return what `hmsa_ros.planning.planner.Planner` is to believe of a time in ns."""
         try:
             found = self.state(name, time) if self.adapted(name) else None
@@ -288,9 +287,9 @@ class Feedback:
             return None
         return self._predicted(name, joint, time)
 
-    def adapted(self, name: str) -> bool:
-        """Return whether plans use parameters that were learnt."""
-        return self._group.planners[name].model != self._nominal[name]
+    def adapted(self, name: str, model: Model | None = None) -> bool:
+        """Return whether plans, or one by a model, use parameters that were learnt."""
+        return (model or self._group.planners[name].model) != self._nominal[name]
 
     def follows(self, name: str) -> bool:
         """Return whether plans for a joint begin from what is estimated."""

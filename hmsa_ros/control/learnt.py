@@ -9,12 +9,14 @@ import numpy as np
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation import Estimate
+from hmsa_ros.estimation.motion import followed
 from hmsa_ros.files import write_text, yaml_text
 from hmsa_ros.identification.files import known_lines
 from hmsa_ros.identification.known import Known
 from hmsa_ros.identification.quantities import BRANCHES, derivative, QUANTITIES, values_of
 from hmsa_ros.interfaces.actuator import parameters_of
 from hmsa_ros.model.simulation import check_stretch
+from hmsa_ros.planning.planner import Believed
 from hmsa_ros.planning.timeline import Model
 
 # A model is another one from this share of a parameter, and this many of its deviations, on.
@@ -23,14 +25,25 @@ _NEWS, _SURE = 1e-3, 0.5
 _OTHERS = ('coil_time_constant', 'stretch_bias', 'stretch_gain')
 
 
-def learnt_model(model: Model, estimate: Estimate, held: float) -> Model:
-    """Return a model with an estimate's parameters; as it is if that cannot hold a stretch."""
+def learnt_model(
+        model: Model, estimate: Estimate, held: float, sure: float | None = None) -> Model:
+    """
+    Return a model with an estimate's parameters; as it is if that cannot hold a stretch.
+
+    It creeps if that is known by more deviations than given; default by as many as for a move.
+    """
     try:
-        found = estimate.model(model.options)
+        found = estimate.model(model.options, *([] if sure is None else [sure]))
         check_stretch(held, found.material, 'stretch')
     except BadInputError:
         return model
     return found
+
+
+def believed(estimate: Estimate, *, creeps: bool) -> Believed:
+    """Return what a plan begins from, which takes creep into account or does not."""
+    return estimate.stretch, estimate.rate, (
+        followed(estimate.values, estimate.stretch) if creeps else ())
 
 
 def differs(model: Model, estimate: Estimate) -> bool:

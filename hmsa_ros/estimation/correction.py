@@ -8,8 +8,10 @@ in a move, when little is known, a course that forgives errors so wins against o
 for parameters which are a guess.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +25,8 @@ TOLERANCE = 5e-3
 #: A correction leaves at most this share of what the course in force leaves, while there is time
 #: for more of them, and at rest.
 SHARE, AT_REST = 0.9, 0.5
+#: And of what a path by the model given leaves.
+CLEARLY = 0.25
 #: Share of the step that is to be gained before samples have shown an arrival.
 MUCH = 0.05
 #: Share of the step up to which what a correction changes is little.
@@ -80,6 +84,13 @@ class Outcome:
         return float(np.linalg.norm(self.misses - other.misses))
 
 
+class Ahead(NamedTuple):
+    """A path as far as it is looked ahead."""
+
+    times: Array  # in s from when a course may still be changed, shape (n,)
+    stretch: Array  # wanted then, shape (n,)
+
+
 #: What a motion leaves that cannot be followed.
 _NOWHERE = Outcome(np.full(3, math.inf), np.zeros((3, 3)))
 
@@ -121,6 +132,23 @@ def expect(
         motion.stretch[0] - stretch, motion.rate[0] / frequency, stretch - course.target
     ]), rows @ estimate.off
     return Outcome(misses + off, rows @ estimate.covariance @ rows.T - np.outer(off, off))
+
+
+def expect_along(
+        estimate: Estimate, levels: Sequence[tuple[int, float]], ahead: Ahead,
+        slew_limit: float = math.inf) -> Outcome:
+    """Return how far levels (stamp in ns, T) are expected to lead off a path, in the mean."""
+    begin = estimate.time
+    motion = follow(
+        estimate.values, estimate.free, (estimate.stretch, estimate.rate),
+        Levels(np.array([(x - begin) / NANOSECONDS for x, _ in levels]),
+               np.array([x for _, x in levels]), slew_limit), 0.0, ahead.times)
+    if motion is None:
+        return _NOWHERE
+    rows = motion.by / math.sqrt(len(ahead.times))
+    off = rows @ estimate.off
+    return Outcome((motion.stretch - ahead.stretch) / math.sqrt(len(ahead.times)) + off,
+                   rows @ estimate.covariance @ rows.T - np.outer(off, off))
 
 
 def worthwhile(

@@ -89,9 +89,13 @@ class Estimate:
     @property
     def actuator(self) -> ActuatorParameters:
         """The block; it creeps where that is known of it."""
+        return self.block(_CREEPS)
+
+    def block(self, sure: float) -> ActuatorParameters:
+        """Return the block; it creeps where a ratio is known by more than so many deviations."""
         found, (ratio, time) = actuator_of(self.values), BRANCHES[0]
         value = self.values[ratio]
-        if ratio in self.free and value > _CREEPS * self.deviations[ratio]:
+        if ratio in self.free and value > sure * self.deviations[ratio]:
             return replace(found, creep=Creep((value,), (self.values[time],)))
         return found
 
@@ -104,9 +108,10 @@ class Estimate:
         left[known], left[:, known] = 0.0, 0.0
         return replace(self, covariance=left, off=np.zeros_like(self.off))
 
-    def model(self, options: PlannerOptions) -> Model:
-        """Return the model to plan with; the estimated lag takes the place of the options'."""
-        return Model(self.actuator, replace(options, **{x: self.values[x] for x in ESTIMATED}))
+    def model(self, options: PlannerOptions, sure: float = _CREEPS) -> Model:
+        """Return the model to plan with, of `block`; estimates take the place of options."""
+        return Model(
+            self.block(sure), replace(options, **{x: self.values[x] for x in ESTIMATED}))
 
 
 class Estimator:

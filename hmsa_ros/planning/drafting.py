@@ -43,6 +43,11 @@ _SETTLED = 1e-6
 _STOPPED = 1e-7
 # Codes of plans that do not do what was requested.
 _WARNINGS = (Code.TOO_DAMPED, Code.INDISTINGUISHABLE, Code.SPELL_TOO_SHORT)
+# Share of a natural period in which a path is joined again: in a longer one vibration swings
+# farther than if it were left alone.
+_BACK = 0.4
+# Deviation from a path, as a share of its range, that is too little for a correction to keep.
+_ANEW = 1e-4
 # Setpoints that are checked between two pauses, which takes some 0.1 ms; levels take more.
 _CHECKED = 200
 
@@ -204,11 +209,37 @@ def draft_path(
         times = np.append(0.0, times[ahead])
         rows = np.column_stack([here, rows[:, ahead]])
         path = Path.through(times, rows[0], rows[1], None if given is None else rows[2])
-    frame = replace(_frame(model, state), target=float(rows[0, -1]))
     yield
-    move = yield from along(frame, path, model.options.path_tolerance)
+    draft = yield from _along(outset, path, float(rows[0, -1]), model.options.path_tolerance)
+    return replace(draft, segments=(
+        replace(draft.segments[0], path=path.scaled(1.0 / unit)),))
+
+
+def draft_path_anew(outset: Outset) -> Steps[Draft]:
+    """
+    Plan what is left of the path under way anew, back to it within half a natural period.
+
+    What cannot be carried out is a `RefusedError`.
+    """
+    model, state, place = outset.model, outset.state, outset.plan.under_way(outset.begin)
+    segment = outset.plan.segments[place]
+    if segment.path is None:
+        raise ValueError('the setpoint under way is no path')
+    left = segment.path.scaled(model.units.time).since(model.time(outset.begin - segment.since))
+    span = min(_BACK * 2.0 * math.pi / model.frequency(segment.stretch), float(left.breaks[-1]))
+    draft = yield from _along(
+        outset, left.joined(state.stretch, state.rate, span), segment.stretch,
+        max(model.options.path_tolerance, _ANEW))
+    return replace(draft, resumed=place, segments=(replace(
+        draft.segments[0], since=segment.since, path=segment.path),))
+
+
+def _along(outset: Outset, path: Path, target: float, tolerance: float) -> Steps[Draft]:
+    """Follow a path to rest at a target."""
+    move = yield from along(
+        replace(_frame(outset.model, outset.state), target=target), path, tolerance)
     return (yield from draft_moves(
-        outset, [Setpoint(frame.target, math.inf)], first=lambda request: move))
+        outset, [Setpoint(target, math.inf)], first=lambda request: move))
 
 
 def draft_setpoints(outset: Outset, setpoints: Sequence[Setpoint]) -> Steps[Draft | None]:

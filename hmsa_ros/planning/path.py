@@ -37,6 +37,8 @@ _SHARE = 0.15
 # Levels of a path at the least and at the most, of a natural period, of a block, by which blocks
 # overlap, and levels at the end that are corrected at the most.
 _FEWEST, _MOST, _OF_EACH, _BLOCK, _OVERLAP, _LAST = 24, 200_000, 6, 200, 12, 240
+# Breaks of a way back to a path.
+_JOINT = 9
 # How often ramps are allowed for, and the change of a load that is none.
 _RAMPED, _SETTLED = 60, 1e-9
 #: How near a path the actuator is on it, stretch.
@@ -104,6 +106,34 @@ class Path:
         return Path(
             np.append(0.0, self.breaks[begins:] - time),
             lambda t: self.course(t + time))
+
+    def scaled(self, unit: float) -> 'Path':
+        """Return the path with its times in another unit, so many old ones long."""
+        scale = np.array([[1.0], [unit], [unit * unit]])
+
+        def course(t: Array) -> tuple[Array, Array, Array]:
+            stretch, rate, change = scale * self.course(t * unit)
+            return stretch, rate, change
+
+        return Path(self.breaks / unit, course)
+
+    def joined(self, stretch: float, rate: float, span: float) -> 'Path':
+        """Return the path from a state beside its begin, which it leads back from in a span."""
+        here = self.course(np.zeros(1))
+        off, fast = stretch - float(here[0][0]), rate - float(here[1][0])
+        back = np.polynomial.Polynomial([
+            off, fast * span, 0.0, -10.0 * off - 6.0 * fast * span,
+            15.0 * off + 8.0 * fast * span, -6.0 * off - 3.0 * fast * span])
+        slope, curve = back.deriv(), back.deriv(2)
+
+        def course(t: Array) -> tuple[Array, Array, Array]:
+            share = np.minimum(t / span, 1.0)
+            more = back(share), slope(share) / span, curve(share) / span ** 2
+            wanted = self.course(t)
+            return wanted[0] + more[0], wanted[1] + more[1], wanted[2] + more[2]
+
+        joint = np.linspace(0.0, span, _JOINT)
+        return Path(np.union1d(self.breaks, joint), course)
 
 
 def _quintic(spans: Array, x: Array, v: Array, a: Array) -> Array:

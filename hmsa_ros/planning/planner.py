@@ -25,6 +25,9 @@ from hmsa_ros.planning.timeline import Draft, Model, Options, Plan
 
 __all__ = ['Options', 'Planner']
 
+#: Stretch, rate in 1/s and what branches follow.
+Believed = tuple[float, float, tuple[float, ...]]
+
 
 class Planner(RunningPlan):
     """Keeps one timeline and replaces its future on request."""
@@ -37,8 +40,7 @@ class Planner(RunningPlan):
             Model(actuator, options), actuator.rest if stretch is None else stretch)
         #: Returns stretch, rate in 1/s and what branches follow, as samples show them of a time in
         #: ns; None for what is predicted.
-        self.believed: Callable[
-            [int], tuple[float, float, tuple[float, ...]] | None] = lambda time: None
+        self.believed: Callable[[int], Believed | None] = lambda time: None
 
     @property
     def options(self) -> Options:
@@ -167,6 +169,11 @@ class Planner(RunningPlan):
                 yield
         return (yield from drafting.draft_resumption(outset))
 
+    def draft_path_anew(
+            self, begin: int, model: Model, believed: Believed | None) -> Steps[Draft]:
+        """Plan what is left of the path under way anew under a model, from what is believed."""
+        return (yield from drafting.draft_path_anew(self._from(begin, model, believed)))
+
     def draft_trim(self, now: int, flux_density: float) -> Steps[Draft]:
         """Work out how to hold the setpoint under way by another level in T, from rest."""
         model, begin = self.model, self.soonest(now)
@@ -182,13 +189,15 @@ class Planner(RunningPlan):
         return replace(draft, segments=(anew,), resumed=place)
 
     def _outset(self, begin: int) -> Outset:
-        state = self._delayed(begin)
-        believed = self.believed(begin + self.delay)
+        return self._from(begin, self.model, self.believed(begin + self.delay))
+
+    def _from(self, begin: int, model: Model, believed: Believed | None) -> Outset:
+        state = model.taken_from(self._delayed(begin), self.model)
         if believed is not None:
             state = replace(
-                state, stretch=believed[0], rate=believed[1] * self.model.units.time,
+                state, stretch=believed[0], rate=believed[1] * model.units.time,
                 followed=believed[2] or state.followed)
-        return Outset(self.plan, self.model, begin, state, self._history.stale)
+        return Outset(self.plan, model, begin, state, self._history.stale)
 
     def as_sent(self, time: int) -> bool:
         """Whether levels are in force at a time in ns that are to be as somebody sent them."""

@@ -23,6 +23,7 @@ from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParamete
 from hmsa_ros.model.simulation import follow, longest_motion, sampled
 from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS, Units
+from hmsa_ros.planning.path import Path
 from hmsa_ros.planning.sequence import SHORT_SPELL
 from hmsa_ros.planning.shapers import creeping, get_shaper
 from hmsa_ros.planning.shapers.pace import PACE, Pace
@@ -246,6 +247,8 @@ class PlannedSegment:
     vibration: float = 0.0
     until: int | None = None  #: end as requested; None for one that is held on
     carried_out: bool = True  #: whether its commands were sent and took effect, as far as known
+    #: What is followed, in s from ``since`` on; None for a move.
+    path: Path | None = field(default=None, compare=False, repr=False)
 
     def shifted(self, span: int) -> 'PlannedSegment':
         """Return the segment with a span in ns added to all times."""

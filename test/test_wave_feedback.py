@@ -1,0 +1,169 @@
+"""Waves that feedback keeps at their amplitude and mean, on a plant that SciPy integrates."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from test_path import C1, force, LOAD, TIME, ZETA
+
+from hmsa_ros import Actuator
+from hmsa_ros.api.paths import smooth_points, wave_of, wave_path, wave_points
+from hmsa_ros.control.planner import PlannerRuntime
+from hmsa_ros.control.records import Send, Settings, StatusChanged, Stop, Trajectory
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.planner import Options, Planner
+
+MS, SECOND = 1_000_000, 1_000_000_000
+AMPLITUDE, LEAD = 0.1, 20 * MS
+NATURAL = math.sqrt(18.0 / (1.0 + C1)) / (2.0 * math.pi * TIME)
+EXACT = {'g': 1.0, 'damping': 1.0, 'remanence': 1.0, 'creep': 0.0}
+
+
+class Plant:
+    """The paper's block with other parameters, which may change at any time."""
+
+    def __init__(self, **parameters):
+        self.parameters = EXACT | parameters
+        self._state, self._load, self._now = [1.0, 0.0, 0.0], 0.0, 0
+        self.commands = []
+
+    def _motion(self, t, y):
+        x, v, held = y
+        p = self.parameters
+        stiffness = (force(x + 1e-6) - force(x - 1e-6)) / 2e-6
+        pull = (p['remanence'] * self._load - p['g'] * (force(x) + held)
+                - 0.5 * p['damping'] * ZETA * C1 * v + 0.25 * x ** -4 * v * v)
+        return [v, pull * 6.0 / (x ** -3 + C1), p['creep'] * stiffness * v - TIME / 0.05 * held]
+
+    def at(self, now):
+        """Return the stretch at a time in ns."""
+        due = [x for x in self.commands if x[0] <= now]
+        self.commands = self.commands[len(due):]
+        for stamp, level in [*due, (now, None)]:
+            if stamp > self._now:
+                self._state = solve_ivp(
+                    self._motion, (0.0, (stamp - self._now) / TIME / SECOND), self._state,
+                    method='DOP853', rtol=1e-9, atol=1e-11).y[:, -1]
+                self._now = stamp
+            self._load = self._load if level is None else level / LOAD
+        return self._state[0]
+
+
+class Run:
+    """A wave of the stretch that is sent as a path, and what comes of it."""
+
+    def __init__(self, plant, share, *, shape='sine', cycles=10, noise=1e-4, feedback='adapt'):
+        self.plant, self.noise, self.begin, self.now = plant, noise, 0, SECOND
+        self.frequency = share * NATURAL
+        rows = smooth_points(*wave_points(wave_path(
+            Actuator(), wave_of(Actuator(), shape, AMPLITUDE, None), (self.frequency,) * 2,
+            cycles), TIME).T)
+        self.times, self.wanted = rows[:, 0], rows[:, 1]
+        self.planner = Planner(paper_actuator(), Options(
+            flux_density_min=-0.5, flux_density_max=0.5, lead_time=LEAD, path_tolerance=1e-4))
+        self.runtime = PlannerRuntime(
+            PlannerGroup({'a': self.planner}),
+            Settings(takeover_timeout=0, heartbeat_period=0, feedback=feedback),
+            clock=lambda: self.now, steady=lambda: self.now)
+        self.runtime.active, self.runtime.one_clock = True, lambda: True
+        self.sent, self.codes, self.truth = [], [], []
+        self._random = np.random.default_rng(1)
+        path = [((tuple(x),), round(t * SECOND)) for t, *x in rows.tolist()]
+        self.runtime.request(Trajectory(
+            ('a',), path, len(path), path=path, follows=True))
+        self.begin = self.planner.plan.segments[0].since
+
+    def go(self, seconds):
+        """Go on for a time in s from the begin of the wave."""
+        while self.now < self.begin + seconds * SECOND:
+            for x in self.runtime.tick(self.now):
+                if isinstance(x, Send):
+                    assert x.stamp >= self.now
+                    self.sent.append((x.stamp, x.flux_density))
+                    self.plant.commands.append(self.sent[-1])
+                elif isinstance(x, StatusChanged):
+                    self.codes.append(x.verdict.code)
+            self.now += MS
+            stretch = self.plant.at(self.now)
+            self.truth.append((self.now, stretch))
+            for stamp, level in [x for x in self.sent if self.now - MS < x[0] <= self.now]:
+                self.runtime.applied('a', stamp, level)
+            if self.runtime.looks_at(self.now):
+                self.runtime.observed(
+                    'a', self.now, stretch + self.noise * self._random.normal(), math.nan,
+                    math.nan)
+        return self
+
+    @property
+    def off(self):
+        """Return times in s and how far off the wave the actuator is, as shares of it."""
+        times, stretch = np.array(self.truth).T
+        times = (times - self.begin) / SECOND
+        return times, (stretch - np.interp(times, self.times, self.wanted)) / AMPLITUDE
+
+    def kept(self, first, last):
+        """Return amplitude and mean from one cycle to another, as errors in shares of it."""
+        times, stretch = np.array(self.truth).T
+        turns = (times - self.begin) / SECOND * self.frequency
+        inside = (turns >= first) & (turns < last)
+        angle = 2.0 * math.pi * np.outer(turns[inside], np.arange(1, 6))
+        found = np.linalg.lstsq(np.column_stack([
+            np.ones(len(angle)), np.sin(angle), np.cos(angle)]), stretch[inside], rcond=None)[0]
+        return math.hypot(found[1], found[6]) / AMPLITUDE - 1.0, (found[0] - 1.0) / AMPLITUDE
+
+
+@pytest.mark.parametrize(('share', 'shape', 'cycles', 'others'), [
+    pytest.param(0.33, 'sine', 10, {'g': 0.9}, id='a third'),
+    pytest.param(0.33, 'sine', 10, {'g': 0.9, 'creep': 0.04}, id='creep'),
+    pytest.param(
+        0.12, 'triangle', 4, {'g': 1.1, 'remanence': 0.95}, id='triangle',
+        marks=pytest.mark.slow),
+    pytest.param(
+        0.9, 'sine', 24, {'g': 1.1, 'damping': 1.4, 'remanence': 0.95}, id='resonance')])
+def test_amplitude_and_mean_come_back_and_the_wave_ends_at_rest(share, shape, cycles, others):
+    closed, without = (
+        Run(Plant(**others), share, shape=shape, cycles=cycles, feedback=x)
+        for x in ('adapt', 'off'))
+    end = closed.times[-1]
+    ends = []
+    for run in (closed, without):
+        run.go(end + 0.05)
+        times, off = run.off
+        ends.append(np.ptp(off[times > end + 0.005]))
+    assert closed.codes.count('corrected') < 8
+    last = round(end * closed.frequency) - math.ceil(max(1.0, 2.0 * share))
+    if shape == 'sine':
+        assert abs(without.kept(last - 2, last)[0]) > 0.05
+        assert np.abs(closed.kept(last - 2, last)).max() < 3e-3
+    times, off = closed.off
+    late = (times > (last - 2) / closed.frequency) & (times < end)
+    assert np.abs(off[late]).max() < 5e-3
+    # Neither on the way, where plans meet, nor after it there is more than without.
+    assert np.abs(off).max() < np.abs(without.off[1]).max() + 2e-3
+    assert ends[0] < max(2e-3, 0.1 * ends[1])
+    # What has been handed out is not taken back.
+    stamps = [x for x, _ in closed.sent]
+    assert stamps == sorted(set(stamps))
+
+
+def test_what_changes_on_the_way_is_corrected_and_a_stop_comes_to_rest():
+    run = Run(Plant(), 0.33, cycles=16, noise=1e-3)
+    run.go(4.0 / run.frequency)
+    run.plant.parameters |= {'g': 0.93}
+    run.go(10.0 / run.frequency)
+    assert abs(run.kept(5, 6)[0]) > 0.03
+    run.go(15.0 / run.frequency)
+    assert np.abs(run.kept(13, 15)).max() < 3e-3
+    run.runtime.request(Stop())
+    arrival = run.planner.plan.segments[-1].arrival
+    run.go((arrival - run.begin) / SECOND + 0.05)
+    assert np.ptp([x for t, x in run.truth if t > arrival + 2 * MS]) < 0.01 * AMPLITUDE
+
+
+@pytest.mark.parametrize(('share', 'cycles'), [(0.33, 5), (0.9, 16)])
+def test_a_wave_of_an_actuator_that_is_as_known_is_left_as_it_is(share, cycles):
+    runs = [Run(Plant(), share, cycles=cycles, noise=3e-3, feedback=x) for x in ('adapt', 'off')]
+    sent = [run.go(run.times[-1]).sent for run in runs]
+    assert sent[0] == sent[1]
