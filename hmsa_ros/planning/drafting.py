@@ -9,7 +9,7 @@ from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 import math
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -210,9 +210,9 @@ def draft_path(
         rows = np.column_stack([here, rows[:, ahead]])
         path = Path.through(times, rows[0], rows[1], None if given is None else rows[2])
     yield
-    draft = yield from _along(outset, path, float(rows[0, -1]), model.options.path_tolerance)
-    return replace(draft, segments=(
-        replace(draft.segments[0], path=path.scaled(1.0 / unit)),))
+    return (yield from _along(
+        outset, path, float(rows[0, -1]), model.options.path_tolerance,
+        path=path.scaled(1.0 / unit)))
 
 
 def draft_path_anew(outset: Outset) -> Steps[Draft]:
@@ -227,19 +227,22 @@ def draft_path_anew(outset: Outset) -> Steps[Draft]:
         raise ValueError('the setpoint under way is no path')
     left = segment.path.scaled(model.units.time).since(model.time(outset.begin - segment.since))
     span = min(_BACK * 2.0 * math.pi / model.frequency(segment.stretch), float(left.breaks[-1]))
-    draft = yield from _along(
+    return replace((yield from _along(
         outset, left.joined(state.stretch, state.rate, span), segment.stretch,
-        max(model.options.path_tolerance, _ANEW))
-    return replace(draft, resumed=place, segments=(replace(
-        draft.segments[0], since=segment.since, path=segment.path),))
+        max(model.options.path_tolerance, _ANEW), since=segment.since, path=segment.path)),
+        resumed=place)
 
 
-def _along(outset: Outset, path: Path, target: float, tolerance: float) -> Steps[Draft]:
-    """Follow a path to rest at a target."""
+def _along(
+        outset: Outset, wanted: Path, target: float, tolerance: float,
+        **known: Any) -> Steps[Draft]:
+    """Follow a path to rest at a target, of whose setpoint more is known."""
     move = yield from along(
-        replace(_frame(outset.model, outset.state), target=target), path, tolerance)
-    return (yield from draft_moves(
-        outset, [Setpoint(target, math.inf)], first=lambda request: move))
+        replace(_frame(outset.model, outset.state), target=target), wanted, tolerance)
+    draft = yield from draft_moves(
+        outset, [Setpoint(target, math.inf)], first=lambda request: move)
+    segment = replace(draft.segments[0], **known)
+    return replace(draft, segments=(segment,), warning=draft.warning and segment)
 
 
 def draft_setpoints(outset: Outset, setpoints: Sequence[Setpoint]) -> Steps[Draft | None]:
