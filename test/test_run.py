@@ -5,6 +5,7 @@ import re
 import signal
 
 from mcap.reader import make_reader
+import numpy as np
 import pytest
 
 from hmsa_ros.recordings.bags import read_runs
@@ -50,6 +51,32 @@ def test_a_simulated_experiment_arrives_and_leaves_its_bag_and_a_report(start, t
     # The bag itself is held against rosbags behind each test.
     found, = read_runs(out / 'run')
     assert len(without_repeats(found.commands)[0]) == 2 * len(SETPOINTS)
+
+
+def test_a_wave_comes_back_to_its_amplitude_and_mean_in_the_nodes(start, tmp_path):
+    file, path, out = (tmp_path / x for x in ('softer.yaml', 'path.csv', 'out'))
+    file.write_text(MISMATCHED.replace('1.1', '0.9'))
+    wave = ('wave', 'sine', '--frequency', '30', '--amplitude', '0.05', '--path', str(path))
+    assert start.hmsa(*wave).wait(RUN_SECONDS) == 0
+    run = start.hmsa(
+        'run', '--path', str(path), '--simulate', '--feedback', 'adapt', '--params-file',
+        str(file), '--out', str(out), '--json')
+    assert run.wait(RUN_SECONDS) == 0, run.output
+    assert json.loads(run.stdout)['verdict'] == 'arrived'
+    found, = read_runs(out / 'run')
+    begin = without_repeats(found.commands)[0][0].stamp
+    turns = 30.0 * (np.asarray(found.time) - begin) / 1e9
+
+    def kept(first):
+        inside = (turns >= first) & (turns < first + 1)
+        angle = 2.0 * np.pi * turns[inside]
+        mean, *both = np.linalg.lstsq(np.column_stack([
+            np.ones(len(angle)), np.sin(angle), np.cos(angle), np.sin(2.0 * angle),
+            np.cos(2.0 * angle)]), found.stretch[inside], rcond=None)[0][:3]
+        return np.hypot(*both) / 0.05 - 1.0, (mean - 1.0) / 0.05
+
+    assert kept(1)[0] > 0.05
+    assert np.abs(kept(9)).max() < 3e-3
 
 
 @pytest.mark.slow

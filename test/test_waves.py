@@ -129,7 +129,13 @@ def test_the_command_tells_the_reach_first_and_writes_levels(tmp_path, capsys):
     written = np.loadtxt(out, delimiter=',', skiprows=1)
     assert main([*wave, '--offset', '1.1', '--json']) == 0
     assert np.allclose(json.loads(capsys.readouterr().out)['levels'], written, atol=1e-12)
-    assert main(['wave', 'sweep', *wave[2:], '--to', '40']) == 0
+    assert main(['wave', 'sweep', *wave[2:], '--to', '40', '--path', str(out)]) == 0
+    times, stretch = np.loadtxt(out, delimiter=',', skiprows=1).T
+    assert (stretch[0], stretch[-1]) == (1.0, 1.0)
+    assert np.ptp(stretch) == pytest.approx(0.1, rel=1e-3)
+    assert np.all(np.diff(times) > 0.0)
+    assert main(['wave', 'square', *wave[2:], '--path', str(out)]) == 2
+    assert 'a square wave is no path: expected' in capsys.readouterr().err
     for extra, words in ((['--to', '40'], 'expected --to HZ with sweep'),
                          (['--amplitude', '3'], 'an extreme of the wave is -2'),
                          (['--frequency', '900'], 'Hz: expected 0.08')):

@@ -20,7 +20,7 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_command, add_options, NAMESPACE
 from hmsa_ros.cli.progress import progress
-from hmsa_ros.cli.setpoints import add_sequence, levels_of
+from hmsa_ros.cli.setpoints import add_sequence, levels_of, path_of
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
@@ -100,7 +100,8 @@ def run(arguments: argparse.Namespace) -> int:
                 f'interrupted; the bag so far: {experiment.bag}' if experiment.bag.exists()
                 else 'interrupted', highlight=False, soft_wrap=True)
             return ENDING.status
-        findings = [] if experiment.levels else [y for x in parts for y in x.evaluation.findings]
+        findings = [] if experiment.levels or experiment.path else [
+            y for x in parts for y in x.evaluation.findings]
         verdict, reason = _verdict(experiment, findings, done)
         verdicts.append(verdict)
         each.append(findings)
@@ -151,9 +152,10 @@ def _tolerances(arguments: argparse.Namespace) -> 'Tolerances | None':
     tolerance = arguments.tolerance
     if tolerance is None:
         return None
-    if arguments.levels is not None:
+    if arguments.levels is not None or arguments.path is not None:
+        given = 'levels' if arguments.path is None else 'path'
         raise BadInputError(
-            '--tolerance is given with --levels: expected setpoints with it; the end of levels is '
+            f'--tolerance is given with --{given}: expected setpoints with it; the end is '
             "judged by the planner's arrival_tolerance and vibration_tolerance")
     if not 0.0 < tolerance < math.inf:
         raise BadInputError(f'tolerance is {tolerance:g}: expected a share above 0')
@@ -168,12 +170,14 @@ def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
         arguments.params_file))
     if arguments.feedback is not None:
         expected['planner.feedback'] = arguments.feedback
+    if arguments.path is not None:
+        expected['planner.trajectory_mode'] = 'path'
     nodes = simulated_nodes(
         expected, str(arguments.params_file or ''), arguments.namespace
     ) if arguments.simulate else ()
     return Experiment(
         folder, tuple(arguments.setpoints), nodes, arguments.namespace,
-        tuple(arguments.joint.split(',')), expected, levels_of(arguments))
+        tuple(arguments.joint.split(',')), expected, levels_of(arguments), path_of(arguments))
 
 
 def _measure(experiment: 'Experiment', tolerances: 'Tolerances | None') -> 'list[Part]':
@@ -205,8 +209,8 @@ def _verdict(
     """Return the verdict on all setpoints, or on the end of levels, and why."""
     from hmsa_ros.judge import worst
 
-    if experiment.levels or not done.measured:
-        reason = ('the levels end at rest' if done.measured
+    if experiment.levels or experiment.path or not done.measured:
+        reason = ('the levels or the path end at rest' if done.measured
                   else 'no node publishes joint_states')
         if done.verdict.failure:
             return done.verdict.measured or done.verdict.code, done.verdict.failure
@@ -234,7 +238,7 @@ def _print(
     levels = _levels(parts) if experiment.levels else []
     if levels:
         print(level_table(levels, parts[0].run.plant.coordinate.drive))
-    elif any(x.evaluation.findings for x in parts):
+    elif not experiment.path and any(x.evaluation.findings for x in parts):
         print(setpoints(parts))
     seconds = [f'{key} {x:.1f} s' for key, x in done.seconds.items()]
     if done.pace < _SLOW:

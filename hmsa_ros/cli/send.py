@@ -12,7 +12,7 @@ import sys
 from typing import Any
 
 from hmsa_ros.cli.options import add_command, add_options, NAMESPACE, timeout_of
-from hmsa_ros.cli.setpoints import add_sequence, levels_of
+from hmsa_ros.cli.setpoints import add_sequence, levels_of, path_of
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import HmsaError
 
@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.lab.client import PlannerClient
 
     timeout = timeout_of(arguments)
-    levels = levels_of(arguments)
+    levels, path = levels_of(arguments), path_of(arguments)
     ENDING.note()
     with PlannerClient(
             namespace=arguments.namespace, joints=arguments.joint.split(','),
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.recorded:
             client.find_recorder()
         client.find_plant()
-        verdict = client.send(arguments.setpoints, levels)
+        verdict = client.send(arguments.setpoints, levels, path)
         print(verdict.message)
         if not arguments.wait:
             return 0
@@ -63,7 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
                 seen = line
                 print(line, file=sys.stderr, flush=True)
 
-        length = levels[-1][0] if levels else sum(span for _, span in arguments.setpoints)
+        length = sum(span for _, span in arguments.setpoints) + sum(
+            x[-1][0] for x in (levels, path) if x)
         verdict = client.follow(verdict, each=report, timeout=length + timeout)
         if verdict.failure:
             raise HmsaError(verdict.failure)

@@ -21,14 +21,37 @@ def add_sequence(parser: argparse.ArgumentParser) -> None:
              'limits of coil and block; levels that do not end at rest are followed by a shaped '
              'move to rest')
 
+    parser.add_argument(
+        '--path', type=Path, metavar='CSV',
+        help='instead of setpoints: CSV with the columns time and stretch, as hmsa wave --path '
+             'writes it, followed from rest to rest by a planner whose trajectory_mode is path; '
+             'with feedback: adapt it is corrected on the way')
+
+
+def path_of(arguments: argparse.Namespace) -> list[list[float]]:
+    """
+    Return time in s, stretch, rate and acceleration of the points of --path, if any.
+
+    What is no path is a `BadInputError`.
+    """
+    if arguments.path is None:
+        return []
+    from hmsa_ros.api.paths import read_path, smooth_points
+
+    found: list[list[float]] = smooth_points(*read_path(arguments.path)).tolist()
+    return found
+
 
 def levels_of(arguments: argparse.Namespace) -> list[tuple[float, float]]:
     """Return times in s and flux densities in T of --levels, if any, or raise `BadInputError`."""
-    if bool(arguments.setpoints) == (arguments.levels is not None):
+    given = [x for x, y in (
+        ('setpoints', arguments.setpoints), ('--levels', arguments.levels),
+        ('--path', arguments.path)) if y]
+    if len(given) != 1:
         raise BadInputError(
-            ('both setpoints and --levels are given' if arguments.setpoints
-             else 'neither setpoints nor --levels are given')
-            + ': expected STRETCH:SECONDS ... or --levels CSV')
+            (f'both {" and ".join(given[:2])} are given' if given
+             else 'neither setpoints nor --levels nor --path are given')
+            + ': expected STRETCH:SECONDS ..., or --levels CSV, or --path CSV')
     if arguments.levels is None:
         return []
     if arguments.levels.suffix.lower() in ('.yaml', '.yml'):

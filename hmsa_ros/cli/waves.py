@@ -11,11 +11,14 @@ example: hmsa wave sine --frequency 30 --amplitude 0.05 --out wave.csv
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_command, add_options, JSON
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
+
+if TYPE_CHECKING:
+    from hmsa_ros.api.actuator import Actuator
 
 
 def add_parser(subparsers: Any) -> None:
@@ -38,6 +41,9 @@ def add_parser(subparsers: Any) -> None:
          'parameter file of the actuator (default: the example block)'),
         ('--out', 'FILE', Path,
          'levels to write, ending in .csv, .parquet or .mat; an existing file is replaced'),
+        ('--path', 'FILE', Path,
+         'points of the wave to write, which hmsa run --path and hmsa send --path follow; no '
+         'square wave'),
         JSON)
 
 
@@ -58,6 +64,8 @@ def run(arguments: argparse.Namespace) -> int:
         shape = {'time': times, 'stretch': stretches}
     elif shape == 'sweep':
         shape = 'sine'
+    if arguments.path is not None:
+        _write_path(arguments, actuator, shape)
     bands = actuator.wave_bands(shape, arguments.amplitude, arguments.offset)
     if not arguments.json:
         print(f'an amplitude of {arguments.amplitude:g} is possible at '
@@ -79,6 +87,23 @@ def run(arguments: argparse.Namespace) -> int:
           f'{plan.flux_densities.max():.4g}{units.load_name}, at rest after {duration:.4g} s')
     for note in notes:
         print(f'note: {note}')
-    if arguments.out is not None:
-        print(f'{arguments.out} written')
+    for file in filter(None, (arguments.out, arguments.path)):
+        print(f'{file} written')
     return 0
+
+
+def _write_path(arguments: argparse.Namespace, actuator: 'Actuator', shape: Any) -> None:
+    """Write the points of the wave; a square wave is a `BadInputError`."""
+    from hmsa_ros.api.paths import wave_of, wave_path, wave_points
+    from hmsa_ros.recordings.tables import write_table
+
+    if shape == 'square':
+        raise BadInputError(
+            'a square wave is no path: expected --out FILE, or its extremes as setpoints of '
+            'hmsa run, which feedback corrects one by one')
+    first, last = arguments.frequency, arguments.to
+    path = wave_path(
+        actuator, wave_of(actuator, shape, arguments.amplitude, arguments.offset),
+        (first, first if last is None else last), arguments.cycles)
+    times, stretches = wave_points(path, actuator.model.units.time).T
+    write_table(arguments.path, {'time': times, 'stretch': stretches})

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 import math
 from time import monotonic, sleep
+from typing import Any
 from uuid import uuid4
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -187,7 +188,8 @@ class PlannerClient(Visitor):
 
     def send(
             self, setpoints: Sequence[tuple[float | Sequence[float], float]],
-            levels: Sequence[tuple[float, float]] = ()) -> Verdict:
+            levels: Sequence[tuple[float, float]] = (),
+            path: Sequence[Sequence[float]] = ()) -> Verdict:
         """
         Send a sequence that begins now and wait for the verdict.
 
@@ -198,6 +200,9 @@ class PlannerClient(Visitor):
         levels : sequence of (float, float)
             Instead, with no setpoints: time in s from now, and flux density in T of all joints
             from then on.
+        path : sequence of sequence of float
+            Instead: time in s from now, stretch of all joints, rate in 1/s and acceleration in
+            1/s^2, ending at rest. The planner's trajectory_mode must be path.
 
         Returns
         -------
@@ -214,7 +219,7 @@ class PlannerClient(Visitor):
         """
         deadline = monotonic() + self._timeout
         while True:
-            request = self.publish(setpoints, levels)
+            request = self.publish(setpoints, levels, path)
             self.spin_until(
                 lambda request=request: self.verdict.request == request,  # type: ignore[misc]
                 'the planner did not reply with a verdict')
@@ -228,7 +233,8 @@ class PlannerClient(Visitor):
 
     def publish(
             self, setpoints: Sequence[tuple[float | Sequence[float], float]],
-            levels: Sequence[tuple[float, float]] = ()) -> str:
+            levels: Sequence[tuple[float, float]] = (),
+            path: Sequence[Sequence[float]] = ()) -> str:
         """
         Send a sequence as `send` does, without waiting; return the name of the request.
 
@@ -238,8 +244,9 @@ class PlannerClient(Visitor):
             If the stretches are not as many as the joints, or the sequence is too long.
 
         """
-        points: list[tuple[float | Sequence[float], int]] = [
+        points: list[tuple[Any, int]] = [
             (level, round(time * NANOSECONDS)) for time, level in levels]
+        points += [(point, round(time * NANOSECONDS)) for time, *point in path]
         end = 0.0
         for stretch, span in setpoints:
             if np.size(stretch) not in (1, len(self._joints)):
@@ -252,7 +259,7 @@ class PlannerClient(Visitor):
             points.append((stretch, round(end * NANOSECONDS)))
         self._requested = uuid4().hex
         self._publisher.publish(to_trajectory(
-            points, self._joints, frame=self._requested, raw=bool(levels)))
+            points, self._joints, frame=self._requested, raw=bool(levels), path=bool(path)))
         return self._requested
 
     @property

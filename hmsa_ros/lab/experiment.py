@@ -49,11 +49,14 @@ class Experiment:
     #: parameters of running nodes by ``'node.name'``, from a parameter file
     expected: Mapping[str, object] = field(default_factory=dict)
     levels: Sequence[tuple[float, float]] = ()  #: time in s, and flux density in T from then on
+    #: time in s, stretch, rate in 1/s and acceleration in 1/s^2, ending at rest
+    path: Sequence[Sequence[float]] = ()
 
     @property
     def duration(self) -> float:
         """Length in s of the sequence."""
-        return sum(x for _, x in self.setpoints) + (self.levels[-1][0] if self.levels else 0.0)
+        return sum(x for _, x in self.setpoints) + sum(
+            x[-1][0] for x in (self.levels, self.path) if x)
 
     @property
     def bag(self) -> Path:
@@ -221,7 +224,7 @@ def recorder_of(experiment: Experiment, simulated: bool) -> NodeProcess:
 def _carry_out(experiment: Experiment, watch: 'Watch', progress: Tell) -> Verdict:
     """Send the sequence, and wait until the last setpoint has been watched for its span."""
     watch.sent = True
-    verdict = watch.client.send(experiment.setpoints, experiment.levels)
+    verdict = watch.client.send(experiment.setpoints, experiment.levels, experiment.path)
     begin = watch.now
     lead = watch.parameter('planner.lead_time')
     total = experiment.duration + (
@@ -266,7 +269,8 @@ def simulated_nodes(
         f'{PLANT}:start_paused': True, f'{PLANT}:publish_rate': rate,
         f'{PLANT}:publish_scalars': 'never',
         f'{PLANT}:real_time_factor': factor, f'{PLANNER}:use_sim_time': True,
-        f'{PLANNER}:feedback': settings.get(f'{PLANNER}.feedback', 'off')},
+        f'{PLANNER}:feedback': settings.get(f'{PLANNER}.feedback', 'off'),
+        f'{PLANNER}:trajectory_mode': settings.get(f'{PLANNER}.trajectory_mode', 'rest')},
         namespace, params_file),
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import zip_longest
 import json
 import math
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -82,22 +82,26 @@ def to_receipt(joint: str, time: int, command: int, refuses: str) -> TimeReferen
 
 
 def to_trajectory(
-        setpoints: Iterable[tuple[float | Sequence[float], int]], joints: str | Sequence[str], *,
-        stamp: int = 0, frame: str = '', raw: bool = False) -> JointTrajectory:
+        setpoints: Iterable[tuple[Any, int]], joints: str | Sequence[str], *,
+        stamp: int = 0, frame: str = '', raw: bool = False,
+        path: bool = False) -> JointTrajectory:
     """
     Return a request: stretches, of all joints or one a joint, each until a time from the start.
 
-    Times are in ns. If raw, they are levels in T, each from a time on. The stamp is the start, 0
-    for now; the planner's verdict repeats the frame.
+    Times are in ns. If raw, they are levels in T, each from a time on; on a path they are stretch,
+    rate (1/s) and acceleration (1/s^2) of all joints. The stamp is the start, 0 for now; the
+    planner's verdict repeats the frame.
     """
     names = [joints] if isinstance(joints, str) else list(joints)
+    fields = ('positions', 'velocities', 'accelerations') if path else (
+        ('effort',) if raw else ('positions',))
     return JointTrajectory(
         header=Header(stamp=to_time(stamp), frame_id=frame), joint_names=names,
         points=[
             JointTrajectoryPoint(
                 time_from_start=to_duration(time),
-                **{'effort' if raw else 'positions': np.broadcast_to(
-                    stretch, len(names)).tolist()})
+                **{field: np.broadcast_to(value, len(names)).tolist() for field, value in zip(
+                    fields, stretch if path else (stretch,), strict=True)})
             for stretch, time in setpoints])
 
 
