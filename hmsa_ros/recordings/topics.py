@@ -2,11 +2,13 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 import re
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.interfaces import topics as declared
+
+if TYPE_CHECKING:
+    from hmsa_ros.bag.reader import BagReader
 
 #: Message type by role: the end of a topic's name.
 TYPES = {
@@ -19,7 +21,7 @@ JOINT_STATES, COMMAND, APPLIED, FORCE, PLAN, TRAJECTORY, SETPOINT, STATUS, ESTIM
 _OF_A_JOINT = (COMMAND, APPLIED, FORCE, SETPOINT)
 
 
-def topics_by_joint(reader: BagReader) -> dict[str, dict[str, dict[str, str]]]:
+def topics_by_joint(reader: 'BagReader') -> dict[str, dict[str, dict[str, str]]]:
     """
     Return topics by namespace, joint (empty for the only one) and role.
 
@@ -80,7 +82,7 @@ def _topics_in(
     return topics
 
 
-def unanswered(reader: BagReader) -> Iterator[str]:
+def unanswered(reader: 'BagReader') -> Iterator[str]:
     """Yield a sentence for each topic of sequences that holds some without a verdict."""
     for topic, found in sorted(reader.topics.items()):
         if found.type != TYPES[TRAJECTORY] or not f'/{topic}'.endswith(f'/{TRAJECTORY}'):
@@ -97,7 +99,7 @@ def unanswered(reader: BagReader) -> Iterator[str]:
                    f'{"have" if count > 1 else "has"} no verdict on {status}: {why}')
 
 
-def _messages(reader: BagReader, topic: str) -> Iterator[Any]:
+def _messages(reader: 'BagReader', topic: str) -> Iterator[Any]:
     """Yield what can be decoded of a topic."""
     if topic not in reader.topics:
         return
