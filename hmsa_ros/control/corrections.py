@@ -254,6 +254,9 @@ class Corrections:
             words = self._feedback.words(name, self._clock())
             self._group.planners[name].take(draft, now)
             self._feedback.corrected(name, draft.begin, self._after.pop(name, 0.0))
+            if draft.segments[0].path is not None:
+                # What the path was corrected by also takes it to rest, should it be stopped.
+                self._feedback.use(name, draft.levels[0].model)
             return Verdict(
                 Severity.OK, Code.CORRECTED, f'corrected from samples: {words}', request)
         return None

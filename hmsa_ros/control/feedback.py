@@ -373,6 +373,11 @@ class Feedback:
             joint.moves.corrected.append(stamp)
             joint.moves.expected = expected
 
+    def use(self, name: str, model: Model) -> None:
+        """Plan with what a path under way was corrected by."""
+        self._joints[name].used = model
+        self._group.planners[name].take_model(model)
+
     @property
     def named(self) -> int:
         """How many parameters are estimated by name."""
