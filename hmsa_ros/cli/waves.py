@@ -41,7 +41,7 @@ def add_parser(subparsers: Any) -> None:
          'parameter file of the actuator (default: the example block)'),
         ('--out', 'FILE', Path,
          'levels to write, ending in .csv, .parquet or .mat; an existing file is replaced'),
-        ('--path', 'FILE', Path,
+        ('--path', 'CSV', Path,
          'points of the wave to write, which hmsa run --path and hmsa send --path follow; no '
          'square wave'),
         JSON)

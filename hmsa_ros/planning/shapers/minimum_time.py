@@ -25,9 +25,10 @@ def minimum_time(request: Request) -> Move:
     found: list[Move] = []
     refusals: list[RefusedError] = []
     # What the two-step command would find alone, it finds here.
-    shapers = [(push_brake, Work(_PUSHING)), (two_step, request.work)]
+    pushing = Work(_PUSHING)
+    shapers = [(push_brake, pushing), (two_step, request.work)]
     if request.delivery.period == 0.0 and request.delivery.slew < math.inf:
-        shapers.append((free_levels, Work(_PUSHING)))
+        shapers.append((free_levels, pushing))
     for shaper, work in shapers:
         try:
             found.append(shaper(replace(request, work=work)))
