@@ -386,8 +386,8 @@ class _Collected:
         if not (lost := run.lost(roles.COMMAND, roles.APPLIED)):
             return run
         return replace(run, notes=(
-            *run.notes, f'The recorder lost {" and ".join(lost)}, levels that are missing here: '
-            'record on a machine that is less busy.'))
+            *run.notes, f'The recorder lost {" and ".join(lost)}: levels may be missing; record '
+            'on a machine that is less busy.'))
 
 
 def _begun(levels: Sequence[Level], first: int) -> tuple[Level, ...]:
