@@ -14,16 +14,23 @@ import numpy as np
 
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.estimation import Estimate
-from hmsa_ros.estimation.correction import AT_REST, Course, expect, MUCH, Outcome, worthwhile
+from hmsa_ros.estimation.correction import (
+    AT_REST,
+    CLEARLY,
+    Course,
+    expect,
+    MUCH,
+    Outcome,
+    worthwhile,
+)
 from hmsa_ros.estimation.motion import rest
 from hmsa_ros.planning.planner import Planner
 from hmsa_ros.planning.timeline import Model
 
 # Other parameters are to leave less by this share of the step.
 _LEAST = 3e-4
-# Share of the step up to which a change is little; none is where the given ones are in use, and
-# others are to leave at most this share of what these leave.
-_LITTLE, _CLEARLY = 0.015, 0.25
+# Share of the step up to which a change is little; none is where the given ones are in use.
+_LITTLE = 0.015
 # Smaller steps are tried as this one.
 _STEP = 0.15
 
@@ -57,7 +64,7 @@ def clearly_better(
     before, after = (_together([x[i] for x in pairs]) for i in (0, 1))
     return worthwhile(
         before, after, MUCH if given and not shown else _LEAST,
-        little=0.0 if given else _LITTLE, share=_CLEARLY if given else AT_REST)
+        little=0.0 if given else _LITTLE, share=CLEARLY if given else AT_REST)
 
 
 def _shared(left: Outcome, step: float) -> Outcome:

@@ -10,7 +10,7 @@ import numpy as np
 from hmsa_ros.control.choice import clearly_better
 from hmsa_ros.control.field import Field
 from hmsa_ros.control.holds import Hold
-from hmsa_ros.control.learnt import alike, differs, learnt_model, save
+from hmsa_ros.control.learnt import alike, believed, differs, learnt_model, save
 from hmsa_ros.control.ledger import Ledger, Moves
 from hmsa_ros.control.records import EstimateChanged, Output, Settings, Severity
 from hmsa_ros.control.slices import Clock
@@ -18,7 +18,7 @@ from hmsa_ros.control.tracked import Joint
 from hmsa_ros.control.trust import Trust
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.estimation import Estimate, Estimator, Options, Prior
-from hmsa_ros.estimation.motion import followed, rest
+from hmsa_ros.estimation.motion import rest
 from hmsa_ros.estimation.words import differences
 from hmsa_ros.identification.known import Known
 from hmsa_ros.judge import Sensor
@@ -274,8 +274,8 @@ class Feedback:
         if at is None:
             return None
         shift = float(equilibrium_stretch(model.load(level), model.material)) - at[0]
-        return found.stretch + shift, found.rate, (
-            followed(found.values, found.stretch) if model.material.creep else ())
+        stretch, rate, behind = believed(found, creeps=bool(model.material.creep))
+        return stretch + shift, rate, behind
 
     def state(self, name: str, time: int) -> Estimate | None:
         """Return what plans may begin from at a time in ns; None where predictions count."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation import Estimate
+from hmsa_ros.estimation.estimator import CREEPS
 from hmsa_ros.estimation.motion import followed
 from hmsa_ros.files import write_text, yaml_text
 from hmsa_ros.identification.files import known_lines
@@ -26,14 +27,14 @@ _OTHERS = ('coil_time_constant', 'stretch_bias', 'stretch_gain')
 
 
 def learnt_model(
-        model: Model, estimate: Estimate, held: float, sure: float | None = None) -> Model:
+        model: Model, estimate: Estimate, held: float, sure: float = CREEPS) -> Model:
     """
     Return a model with an estimate's parameters; as it is if that cannot hold a stretch.
 
     It creeps if that is known by more deviations than given; default by as many as for a move.
     """
     try:
-        found = estimate.model(model.options, *([] if sure is None else [sure]))
+        found = estimate.model(model.options, sure)
         check_stretch(held, found.material, 'stretch')
     except BadInputError:
         return model

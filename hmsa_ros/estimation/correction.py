@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hmsa_ros.estimation.estimator import Estimate
-from hmsa_ros.estimation.motion import follow, Levels, rest
+from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.units import NANOSECONDS
 
@@ -25,7 +25,7 @@ TOLERANCE = 5e-3
 #: A correction leaves at most this share of what the course in force leaves, while there is time
 #: for more of them, and at rest.
 SHARE, AT_REST = 0.9, 0.5
-#: And of what a path by the model given leaves.
+#: And of what plans by the parameters given leave.
 CLEARLY = 0.25
 #: Share of the step that is to be gained before samples have shown an arrival.
 MUCH = 0.05
@@ -114,11 +114,7 @@ def expect(
         # A level that begins with the course is a step in it.
         levels = ((min(begin, levels[0][0]) - _LONG, course.before), *(
             (x + (x == begin), y) for x, y in levels))
-    motion = follow(
-        estimate.values, estimate.free, (estimate.stretch, estimate.rate),
-        Levels(np.array([(x - begin) / NANOSECONDS for x, _ in levels]),
-               np.array([x for _, x in levels]), slew_limit),
-        0.0, np.array([(end - begin) / NANOSECONDS]))
+    motion = _motion(estimate, levels, slew_limit, np.array([(end - begin) / NANOSECONDS]))
     at = rest(estimate.values, estimate.free, course.holding)
     if motion is None or at is None:
         return _NOWHERE
@@ -128,27 +124,35 @@ def expect(
     rows[0, :-2] -= by
     rows[1] = motion.rate_by[0] / frequency
     rows[2, :-2] = by
-    misses, off = np.array([
-        motion.stretch[0] - stretch, motion.rate[0] / frequency, stretch - course.target
-    ]), rows @ estimate.off
-    return Outcome(misses + off, rows @ estimate.covariance @ rows.T - np.outer(off, off))
+    return _outcome(estimate, np.array([
+        motion.stretch[0] - stretch, motion.rate[0] / frequency, stretch - course.target]), rows)
 
 
 def expect_along(
         estimate: Estimate, levels: Sequence[tuple[int, float]], ahead: Ahead,
         slew_limit: float = math.inf) -> Outcome:
     """Return how far levels (stamp in ns, T) are expected to lead off a path, in the mean."""
-    begin = estimate.time
-    motion = follow(
-        estimate.values, estimate.free, (estimate.stretch, estimate.rate),
-        Levels(np.array([(x - begin) / NANOSECONDS for x, _ in levels]),
-               np.array([x for _, x in levels]), slew_limit), 0.0, ahead.times)
+    motion = _motion(estimate, levels, slew_limit, ahead.times)
     if motion is None:
         return _NOWHERE
-    rows = motion.by / math.sqrt(len(ahead.times))
+    root = math.sqrt(len(ahead.times))
+    return _outcome(estimate, (motion.stretch - ahead.stretch) / root, motion.by / root)
+
+
+def _motion(
+        estimate: Estimate, levels: Sequence[tuple[int, float]], slew_limit: float,
+        times: Array) -> Motion | None:
+    """Return the motion at times in s after that of an estimate; None if it has none."""
+    return follow(
+        estimate.values, estimate.free, (estimate.stretch, estimate.rate),
+        Levels(np.array([(x - estimate.time) / NANOSECONDS for x, _ in levels]),
+               np.array([x for _, x in levels]), slew_limit), 0.0, times)
+
+
+def _outcome(estimate: Estimate, misses: Array, rows: Array) -> Outcome:
+    """Return an outcome by the most probable misses, and how they follow the coordinates."""
     off = rows @ estimate.off
-    return Outcome((motion.stretch - ahead.stretch) / math.sqrt(len(ahead.times)) + off,
-                   rows @ estimate.covariance @ rows.T - np.outer(off, off))
+    return Outcome(misses + off, rows @ estimate.covariance @ rows.T - np.outer(off, off))
 
 
 def worthwhile(

@@ -45,8 +45,8 @@ _CALM = 12.0
 _CORRECTS = 0.1
 # So many windows of samples wait at most for an update.
 _WAITING = 10
-# Deviations from which on a suspected branch of creep is one.
-_CREEPS = 2.0
+#: Deviations from which on a suspected branch of creep is one.
+CREEPS = 2.0
 # Window, as a share, that is left when it moves on, its longest span in units of time, and the
 # samples from which on that counts.
 _KEPT, _LONGEST, _FEWEST = 0.5, 200.0, 20
@@ -89,7 +89,7 @@ class Estimate:
     @property
     def actuator(self) -> ActuatorParameters:
         """The block; it creeps where that is known of it."""
-        return self.block(_CREEPS)
+        return self.block(CREEPS)
 
     def block(self, sure: float) -> ActuatorParameters:
         """Return the block; it creeps where a ratio is known by more than so many deviations."""
@@ -108,7 +108,7 @@ class Estimate:
         left[known], left[:, known] = 0.0, 0.0
         return replace(self, covariance=left, off=np.zeros_like(self.off))
 
-    def model(self, options: PlannerOptions, sure: float = _CREEPS) -> Model:
+    def model(self, options: PlannerOptions, sure: float = CREEPS) -> Model:
         """Return the model to plan with, of `block`; estimates take the place of options."""
         return Model(
             self.block(sure), replace(options, **{x: self.values[x] for x in ESTIMATED}))
