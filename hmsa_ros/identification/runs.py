@@ -12,7 +12,6 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.bags import read_run
 from hmsa_ros.recordings.levels import in_force, without_repeats
 from hmsa_ros.recordings.record import Run
-from hmsa_ros.recordings.topics import APPLIED
 
 
 def read_bag(
@@ -34,9 +33,7 @@ def recording_of(
     """Return the recording that a run is, as `read_bag`; no level is a `BadInputError`."""
     block = actuator or run.planner
     # A recorder gets the latched changes of before after the first new one.
-    whole = run.applied and not (run.commands and run.lost(APPLIED))
-    levels = run.levels if whole else in_force(
-        (x,) for x in without_repeats(run.commands)[0])
+    levels = run.reported or in_force((x,) for x in without_repeats(run.commands)[0])
     if not levels:
         raise BadInputError(
             f'{run.path} has no command that took effect: expected the levels of the field')

@@ -112,6 +112,17 @@ class Run:
         return value if value is not None and 0.0 <= value < math.inf else 0.0
 
     @property
+    def reported(self) -> tuple[Level, ...]:
+        """
+        What the plant reported as applied, by stamp.
+
+        None if some of that was lost and there are commands to take instead.
+        """
+        if self.commands and self.lost(APPLIED):
+            return ()
+        return tuple(sorted(self.applied, key=lambda x: x.stamp))
+
+    @property
     def levels(self) -> tuple[Level, ...]:
         """
         Changes of the field in force, by stamp.
@@ -119,8 +130,8 @@ class Run:
         What the plant reported as applied; else, or where some of that was lost, the commands that
         were not superseded; else changes of the measured flux density, known to one sample.
         """
-        if self.applied and not (self.commands and self.lost(APPLIED)):
-            return tuple(sorted(self.applied, key=lambda x: x.stamp))
+        if reported := self.reported:
+            return reported
         if self.commands:
             return in_force((x,) for x in self.commands)
         known = np.flatnonzero(np.isfinite(self.flux_density))
