@@ -18,6 +18,8 @@ from hmsa_ros.api.arguments import (
     limits_of,
     number,
     numbers,
+    setpoints_of,
+    whole,
 )
 from hmsa_ros.api.facts import facts
 from hmsa_ros.errors import BadInputError, excerpt
@@ -40,7 +42,7 @@ from hmsa_ros.model.moves import State
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.planning.scales import Coil, Scales, scales
 from hmsa_ros.planning.sequence import plan_sequence
-from hmsa_ros.planning.setpoint import impossible, Setpoint
+from hmsa_ros.planning.setpoint import Setpoint
 from hmsa_ros.planning.shapers.pace import Pace
 from hmsa_ros.planning.shapers.request import as_errors, ERRORS, Request
 from hmsa_ros.planning.timeline import Model
@@ -503,18 +505,8 @@ class Actuator:
         model = self.model
         if not isinstance(shaper, str):
             raise BadInputError(f'shaper is {excerpt(shaper)}: expected a name such as two_step')
-        stretches, durations = columns_of(setpoints, ('stretch', 'duration'), 'setpoints')
-        for stretch, duration in zip(stretches.tolist(), durations.tolist(), strict=True):
-            if reason := impossible(stretch, model.material.rest):
-                raise BadInputError(reason)
-            if not duration > 0.0:
-                raise BadInputError(
-                    f'duration is {duration:g} s: expected a number greater than 0')
-        if np.any(np.isinf(durations[:-1])):
-            raise BadInputError('duration is inf s: only that of the last setpoint may be')
-        if isinstance(order, bool) or not isinstance(order, (int, np.integer)):
-            raise BadInputError(
-                f'order is {excerpt(order)}: expected a whole number')
+        stretches, durations = setpoints_of(setpoints, model.material.rest)
+        order = whole(order, 'order')
         if limits is not None:
             low, high = limits_of(limits)
             model = Model(model.actuator, replace(

@@ -13,6 +13,7 @@ from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws import LAWS
 from hmsa_ros.model.moves import Limits
+from hmsa_ros.planning.setpoint import impossible
 
 #: Parameters of a block by their names without the group, with their defaults.
 DEFAULTS = {x.name.partition('.')[2]: x.default for x in ACTUATOR}
@@ -65,6 +66,35 @@ def columns_of(value: Any, names: tuple[str, str], what: str) -> tuple[Array, Ar
             f'{what} have {names[0]} of shape {one.shape} and {names[1]} of shape {other.shape}: '
             'expected two rows of one length, of at least 1')
     return one, other
+
+
+def setpoints_of(value: Any, rest: float) -> tuple[Array, Array]:
+    """
+    Return stretches and durations in s, each of shape (n,).
+
+    Raises
+    ------
+    BadInputError
+        If they are none, no actuator with such a rest has a stretch, or a duration is not above 0,
+        or endless before the last.
+
+    """
+    stretches, durations = columns_of(value, ('stretch', 'duration'), 'setpoints')
+    for stretch, duration in zip(stretches.tolist(), durations.tolist(), strict=True):
+        if reason := impossible(stretch, rest):
+            raise BadInputError(reason)
+        if not duration > 0.0:
+            raise BadInputError(f'duration is {duration:g} s: expected a number greater than 0')
+    if np.any(np.isinf(durations[:-1])):
+        raise BadInputError('duration is inf s: only that of the last setpoint may be')
+    return stretches, durations
+
+
+def whole(value: Any, what: str) -> int:
+    """Return a whole number, or raise `BadInputError`."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise BadInputError(f'{what} is {excerpt(value)}: expected a whole number')
+    return int(value)
 
 
 def _column(value: Any, name: str, what: str) -> Any:

@@ -100,8 +100,8 @@ def run(arguments: argparse.Namespace) -> int:
                 f'interrupted; the bag so far: {experiment.bag}' if experiment.bag.exists()
                 else 'interrupted', highlight=False, soft_wrap=True)
             return ENDING.status
-        findings = [] if experiment.levels or experiment.path else [
-            y for x in parts for y in x.evaluation.findings]
+        judged = parts if experiment.setpoints else []
+        findings = [y for x in judged for y in x.evaluation.findings]
         verdict, reason = _verdict(experiment, findings, done)
         verdicts.append(verdict)
         each.append(findings)
@@ -209,7 +209,7 @@ def _verdict(
     """Return the verdict on all setpoints, or on the end of levels, and why."""
     from hmsa_ros.judge import worst
 
-    if experiment.levels or experiment.path or not done.measured:
+    if not experiment.setpoints or not done.measured:
         reason = ('the levels or the path end at rest' if done.measured
                   else 'no node publishes joint_states')
         if done.verdict.failure:

@@ -380,7 +380,6 @@ class Trial:
                 f'its clock is known to {known.error * 1e6:.3g} us, and drifts by '
                 f'{known.drift * 1e6:.3g} ppm', 'clock() must answer at once')
 
-
     def _check_temperature(self, bench: _ProbedBench) -> None:
         device = bench.worker.device
         if device.instruments[0].has('temperature'):
