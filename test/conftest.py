@@ -4,7 +4,7 @@ What tests share: a ROS domain of their own, processes, and waiting on a conditi
 Tests that do not ask for one of these fixtures need no ROS.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 import fcntl
@@ -53,6 +53,19 @@ def pytest_configure(config: pytest.Config) -> None:
             # To explain an example, Python's lines are traced: integrations take minutes then.
             phases=[x for x in Phase if x is not Phase.explain])
     settings.load_profile(config.getoption('--hypothesis-profile') or 'gate')
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+        item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Show what the processes of a failed test have printed."""
+    report = yield
+    starter = getattr(item, 'funcargs', {}).get('start')
+    if report.failed and starter is not None:
+        report.sections += [
+            (f'{" ".join(map(str, x.popen.args))}: {x.popen.poll()}', x.output)
+            for x in starter.processes]
+    return report
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -339,6 +352,15 @@ class RosSide:
                 pytest.fail(f'waited {seconds:g} s for {what}')
             self.executor.spin_once(SPIN_SECONDS)
         return result
+
+    def ask(self, publisher: Any, status: list[Any], stretch: float, *expected: str) -> None:
+        """Publish a setpoint, again and again, until a status with an expected value comes."""
+        from std_msgs.msg import Float64
+        begin = len(status)
+        again = self.node.create_timer(0.5, lambda: publisher.publish(Float64(data=stretch)))
+        self.spin_until(lambda: any(
+            x.value in expected for y in status[begin:] for x in y.values), str(expected))
+        again.cancel()
 
     def collect(
             self, message_type: type[Any] | str, topic: str, qos: Any = 1000) -> list[Any]:

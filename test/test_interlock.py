@@ -1,11 +1,12 @@
 """The interlock: what opens it, what it does to coil and planner, and what comes after it."""
 
 from dataclasses import replace
+from functools import partial
 import math
 
 from lifecycle_msgs.srv import ChangeState
 import pytest
-from std_msgs.msg import Bool, Float64
+from std_msgs.msg import Bool
 from test_runtime_hosts import BEATING, Bench, MS, START
 from test_runtime_planner import Rig, trajectory
 
@@ -269,12 +270,7 @@ def test_a_required_interlock_wins_over_everything(command, start, ros, tmp_path
         return any(x.message.startswith(text) for y in health[-20:] for x in y.status
                    if x.name == 'driver: interlock')
 
-    def ask(stretch, *expected):
-        begin = len(status)
-        again = ros.node.create_timer(0.5, lambda: setpoint.publish(Float64(data=stretch)))
-        ros.spin_until(lambda: any(
-            x.value in expected for y in status[begin:] for x in y.values), expected)
-        again.cancel()
+    ask = partial(ros.ask, setpoint, status)
     ros.spin_until(lambda: says('open: no publisher has closed it'), 'an open interlock')
     ask(1.1, 'interlock')
     beat = ros.node.create_timer(0.1, lambda: door.publish(Bool(data=True)))

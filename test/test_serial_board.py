@@ -1,6 +1,7 @@
 """The serial board: firmware, line and driver, with what boards and cables do to them."""
 
 import errno
+from functools import partial
 import math
 import os
 from pathlib import Path
@@ -14,7 +15,6 @@ import tty
 from conftest import wait_until
 import numpy as np
 import pytest
-from std_msgs.msg import Float64
 
 from hmsa_ros.cli import main
 from hmsa_ros.device import _board
@@ -267,12 +267,7 @@ def test_a_driver_goes_on_after_a_pulled_cable_when_it_is_asked_to(start, ros, l
     start.hmsa('planner')
     setpoint = ros.publisher(topics.SETPOINT.type, 'planner/setpoint', topics.SETPOINT.qos)
 
-    def ask(stretch, *expected):
-        begin = len(status)
-        again = ros.node.create_timer(0.5, lambda: setpoint.publish(Float64(data=stretch)))
-        ros.spin_until(lambda: any(
-            x.value in expected for y in status[begin:] for x in y.values), expected)
-        again.cancel()
+    ask = partial(ros.ask, setpoint, status)
 
     def level():
         return applied[-1].magnetic_field.z if applied else math.nan
