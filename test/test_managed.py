@@ -1,5 +1,7 @@
 """Managed nodes: their states, from inside and over the services of ROS 2."""
 
+from time import sleep
+
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 import pytest
@@ -73,6 +75,40 @@ def test_a_node_starts_by_itself_and_goes_through_all_states(ros, serve):
     assert node.active
     assert node.done == [
         'configure', 'activate', 'deactivate', 'cleanup', 'configure', 'activate']
+
+
+class Asked(Example):
+    """Is called in every way while it is cleaned up."""
+
+    def configure(self):
+        super().configure()
+        self.calls = []
+        self.create_timer(0.001, lambda: self.calls.append('timer'))
+        self.create_subscription(Float64, 'in', lambda _: self.calls.append('subscription'), 10)
+        self.create_service(GetState, 'ask', lambda *_: self.calls.append('service'))
+
+    def cleanup(self):
+        super().cleanup()
+        self.disturb()
+        sleep(0.5)
+        self.calls.clear()
+
+
+def test_what_comes_for_a_node_while_it_is_cleaned_up_is_dropped(ros, serve):
+    node = serve(Asked).nodes[0]
+    publisher = ros.publisher(Float64, 'in')
+    client = ros.node.create_client(GetState, 'ask')
+    ros.spin_until(client.service_is_ready, 'the service')
+
+    def disturb():
+        publisher.publish(Float64())
+        client.call_async(GetState.Request())
+
+    node.disturb = disturb
+    assert change(ros, Transition.TRANSITION_DEACTIVATE)
+    assert change(ros, Transition.TRANSITION_CLEANUP)
+    assert state(ros) == State.PRIMARY_STATE_UNCONFIGURED
+    assert node.calls == []
 
 
 def test_shutdown_ends_the_node(ros, serve):

@@ -18,7 +18,7 @@ from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.parameters import JOINT, ParameterSpec
 from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.capture import decode, RawSubscription
-from hmsa_ros.nodes.managed import ManagedNode
+from hmsa_ros.nodes.managed import ManagedNode, silence
 from hmsa_ros.nodes.outlet import Outlet
 from hmsa_ros.nodes.parameters import JointParameters, JOINTS
 from hmsa_ros.nodes.presence import Presence
@@ -138,6 +138,7 @@ class CommandInput:
             self._raw.destroy()
             self._raw = None
         if self._subscription is not None:
+            silence(self._subscription)
             self._node.destroy_subscription(self._subscription)
             self._subscription = None
 

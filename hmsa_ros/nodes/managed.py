@@ -244,7 +244,24 @@ class ManagedNode(LifecycleNode):
                 (self.publishers, self.destroy_publisher)):
             for entity in list(found):
                 if entity not in self._kept:
+                    silence(entity)
                     destroy(entity)
+
+
+def silence(entity: Any) -> None:
+    """
+    Have what is about to be destroyed do nothing any more.
+
+    The executor holds events that came for it during the present callback, and serves them later:
+    a destroyed timer would act once more, and a destroyed service raise an error as it answers.
+    """
+    def nothing(*_: object) -> None:
+        pass
+
+    if hasattr(entity, 'callback'):
+        entity.callback = nothing
+    if hasattr(entity, 'send_response'):
+        entity.send_response = nothing
 
 
 class _CarefulParameterService(ParameterService):
