@@ -24,6 +24,7 @@ from hmsa_ros.bag.info import summarize
 from hmsa_ros.bag.qos import Qos
 from hmsa_ros.bag.writer import BagWriter, Topic
 from hmsa_ros.cli import main
+from hmsa_ros.interfaces import topics
 from hmsa_ros.lab.launching import REPLAY
 
 pytestmark = pytest.mark.ros
@@ -331,7 +332,8 @@ def test_it_waits_for_the_node_that_obeys_and_not_for_a_listener(ros, start, pla
         bag, 'play.wait_for_nodes:=[plant]', 'play.wait_for_subscribers:=[flux_density_command]',
         'play.allow_commands:=[flux_density_command]')
     ros.spin_until(lambda: ros.node.count_publishers('/flux_density_command'), 'the publisher')
-    applied = ros.collect(MagneticField, '/flux_density_applied')
+    # Latched: the plant may find this subscription after the player.
+    applied = ros.collect(MagneticField, '/flux_density_applied', topics.FLUX_DENSITY_APPLIED.qos)
     start.hmsa('plant')
     finish(ros, process, got, 50)
     ros.spin_until(lambda: applied, 'the level in force')
