@@ -1,14 +1,14 @@
 """Managed nodes: their states, from inside and over the services of ROS 2."""
 
-from time import sleep
-
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 import pytest
+from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces.parameters import ParameterSpec
+from hmsa_ros.nodes.capture import RawSubscription
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare
 from hmsa_ros.nodes.service_call import ServiceCall
@@ -89,20 +89,23 @@ class Asked(Example):
 
     def cleanup(self):
         super().cleanup()
-        self.disturb()
-        sleep(0.5)
+        witness = RawSubscription(self, Float64, 'in', QoSProfile(depth=10))
+        self.disturb(witness)
         self.calls.clear()
 
 
-def test_what_comes_for_a_node_while_it_is_cleaned_up_is_dropped(ros, serve):
+def test_what_comes_for_a_node_while_it_is_cleaned_up_is_dropped(ros, serve, wait_until):
     node = serve(Asked).nodes[0]
     publisher = ros.publisher(Float64, 'in')
     client = ros.node.create_client(GetState, 'ask')
     ros.spin_until(client.service_is_ready, 'the service')
 
-    def disturb():
-        publisher.publish(Float64())
+    def disturb(witness):
+        wait_until(lambda: publisher.get_subscription_count() == 2)
         client.call_async(GetState.Request())
+        publisher.publish(Float64())
+        wait_until(witness.take)
+        witness.destroy()
 
     node.disturb = disturb
     assert change(ros, Transition.TRANSITION_DEACTIVATE)
