@@ -139,6 +139,8 @@ def test_moves_that_get_worse_end_feedback_and_what_it_did_is_taken_back(monkeyp
     assert 'feedback has ended, open loop with the parameters given; ~/reset_' in it.message
     assert it.estimates[-1].values['ended'] is True
     assert 'feedback_ended' in it.codes
+    # Nor does it ring where another level takes the place of what was learnt.
+    assert 'vibrating' not in it.codes
     it.runtime.feedback.reset()
     it.pass_time(300 * MS)
     assert it.estimates[-1].values['ended'] is False

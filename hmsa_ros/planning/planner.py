@@ -179,8 +179,8 @@ class Planner(RunningPlan):
         model, begin = self.model, self.soonest(now)
         state, place = self.state(begin), self.plan.under_way(begin)
         # Beside the target, by what the model does not know of: it goes by its own stretches.
-        held, wanted = (float(equilibrium_stretch(x, model.material)) for x in (
-            self.plan.level(begin).load, model.load(flux_density)))
+        held, wanted = (float(equilibrium_stretch(model.load(x), model.material)) for x in (
+            self.plan.level(begin).flux_density, flux_density))
         draft = yield from drafting.draft_moves(
             Outset(self.plan, model, begin, replace(state, stretch=held, rate=0.0)),
             [Setpoint(wanted, math.inf)])
