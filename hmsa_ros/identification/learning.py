@@ -196,8 +196,9 @@ class _Sequence:
         """Return by how much in s the samples are later than the model, by lag and latency."""
         seen, shown = trial.stretch, self.simulated(self.levels(trial), trial.time)
         delays = float(np.min(self.period)) * _DELAYS
-        return float(min(delays, key=lambda x: float(np.sum(
-            (seen - np.interp(trial.time - x, trial.time, shown))**2))))
+        off = [float(np.sum((seen - np.interp(trial.time - x, trial.time, shown))**2))
+               for x in delays]
+        return float(delays[np.argmin(off)])
 
     def derivatives(self, levels: Array, time: Array) -> Array:
         """Return the derivatives of the residual by levels at the knots in T, shape (r, k)."""
