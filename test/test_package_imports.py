@@ -148,7 +148,7 @@ for i in range(300):
 from pathlib import Path
 Path('run.csv').write_text('\\n'.join(rows))
 for words in (
-        ['plan', '1.1:10'], ['identify', 'run.csv', '--free', 'shear_modulus'], ['excite'],
+        ['plan', '1.1:10'], ['identify', 'run.csv', '--free', 'shear_modulus'],
         ['sweep', '--target', '1.1', '--out', 'sweep.csv']):
     assert main(words) == 0, words
 # As far as the file, which is no bag.

@@ -36,19 +36,19 @@ def force(x):
 
 def moved(levels, times, start=1.0, slew=math.inf, lag=0.0, creep=()):
     """Return stretches at times (s) under levels (s, T), by ramps and lag, each piece by SciPy."""
-    ratios, speeds = np.array([x for x, _ in creep]), np.array([TIME / x for _, x in creep])
+    ratios, speeds = [x for x, _ in creep], [TIME / x for _, x in creep]
 
     def motion(t, y, load, slope, begin):
-        x, v, field, held = y[0], y[1], y[2], y[3:]
+        x, v, field, *held = y.tolist()
         output = load + slope * (t - begin)
-        stiffness = (force(x + 1e-6) - force(x - 1e-6)) / 2e-6
-        pull = (field if lag else output) - force(x) - held.sum()
+        pull = (field if lag else output) - force(x) - sum(held)
+        stiffness = (force(x + 1e-6) - force(x - 1e-6)) / 2e-6 if held else 0.0
         return [v, (pull - 0.5 * ZETA * C1 * v + 0.25 * x ** -4 * v * v) * 6.0 / (x ** -3 + C1),
                 (output - field) * TIME / lag if lag else 0.0,
-                *(ratios * stiffness * v - speeds * held)]
+                *(r * stiffness * v - s * h for r, s, h in zip(ratios, speeds, held, strict=True))]
 
     times, slew = times / TIME, slew * TIME / LOAD
-    y, load = np.array([start, 0.0, force(start), *(0.0 * ratios)]), force(start)
+    y, load = np.array([start, 0.0, force(start), *(0.0 for _ in creep)]), force(start)
     found, done = np.empty(len(times)), 0
     end = max(times[-1], levels[-1][0] / TIME) + 1e-9
     for (begin, level), (until, _) in pairwise([

@@ -30,7 +30,7 @@ class Plant:
         self.commands = []
 
     def _motion(self, t, y):
-        x, v, held = y
+        x, v, held = y.tolist()
         p = self.parameters
         stiffness = (force(x + 1e-6) - force(x - 1e-6)) / 2e-6
         pull = (p['remanence'] * self._load - p['g'] * (force(x) + held)
@@ -115,13 +115,14 @@ class Run:
 
 
 @pytest.mark.parametrize(('share', 'shape', 'cycles', 'others'), [
-    pytest.param(0.33, 'sine', 10, {'g': 0.9}, id='a third'),
+    pytest.param(0.33, 'sine', 10, {'g': 0.9}, id='a third', marks=pytest.mark.slow),
     pytest.param(0.33, 'sine', 10, {'g': 0.9, 'creep': 0.04}, id='creep'),
     pytest.param(
         0.12, 'triangle', 4, {'g': 1.1, 'remanence': 0.95}, id='triangle',
         marks=pytest.mark.slow),
     pytest.param(
-        0.9, 'sine', 24, {'g': 1.1, 'damping': 1.4, 'remanence': 0.95}, id='resonance')])
+        0.9, 'sine', 24, {'g': 1.1, 'damping': 1.4, 'remanence': 0.95}, id='resonance',
+        marks=pytest.mark.slow)])
 def test_amplitude_and_mean_come_back_and_the_wave_ends_at_rest(share, shape, cycles, others):
     closed, without = (
         Run(Plant(**others), share, shape=shape, cycles=cycles, feedback=x)
@@ -162,7 +163,8 @@ def test_what_changes_on_the_way_is_corrected_and_a_stop_comes_to_rest():
     assert np.ptp([x for t, x in run.truth if t > arrival + 2 * MS]) < 0.01 * AMPLITUDE
 
 
-@pytest.mark.parametrize(('share', 'cycles'), [(0.33, 5), (0.9, 16)])
+@pytest.mark.parametrize(('share', 'cycles'), [
+    (0.33, 5), pytest.param(0.9, 16, marks=pytest.mark.slow)])
 def test_a_wave_of_an_actuator_that_is_as_known_is_left_as_it_is(share, cycles):
     runs = [Run(Plant(), share, cycles=cycles, noise=3e-3, feedback=x) for x in ('adapt', 'off')]
     sent = [run.go(run.times[-1]).sent for run in runs]

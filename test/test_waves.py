@@ -32,9 +32,10 @@ def spectrum(plan, frequency, fade, mean=1.0, **coil):
 
 
 @pytest.mark.parametrize(('share', 'options', 'coil'), [
-    (1.0 / 3.0, {}, {}), (1.0, {}, {}), (1.7, {}, {}),
-    (1.0 / 3.0, {'slew_limit': 60.0, 'coil_time_constant': 5e-4}, {'slew': 60.0, 'lag': 5e-4})],
-    ids=['a third', 'resonance', 'above', 'ramps and lag'])
+    (1.0, {}, {}), (1.7, {}, {}), *(pytest.param(1.0 / 3.0, *x, marks=pytest.mark.slow) for x in (
+        ({}, {}),
+        ({'slew_limit': 60.0, 'coil_time_constant': 5e-4}, {'slew': 60.0, 'lag': 5e-4})))],
+    ids=['resonance', 'above', 'a third', 'ramps and lag'])
 def test_a_sine_of_the_field_is_not_what_a_sine_of_the_stretch_needs(share, options, coil):
     frequency = share * NATURAL
     plan = Actuator(**options).wave('sine', frequency, AMPLITUDE)
@@ -73,13 +74,13 @@ def test_a_triangle_and_a_period_of_ones_own_are_followed_about_a_mean():
 
 
 def test_a_sweep_goes_through_the_resonance_at_one_amplitude():
-    plan = Actuator().wave('sine', 20.0, 0.05, last=200.0, cycles=60)
-    times = np.linspace(0.0, plan.move_times[-1] + 0.05, 6000)
+    plan = Actuator().wave('sine', 20.0, 0.05, last=200.0, cycles=25)
+    times = np.linspace(0.0, plan.move_times[-1] + 0.05, 3000)
     stretch = moved(plan.levels.tolist(), times)
     inside = (times > 0.06) & (times < plan.move_times[-1] - 0.03)
     peaks = np.abs(stretch[1:-1] - 1.0)[
         inside[1:-1] & ((np.diff(stretch)[1:] * np.diff(stretch)[:-1]) < 0.0)]
-    assert len(peaks) > 100
+    assert len(peaks) > 30
     assert peaks == pytest.approx(np.full(len(peaks), 0.05), rel=0.02)
     assert np.abs(stretch[times > plan.move_times[-1] + 1e-6] - 1.0).max() < 1e-9
 
