@@ -57,7 +57,7 @@ def check_unlearnt(fault, slow, noise):
     assert np.max(np.abs(moves(it, (1.15,)))) < 0.5
 
 
-@pytest.mark.parametrize('fault', FAULTS)
+@pytest.mark.parametrize('fault', ['low-pass'])
 def test_what_a_faulty_sensor_taught_is_forgotten_with_a_healthy_one(fault):
     check_unlearnt(fault, slow=False, noise=1e-4)
 
@@ -74,8 +74,9 @@ def test_all_faults_of_a_sensor_are_forgotten_by_all_actuators(fault, slow, nois
 # what is found, or that samples do not fit.
 NOT_NAMED = pytest.mark.parametrize(('plant', 'factors', 'late', 'word'), [
     ({}, {'remanence': 1.05}, 0, 'Br about +5 %; plans use it'),
-    ({'lag': 5e-4}, {}, 0, 'lag about 0.5 ms; plans use it'), ({'lag': 5e-3}, {}, 0, ''),
-    ({'ratio': 0.05}, {}, 0, ''), ({}, {}, 2, '')])
+    ({'lag': 5e-4}, {}, 0, 'lag about 0.5 ms; plans use it'), ({}, {}, 2, ''),
+    pytest.param({'lag': 5e-3}, {}, 0, '', marks=pytest.mark.slow),
+    pytest.param({'ratio': 0.05}, {}, 0, '', marks=pytest.mark.slow)])
 
 
 def check_harmless(slow, plant, factors, late, word):
@@ -101,7 +102,7 @@ def test_nor_does_it_with_a_slow_actuator(plant, factors, late, word):
 
 
 # Where others are suspected first, only another look finds it in time.
-@pytest.mark.parametrize('slow', [True, False])
+@pytest.mark.parametrize('slow', [pytest.param(True, marks=pytest.mark.slow), False])
 def test_a_creep_alone_is_planned_with_from_the_second_move_on(slow):
     it = bench(slow, plant={'ratio': 0.05})
     # Open loop leaves 5 or 6 % of each.
@@ -187,7 +188,8 @@ def test_a_clock_that_is_ahead_is_named_and_leaves_no_vibration(ahead):
         assert it.estimates[-1].values['ahead_of_clock'] > 100
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', [0, *(
+    pytest.param(x, marks=pytest.mark.slow) for x in (1, 2))])
 def test_an_update_costs_no_more_whatever_timestamps_come(seed, monkeypatch):
     random, work = np.random.default_rng(seed), []
     it = bench(False, seed=seed)

@@ -63,7 +63,9 @@ def test_observing_says_what_is_wrong_and_changes_nothing(factor):
     assert last.values['used_by_plans'] is False
 
 
-@pytest.mark.parametrize(('factor', 'noise'), [(0.8, 1e-3), (1.2, 1e-3), (1.2, 0.0)])
+@pytest.mark.parametrize(('factor', 'noise'), [
+    (0.8, 1e-3), pytest.param(1.2, 1e-3, marks=pytest.mark.slow),
+    pytest.param(1.2, 0.0, marks=pytest.mark.slow)])
 def test_adapting_corrects_the_first_move_and_plans_the_second_with_what_was_learnt(
         factor, noise):
     loop = Loop(factor, noise, delay=2 * MS, feedback='adapt')
@@ -103,7 +105,7 @@ def moved(loop, target):
     return loop.runtime.group.planners['a'].plan.segments[-1], loop.run((target, 500 * MS))
 
 
-@pytest.mark.parametrize('factor', [0.8, 1.2])
+@pytest.mark.parametrize('factor', [0.8, pytest.param(1.2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize('creep', [
     Creep(), pytest.param(Creep((0.1, 0.05), (0.09, 0.9)), marks=pytest.mark.slow)])
 def test_a_cautious_first_move_takes_longer_and_arrives_and_the_next_one_does_not(factor, creep):
@@ -173,7 +175,9 @@ def test_an_actuator_that_was_identified_is_not_moved_with_caution():
     assert (first.arrival - first.begin) / MS == pytest.approx(59.4, abs=1)
 
 
-@pytest.mark.parametrize(('named', 'bound'), [(False, 0.0), (True, 0.0), (True, 0.02)])
+@pytest.mark.parametrize(('named', 'bound'), [
+    pytest.param(False, 0.0, marks=pytest.mark.slow),
+    pytest.param(True, 0.0, marks=pytest.mark.slow), (True, 0.02)])
 def test_moves_make_up_for_a_constant_force_once_samples_show_it(named, bound):
     given = ('shear_modulus', 'damping_coefficient', 'stretch_bias')
     loop = Loop(
@@ -292,7 +296,7 @@ def test_what_was_learnt_outlives_other_options_but_not_another_block():
     assert planner.model.actuator.shear_modulus == 1e4
 
 
-@pytest.mark.parametrize('factor', [0.9, 1.1])
+@pytest.mark.parametrize('factor', [0.9, pytest.param(1.1, marks=pytest.mark.slow)])
 def test_adapting_corrects_the_moves_of_a_beam_to_both_sides(factor):
     loop = Loop(factor, 1e-3, 200, 10 * MS, silicone(), 2 * MS, feedback='adapt')
     truth = loop.run((0.4, 700 * MS), (-0.2, 700 * MS))

@@ -271,6 +271,7 @@ def test_setpoints_that_late_commands_spoil_are_never_forgotten(deaf):
         assert loop.status.verdict.severity == 1
 
 
+@pytest.mark.slow
 def test_a_correction_counts_against_the_step_that_was_requested():
     loop = Loop(1.05, 1e-4, feedback='adapt', heartbeat_period=0)
     truth = loop.run((1.2, HOLD), (1.4, HOLD), (1.4, HOLD))
