@@ -48,18 +48,19 @@ def left(segments, creep, longest=40.0, delivery=IDEAL):
 
 
 @pytest.mark.parametrize(('material', 'shaper', 'delivery', 'wanted'), [
-    (ONE, 'two_step', Delivery(), 1e-6),
     (ONE, 'two_step', SAMPLED, 3e-4),
-    (THREE, 'two_step', SAMPLED, 1e-3),
     (THREE, 'robust', Delivery(), 1e-3),
     (ONE, 'two_step', Delivery(lag=0.12), 1e-6),
-    (THREE, 'robust', Delivery(lag=0.02), 1e-3),
-    (THREE, 'two_step', replace(SAMPLED, lag=0.1), 1.1e-3),
-    (THREE, 'two_step', Delivery(slew=2.0), 1e-3),
     (ONE, 'robust', Delivery(slew=0.6), 1.1e-6),
-    (ONE, 'two_step', replace(SAMPLED, slew=2.0), 1e-3),
-    (ONE, 'two_step', Delivery(slew=2.0, lag=0.1), 1.4e-6),
-    (ONE, 'smooth', Delivery(slew=2.0, lag=0.1), 1.1e-6)])
+    *(pytest.param(*x, marks=pytest.mark.slow) for x in (
+        (ONE, 'two_step', Delivery(), 1e-6),
+        (THREE, 'two_step', SAMPLED, 1e-3),
+        (THREE, 'robust', Delivery(lag=0.02), 1e-3),
+        (THREE, 'two_step', replace(SAMPLED, lag=0.1), 1.1e-3),
+        (THREE, 'two_step', Delivery(slew=2.0), 1e-3),
+        (ONE, 'two_step', replace(SAMPLED, slew=2.0), 1e-3),
+        (ONE, 'two_step', Delivery(slew=2.0, lag=0.1), 1.4e-6),
+        (ONE, 'smooth', Delivery(slew=2.0, lag=0.1), 1.1e-6)))])
 def test_a_creeping_block_rests_after_a_move_and_after_the_next_one_right_away(
         material, shaper, delivery, wanted):
     segments = plan_sequence(

@@ -138,7 +138,8 @@ def end_of(force, start, zeta, c1, beta, tau):
 
 
 @every_law
-@pytest.mark.parametrize(('start', 'target'), [(1.0, 1.1), (1.2, 1.6), (1.0, 0.8)])
+@pytest.mark.parametrize(('start', 'target'), [
+    (1.2, 1.6), *(pytest.param(1.0, x, marks=pytest.mark.slow) for x in (1.1, 0.8))])
 def test_a_plan_is_that_of_a_solution_with_40_digits(name, start, target):
     group = block(name).nondimensional
     plan = plan_two_step(start, target, group)

@@ -321,7 +321,9 @@ def test_days_next_to_the_limit_are_planned():
 
 
 @pytest.mark.parametrize('rate', [0.0, 1e-9, -40.0, 100.0])
-@pytest.mark.parametrize('limits', [Limits(), Limits(-1e-3, 1e-3), Limits(-10.0, 10.0)])
+@pytest.mark.parametrize('limits', [
+    Limits(-10.0, 10.0), *(pytest.param(x, marks=pytest.mark.slow) for x in (
+        Limits(), Limits(-1e-3, 1e-3)))])
 def test_corners_of_every_argument_end_in_a_plan_or_a_refusal(rate, limits):
     lower, upper = stretch_limits(5.0)
     for start in (lower + 1e-6, 1.0, upper - 1e-6):

@@ -279,7 +279,7 @@ def test_a_refusal_names_limits_with_each_of_which_a_command_is_found():
     random = np.random.default_rng(2)
     named: Counter[str] = Counter()
     refused = 0
-    while refused < 12:
+    while refused < 5:
         request = drawn(random)
         if not (request.delivery.period and request.delivery.slew < math.inf):
             continue  # seldom refused

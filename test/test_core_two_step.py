@@ -65,7 +65,8 @@ def after_plan(start, rate, plan, material, tolerance=1e-13):
 # -- the paper's moves --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(('start', 'target', 'zeta', 'j_lim'), MOVES)
+@pytest.mark.parametrize(('start', 'target', 'zeta', 'j_lim'), [
+    pytest.param(*x, marks=pytest.mark.slow if i % 4 else ()) for i, x in enumerate(MOVES)])
 def test_plan_agrees_with_an_independent_solution(start, target, zeta, j_lim):
     beta_p, tau_p, beta_1 = two_step(start, target, zeta, j_lim)
     plan = plan_two_step(start, target, group(zeta, j_lim))

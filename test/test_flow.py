@@ -76,13 +76,14 @@ def test_after_the_vibration_branches_relax_alone_as_they_do_in_the_motion():
 
 
 @pytest.mark.parametrize(('material', 'shaper', 'delivery', 'wanted'), [
-    (ONE, 'two_step', IDEAL, 1e-6),
     (TWO, 'minimum_time', IDEAL, 1e-6),
-    (TWO, 'robust', Delivery(lag=0.1), 1e-6),
-    (ONE, 'smooth', Delivery(slew=2.0, lag=0.1), 1.5e-6),
-    (TWO, 'two_step', Delivery(slew=2.0), 1.5e-6),
     (ONE, 'robust', SAMPLED_PERIOD, 4e-4),
-    (TWO, 'two_step', replace(SAMPLED_PERIOD, lag=0.1), 1.1e-3)])
+    *(pytest.param(*x, marks=pytest.mark.slow) for x in (
+        (ONE, 'two_step', IDEAL, 1e-6),
+        (TWO, 'robust', Delivery(lag=0.1), 1e-6),
+        (ONE, 'smooth', Delivery(slew=2.0, lag=0.1), 1.5e-6),
+        (TWO, 'two_step', Delivery(slew=2.0), 1.5e-6),
+        (TWO, 'two_step', replace(SAMPLED_PERIOD, lag=0.1), 1.1e-3)))])
 def test_a_block_whose_branches_flow_rests_after_a_move_and_after_the_next_one(
         material, shaper, delivery, wanted):
     segments = plan_sequence(

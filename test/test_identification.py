@@ -467,7 +467,8 @@ def test_sixty_uneven_points_of_a_figure_are_enough():
     assert max(map(abs, relative(found).values())) < 4.0
 
 
-@pytest.mark.parametrize(('jitter', 'offset'), [(0.01, 0.0), (0.0, 0.003)])
+@pytest.mark.parametrize(('jitter', 'offset'), [
+    pytest.param(0.01, 0.0, marks=pytest.mark.slow), (0.0, 0.003)])
 def test_intervals_of_one_step_of_sixty_points_with_wrong_stamps_cover_the_truth(jitter, offset):
     period, start = 2.56 * T, replace(BLOCK, shear_modulus=1.05 * BLOCK.shear_modulus)
     level_times, levels = steps((1.3,), SPAN, 1)

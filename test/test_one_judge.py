@@ -168,7 +168,7 @@ def test_status_and_record_have_the_same_verdicts():
         'arrived', 'off_target', 'undecided', 'late', 'missed'}
 
 
-@pytest.mark.parametrize('behind', [-1, 0, 1])
+@pytest.mark.parametrize('behind', [-1, 1])
 def test_a_recorder_whose_clock_lags_shows_the_same_setpoints(behind):
     for seed in range(4):
         run = Drawn(seed).carry_out()
