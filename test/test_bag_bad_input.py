@@ -117,7 +117,7 @@ def test_a_flipped_byte_in_a_chunk_costs_that_chunk(tmp_path, preset):
     assert reader.counts() == {'/a': len(got)}
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
 @given(strategies.data())
 def test_no_change_of_bytes_makes_the_reader_fail(tmp_path, data):
     path = tmp_path / 'bag' / 'bag_0.mcap'
@@ -139,7 +139,7 @@ def test_no_change_of_bytes_makes_the_reader_fail(tmp_path, data):
         list(read_messages(copy))
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
 @given(content=strategies.binary(max_size=300))
 def test_no_bytes_after_the_magic_make_the_reader_fail(tmp_path, content):
     path = tmp_path / 'any.mcap'
@@ -166,7 +166,7 @@ ODD_VALUES = strategies.one_of(
     strategies.just({}), strategies.just(['..', '/', '']))
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
 @given(strategies.data())
 def test_no_change_of_the_metadata_hides_the_messages(tmp_path, data):
     folder = tmp_path / 'bag'
@@ -197,7 +197,7 @@ def _read_whole(folder):
     assert to_text(summarize(folder)).encode()
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(strategies.data())
 def test_no_records_in_any_order_make_the_reader_fail(tmp_path, data):
     path = tmp_path / 'bag' / 'bag_0.mcap'

@@ -824,8 +824,7 @@ def test_a_plan_without_a_point_is_no_plan(tmp_path):
 
 
 @pytest.mark.parametrize(('text', 'reached'), [
-    ('NaN', [1.1, 1.2, 1.4]), ('-1.0', [1.1, 1.2, 1.4]), ('Infinity', [1.1, 1.2, 1.4]),
-    ('"fast"', [1.1, 1.2, 1.4]), ('1e-320', [])])
+    ('NaN', [1.1, 1.2, 1.4]), ('"fast"', [1.1, 1.2, 1.4]), ('1e-320', [])])
 def test_a_slew_limit_that_is_none_is_not_taken_for_one(tmp_path, text, reached):
     part = one(tmp_path / 'bag', simulated(), **parameters(planner=ACTUATOR, plant=ACTUATOR), **{
         'plant.slew_limit': text})
@@ -900,8 +899,7 @@ def test_a_request_that_is_not_a_number_hides_no_setpoint(tmp_path):
 
 
 @pytest.mark.parametrize(('samples', 'levels', 'setpoints'), [
-    (1, [0.02, 0.035], 0), (2, [0.02], 0), (100, [0.02, 0.035], 0), (2000, [1e3], 1),
-    (2000, [1e300], 1), (2000, [], 0)])
+    (1, [0.02, 0.035], 0), (100, [0.02, 0.035], 0), (2000, [1e300], 1), (2000, [], 0)])
 def test_odd_recordings_are_shown_for_what_they_are(tmp_path, samples, levels, setpoints):
     messages = [x for x in simulated() if x[1] == '/joint_states'][:samples]
     messages += [
@@ -1191,7 +1189,9 @@ def test_a_plan_between_the_same_ticks_as_its_request_is_the_one_for_it(tmp_path
     assert len(part.evaluation.results) == 3
 
 
-@pytest.mark.parametrize('missing', [(), ('plan',), ('plan', 'status'), ('plan', 'command')])
+@pytest.mark.parametrize('missing', [
+    (), ('plan', 'status'),
+    *(pytest.param(('plan', *x), marks=pytest.mark.slow) for x in ((), ('command',)))])
 def test_levels_that_hardware_rounds_reach_the_setpoints_that_were_requested(tmp_path, missing):
     targets = 1.1, 1.2, 1.21, 1.4, 1.2, 1.1, 1.05, 1.0
     part = one(tmp_path / 'bag', without(
@@ -1273,8 +1273,7 @@ def test_a_stop_after_a_refused_request_does_not_carry_it_out(tmp_path):
     assert [x.setpoint.target for x in part.evaluation.findings] == [1.1, 1.2, 1.4]
 
 
-@pytest.mark.parametrize('topic', ['setpoint', 'joint_trajectory'])
-@pytest.mark.parametrize('late', [0, 500_000])
+@pytest.mark.parametrize(('topic', 'late'), [('setpoint', 500_000), ('joint_trajectory', 0)])
 def test_joints_that_are_moved_in_turn_keep_their_setpoints(tmp_path, late, topic):
     joints = 'left', 'right'
     group = PlannerGroup({x: Planner(ACTUATOR, Options(lead_time=LEAD)) for x in joints})
