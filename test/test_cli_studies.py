@@ -135,6 +135,7 @@ def test_robustness_in_chunks_is_the_same_whatever_computes_it(run, tmp_path):
     assert 'another study' in run(*words, '--zeta', 0.3, '--resume', '--out', 'two')[2]
 
 
+@pytest.mark.slow
 def test_robustness_says_what_could_not_be_had(run):
     status, out, _ = run(
         'robustness', '--move', '1:1.1', '--shapers', 'two_step,zv', '--zeta', 3, *QUICKLY)

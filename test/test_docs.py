@@ -53,8 +53,7 @@ def test_every_block_of_the_page_is_run_or_checked(page):
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize('page', [
     pytest.param(
-        x, marks=[] if x.name in ('README.md', 'half-an-hour.md') else pytest.mark.slow,
-        id=name_of(x))
+        x, marks=[] if x.name == 'README.md' else pytest.mark.slow, id=name_of(x))
     for x in RUNNING])
 def test_page_does_what_it_says(page, ros_env, tmp_path):
     # How long each block took: shown if it fails, or by pytest -rP.

@@ -6,8 +6,7 @@ from benchmarks.faults import hardware
 from benchmarks.faults.table import inject
 
 # In the gate; the others, of which each is like one of these, take longer.
-_FAST = ('driver_systemexit', 'driver_keyboardinterrupt', 'driver_cable', 'driver_reboot',
-         'driver_saturated', 'driver_write_blocks', 'driver_blocked_ended', 'driver_gil')
+_FAST = ('driver_systemexit', 'driver_cable', 'driver_saturated', 'driver_gil')
 
 
 @pytest.mark.ros

@@ -250,7 +250,8 @@ class Coil:
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize('command', ['driver', 'controller'])
+@pytest.mark.parametrize('command', [
+    'driver', pytest.param('controller', marks=pytest.mark.slow)])
 def test_a_required_interlock_wins_over_everything(command, start, ros, tmp_path):
     (tmp_path / 'lab.py').write_text(BENCH)
     health = ros.collect(topics.DIAGNOSTICS.type, topics.DIAGNOSTICS.name)

@@ -456,6 +456,7 @@ def test_a_bag_played_in_a_loop_is_recorded_round_by_round(record, start, ros, t
         assert values(BagReader(file)) == list(range(200))
 
 
+@pytest.mark.slow
 def test_of_two_clocks_one_is_followed_and_that_is_told(record, ros, make_ros):
     recorder = record('use_sim_time:=true')
     publisher = ros.publisher(Float64, '/a', subscribers=0)

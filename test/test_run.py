@@ -53,6 +53,7 @@ def test_a_simulated_experiment_arrives_and_leaves_its_bag_and_a_report(start, t
     assert len(without_repeats(found.commands)[0]) == 2 * len(SETPOINTS)
 
 
+@pytest.mark.slow
 def test_a_wave_comes_back_to_its_amplitude_and_mean_in_the_nodes(start, tmp_path):
     file, path, out = (tmp_path / x for x in ('softer.yaml', 'path.csv', 'out'))
     file.write_text(MISMATCHED.replace('1.1', '0.9'))

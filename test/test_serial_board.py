@@ -253,6 +253,7 @@ def test_a_board_whose_cable_is_pulled_switches_off_and_is_found_again(line):
     assert device.close() == ''
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_a_driver_goes_on_after_a_pulled_cable_when_it_is_asked_to(start, ros, line):
     applied = ros.collect(

@@ -139,6 +139,7 @@ def test_creep_behind_a_lagging_coil_in_error_is_that_of_another_actuator_in_si_
     assert found == pytest.approx(expected, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_creep_after_arrival_is_followed_and_leaves_nothing_without_errors():
     case = Case(
         1.0, 1.2, replace(MATERIAL, creep=Creep((0.2,), (11.0,))), delivery=Delivery(lag=0.2))
