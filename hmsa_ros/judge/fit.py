@@ -7,7 +7,8 @@ Each fit that leaves little more than the best is possible, and the bounds hold 
 what samples do not tell apart widens them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 import math
 from statistics import NormalDist
@@ -72,11 +73,15 @@ class Fit:
     independent: float  #: share of the samples that noise which is not white leaves
 
 
-def fit(time: Array, rest: Array, frequency: float, decay: float) -> Fit | None:
+def fit(
+        time: Array, rest: Array, frequency: float, decay: float,
+        settles: Callable[[Fit], bool] = lambda _: False) -> Fit | None:
     """
     Fit samples: times in s, from 0 on and increasing, and how far from the target.
 
-    Frequency (rad/s) and decay (1/s) are the model's. None where samples are too few.
+    Frequency (rad/s) and decay (1/s) are the model's. A fit without creep that ``settles`` what is
+    asked is not compared with those with creep, which take several times as long. None where
+    samples are too few.
     """
     count, span = len(time), float(time[-1] - time[0]) if len(time) else 0.0
     periods = span * frequency / (2.0 * math.pi)
@@ -97,146 +102,155 @@ def fit(time: Array, rest: Array, frequency: float, decay: float) -> Fit | None:
     searched = 2.0 * math.log(max((high - low) * span / (2.0 * math.pi), 1.0))
 
     coarse = _Sinusoids(time, omegas, decays)
-    problem = _Problem(time, rest, [time] if periods >= _DRIFTS else [])
-    solved = _refined(problem, problem.solve(coarse))
-    plain = _bounds(problem, solved, searched)
-    if plain.independent > _INDEPENDENT:
+    problem = _Problems(time, rest, time[None] if periods >= _DRIFTS else None)
+    solved = _refined(problem, problem.solve(coarse), coarse)
+    plain = _bounds(problem, 0, _Solved(*(x[..., 0, :] for x in solved)), searched)
+    if plain.independent > _INDEPENDENT or settles(plain):
         return plain
     # What is left is not chance alone: it may creep.
-    creeps = [_Problem(time, rest, [np.exp(-time / (x * span))]) for x in _CREEPS]
-    fits = [x.solve(coarse) for x in creeps]
-    place = int(np.argmin([x.least for x in fits]))
-    for near in range(max(place - 1, 0), min(place + 2, len(creeps))):
-        fits[near] = _refined(creeps[near], fits[near])
-    place = int(np.argmin([x.least for x in fits]))
-    if fits[place].least > _EXPLAINED * solved.least:
+    creeping = _Problems(time, rest, np.exp(-time / (_CREEPS[:, None] * span)))
+    fits = creeping.solve(coarse)
+    place = int(np.argmin(np.min(fits.squares, axis=-1)))
+    near = slice(max(place - 1, 0), place + 2)
+    nearest = _refined(creeping.taken(near), _Solved(*(x[..., near, :] for x in fits)), coarse)
+    least = np.min(nearest.squares, axis=-1)
+    if np.min(least) > _EXPLAINED * np.min(solved.squares):
         return plain
-    return _bounds(creeps[place], _Solved.all(fits), searched)
+    count = fits.squares.shape[-1]
+    return _bounds(creeping, near.start + int(np.argmin(least)), _Solved(*(
+        np.concatenate((x.reshape(*x.shape[:-2], -1), y[..., count:].reshape(*y.shape[:-2], -1)),
+                       axis=-1) for x, y in zip(fits, nearest, strict=True))), searched)
 
 
 # -- fits of a grid -----------------------------------------------------------------------------
 
-@dataclass(frozen=True)
-class _One:
-    omega: float
-    decay: float
-
-
 class _Solved(NamedTuple):
-    """Fits, one an element: their residuals, sinusoids, offsets and covariances of unit noise."""
+    """Fits: their residuals, sinusoids, offsets and covariances of unit noise, shape (..., n)."""
 
     omega: Array
     decay: Array
     squares: Array  # sum of the squares of what is left
-    pair: Array  # factors of cosine and sine, shape (2, n)
+    pair: Array  # factors of cosine and sine, shape (2, ..., n)
     offset: Array
     offset_variance: Array
     pair_variance: Array  # the larger of the two
-
-    @property
-    def best(self) -> _One:
-        place = int(np.argmin(self.squares))
-        return _One(float(self.omega[place]), float(self.decay[place]))
-
-    @property
-    def least(self) -> float:
-        return float(np.min(self.squares))
-
-    @classmethod
-    def all(cls, parts: Sequence['_Solved']) -> '_Solved':
-        return cls(*(np.concatenate(x, axis=-1) for x in zip(*parts, strict=True)))
 
     def taken(self, places: NDArray[np.intp]) -> '_Solved':
         return _Solved(*(x[..., places] for x in self))
 
 
 class _Sinusoids:
-    """Sinusoids of each frequency of some and each decay of others, at some times."""
+    """Sinusoids of each of some frequencies and decays, shapes (..., m) and (..., d)."""
 
     def __init__(self, time: Array, omegas: Array, decays: Array) -> None:
         self.omegas, self.decays = omegas, decays
-        self.turning = np.exp(1j * np.outer(omegas, time))
-        self.fading = np.exp(-np.outer(time, decays))
-        self.plain = np.sum(self.fading**2, axis=0)
-        self.twice = self.turning**2 @ self.fading**2
+        phase = omegas[..., None] * time
+        cosine, sine = np.cos(phase), np.sin(phase)
+        self.turning = np.stack((cosine, sine), axis=-3)  # shape (..., 2, m, n)
+        self.fading = np.exp(-decays[..., None] * time)  # shape (..., d, n)
+        squared = (self.fading**2)[..., None, :, :].swapaxes(-1, -2)
+        self.plain = np.sum(squared, axis=-2)
+        self.twice = np.stack(
+            (cosine**2 - sine**2, 2.0 * cosine * sine), axis=-3) @ squared
 
 
-class _Problem:
-    """Samples, with what an offset and a drift explain taken out."""
+class _Problems:
+    """Samples, with what an offset and each of some drifts, shape (k, n), explain taken out."""
 
-    def __init__(self, time: Array, rest: Array, drifts: Sequence[Array]) -> None:
+    def __init__(self, time: Array, rest: Array, drifts: Array | None) -> None:
         self.time, self._rest = time, rest
-        # Of an offset they have no part: their means over the time are 0.
-        share = np.diff(time) / (time[-1] - time[0])
-        columns = [np.ones(len(time)), *(
-            x - 0.5 * float(share @ (x[1:] + x[:-1])) for x in drifts)]
-        self._straight, upper = np.linalg.qr(np.stack(columns, axis=1))
-        self._explained = self._straight.T @ rest
-        self._left = rest - self._straight @ self._explained
+        level = np.full(len(time), 1.0 / math.sqrt(len(time)))
+        self._straight = level[None, None]  # orthonormal, shape (k, 1 or 2, n)
         # What an offset in the middle is of the coordinates of the straight line.
-        row = np.zeros(len(columns))
-        row[0] = 1.0
-        self._middle = np.linalg.solve(upper.T, row)
+        self._middle = np.full((1, 1), level[0])
+        if drifts is not None:
+            # Of an offset they have no part: their means over the time are 0.
+            share = np.diff(time) / (time[-1] - time[0])
+            drifts = drifts - 0.5 * ((drifts[:, 1:] + drifts[:, :-1]) @ share)[:, None]
+            along = drifts @ level
+            drifts = drifts - along[:, None] * level
+            size = np.sqrt(np.sum(drifts**2, axis=1))
+            self._straight = np.stack(
+                (np.broadcast_to(level, drifts.shape), drifts / size[:, None]), axis=1)
+            self._middle = np.stack(
+                (np.full(len(size), level[0]), -level[0] * along / size), axis=1)
+        self._explained = self._straight @ rest
+        self._left = rest - (self._explained[:, None] @ self._straight)[:, 0]
+
+    def taken(self, places: slice) -> '_Problems':
+        """Return the problems of some drifts."""
+        found = copy(self)
+        for name in ('_straight', '_middle', '_explained', '_left'):
+            setattr(found, name, getattr(self, name)[places])
+        return found
 
     def solve(self, tried: _Sinusoids) -> _Solved:
-        """Fit sinusoids."""
-        omegas, decays, plain, twice = tried.omegas, tried.decays, tried.plain, tried.twice
-        *overlaps, right = (
-            tried.turning @ (tried.fading * x[:, None])
-            for x in (*self._straight.T, self._left))
-        one = 0.5 * (plain + twice.real) - sum(x.real**2 for x in overlaps)
-        two = 0.5 * (plain - twice.real) - sum(x.imag**2 for x in overlaps)
-        cross = 0.5 * twice.imag - sum(x.real * x.imag for x in overlaps)
+        """Fit sinusoids to each problem; shapes (k, m d)."""
+        plain, (real, imaginary) = tried.plain, np.moveaxis(tried.twice, -3, 0)
+        columns = np.concatenate((self._straight, self._left[:, None]), axis=1)
+        # Parts of cosine and sine, shapes (k, 1 or 2, m, d) and (k, m, d).
+        cosines, sines = (
+            tried.turning[..., None, i, :, :] @ (
+                tried.fading[..., None, :, :] * columns[..., None, :]).swapaxes(-1, -2)
+            for i in (0, 1))
+        by_cosines, by_sines = cosines[:, :-1], sines[:, :-1]
+        rights = cosines[:, -1], sines[:, -1]
+        one = 0.5 * (plain + real) - np.sum(by_cosines**2, axis=1)
+        two = 0.5 * (plain - real) - np.sum(by_sines**2, axis=1)
+        cross = 0.5 * imaginary - np.sum(by_cosines * by_sines, axis=1)
         determinant = np.maximum(one * two - cross**2, 1e-12 * plain**2)
-        cosine = (two * right.real - cross * right.imag) / determinant
-        sine = (one * right.imag - cross * right.real) / determinant
-        squares = float(self._left @ self._left) - (cosine * right.real + sine * right.imag)
+        cosine = (two * rights[0] - cross * rights[1]) / determinant
+        sine = (one * rights[1] - cross * rights[0]) / determinant
+        squares = np.sum(self._left**2, axis=1)[:, None, None] - (
+            cosine * rights[0] + sine * rights[1])
         # How far the sinusoid moves the offset, by its two factors.
-        by_cosine = sum(x.real * y for x, y in zip(overlaps, self._middle, strict=True))
-        by_sine = sum(x.imag * y for x, y in zip(overlaps, self._middle, strict=True))
-        offset = float(self._middle @ self._explained) - by_cosine * cosine - by_sine * sine
-        variance = float(self._middle @ self._middle) + (
+        middle = self._middle[..., None, None]
+        by_cosine, by_sine = (np.sum(middle * x, axis=1) for x in (by_cosines, by_sines))
+        offset = np.sum(self._middle * self._explained, axis=1)[:, None, None] - (
+            by_cosine * cosine + by_sine * sine)
+        variance = np.sum(middle**2, axis=1) + (
             two * by_cosine**2 - 2.0 * cross * by_cosine * by_sine + one * by_sine**2
         ) / determinant
         larger = (0.5 * (one + two) + np.sqrt(
             0.25 * (one - two)**2 + cross**2)) / determinant
-        shape = determinant.shape
-        return _Solved(
-            np.broadcast_to(omegas[:, None], shape).ravel(),
-            np.broadcast_to(decays, shape).ravel(), np.maximum(squares, 0.0).ravel(),
-            np.stack((cosine.ravel(), sine.ravel())), offset.ravel(), variance.ravel(),
-            larger.ravel())
+        shape = len(determinant), -1
+        return _Solved(*(x.reshape(*x.shape[:-3], *shape) for x in (
+            np.broadcast_to(tried.omegas[..., None], determinant.shape),
+            np.broadcast_to(tried.decays[..., None, :], determinant.shape),
+            np.maximum(squares, 0.0), np.stack((cosine, sine)), offset, variance, larger)))
 
-    def residuals(self, one: _One, pair: Array) -> Array:
-        """Return what a sinusoid leaves with the best offset and drift."""
-        fading = np.exp(-one.decay * self.time)
-        wave = fading * (pair[0] * np.cos(one.omega * self.time)
-                         + pair[1] * np.sin(one.omega * self.time))
-        left = self._rest - wave
-        return np.asarray(left - self._straight @ (self._straight.T @ left))
+    def residuals(self, place: int, omega: float, decay: float, pair: Array) -> Array:
+        """Return what a sinusoid leaves with the best offset and a drift."""
+        fading = np.exp(-decay * self.time)
+        wave = fading * (pair[0] * np.cos(omega * self.time)
+                         + pair[1] * np.sin(omega * self.time))
+        left, straight = self._rest - wave, self._straight[place]
+        return np.asarray(left - straight.T @ (straight @ left))
 
 
-def _refined(problem: _Problem, solved: _Solved) -> _Solved:
-    """Add fits about the best one of a grid."""
-    omegas, decays = np.unique(solved.omega), np.unique(solved.decay)
+def _refined(problems: _Problems, solved: _Solved, coarse: _Sinusoids) -> _Solved:
+    """Add fits about the best one of a grid to those of each problem."""
+    omegas, decays = coarse.omegas, coarse.decays
     width, spread = float(omegas[1] - omegas[0]), float(decays[1])
-    parts = [solved]
     for _ in range(_ROUNDS):
-        best = _Solved.all(parts).best
-        parts.append(problem.solve(_Sinusoids(
-            problem.time,
-            np.clip(best.omega + width * np.linspace(-1.0, 1.0, _REFINED), omegas[0], omegas[-1]),
-            np.clip(best.decay + spread * np.linspace(-2.0, 2.0, 5), 0.0, decays[-1]))))
+        best = np.argmin(solved.squares, axis=-1)[:, None]
+        omega, decay = (np.take_along_axis(x, best, -1) for x in (solved.omega, solved.decay))
+        more = problems.solve(_Sinusoids(
+            problems.time,
+            np.clip(omega + width * np.linspace(-1.0, 1.0, _REFINED), omegas[0], omegas[-1]),
+            np.clip(decay + spread * np.linspace(-2.0, 2.0, 5), 0.0, decays[-1])))
+        solved = _Solved(*(np.concatenate(x, axis=-1) for x in zip(solved, more, strict=True)))
         width, spread = 2.0 * width / (_REFINED - 1), 0.5 * spread
-    return _Solved.all(parts)
+    return solved
 
 
-def _bounds(problem: _Problem, tried: _Solved, searched: float) -> Fit:
-    """Return the figures of the best fit, and their bounds by all that are possible."""
-    count = len(problem.time)
+def _bounds(problems: _Problems, number: int, tried: _Solved, searched: float) -> Fit:
+    """Return the figures of the best fit, of a problem, and their bounds by all possible ones."""
+    count = len(problems.time)
     place = int(np.argmin(tried.squares))
-    least = tried.least
-    left = problem.residuals(tried.best, tried.pair[:, place])
+    least = float(tried.squares[place])
+    left = problems.residuals(
+        number, float(tried.omega[place]), float(tried.decay[place]), tried.pair[:, place])
     together = _together(left)
     freedom = max(count - _FITTED, 1)
     variance = least / freedom

@@ -5,8 +5,9 @@ A setpoint is arrived at where samples show offset and vibration to be within th
 missed where they show one to be outside, and undecided otherwise.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 import math
 
 import numpy as np
@@ -35,6 +36,8 @@ _KEPT = 32
 # Whatever stays nearer to the target than this share of a tolerance, as a root mean square, is
 # within it.
 _QUIET = 0.3
+# What a fit leaves is nothing below this share of a tolerance.
+_NOTHING = 0.01
 # Noise of a period from peak to peak, in standard deviations, that is hardly ever exceeded.
 _PEAKS = 7.0
 # Samples in a period from which on they show how far it moves.
@@ -105,7 +108,8 @@ def _judged(
     every = stamps[held], values[held]
     stamps, values = _thinned(*every, begin, setpoint)
     allowed, swing = tolerances.of(setpoint)
-    quiet = _QUIET * min(allowed, swing)
+    least = min(allowed, swing)
+    quiet = _QUIET * least
     findings: list[Finding] = []
     noise, alike = math.inf, 1.0
     for number, part in enumerate(_looks(stamps, begin, setpoint)):
@@ -117,12 +121,14 @@ def _judged(
         # Later looks see the vibration from their own beginning on.
         origin = int(stamps[part][0]) if number else begin
         seconds = ((stamps[part] - origin) / NANOSECONDS).astype(np.float64)
-        shown = fit(seconds, rest, setpoint.frequency, setpoint.decay)
+        decided = partial(
+            _decided, count=len(rest), setpoint=setpoint, tolerances=tolerances, sensor=sensor,
+            moves=moves if number else None)
+        shown = fit(
+            seconds, rest, setpoint.frequency, setpoint.decay,
+            partial(_settles, decided=decided, nothing=_NOTHING * least))
         if shown is not None:
-            findings.append(_decided(
-                shown, len(rest), setpoint, tolerances, sensor,
-                # What has come to rest is taken to do so until it is seen to move.
-                rests=not moves if number else shown.vibration.high <= swing))
+            findings.append(decided(shown))
             noise = min(noise, shown.usual)
             alike = min(alike, shown.independent)
         elif not number:
@@ -287,15 +293,23 @@ def _too_few(setpoint: Setpoint, stamps: Stamps) -> Finding:
 
 # -- the rule -----------------------------------------------------------------------------------
 
+def _settles(found: Fit, *, decided: Callable[[Fit], Finding], nothing: float) -> bool:
+    """Return whether a look is decided, and what its fit leaves changes nothing."""
+    return found.noise < nothing and not decided(found).open
+
+
 def _decided(
         found: Fit, count: int, setpoint: Setpoint, tolerances: Tolerances,
-        sensor: Sensor, *, rests: bool) -> Finding:
+        sensor: Sensor, moves: bool | None) -> Finding:
+    """Decide on a look by what it shows and, of a later one, whether it is seen to move."""
     offset, vibration = _widened(found.offset, sensor.std(setpoint.target)), found.vibration
     allowed, swing = tolerances.of(setpoint)
     # One of several looks is enough for a miss, so that each has to be surer.
     off = offset.value - _SURER * (offset.value - offset.low) > allowed or (
         offset.value + _SURER * (offset.high - offset.value) < -allowed)
     vibrates = vibration.value - _SURER * (vibration.value - vibration.low) > swing
+    # What has come to rest is taken to do so until it is seen to move.
+    rests = vibration.high <= swing if moves is None else not moves
     within = max(-offset.low, offset.high) <= allowed and rests
     code = (Code.OFF_TARGET if off else Code.VIBRATING if vibrates
             else Code.ARRIVED if within else Code.UNDECIDED)
