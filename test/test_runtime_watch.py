@@ -6,10 +6,12 @@ import math
 import numpy as np
 import pytest
 
+from hmsa_ros.control import holds
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import Note, Send, Settings, StatusChanged, Trajectory
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
+from hmsa_ros.judge import judging
 from hmsa_ros.model.actuators import Setup
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.planning.group import PlannerGroup
@@ -328,3 +330,30 @@ def test_a_stalled_planner_judges_what_came_meanwhile_and_misses_what_it_did_not
     assert 'commands were not sent in time' in found[2].message
     assert loop.status.worst is found[2]
     assert loop.status.verdict.code == 'missed'
+
+
+def test_judging_several_joints_does_not_keep_commands_waiting(monkeypatch):
+    now, cost, judged = START, 0, []
+
+    def judge(*args, **options):
+        nonlocal cost
+        cost += 20 * MS
+        judged.append(now)
+        return judging.judge(*args, **options)
+
+    monkeypatch.setattr(holds, 'judge', judge)
+    block, names = paper_actuator(), ('a', 'b', 'c', 'd')
+    runtime = PlannerRuntime(
+        PlannerGroup({x: Planner(block, Options(
+            flux_density_min=-0.5, flux_density_max=0.5)) for x in names}),
+        Settings(takeover_timeout=0), clock=lambda: now, steady=lambda: now + cost,
+        observable=lambda: True, unheard=lambda: '')
+    runtime.active = True
+    runtime.request(Trajectory(names, [((1.2,) * 4, HOLD)], 1, name='x'))
+    while now < START + 3 * HOLD:
+        runtime.tick(now)
+        now += MS
+        for name in names:
+            runtime.observed(name, now, 1.0 if now < START + 100 * MS else 1.2, 0.0, math.nan)
+    assert len(judged) >= 4
+    assert len(set(judged)) == len(judged)

@@ -218,7 +218,7 @@ class Feedback:
 
     def update(self, now: int) -> bool:
         """
-        Process the samples that have come by a time in ns, and publish the estimate.
+        Process the samples of a joint that have come by a time in ns, and publish the estimate.
 
         Returned is whether that has taken a while.
         """
@@ -242,6 +242,8 @@ class Feedback:
             if now >= joint.next_tell:
                 joint.next_tell = now + _TELL
                 self._tell(name, joint, now)
+            # Commands go out before the next joint has its turn.
+            break
         return busy
 
     def _tell(self, name: str, joint: Joint, now: int) -> None:

@@ -59,7 +59,8 @@ class Ledger:
         if not learnt and math.isfinite(early.vibration):
             self._without = max(early.vibration / setpoint.step, _or(self._without, 0.0))
         arrival = setpoint.moved or asked
-        found = hold.judged(replace(setpoint, arrival=arrival, moved=None), sensor=sensor)
+        found = early if not later and arrival == setpoint.arrival else hold.judged(
+            replace(setpoint, arrival=arrival, moved=None), sensor=sensor)
         if not math.isfinite(found.offset):
             return ''
         self.left = (abs(found.offset) + _or(found.vibration, 0.0)) / setpoint.step

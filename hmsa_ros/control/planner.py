@@ -459,7 +459,8 @@ class PlannerRuntime:
             return
         end, observable = self._steady() + SLICE, self._observable()
         while self._steady() < end:
-            finding = self._watch.judge(now, self.settings.tolerances, observable=observable)
+            finding = self._watch.judge(
+                now, self.settings.tolerances, end, observable=observable)
             if finding is not None or not self._watch.open:
                 self._bulletin.found(finding)
             if finding is None:

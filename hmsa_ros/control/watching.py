@@ -285,8 +285,14 @@ class Watch:
         for hold in self._joints[name].holds:
             hold.add(stamp, stretch, self._now)
 
-    def judge(self, now: int, tolerances: Tolerances, *, observable: bool) -> Finding | None:
-        """Judge one setpoint, if one can be judged by a time in ns and changes what is known."""
+    def judge(
+            self, now: int, tolerances: Tolerances, until: int, *,
+            observable: bool) -> Finding | None:
+        """
+        Judge one setpoint, if one can be judged by a time in ns and changes what is known.
+
+        None is begun after a steady time in ns.
+        """
         self._now = now
         for name, joint in self._joints.items():
             if joint.news:
@@ -294,8 +300,10 @@ class Watch:
                 joint.close(joint.newest)
                 return joint.newest
             for hold in joint.holds:
+                if (steady := self._steady()) >= until:
+                    return None
                 found = hold.judge(
-                    now, self._steady(), tolerances, self.sensor(name), observable=observable)
+                    now, steady, tolerances, self.sensor(name), observable=observable)
                 if hold.news:
                     hold.news = False
                     self.audit(name, hold)
