@@ -253,7 +253,7 @@ def test_stop_and_a_closed_page_bring_what_the_panel_moves_to_rest(panel, start)
         page = await opened(address)
         for words, reason in (
                 ('', 'no setpoint'), ('1.1', 'STRETCH:DURATION'), ('nan:1', 'finite'),
-                ('1,1,1:1', '3 values for 1 joints'), ('1.1:1e300', 'less than')):
+                ('1,1,1:1', '3 stretches for actuator'), ('1.1:1e300', 'less than')):
             await page.send(do='send', setpoints=words)
             await page.until(lambda x, reason=reason: reason in x['note']['text'])
         await page.send(do='launch')

@@ -9,7 +9,6 @@ from uuid import uuid4
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.srv import GetState
-import numpy as np
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
@@ -19,6 +18,7 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.status import Verdict
 from hmsa_ros.lab import graph
+from hmsa_ros.lab.experiment import check_stretches
 from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
@@ -248,11 +248,8 @@ class PlannerClient(Visitor):
             (level, round(time * NANOSECONDS)) for time, level in levels]
         points += [(point, round(time * NANOSECONDS)) for time, *point in path]
         end = 0.0
+        check_stretches(setpoints, self._joints)
         for stretch, span in setpoints:
-            if np.size(stretch) not in (1, len(self._joints)):
-                raise BadInputError(
-                    f'{np.size(stretch)} values for {len(self._joints)} joints '
-                    f'({", ".join(self._joints)}): expected one for all, or one per joint')
             end += span
             if end >= 2**31:
                 raise BadInputError(f'the sequence lasts {end:g} s: expected less than 2^31 s')

@@ -14,6 +14,8 @@ from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces import topics
@@ -34,6 +36,17 @@ Tell = Callable[[str, float], None]
 START_SECONDS = 20.0
 
 
+def check_stretches(
+        setpoints: Sequence[tuple[float | Sequence[float], float]],
+        joints: Sequence[str]) -> None:
+    """Refuse, by `BadInputError`, stretches that are not as many as the joints, or one for all."""
+    for stretch, _ in setpoints:
+        if np.size(stretch) not in (1, len(joints)):
+            raise BadInputError(
+                f'{np.size(stretch)} stretches for {", ".join(joints)}: expected one for all, or '
+                'one per joint (--joint names the joints)')
+
+
 @dataclass(frozen=True)
 class Experiment:
     """What is done."""
@@ -51,6 +64,9 @@ class Experiment:
     levels: Sequence[tuple[float, float]] = ()  #: time in s, and flux density in T from then on
     #: time in s, stretch, rate in 1/s and acceleration in 1/s^2, ending at rest
     path: Sequence[Sequence[float]] = ()
+
+    def __post_init__(self) -> None:
+        check_stretches(self.setpoints, self.joints)
 
     @property
     def duration(self) -> float:
