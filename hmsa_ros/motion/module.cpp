@@ -376,7 +376,6 @@ std::tuple<int, double> staircase(Numbers behind, Numbers branches, double stret
 
 // -- recordings --------------------------------------------------------------------------------------
 
-using Four = Dual<double, 4>;
 using Eight = Dual<double, 8>;
 template <class S, class System, int NB = most_branches> bool respond_as(const Recorded &of, int from)
 {
@@ -389,15 +388,16 @@ template <class S, int NB> __attribute__((target("avx2"), flatten)) bool respond
 {
     return respond_as<S, Block<S, Gent>, NB>(of, from);
 }
-template <class S> bool respond_gent(const Recorded &of, int from)
+bool respond_gent(const Recorded &of, int from)
 {
     if (!__builtin_cpu_supports("avx2"))
-        return respond_as<S, Block<S, Gent>>(of, from);
+        return respond_as<Eight, Block<Eight, Gent>>(of, from);
     // What identification does most has code of its own.
-    if constexpr (count_of<S> == 8)
-        if (of.branches == 1 && of.theta[first_branch + 2] == maxwell)
-            return respond_wide<S, 1>(of, from);
-    return respond_wide<S, most_branches>(of, from);
+    if (of.branches == 0 && of.wanted_count - from <= 4)
+        return respond_wide<Dual<four, 1>, 0>(of, from);
+    if (of.branches == 1 && of.theta[first_branch + 2] == maxwell)
+        return respond_wide<Dual<four, 2>, 1>(of, from);
+    return respond_wide<Dual<four, 2>, most_branches>(of, from);
 }
 bool respond_part(const Recorded &of, int from)
 {
@@ -405,8 +405,7 @@ bool respond_part(const Recorded &of, int from)
     if (int(of.material[kind_at]) > neo_hookean)
         return of.by_constants() ? respond_as<Eight, AnyOf<Eight>>(of, from)
             : left > 0 ? respond_as<Eight, Any>(of, from) : respond_as<double, Any>(of, from);
-    return left > 4 ? respond_gent<Eight>(of, from) : left > 0 ? respond_gent<Four>(of, from)
-        : respond_as<double, Block<double, Gent>>(of, from);
+    return left > 0 ? respond_gent(of, from) : respond_as<double, Block<double, Gent>>(of, from);
 }
 bool respond_all(const Recorded &of)
 {

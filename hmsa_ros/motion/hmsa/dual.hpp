@@ -7,6 +7,14 @@ namespace hmsa {
 template <class R, int N> struct Dual {
     R v;
     R d[N];
+    // Number by number: in halves, as compilers copy bytes, a vector is not read back at once.
+    HMSA_INLINE Dual &operator=(const Dual &x)
+    {
+        v = x.v;
+        for (int i = 0; i < N; i++)
+            d[i] = x.d[i];
+        return *this;
+    }
 };
 template <class S> struct real_of { using type = S; };
 template <class R, int N> struct real_of<Dual<R, N>> { using type = R; };
@@ -18,7 +26,12 @@ template <class R> HMSA_INLINE const R &value(const R &x) { return x; }
 template <class R, int N> HMSA_INLINE const R &value(const Dual<R, N> &x) { return x.v; }
 
 #define HMSA_OP template <class R, int N> HMSA_INLINE Dual<R, N> operator
-#define HMSA_EACH(expression) for (int i = 0; i < N; i++) c.d[i] = expression; return c
+// A loop over two would keep them in memory.
+#define HMSA_ONE(n, expression) { constexpr int i = n; c.d[i] = expression; }
+#define HMSA_EACH(expression) \
+    if constexpr (N <= 2) { HMSA_ONE(0, expression) HMSA_ONE(N - 1, expression) } \
+    else for (int i = 0; i < N; i++) c.d[i] = expression; \
+    return c
 HMSA_OP +(const Dual<R, N> &a, const Dual<R, N> &b) { Dual<R, N> c{a.v + b.v, {}}; HMSA_EACH(a.d[i] + b.d[i]); }
 HMSA_OP -(const Dual<R, N> &a, const Dual<R, N> &b) { Dual<R, N> c{a.v - b.v, {}}; HMSA_EACH(a.d[i] - b.d[i]); }
 HMSA_OP *(const Dual<R, N> &a, const Dual<R, N> &b) { Dual<R, N> c{a.v * b.v, {}}; HMSA_EACH(a.d[i] * b.v + a.v * b.d[i]); }
@@ -45,8 +58,18 @@ template <class R, int N> HMSA_INLINE Dual<R, N> through(const Dual<R, N> &x, co
 template <class R, int N> HMSA_INLINE double get(const Dual<R, N> &x, int i) { return get(x.v, i); }
 template <class R, int N> HMSA_INLINE void set(Dual<R, N> &x, int i, double value)
 {
-    x = Dual<R, N>{};
     set(x.v, i, value);
+    for (R &d : x.d)
+        set(d, i, 0);
+}
+// The derivative by parameter j. Where R is lanes, all share a value, and each has parameters of its own.
+template <class R, int N> HMSA_INLINE double slope(const Dual<R, N> &x, int j)
+{
+    return get(x.d[j / lanes<R>], j % lanes<R>);
+}
+template <class R, int N> HMSA_INLINE void incline(Dual<R, N> &x, int j, double slope)
+{
+    set(x.d[j / lanes<R>], j % lanes<R>, slope);
 }
 // A number as its own parameter; and what was differentiated by it, by the parameters of x.
 template <class S> HMSA_INLINE S seeded(const real<S> &x)

@@ -22,8 +22,12 @@ template <class C> struct PowerLaw {
     // x |x/s|^(m - 1): the flow of J. S. Bergstroem and M. C. Boyce, J. Mech. Phys. Solids 46, 931
     // (1998), without its dependence on the strain of the branch.
     C m, s;
-    void read(const double *c) { set(m, 0, c[0]), set(s, 0, c[1]); }
-    void seed(int constant, int j) { (constant == 0 ? m : s).d[j] = 1; }
+    void read(const double *c)
+    {
+        for (int i = 0; i < lanes<real<C>>; i++)
+            set(m, i, c[0]), set(s, i, c[1]);
+    }
+    void seed(int constant, int j) { incline(constant == 0 ? m : s, j, 1); }
     template <class S> S operator()(const S &x) const
     {
         constexpr double nothing = 1e-200;  // so that there is a logarithm

@@ -10,7 +10,7 @@ template <class R> struct Gent {
     // psi = -(J/2) ln(1 - (I1 - 3)/J), A. N. Gent, Rubber Chem. Technol. 69, 59 (1996).
     R i_j;  // 1/J_lim; 0 is neo-Hookean
     void read(int lane, const double *c) { set(i_j, lane, c[0]); }
-    void seed(int, int j) { i_j.d[j] = 1; }
+    void seed(int, int j) { incline(i_j, j, 1); }
     template <class S> HMSA_INLINE S force(const S &l) const
     {
         const S e = l - 1.0, lg = l - e * e * (l + 2.0) * i_j;
@@ -31,7 +31,7 @@ template <class R> struct Polynomial {
         for (int i = 0; i < 6; i++)
             set(c[i], lane, from[i]);
     }
-    void seed(int constant, int j) { c[constant].d[j] = 1; }
+    void seed(int constant, int j) { incline(c[constant], j, 1); }
     template <class S> HMSA_INLINE S force(const S &l) const
     {
         // Free of cancellation near l = 1.
@@ -65,7 +65,7 @@ template <class R> struct ArrudaBoyce : Polynomial<R> {
     }
     void seed(int constant, int j)
     {
-        (constant == 0 ? mu : lambda_m).d[j] = 1;
+        incline(constant == 0 ? mu : lambda_m, j, 1);
         expand();
     }
     void expand()
@@ -96,7 +96,7 @@ template <class R> struct Ogden {
         for (int i = 0; i < 2 * count; i++)
             set(terms[i], lane, c[1 + i]);
     }
-    void seed(int constant, int j) { terms[constant - 1].d[j] = 1; }
+    void seed(int constant, int j) { incline(terms[constant - 1], j, 1); }
     template <class S> HMSA_INLINE S force(const S &l) const
     {
         S sum = 0.0 * positive(l);

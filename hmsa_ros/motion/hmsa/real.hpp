@@ -156,16 +156,19 @@ inline void sine_cosine(double x, double &sine, double &cosine)
     if (quarter == 1 || quarter == 2)
         cosine = -cosine;
 }
+// Worked out once where lanes are alike.
 template <class R> inline R exp(R x)
 {
+    const double at = x[0], first = exp(at);
     for (int i = 0; i < lanes<R>; i++)
-        x[i] = exp(double(x[i]));
+        x[i] = x[i] == at ? first : exp(double(x[i]));
     return x;
 }
 template <class R> inline R log(R x)
 {
+    const double at = x[0], first = log(at);
     for (int i = 0; i < lanes<R>; i++)
-        x[i] = log(double(x[i]));
+        x[i] = x[i] == at ? first : log(double(x[i]));
     return x;
 }
 }  // namespace hmsa

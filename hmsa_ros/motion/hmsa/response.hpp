@@ -16,11 +16,9 @@ constexpr int friction_of = 400, square_of = 401, constant_of = 500, switch_of =
 // Rate over the fastest frequency at which the friction turns.
 constexpr double soft_rate = 3e-3;
 
-// Phase of the fastest motion over which a quintic interpolates to about 1e-8.
-constexpr double smooth_phase = 0.45;
-// Largest phase of a step where there are derivatives: they ring on when the motion is over, and the
-// error that is controlled is that of the motion alone. And in times of the fastest branch: beyond
-// some six the derivatives would grow without an end.
+// Largest phase of a step: the dense output is then good to about 1e-8, and so are derivatives, which
+// ring on when the motion is over: the error that is controlled is that of the motion alone. And in
+// times of the fastest branch: beyond some six the derivatives would grow without an end.
 constexpr double longest_phase = 1, relaxed_share = 4;
 // What no recording needs and a start value far off may ask for.
 constexpr int most_response_steps = 20000, most_steps_a_sample = 20;
@@ -55,9 +53,10 @@ struct Recorded {
 // N of the wanted parameters at a time, from one of them on; the motion is the same to the bit.
 template <class C, class System, int NB = most_branches> struct Response {
     using S = C;
-    static constexpr int most = room_of<S, NB>, N = count_of<S>;
+    using R = real<S>;
+    static constexpr int most = room_of<S, NB>, N = count_of<S> * lanes<R>;
     const Recorded &of;
-    const int from, width = 2 + of.branches;
+    const int from, creeping = NB == most_branches ? of.branches : NB, width = 2 + creeping;
     Response(const Recorded &recorded, int first) : of(recorded), from(first) { step.use(width); }
     System system;
     typename System::Bare bare;  // the same without derivatives
@@ -68,16 +67,10 @@ template <class C, class System, int NB = most_branches> struct Response {
     S excess;  // of the field over the line, where the piece began
     double piece_begin, fastest;
     int rubs, squares;  // places among the derivatives, -1 for none
-    Step<S, most> step;
+    Step<S, most, 16> step;
 
-    static S plain(double x)
-    {
-        S made{};
-        value_of(made) = x;
-        return made;
-    }
-    static double &value_of(double &x) { return x; }
-    template <int M> static double &value_of(Dual<double, M> &x) { return x.v; }
+    static S plain(double x) { return S{R{} + x}; }
+    static double first(const S &x) { return get(value(x), 0); }
     template <class F> void each(const F &f) const
     {
         for (int j = 0; j < N && from + j < of.wanted_count; j++)
@@ -87,12 +80,13 @@ template <class C, class System, int NB = most_branches> struct Response {
     {
         S x = plain(of.theta[place]);
         if constexpr (N > 0)
-            each([&](int j, int wanted) { x.d[j] = wanted == place ? 1 : 0; });
+            each([&](int j, int wanted) { incline(x, j, wanted == place); });
         return x;
     }
     void set_up()
     {
-        system.read(0, of.material);
+        for (int i = 0; i < lanes<R>; i++)
+            system.read(i, of.material);
         bare.read(0, of.material);
         if constexpr (System::direct)
             each([&](int j, int wanted) {
@@ -106,27 +100,27 @@ template <class C, class System, int NB = most_branches> struct Response {
             rubs = wanted == friction_of ? j : rubs;
             squares = wanted == square_of ? j : squares;
         });
-        branches.in_use = of.branches;
-        for (int b = 0; b < of.branches; b++) {
-            const int first = first_branch + branch_places * b;
-            branches.ratio[b] = seeded_at(first);
-            branches.speed[b] = inverse(seeded_at(first + 1));
-            bare_branches.speed[b] = value(branches.speed[b]);
+        branches.in_use = creeping;
+        for (int b = 0; b < creeping; b++) {
+            const int at = first_branch + branch_places * b;
+            branches.ratio[b] = seeded_at(at);
+            branches.speed[b] = inverse(seeded_at(at + 1));
+            bare_branches.speed[b] = first(branches.speed[b]);
             if constexpr (NB == most_branches) {
-                branches.flow[b].read(of.theta + first + 2);
-                bare_branches.flow[b].read(of.theta + first + 2);
+                branches.flow[b].read(of.theta + at + 2);
+                bare_branches.flow[b].read(of.theta + at + 2);
             }
             if constexpr (NB == most_branches && N > 0)
                 each([&](int j, int wanted) {
-                    if (first + 3 <= wanted && wanted < first + branch_places)
-                        branches.flow[b].seed(wanted - first - 3, j);
+                    if (at + 3 <= wanted && wanted < at + branch_places)
+                        branches.flow[b].seed(wanted - at - 3, j);
                 });
         }
     }
     S field(double dt) const
     {
         S now = plain(level + ramp * dt) - lag * ramp;
-        if (value(lag) > 0)
+        if (of.theta[lag_of] > 0)
             now = now + excess * exp(inverse(lag) * -dt);
         return now;
     }
@@ -134,11 +128,11 @@ template <class C, class System, int NB = most_branches> struct Response {
     {
         S pull = drive * field(dt) + force;
         if constexpr (N > 0) {
-            const double v = value(x[1]), soft = soft_rate * fastest;
+            const double v = first(x[1]), soft = soft_rate * fastest;
             if (rubs >= 0)
-                pull.d[rubs] -= v / sqrt(v * v + soft * soft);
+                incline(pull, rubs, slope(pull, rubs) - v / sqrt(v * v + soft * soft));
             if (squares >= 0)
-                pull.d[squares] -= abs(v) * v;
+                incline(pull, squares, slope(pull, squares) - abs(v) * v);
         }
         by[0] = x[1];
         by[1] = system.acceleration(x[0], x[1], damping, [&](const S &elastic)
@@ -149,53 +143,44 @@ template <class C, class System, int NB = most_branches> struct Response {
                 return pull - a * held;
             });
     }
-    static S quintic(double x, double h, const S &p0, const S &v0, const S &a0, const S &p1,
-        const S &v1, const S &a1, S &rate)
-    {
-        const S v = v0 * h, b = a0 * (h * h);
-        const S r = p1 - p0 - v - 0.5 * b, s = v1 * h - v - b, u = a1 * (h * h) - b;
-        const S c3 = 10.0 * r - 4.0 * s + 0.5 * u, c4 = 7.0 * s - 15.0 * r - u;
-        const S c5 = 6.0 * r - 3.0 * s + 0.5 * u;
-        rate = (v + x * (b + x * (3.0 * c3 + x * (4.0 * c4 + x * (5.0 * c5))))) * (1 / h);
-        return p0 + x * (v + x * (0.5 * b + x * (c3 + x * (c4 + x * c5))));
-    }
     void put(int i, const S &l, const S &v) const
     {
-        of.stretch[i] = value(l), of.rate[i] = value(v);
+        of.stretch[i] = first(l), of.rate[i] = first(v);
         if constexpr (N > 0)
             each([&](int j, int) {
-                of.jacobian[int64_t(i) * of.wanted_count + from + j] = l.d[j];
+                of.jacobian[int64_t(i) * of.wanted_count + from + j] = slope(l, j);
                 if (of.by_rate)
-                    of.by_rate[int64_t(i) * of.wanted_count + from + j] = v.d[j];
+                    of.by_rate[int64_t(i) * of.wanted_count + from + j] = slope(v, j);
             });
     }
     // Derivatives of the stretch at which a level holds the actuator at rest.
     void hold(double l, double level, double *slopes)
     {
         set_up();
-        const double stiffness = value(a) * bare.elastic(l).d[0];
+        const double stiffness = of.theta[stiffness_of] * bare.elastic(l).d[0];
         const S lacks = drive * level + force - a * system.force(plain(l));
         if constexpr (N > 0)
-            each([&](int j, int) { slopes[from + j] = lacks.d[j] / stiffness; });
+            each([&](int j, int) { slopes[from + j] = slope(lacks, j) / stiffness; });
     }
     bool operator()()
     {
         set_up();
-        S y[most] = {}, end[most], final[most];
-        const auto &first = step.k[0];
+        S y[most] = {}, end[most], at[2] = {};
+        R dense[7][2 * size_of<S>];
+        const int shown = of.by_rate ? 2 * size_of<S> : size_of<S> + 1;  // numbers of it that are asked for
         y[0] = plain(of.theta[stretch_of]), y[1] = seeded_at(rate_of);
         if constexpr (N > 0)
-            each([&](int j, int) { y[0].d[j] = of.start[from + j]; });
-        for (int b = 0; b < of.branches; b++)
+            each([&](int j, int) { incline(y[0], j, of.start[from + j]); });
+        for (int b = 0; b < creeping; b++)
             y[2 + b] = system.force(y[0]) + (of.behind ? of.behind[b] : 0);
         level = of.levels[0], ramp = of.ramps[0], piece_begin = of.begins[0];
         excess = plain(of.field - level) + lag * ramp;
         if constexpr (N > 0)
             each([&](int j, int wanted) {
                 if (wanted == lag_of)
-                    excess.d[j] += of.field_lag;
+                    incline(excess, j, slope(excess, j) + of.field_lag);
             });
-        const double stiff = value(a);
+        const double stiff = of.theta[stiffness_of];
         fastest = sqrt(stiff / bare.mass(bare.rest));
         double h = 0.2 / fastest, t = of.begins[0];
         bool fresh = true;
@@ -205,22 +190,18 @@ template <class C, class System, int NB = most_branches> struct Response {
             for (; i < of.count && of.times[i] <= t; i++)  // before the begin it is uniform
                 put(i, y[0] + y[1] * (of.times[i] - t), y[1]);
             if (i == of.count) {
-                for (int b = 0; of.behind_last && b < of.branches; b++)
-                    of.behind_last[b] = value(y[2 + b]) - value(system.force(y[0]));
+                for (int b = 0; of.behind_last && b < creeping; b++)
+                    of.behind_last[b] = first(y[2 + b]) - first(system.force(y[0]));
                 return true;
             }
             const double limit = piece + 1 < of.pieces ? of.begins[piece + 1] : infinity();
-            const double l = value(y[0]);
+            const double l = first(y[0]);
             const double per_phase = sqrt(bare.mass(l) / (stiff * bare.elastic(l).d[0]));
-            const double smooth = smooth_phase * per_phase;
-            double target = min(limit, of.times[i] - t >= smooth ? of.times[i] : t + smooth);
-            if (of.behind_last)
-                target = min(target, of.times[of.count - 1]);
-            if (of.wanted_count > 0) {
-                h = min(h, longest_phase * per_phase);
-                for (int b = 0; b < of.branches; b++)
-                    h = min(h, relaxed_share / bare_branches.tangent(b, bare.elastic(l).v - value(y[2 + b])));
-            }
+            const double target = min(limit, of.times[of.count - 1]);
+            h = min(h, longest_phase * per_phase);
+            if (of.wanted_count > 0)
+                for (int b = 0; b < creeping; b++)
+                    h = min(h, relaxed_share / bare_branches.tangent(b, bare.elastic(l).v - first(y[2 + b])));
             const double span = min(h, target - t), dt = t - piece_begin;
             const double error = make(y, fresh, dt, span, end);
             fresh = false;
@@ -231,15 +212,17 @@ template <class C, class System, int NB = most_branches> struct Response {
                 continue;
             }
             const double after = span == target - t ? target : t + span;
-            change(end, after - piece_begin, final);
+            change(end, after - piece_begin, step.k[12]);
+            if (of.times[i] < after)
+                step.spread([&](int stage, const S *x, S *by) __attribute__((always_inline)) {
+                    change(x, dt + span * dop853::node[stage], by);
+                }, y, R{} + span, end, shown, dense, std::make_integer_sequence<int, 4>());
             for (; i < of.count && of.times[i] < after; i++) {
-                S rate;
-                const S stretch = quintic((of.times[i] - t) / span, span, y[0], y[1], first[1],
-                    end[0], end[1], final[1], rate);
-                put(i, stretch, rate);
+                step.between((of.times[i] - t) / span, y, shown, dense, at);
+                put(i, at[0], at[1]);
             }
             for (int w = 0; w < width; w++)
-                y[w] = end[w], step.k[0][w] = final[w];
+                y[w] = end[w], step.k[0][w] = step.k[12][w];
             t = after;
             if (span == h || error > 0.5)
                 h = span * resized(error);
@@ -252,16 +235,16 @@ template <class C, class System, int NB = most_branches> struct Response {
     {
         const S before = field(of.begins[piece] - piece_begin);
         piece_begin = of.begins[piece];
-        const double jump = of.levels[piece] - value(before);
+        const double jump = of.levels[piece] - first(before);
         level = of.levels[piece], ramp = of.ramps[piece];
         excess = before - level + lag * ramp;
         if constexpr (N > 0)
             if (jump != 0) {
                 // By a lag of 0, or by a later switch: what the step lacks is an impulse.
-                const double impulse = value(drive) * jump / bare.mass(value(y[0]));
+                const double impulse = first(drive) * jump / bare.mass(first(y[0]));
                 each([&](int j, int wanted) {
-                    if (wanted == switch_of + piece || (wanted == lag_of && !(value(lag) > 0)))
-                        y[1].d[j] -= impulse;
+                    if (wanted == switch_of + piece || (wanted == lag_of && !(of.theta[lag_of] > 0)))
+                        incline(y[1], j, slope(y[1], j) - impulse);
                 });
             }
     }

@@ -16,17 +16,17 @@ enum Family { gent, neo_hookean, polynomial, ogden, table, beam, arruda_boyce, d
 // constants of the law have derivatives, too.
 template <class S, class C> using Along = std::conditional_t<
     (count_of<C> > 0 || count_of<S> == 0), S, Dual<real<S>, 1>>;
-template <class L, bool direct, class S> HMSA_INLINE L inner(const S &l)
+template <class L, bool direct, class S> HMSA_INLINE decltype(auto) inner(const S &l)
 {
     if constexpr (direct || count_of<S> == 0)
-        return l;
+        return (l);
     else
         return seeded<L>(value(l));
 }
-template <bool direct, class L, class S> HMSA_INLINE S outer(const L &f, const S &l)
+template <bool direct, class L, class S> HMSA_INLINE decltype(auto) outer(const L &f, const S &l)
 {
     if constexpr (direct || count_of<S> == 0)
-        return f;
+        return (f);
     else
         return chained(f, l);
 }
@@ -53,12 +53,13 @@ template <class C, template <class> class Law> struct Block {
         const S &l, const S &v, const D &damping, const F &net, real<S> *squared = nullptr) const
     {
         using L = Along<S, C>;
-        const L x = inner<L, direct>(l), x2 = x * x, x4 = x2 * x2, q = inverse(x + x4 * c1);
+        const L &x = inner<L, direct>(l);
+        const L x2 = x * x, x4 = x2 * x2, q = inverse(x + x4 * c1);
         const L force = law.force(x), per_mass = 6.0 * x4 * q;
         if constexpr (count_of<S> > 0 && !direct)
             if (squared)
                 *squared = force.d[0] * per_mass.v;
-        const S i_mass = outer<direct>(per_mass, l);
+        const S &i_mass = outer<direct>(per_mass, l);
         return net(outer<direct>(force, l)) * i_mass
             - (i_mass * damping - outer<direct>(L(1.5 * q), l) * v) * v;
     }
@@ -186,7 +187,8 @@ template <class C> struct AnyOf {
         const S &l, const S &v, const D &damping, const F &net, real<S> *squared = nullptr) const
     {
         using L = Along<S, C>;
-        const L x = inner<L, direct>(l), pull = force(x);
+        const L &x = inner<L, direct>(l);
+        const L pull = force(x);
         L i_mass, falls, damps;
         inertia(x, i_mass, falls, damps);
         if constexpr (count_of<S> > 0 && !direct)
@@ -276,7 +278,7 @@ template <int NB, class C = double> struct Branches {
     }
 };
 // Scalars in a state with so many branches; in pairs where a step goes through them in a loop.
-template <class S, int NB> constexpr int room_of = count_of<S> <= 1 && NB <= 1 ? 2 + NB : (3 + NB) / 2 * 2;
+template <class S, int NB> constexpr int room_of = (count_of<S> <= 1 || lanes<real<S>> > 1) && NB <= 1 ? 2 + NB : (3 + NB) / 2 * 2;
 // Blocks have code of their own; other laws share as much as they can.
 template <class System> constexpr bool has_own_code = false;
 template <class C, template <class> class Law> constexpr bool has_own_code<Block<C, Law>> = true;
