@@ -51,10 +51,13 @@ def test_a_row_that_is_not_met_fails_the_run(ros_domain_id, monkeypatch, tmp_pat
 
 def test_table_says_what_was_expected_beside_what_was_seen():
     fault = rows.FAULTS[0]
-    text = markdown([Outcome(fault, Seen('a | b', '1e-9', met=True))])
-    head, _, row = text.splitlines()
-    assert head.count('|') == 6
-    assert f'{fault.expected} | a \\| b | 1e-9 |' in row
+    text = markdown([
+        Outcome(fault, Seen('a | b', '1e-9', met=True)),
+        Outcome(fault, Seen('a | b', '1e-9', met=False))])
+    head, _, met, missed = text.splitlines()
+    assert head.count('|') == 5
+    assert met.endswith(f'| {fault.expected} | 1e-9 |')
+    assert missed.endswith(f'| {fault.expected}; **not met**: a \\| b | 1e-9 |')
 
 
 def test_residual_counts_from_the_last_change_of_the_field():

@@ -60,11 +60,12 @@ def inject(fault: Fault, domain: int) -> Outcome:
 
 
 def markdown(outcomes: Sequence[Outcome]) -> str:
-    """Return the table for a page of the documentation."""
-    head = ('fault', 'how', 'expected', 'seen', 'residual or loss')
+    """Return the table for a page of the documentation: what was seen only if not expected."""
+    head = ('fault', 'how', 'expected', 'residual or loss')
     lines = ['| ' + ' | '.join(head) + ' |', '|' + ' --- |' * len(head)]
     for row in outcomes:
-        seen = row.seen.text if row.seen.met else f'**not met**: {row.seen.text}'
-        cells = (row.fault.name, row.fault.how, row.fault.expected, seen, row.seen.figure)
+        expected = row.fault.expected + (
+            '' if row.seen.met else f'; **not met**: {row.seen.text}')
+        cells = (row.fault.name, row.fault.how, expected, row.seen.figure)
         lines.append('| ' + ' | '.join(x.replace('|', '\\|') for x in cells) + ' |')
     return '\n'.join(lines) + '\n'
