@@ -13,8 +13,6 @@ import numpy as np
 from hmsa_ros.model.equations import (
     Array,
     critical_zeta,
-    elastic_energy,
-    elastic_force,
     Floats,
     signed_root,
     stretch_limits,
@@ -37,7 +35,7 @@ def lines() -> Iterator[str]:
     """Yield every claim computed, a line a number or group; a claim's title ends in a colon."""
     for section in (
             _limits, _critical, _damping_time, _damping, _mismatch, _inequality, _residuals,
-            _settling, _cycles, _near_limit, _extensibility):
+            _settling, _cycles, _extensibility):
         yield from section()
 
 
@@ -60,7 +58,7 @@ def _critical() -> Iterator[str]:
         c1 = 0.5 * (ratio + math.sqrt(ratio * ratio + 4.0 * ratio * 1.1 ** -3))
         check = float(critical_zeta(1.1, NondimensionalParameters(j_lim=5.0, c1=c1)))
         yield f'  at 1.1, J_lim 5: {check:.3f} for c1 {c1:.4f}'
-    for stretch in (1.2, 1.4, 1.0, 0.9, 0.8, 0.7, 0.6):
+    for stretch in (1.4, 1.2, 1.0, 0.8, 0.6):
         yield f'  at {stretch:g}, J_lim 5, c1 2: {float(critical_zeta(stretch, _PAPER)):.4f}'
     release = 1.05 * float(critical_zeta(1.0, _PAPER))
     for start, target in ((0.6, 1.0), (0.9, 1.0)):
@@ -71,7 +69,7 @@ def _critical() -> Iterator[str]:
 
 def _damping_time() -> Iterator[str]:
     yield 'tau_p over zeta, 1 to 1.1:'
-    for zeta in (0.0, 0.02, 0.2, 0.4, 1.0, 1.1, 1.5, 2.0, 2.1, 2.12, 2.14):
+    for zeta in (0.0, 0.2, 1.0, 2.0, 2.1, 2.14):
         plan = plan_two_step(1.0, 1.1, NondimensionalParameters(zeta, 5.0))
         yield (f'  zeta {zeta:g}: tau_p {plan.tau_p:.4f}, '
                f'b_p {float(signed_root(plan.beta_p)):.4f}, '
@@ -204,24 +202,6 @@ def _unsettled(run: Run, span: float) -> list[tuple[float, float]]:
             & (np.abs(run.stretch - target) > _SETTLED * abs(target - start)))
         parts.append((begin, float(run.time[outside][-1])))
     return parts
-
-
-def _near_limit() -> Iterator[str]:
-    yield '1.4 to 0.999 of the limiting stretch, zeta 0.2:'
-    for j_lim in paper_data.J_LIMS:
-        target = 0.999 * stretch_limits(j_lim)[1]
-        material = NondimensionalParameters(0.2, j_lim)
-        run, = paper_data.respond('', (1.4, target), material, commands=('shaped',), span=2.0)
-        after = run.time >= run.switches[3]
-        error = float(np.max(np.abs(run.stretch[after] - target)))
-        # Undamped, the unshaped step turns back where the energy gained is stored in the chains.
-        work = float(elastic_force(target, j_lim)) * (stretch_limits(j_lim)[1] - 1.4)
-        stored = work + float(elastic_energy(1.4, j_lim))
-        yield (f'  J_lim {j_lim:g}: b_p {float(signed_root(run.loads[2])):.4f}, '
-               f'tau_p {run.switches[3] - run.switches[2]:.4f}, '
-               f'b_1 {float(signed_root(run.loads[3])):.4f}, off target below {_power(error)}, '
-               f'unshaped step leaves 1e{-2.0 * stored / j_lim / math.log(10.0):.0f} of the '
-               'extension')
 
 
 def _extensibility() -> Iterator[str]:

@@ -316,7 +316,7 @@ def test_the_comparison_with_the_paper_says_what_the_computation_says() -> None:
     page = (ROOT / 'docs' / 'validation' / 'paper-comparison.md').read_text(
         encoding='utf-8').splitlines()
     computed = list(claims.lines())
-    assert len(computed) > 60
+    assert len(computed) > 50
     assert [line for line in computed if line not in page] == []
     # And nothing that is not computed stands among the numbers.
     inside = False
