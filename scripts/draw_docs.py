@@ -62,7 +62,7 @@ def force(path: Path) -> None:
     """Draw the load that holds a stretch, and where the chains end it."""
     with style.picture(path, 2.9, replace(SCREEN, width=120)) as figure:
         axes = figure.add_subplot()
-        for j_lim, look in zip((5.0, 1.0, 3.0), looks.CASES, strict=False):
+        for j_lim, look in zip((5.0, 3.0, 1.0), looks.CASES, strict=False):
             lower, upper = stretch_limits(j_lim)
             stretch = np.linspace(lower, upper, 2001)[1:-1]
             load = elastic_force(stretch, j_lim)
@@ -209,8 +209,8 @@ def creep(path: Path) -> None:
     span, grid = 15.0, Delivery(0.25)
     setpoints = [Setpoint(1.4, span), Setpoint(1.1, math.inf)]
     time = np.linspace(0.0, 2.0 * span, 3001)
-    curves = ((MATERIAL, "the paper's two-step", style.UNSHAPED),
-              (creeping, 'two-step and staircase', style.SHAPED))
+    curves = ((MATERIAL, 'planned without creep', style.UNSHAPED),
+              (creeping, 'planned for creep', style.SHAPED))
     with style.picture(path, 4.2, SCREEN) as figure:
         rows = figure.subplots(3, 1, sharex=True, height_ratios=[1.0, 1.2, 0.9])
         for material, name, look in curves:
