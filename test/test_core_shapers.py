@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from hmsa_ros import motion
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.delivery import Delivery, ramps
@@ -295,6 +296,25 @@ def test_a_refusal_names_limits_with_each_of_which_a_command_is_found():
         assert refusal.code is next(
             (code for word, code in by_word.items() if word in first), Code.NO_TWO_STEP)
     assert len(named) >= 2
+
+
+def test_a_refusal_costs_no_more_than_its_searches_and_one_for_advice(monkeypatch):
+    spent, solve = [], motion.solve
+
+    def counted(*arguments):
+        found = solve(*arguments)
+        spent.append(found[2])
+        return found
+
+    monkeypatch.setattr(motion, 'solve', counted)
+    creep = Creep((0.1, 0.2, 0.1), (0.2, 4.0, 100.0))
+    request = Request(
+        State(0.8861966254382365, -0.00023701158342467364, 0.5361491154517042),
+        0.8861926210099953, replace(PAPER, creep=creep), Limits(-0.0928, 6.558),
+        Delivery(slew=0.0002451145879390747), order=4)
+    with pytest.raises(RefusedError, match='expected no flux density limits and no slew limit'):
+        get_shaper('minimum_time')(request)
+    assert sum(spent) < 700_000
 
 
 @pytest.mark.parametrize('name', list(SHAPERS))

@@ -8,7 +8,7 @@ import math
 
 from hmsa_ros.model.moves import Limits, Move
 from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.shapers.request import Request, Shaper
+from hmsa_ros.planning.shapers.request import Request, Shaper, Work
 
 # Codes of refusals that a limit may be to blame for.
 _SEARCHED = (Code.FLUX_LIMIT, Code.SLEW_LIMIT, Code.NO_TWO_STEP, Code.NOT_CONVERGED)
@@ -36,15 +36,15 @@ def advised(
         try:
             return shaper(request)
         except RefusedError as error:
-            request.work.left = _ADVISING
-            ways = _ways(asked, request) if error.code in _SEARCHED else []
+            there = replace(request, work=Work(_ADVISING, advising=True))
+            ways = _ways(asked, there) if error.code in _SEARCHED else []
             what, _, advice = str(error).partition(': expected ')
             if not ways or (advice and ways == [('flux',)] and error.code is Code.FLUX_LIMIT):
                 raise
             raise RefusedError(
                 _CODES[ways[0][0]],
                 f'{what}: expected ' + ', or '.join(
-                    _advice(asked, request, x, factors) for x in ways)) from error
+                    _advice(asked, there, x, factors) for x in ways)) from error
     return shape
 
 

@@ -7,7 +7,7 @@ from hmsa_ros.model.moves import Move
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.shapers.free import free_levels
 from hmsa_ros.planning.shapers.push_brake import push_brake
-from hmsa_ros.planning.shapers.request import Request, Work
+from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.shapers.two_step import two_step
 
 # Of the search for full push and full brake.
@@ -25,7 +25,7 @@ def minimum_time(request: Request) -> Move:
     found: list[Move] = []
     refusals: list[RefusedError] = []
     # What the two-step command would find alone, it finds here.
-    pushing = Work(_PUSHING)
+    pushing = request.work.more(_PUSHING)
     shapers = [(push_brake, pushing), (two_step, request.work)]
     if request.delivery.period == 0.0 and request.delivery.slew < math.inf:
         shapers.append((free_levels, pushing))

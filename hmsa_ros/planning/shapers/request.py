@@ -54,6 +54,12 @@ class Work:
     """
 
     left: int = 700_000
+    #: Of a search for advice, which has no more than this for all that it tries.
+    advising: bool = False
+
+    def more(self, left: int) -> 'Work':
+        """Return work for one more way to the same target."""
+        return self if self.advising else Work(left)
 
 
 @dataclass(frozen=True)
