@@ -46,7 +46,8 @@ def recorded(seed):
     return truth, nominal, (time + truth['latency'], stretch), (time, field), (begins, levels)
 
 
-@pytest.mark.parametrize('seed', range(8))
+@pytest.mark.parametrize('seed', [
+    pytest.param(x, marks=pytest.mark.slow if x > 2 else ()) for x in range(8)])
 def test_transport_lag_and_latency_are_told_apart_on_random_benches(seed):
     truth, nominal, samples, readings, (begins, levels) = recorded(seed)
     found = delays(
