@@ -70,7 +70,8 @@ def test_modulus_damping_bias_and_state_are_found_within_their_deviations(factor
     assert np.max(np.abs(errors)) < 4.5
 
 
-@pytest.mark.parametrize(('coil', 'tau'), [(0.0, 0.01), (5e-4, 0.05)])
+@pytest.mark.parametrize(('coil', 'tau'), [
+    pytest.param(0.0, 0.01, marks=pytest.mark.slow), (5e-4, 0.05)])
 def test_branches_that_are_given_are_followed_over_many_windows(coil, tau):
     extras = oracle.Extras(coil=coil, ratio=0.1, time=tau)
     block = replace(oracle.BLOCK, shear_modulus=9e3)
