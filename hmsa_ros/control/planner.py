@@ -364,7 +364,8 @@ class PlannerRuntime:
         """Do what is due at a time in ns, for some ms at most; return what to pass on."""
         self._begin_anew()
         self._engage()
-        if not (self._send(now) and self.feedback.update(now)):
+        estimated = self._send(now) and self.feedback.update(now)
+        if not estimated:
             self._work_on()
         if self._bulletin.preview_again is not None and now >= self._bulletin.preview_again:
             self._bulletin.show()
@@ -373,7 +374,8 @@ class PlannerRuntime:
                 self._watch.open or self._bulletin.unheard or self._bulletin.unseen
                 or self.hearing.receipts or self._bulletin.next_change is not None):
             self._bulletin.look_for_listeners()
-            self._judge(now)
+            if not estimated:
+                self._judge(now)
         self._begin_anew()
         return self._taken()
 
