@@ -16,6 +16,9 @@ import sys
 def main(argv: list[str] | None = None) -> int:
     """Run the ``hmsa`` command; return its exit status."""
     _take_over()
+    # The matrices here are small: threads of a linear algebra library wait longer for each other
+    # than they compute, and a node would wait for them.
+    os.environ.setdefault('OMP_NUM_THREADS', '1')
     from hmsa_ros.ending import ENDING
     ENDING.leave()
     from hmsa_ros.cli import main as command
