@@ -160,9 +160,9 @@ class _Problems:
     def __init__(self, time: Array, rest: Array, drifts: Array | None) -> None:
         self.time, self._rest = time, rest
         level = np.full(len(time), 1.0 / math.sqrt(len(time)))
-        self._straight = level[None, None]  # orthonormal, shape (k, 1 or 2, n)
+        self._straight: Array = level[None, None]  # orthonormal, shape (k, 1 or 2, n)
         # What an offset in the middle is of the coordinates of the straight line.
-        self._middle = np.full((1, 1), level[0])
+        self._middle: Array = np.full((1, 1), level[0])
         if drifts is not None:
             # Of an offset they have no part: their means over the time are 0.
             share = np.diff(time) / (time[-1] - time[0])
