@@ -62,7 +62,7 @@ ACTUATOR = paper_actuator()
 UNIT = ACTUATOR.time_unit
 SEQUENCE = ((1.1, 10.0), (1.2, 10.0), (1.4, 10.0))
 START = 2 * NANOSECONDS
-PERIOD, FINE = 200_000, 50_000
+PERIOD = 50_000
 LEAD = 5_000_000
 # What the integration leaves of a motion that has come to rest, as a share of the step.
 ROUNDING = 1e-6
@@ -200,7 +200,7 @@ def bag(tmp_path_factory):
     """Return the bag of the paper's sequence."""
     lost = {'/joint_states': 0, '/flux_density_command': 2}
     return write(
-        tmp_path_factory.mktemp('report') / 'run', simulated(period=FINE),
+        tmp_path_factory.mktemp('report') / 'run', simulated(),
         **parameters(planner=ACTUATOR, plant=ACTUATOR), lost=json.dumps(lost))
 
 
@@ -486,7 +486,7 @@ def test_the_plan_predicts_a_plant_that_is_as_planned(tmp_path, slew, lag):
         known |= {'planner.slew_limit': str(slew), 'plant.slew_limit': str(slew)}
     if lag:
         known |= {'planner.coil_time_constant': str(lag), 'plant.coil_time_constant': str(lag)}
-    part = one(tmp_path / 'bag', simulated(slew=slew, lag=lag, period=FINE), **known)
+    part = one(tmp_path / 'bag', simulated(slew=slew, lag=lag), **known)
     difference = part.run.stretch - part.evaluation.planned.at(part.evaluation.time).stretch
     assert np.count_nonzero(np.isfinite(difference)) > 2000
     assert np.nanmax(np.abs(difference)) < SAME
@@ -901,7 +901,7 @@ def test_a_request_that_is_not_a_number_hides_no_setpoint(tmp_path):
 @pytest.mark.parametrize(('samples', 'levels', 'setpoints'), [
     (1, [0.02, 0.035], 0), (100, [0.02, 0.035], 0), (2000, [1e300], 1), (2000, [], 0)])
 def test_odd_recordings_are_shown_for_what_they_are(tmp_path, samples, levels, setpoints):
-    messages = [x for x in simulated(period=FINE) if x[1] == '/joint_states'][:samples]
+    messages = [x for x in simulated() if x[1] == '/joint_states'][:samples]
     messages += [
         (START, '/flux_density_command', TYPES[COMMAND],
          command(START + LEAD + i * 6_000_000, value)) for i, value in enumerate(levels)]
