@@ -8,7 +8,6 @@ what samples do not tell apart widens them.
 """
 
 from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass
 import math
 from statistics import NormalDist
@@ -104,22 +103,21 @@ def fit(
     coarse = _Sinusoids(time, omegas, decays)
     problem = _Problems(time, rest, time[None] if periods >= _DRIFTS else None)
     solved = _refined(problem, problem.solve(coarse), coarse)
-    plain = _bounds(problem, 0, _Solved(*(x[..., 0, :] for x in solved)), searched)
+    plain = _bounds(problem, 0, solved.flat(), searched)
     if plain.independent > _INDEPENDENT or settles(plain):
         return plain
     # What is left is not chance alone: it may creep.
-    creeping = _Problems(time, rest, np.exp(-time / (_CREEPS[:, None] * span)))
-    fits = creeping.solve(coarse)
+    drifts = np.exp(-time / (_CREEPS[:, None] * span))
+    fits = _Problems(time, rest, drifts).solve(coarse)
     place = int(np.argmin(np.min(fits.squares, axis=-1)))
     near = slice(max(place - 1, 0), place + 2)
-    nearest = _refined(creeping.taken(near), _Solved(*(x[..., near, :] for x in fits)), coarse)
-    least = np.min(nearest.squares, axis=-1)
+    nearest = _Problems(time, rest, drifts[near])
+    refined = _refined(nearest, _Solved(*(x[..., near, :] for x in fits)), coarse)
+    least = np.min(refined.squares, axis=-1)
     if np.min(least) > _EXPLAINED * np.min(solved.squares):
         return plain
-    count = fits.squares.shape[-1]
-    return _bounds(creeping, near.start + int(np.argmin(least)), _Solved(*(
-        np.concatenate((x.reshape(*x.shape[:-2], -1), y[..., count:].reshape(*y.shape[:-2], -1)),
-                       axis=-1) for x, y in zip(fits, nearest, strict=True))), searched)
+    more = refined.taken(slice(fits.squares.shape[-1], None))
+    return _bounds(nearest, int(np.argmin(least)), fits.flat().joined(more.flat()), searched)
 
 
 # -- fits of a grid -----------------------------------------------------------------------------
@@ -135,8 +133,15 @@ class _Solved(NamedTuple):
     offset_variance: Array
     pair_variance: Array  # the larger of the two
 
-    def taken(self, places: NDArray[np.intp]) -> '_Solved':
+    def taken(self, places: NDArray[np.intp] | slice) -> '_Solved':
         return _Solved(*(x[..., places] for x in self))
+
+    def flat(self) -> '_Solved':
+        """Return those of all problems together."""
+        return _Solved(*(x.reshape(*x.shape[:-2], -1) for x in self))
+
+    def joined(self, other: '_Solved') -> '_Solved':
+        return _Solved(*(np.concatenate(x, axis=-1) for x in zip(self, other, strict=True)))
 
 
 class _Sinusoids:
@@ -145,13 +150,14 @@ class _Sinusoids:
     def __init__(self, time: Array, omegas: Array, decays: Array) -> None:
         self.omegas, self.decays = omegas, decays
         phase = omegas[..., None] * time
-        cosine, sine = np.cos(phase), np.sin(phase)
-        self.turning = np.stack((cosine, sine), axis=-3)  # shape (..., 2, m, n)
+        self.cosine, self.sine = np.cos(phase), np.sin(phase)  # shape (..., m, n)
         self.fading = np.exp(-decays[..., None] * time)  # shape (..., d, n)
-        squared = (self.fading**2)[..., None, :, :].swapaxes(-1, -2)
-        self.plain = np.sum(squared, axis=-2)
-        self.twice = np.stack(
-            (cosine**2 - sine**2, 2.0 * cosine * sine), axis=-3) @ squared
+        squared = (self.fading**2).swapaxes(-1, -2)
+        self.plain = np.sum(squared, axis=-2)[..., None, :]
+        # Cosine and sine of twice the phase.
+        self.twice = (
+            (self.cosine**2 - self.sine**2) @ squared,
+            (2.0 * self.cosine * self.sine) @ squared)
 
 
 class _Problems:
@@ -177,22 +183,13 @@ class _Problems:
         self._explained = self._straight @ rest
         self._left = rest - (self._explained[:, None] @ self._straight)[:, 0]
 
-    def taken(self, places: slice) -> '_Problems':
-        """Return the problems of some drifts."""
-        found = copy(self)
-        for name in ('_straight', '_middle', '_explained', '_left'):
-            setattr(found, name, getattr(self, name)[places])
-        return found
-
     def solve(self, tried: _Sinusoids) -> _Solved:
         """Fit sinusoids to each problem; shapes (k, m d)."""
-        plain, (real, imaginary) = tried.plain, np.moveaxis(tried.twice, -3, 0)
+        plain, (real, imaginary) = tried.plain, tried.twice
         columns = np.concatenate((self._straight, self._left[:, None]), axis=1)
-        # Parts of cosine and sine, shapes (k, 1 or 2, m, d) and (k, m, d).
-        cosines, sines = (
-            tried.turning[..., None, i, :, :] @ (
-                tried.fading[..., None, :, :] * columns[..., None, :]).swapaxes(-1, -2)
-            for i in (0, 1))
+        faded = (tried.fading[..., None, :, :] * columns[..., None, :]).swapaxes(-1, -2)
+        # Shapes (k, 2 or 3, m, d).
+        cosines, sines = (x[..., None, :, :] @ faded for x in (tried.cosine, tried.sine))
         by_cosines, by_sines = cosines[:, :-1], sines[:, :-1]
         rights = cosines[:, -1], sines[:, -1]
         one = 0.5 * (plain + real) - np.sum(by_cosines**2, axis=1)
@@ -239,7 +236,7 @@ def _refined(problems: _Problems, solved: _Solved, coarse: _Sinusoids) -> _Solve
             problems.time,
             np.clip(omega + width * np.linspace(-1.0, 1.0, _REFINED), omegas[0], omegas[-1]),
             np.clip(decay + spread * np.linspace(-2.0, 2.0, 5), 0.0, decays[-1])))
-        solved = _Solved(*(np.concatenate(x, axis=-1) for x in zip(solved, more, strict=True)))
+        solved = solved.joined(more)
         width, spread = 2.0 * width / (_REFINED - 1), 0.5 * spread
     return solved
 
