@@ -236,7 +236,7 @@ class PlannerNode(ManagedNode):
     def _serve(self) -> None:
         """Publish what the runtime has to say, and note when to look again."""
         if not self._channels:
-            # Cleaned up, and this was on its way.
+            # Cleaned up; the loop of a controller goes on.
             return
         self._take(self._runtime.tick(self.now()))
         if not self.linked:
