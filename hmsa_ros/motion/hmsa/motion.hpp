@@ -61,10 +61,6 @@ template <class S, class System, int NB> struct Motion {
             }
             for (int w = 0; w < width; w++)
                 y[w] = end[w];
-            // A rate on which only damping still acts falls to numbers with which processors take
-            // ten times as long.
-            if (abs(value(y[1])) < 1e-200)
-                settle(y[1]);
             done = span == left ? duration : done + span;
             if (span == h || error > 0.5)
                 h = span * resized(error);
@@ -72,9 +68,7 @@ template <class S, class System, int NB> struct Motion {
         return false;
     }
     static void negate(double &x) { x = -x; }
-    static void settle(double &x) { x = 0; }
     template <int N> static void negate(Dual<double, N> &x) { x.v = -x.v; }
-    template <int N> static void settle(Dual<double, N> &x) { x.v = 0; }
 };
 
 // What is left of an exponential after a duration: nothing that a sum would not show.
