@@ -39,7 +39,9 @@ _RTOL = 1e-9
 # Of the range of the levels: the change by which the vibration is differentiated, and the widest
 # change of a first pass.
 _CHANGE, _STRIDE = 1e-5, 0.3
-_PASSES = 24
+# Passes, and what they may cost: each integrates all cases once for each level and correction, in
+# steps as many as the motion has levels, radians, and time constants of the fastest branch.
+_PASSES, _COST = 24, 400_000
 # Of the range of the levels.
 _MARGIN = 1e-3
 # Of the stride: bounds that are met are this far away, to begin inside of them.
@@ -284,8 +286,12 @@ def _search(
     if request.delivery.slew < math.inf:
         differences = np.vstack([differences, differences - np.eye(len(loads), k=-1)])
     slopes = np.empty((*now.shape, len(loads)))
+    material = request.material
+    speed = float(law.natural_frequency(request.target, material.packed)) + float(
+        material.branches[:, motion.SPEED].max(initial=0.0))
+    cost = len(cases) * (len(loads) + _CORRECTED) * (len(loads) + chain.duration * speed)
     renew = True
-    for _ in range(_PASSES):
+    for _ in range(min(_PASSES, math.ceil(_COST / cost))):
         if not _NOTHING < largest(now) < math.inf:
             break
         if renew:
