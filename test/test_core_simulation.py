@@ -111,7 +111,7 @@ def test_numbers_below_the_least_normal_one_are_zero_in_the_motion_alone():
     least = np.finfo(float).tiny
     for rate, same in ((0.5 * least, False), (2.0 * least, True)):
         _, after = simulate([0.0], [0.0], [0.01], PAPER, rate=rate)
-        assert (after[0] > 0.0) is same
+        assert bool(after[0] > 0.0) == same
     assert 0.5 * least > 0.0
 
 
