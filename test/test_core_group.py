@@ -329,6 +329,21 @@ def test_lost_command_is_noticed_by_the_next_one():
     assert first not in joint.planner.plan.levels
 
 
+def test_the_level_in_force_is_not_the_early_beginning_of_a_gentle_path():
+    joint = Joint(flux_density_min=-0.5, flux_density_max=0.5)
+    path = [((1.0 + 0.3 * x * x * (3.0 - 2.0 * x), 9.0 * x * (1.0 - x), math.nan),
+             round(200 * MS * x)) for x in (i / 20 for i in range(21))]
+    joint.planner.take(finish(joint.planner.draft_path(path, None, START)), START)
+    sent = joint.planner.due(START + 50 * MS)
+    assert len(sent) > 50
+    # Its levels begin and differ by less than hardware that rounds resolves.
+    assert 0.0 < abs(sent[0].flux_density) < 1e-4
+    assert joint.group.applied('x', START, 0.0, TOLERANCE) is None
+    for level in sent:
+        assert joint.group.applied(
+            'x', level.stamp, level.flux_density, TOLERANCE) == Deviation()
+
+
 def test_foreign_level_is_taken_in():
     joint = Joint(lead_time=5 * MS)
     joint.planner.setpoint(1.2, START)

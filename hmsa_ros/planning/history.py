@@ -150,6 +150,8 @@ class History:
         for i in same:
             if levels[i].stamp < stamp and levels[i].flux_density != levels[i - 1].flux_density:
                 return i
+        if _same(flux_density, levels[self.known].flux_density):
+            return None  # in force already, and not the early beginning of a gentle path
         # A driver that rounds to its own steps may be early, but leaves no change out for that.
         return next((i for i in same if not self._changes(range(self.known + 1, i))), None)
 
