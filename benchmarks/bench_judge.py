@@ -19,7 +19,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 from benchmarks.sheet import Sheet
-from hmsa_ros.judge import judge, Setpoint, Tolerances
+from hmsa_ros.judge.judging import judge
+from hmsa_ros.judge.records import Setpoint, Tolerances
 
 #: Runs of each kind.
 RUNS = 200

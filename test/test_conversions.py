@@ -13,7 +13,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from hmsa_ros.control import records
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces.status import Verdict, whole
-from hmsa_ros.judge import Finding, missed, Setpoint, unobserved
+from hmsa_ros.judge.records import Finding, missed, Setpoint, unobserved
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.nodes import conversions

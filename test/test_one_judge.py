@@ -20,7 +20,7 @@ from hmsa_ros.control.records import (
 )
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.judge import Sensor
+from hmsa_ros.judge.records import Sensor
 from hmsa_ros.model.actuators import Setup
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.planning.group import PlannerGroup

@@ -28,7 +28,7 @@ from hmsa_ros.files import json_text
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from hmsa_ros.judge import Finding, Tolerances
+    from hmsa_ros.judge.records import Finding, Tolerances
     from hmsa_ros.lab.experiment import Conducted, Experiment
     from hmsa_ros.report.arrivals import Part
     from hmsa_ros.report.outcome import LevelResult
@@ -147,7 +147,7 @@ def _tell(update: 'Callable[[str, float | None], None]', what: str, share: float
 
 def _tolerances(arguments: argparse.Namespace) -> 'Tolerances | None':
     """Return the tolerances, None for the planner's; refuse what cannot be used."""
-    from hmsa_ros.judge import Tolerances
+    from hmsa_ros.judge.records import Tolerances
 
     tolerance = arguments.tolerance
     if tolerance is None:
@@ -207,7 +207,7 @@ def _report(parts: 'list[Part]', path: Path) -> Path:
 def _verdict(
         experiment: 'Experiment', findings: 'list[Finding]', done: 'Conducted') -> tuple[str, str]:
     """Return the verdict on all setpoints, or on the end of levels, and why."""
-    from hmsa_ros.judge import worst
+    from hmsa_ros.judge.records import worst
 
     if not experiment.setpoints or not done.measured:
         reason = ('the levels or the path end at rest' if done.measured

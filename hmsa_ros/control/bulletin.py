@@ -15,7 +15,7 @@ from hmsa_ros.control.records import (
 )
 from hmsa_ros.control.slices import Clock
 from hmsa_ros.control.watching import Watch
-from hmsa_ros.judge import Finding, VERDICTS
+from hmsa_ros.judge.records import Finding, VERDICTS
 from hmsa_ros.model.status import Code
 from hmsa_ros.planning.group import PlannerGroup, Progress
 from hmsa_ros.planning.timeline import PlannedSegment

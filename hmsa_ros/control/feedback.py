@@ -21,7 +21,7 @@ from hmsa_ros.estimation import Estimate, Estimator, Options, Prior
 from hmsa_ros.estimation.motion import rest
 from hmsa_ros.estimation.words import differences
 from hmsa_ros.identification.known import Known
-from hmsa_ros.judge import Sensor
+from hmsa_ros.judge.records import Sensor
 from hmsa_ros.model.equations import equilibrium_stretch
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import PlannerGroup

@@ -16,7 +16,7 @@ from hmsa_ros.control.holds import AHEAD
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import Severity, StatusChanged, Stop, Trajectory, Verdict
 from hmsa_ros.errors import excerpt
-from hmsa_ros.judge import Finding, GoalTolerances
+from hmsa_ros.judge.records import Finding, GoalTolerances
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.path import Path

@@ -4,14 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from hmsa_ros.judge import (
-    ENOUGH,
+from hmsa_ros.judge.judging import ENOUGH, judge, look_length, rests_from
+from hmsa_ros.judge.records import (
     Finding,
     GoalTolerances,
-    judge,
-    look_length,
     missed,
-    rests_from,
     Sensor,
     Setpoint,
     Tolerances,

@@ -9,7 +9,7 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation.correction import TOLERANCE
 from hmsa_ros.estimation.prior import TRACKED
 from hmsa_ros.identification.known import Known
-from hmsa_ros.judge import Finding, GoalTolerances, Tolerances
+from hmsa_ros.judge.records import Finding, GoalTolerances, Tolerances
 from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import Progress

@@ -6,7 +6,15 @@ from dataclasses import dataclass, field, replace
 
 from hmsa_ros.control.holds import AHEAD, Hold
 from hmsa_ros.control.slices import Clock
-from hmsa_ros.judge import Finding, GoalTolerances, missed, Sensor, Setpoint, Tolerances, worst
+from hmsa_ros.judge.records import (
+    Finding,
+    GoalTolerances,
+    missed,
+    Sensor,
+    Setpoint,
+    Tolerances,
+    worst,
+)
 from hmsa_ros.model.equations import stretch_limits
 from hmsa_ros.model.law import critical_zeta
 from hmsa_ros.planning.group import PlannerGroup

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from hmsa_ros.errors import HmsaError
-from hmsa_ros.judge import Tolerances
+from hmsa_ros.judge.records import Tolerances
 from hmsa_ros.lab.adapting import second_act, SecondAct
 from hmsa_ros.lab.experiment import conduct, Experiment
 from hmsa_ros.lab.processes import NodeProcess

@@ -24,7 +24,7 @@ from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.result import Identification
 from hmsa_ros.identification.runs import recording_of
 from hmsa_ros.interfaces.topics import PLANNER
-from hmsa_ros.judge import worst
+from hmsa_ros.judge.records import worst
 from hmsa_ros.lab.experiment import conduct, Experiment, prepare, Tell
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.recordings.bags import read_run

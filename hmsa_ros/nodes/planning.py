@@ -14,7 +14,7 @@ from hmsa_ros.identification.quantities import check_free
 from hmsa_ros.interfaces import parameters as shared
 from hmsa_ros.interfaces.actuator import planned_from
 from hmsa_ros.interfaces.parameters import ParameterSpec
-from hmsa_ros.judge import Tolerances
+from hmsa_ros.judge.records import Tolerances
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.markers import MARKER_SCALE

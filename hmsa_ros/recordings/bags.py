@@ -16,7 +16,7 @@ from hmsa_ros.bag.info import BagSummary, summarize
 from hmsa_ros.bag.reader import BagReader, Message
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.interfaces.status import whole
-from hmsa_ros.judge import Sensor
+from hmsa_ros.judge.records import Sensor
 from hmsa_ros.model.schedule import obeyed
 from hmsa_ros.recordings import answers
 from hmsa_ros.recordings import topics as roles

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.judge import Sensor
+from hmsa_ros.judge.records import Sensor
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.recordings.levels import in_force, Level

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from hmsa_ros.judge import Setpoint
+from hmsa_ros.judge.records import Setpoint
 from hmsa_ros.model.equations import Array, equilibrium_stretch, natural_frequency, stretch_limits
 from hmsa_ros.model.law import critical_zeta
 from hmsa_ros.model.units import NANOSECONDS

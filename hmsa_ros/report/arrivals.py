@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from hmsa_ros.judge import Tolerances
+from hmsa_ros.judge.records import Tolerances
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.residual import percent
 from hmsa_ros.model.units import NANOSECONDS

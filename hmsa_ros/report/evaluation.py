@@ -12,7 +12,8 @@ import numpy as np
 
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces.topics import PLANNER
-from hmsa_ros.judge import Finding, rests_from, Tolerances
+from hmsa_ros.judge.judging import rests_from
+from hmsa_ros.judge.records import Finding, Tolerances
 from hmsa_ros.model.delivery import Delivery
 from hmsa_ros.model.equations import (
     Array,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.judge import Finding
+from hmsa_ros.judge.records import Finding
 from hmsa_ros.table import Column, Table
 
 
