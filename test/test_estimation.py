@@ -9,9 +9,11 @@ import pytest
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation import Estimator, Options, Prior
 from hmsa_ros.estimation.motion import follow, Levels
+from hmsa_ros.estimation.suspects import Gain, Look, Suspects
 from hmsa_ros.estimation.words import confounded, sentence
 from hmsa_ros.identification.files import read_belief
 from hmsa_ros.model.creep import Creep
+from hmsa_ros.planning.planner import Options as PlannerOptions
 
 # Rest without field, a push, rest near 1.4, and back to rest near 1.1; in s and T.
 TIMES = np.array([0.0, 0.03, 0.036, 0.09])
@@ -268,3 +270,56 @@ def test_a_bias_is_known_no_better_than_the_gain_of_the_sensor_lets_tell_it_from
     samples = measured(oracle.BLOCK, extras, noise=1e-4)
     _, found = run(samples, prior=Prior.nominal(oracle.BLOCK, suspects=True))
     assert abs(found.values['stretch_bias']) < 3.0 * found.deviations['stretch_bias']
+
+
+def test_another_remanence_leaves_modulus_and_damping_as_given():
+    block = replace(oracle.BLOCK, remanence=1.02 * oracle.BLOCK.remanence)
+    _, found = run(measured(block), prior=Prior.nominal(oracle.BLOCK, suspects=True))
+    assert found.values['shear_modulus'] == pytest.approx(oracle.BLOCK.shear_modulus)
+    assert found.values['damping_coefficient'] == pytest.approx(oracle.BLOCK.damping_coefficient)
+    assert found.values['remanence'] == pytest.approx(block.remanence, rel=2e-3)
+
+
+def test_a_gain_of_the_sensor_is_no_chain_limit():
+    samples = measured(oracle.BLOCK, oracle.Extras(bias=0.02, gain=0.98), noise=3e-4)
+    _, found = run(samples, prior=Prior.nominal(oracle.BLOCK, suspects=True))
+    assert found.values['chain_limit'] == pytest.approx(oracle.BLOCK.chain_limit)
+
+
+@pytest.mark.parametrize(('gain', 'sought'), [
+    (Gain(0.0, np.zeros(1), 1.0), (0,)), (Gain(30.0, np.full(1, 100.0), 101.0), ())])
+def test_a_force_is_not_sought_where_a_gain_explains_samples_too(gain, sought):
+    # Thirty hundredths of the prior's deviation, known to a tenth.
+    look = Look(
+        Suspects(('constant_force',), (0,), 0, np.zeros(1), np.ones(1)), np.zeros(1),
+        np.full((1, 1), 101.0), np.full(1, 30.0), np.full(1, -np.inf), np.full(1, np.inf), gain)
+    assert look.choose(())[0] == sought
+
+
+def _unsure(**changes):
+    """Return an estimate of a block as given whose G and ratio of creep lean on each other."""
+    prior = Prior.nominal(oracle.BLOCK, suspects=True)
+    estimator = Estimator(prior)
+    estimator.level(0, 0.0)
+    found = estimator.predict(0)
+    places = [found.free.index(x) for x in ('shear_modulus', 'viscoelastic_ratio')]
+    covariance = np.zeros_like(found.covariance)
+    covariance[np.ix_(places, places)] = [[4e-4, -4e-4], [-4e-4, 5e-4]]
+    off = np.zeros(len(found.off))
+    off[places[0]] = 0.01
+    return replace(
+        found, covariance=covariance, off=off,
+        values={**found.values, 'viscoelastic_ratio': 0.02}, **changes)
+
+
+@pytest.mark.parametrize(('deviation', 'sure', 'modulus'), [
+    # Creep is known: the modulus beside it; what is expected, unless what is sought is likely.
+    (0.005, 0.9, 0.0), (0.005, 0.1, 0.01),
+    # It is not: the modulus if there is none.
+    (0.02, 0.9, 0.8 * 0.02), (0.02, 0.1, 0.01 + 0.8 * 0.02)])
+def test_plans_use_what_is_expected_with_or_without_creep(deviation, sure, modulus):
+    found = _unsure(sure=sure)
+    found.deviations['viscoelastic_ratio'] = deviation
+    block = found.model(PlannerOptions()).actuator
+    assert bool(block.creep) is (deviation < 0.01)
+    assert block.shear_modulus == pytest.approx(np.exp(modulus) * oracle.BLOCK.shear_modulus)

@@ -136,7 +136,7 @@ def test_a_cautious_first_move_takes_longer_and_arrives_and_the_next_one_does_no
 
 def test_the_less_may_be_left_the_more_moves_take_longer():
     block = SCENARIOS[2].block
-    for tolerance, times in ((5e-3, 1.0), (3e-4, 3.0)):
+    for tolerance, times in ((5e-3, 1.0), (1e-4, 3.0)):
         loop = Loop(1.0, 1e-3, 200, 10 * MS, block, 2 * MS, feedback='adapt',
                     feedback_cautious=True, feedback_tolerance=tolerance)
         moved(loop, 1.4)

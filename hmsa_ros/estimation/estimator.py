@@ -14,7 +14,7 @@ from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
 from hmsa_ros.estimation.prior import Prior
 from hmsa_ros.estimation.screening import Screening
 from hmsa_ros.estimation.suspects import Suspects
-from hmsa_ros.estimation.window import coordinates, Solution, Trial, Window
+from hmsa_ros.estimation.window import coordinates, Solution, Trial, values_at, Window
 from hmsa_ros.identification.fit import robust_scale
 from hmsa_ros.identification.quantities import actuator_of, BRANCHES, derivative, QUANTITIES
 from hmsa_ros.model.creep import Creep
@@ -47,6 +47,10 @@ _CORRECTS = 0.1
 _WAITING = 10
 #: Deviations from which on a suspected branch of creep is one.
 CREEPS = 2.0
+# How probable the most probable suspects are that plans take for certain.
+_MOST_LIKELY = 0.5
+# What plans take into account by other levels, however little of it there is.
+_AS_IS = ('coil_time_constant', *BRANCHES[0])
 # Window, as a share, that is left when it moves on, its longest span in units of time, and the
 # samples from which on that counts.
 _KEPT, _LONGEST, _FEWEST = 0.5, 200.0, 20
@@ -82,6 +86,7 @@ class Estimate:
     deviations: dict[str, float]  # standard ones of these, in SI
     covariance: Array  # of the coordinates of these, of stretch and of rate, about the values
     off: Array  # how far what is expected of them is from the values
+    sure: float  # how probable it is that no other suspects are wrong than those sought
     noise: float  # standard deviation of a sample
     trusted: bool  # whether it may be acted upon
     trouble: str  # why not; empty if it may
@@ -109,9 +114,26 @@ class Estimate:
         return replace(self, covariance=left, off=np.zeros_like(self.off))
 
     def model(self, options: PlannerOptions, sure: float = CREEPS) -> Model:
-        """Return the model to plan with, of `block`; estimates take the place of options."""
+        """
+        Return the model to plan with; estimates take the place of options.
+
+        It lags by the most probable coil, and creeps as `block` does. Other parameters are those
+        that are expected then over all that may be wrong.
+        """
+        block, z = self.block(sure), coordinates(self.values, self.free)
+        known = [i for i, x in enumerate(self.free) if x in _AS_IS]
+        off = self.off[:-2] * (self.sure < _MOST_LIKELY)
+        left = -off
+        if BRANCHES[0][0] in self.free and not block.creep:
+            i = self.free.index(BRANCHES[0][0])
+            left[i] -= z[i]
+        spread = self.covariance[:-2, :-2] - np.outer(off, off)
+        z += off + spread[:, known] @ np.linalg.pinv(
+            spread[np.ix_(known, known)], hermitian=True) @ left[known]
+        found = replace(self, values=values_at(self.values, self.free, z))
         return Model(
-            self.block(sure), replace(options, **{x: self.values[x] for x in ESTIMATED}))
+            replace(found.block(sure), creep=block.creep),
+            replace(options, **{x: found.values[x] for x in ESTIMATED}))
 
 
 class Estimator:
@@ -279,12 +301,12 @@ class Estimator:
         covariance[:-2, -2] = covariance[-2, :-2] = known @ by
         covariance[-2, -2] = by @ known @ by + off ** 2
         covariance[-1, -1] = (off * frequency) ** 2
-        first = len(mean) - self.prior.suspects
         return Window(
             dict(prior.values), prior.free, np.append(mean, [stretch, 0.0]), covariance,
             _bounds(self.prior), 0.0, np.zeros(0), np.zeros(0), Suspects(
-                prior.free, coordinates(self.prior.values, self.prior.free)[first:],
-                1.0 / np.diag(self.prior.covariance)[first:]),
+                prior.free, prior.suspects, prior.named,
+                coordinates(self.prior.values, self.prior.free),
+                1.0 / np.diag(self.prior.covariance)),
             self._window.suspected if self._window else ())
 
     def _take(self, window: Window, levels: Levels, until: float) -> Trial | None:
@@ -340,7 +362,7 @@ class Estimator:
         trouble = self.screening.trouble or self._strange(found.z)
         return Estimate(
             time, float(state[-2]), float(state[-1]), values, self.prior.free, deviations,
-            covariance, off, self.noise, not trouble, trouble)
+            covariance, off, found.sure, self.noise, not trouble, trouble)
 
     def _strange(self, z: Array) -> str:
         """Say what would have to be implausibly far off for samples to fit; empty for nothing."""

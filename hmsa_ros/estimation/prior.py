@@ -42,6 +42,8 @@ TRACKED = ('shear_modulus', 'damping_coefficient', 'stretch_bias')
 SUSPECTS = (
     'remanence', 'chain_limit', 'coil_time_constant', 'sensor_latency', 'viscoelastic_ratio',
     'viscoelastic_time', 'constant_force')
+# What is named, and may well be as given.
+_AS_GIVEN = ('shear_modulus', 'damping_coefficient')
 # Relaxation time of a suspected branch in units of time.
 _RELAXATION = 2.0
 
@@ -57,7 +59,8 @@ class Prior:
     # Deviations of the coordinates of a block that was never identified, shape (p,); they bound
     # how far an estimate may go, and how fast, since a block changes after its identification.
     spread: Array
-    suspects: int = 0  # how many, from the last on, are only suspected
+    suspects: tuple[int, ...] = ()  # places of those that are only suspected
+    named: int = 0  # how many of the first are named
 
     @classmethod
     def nominal(
@@ -104,7 +107,9 @@ class Prior:
                     f'the deviation of {name} is {deviation:g}: expected a number above 0')
             size.append(deviation)
         return cls(
-            values, free, np.diag(np.square(size)), np.array(size), len(free) - named)
+            values, free, np.diag(np.square(size)), np.array(size), tuple(
+                i for i, x in enumerate(free) if i >= named or x in _AS_GIVEN) if suspects else (),
+            named)
 
     @property
     def coordinate(self) -> Coordinate:

@@ -16,41 +16,36 @@ from numpy.typing import NDArray
 
 from hmsa_ros.model.equations import Array
 
-# How improbable a suspect is before the first sample, as a logarithm, and the gain of that of the
-# evidence from which on others are sought in place of those sought.
+# How improbable a suspect that is not named is before the first sample, as a logarithm, and the
+# gain of that of the evidence from which on others are sought in place of those sought.
 _PRUDENCE, _CLEARLY = 1.0, 1.0
+# What a gain that explains samples in its place counts against a force at most, as a logarithm.
+_BESIDES = 2.0
 # How much less probable than the most probable ones suspects are that do not count.
 _UNLIKELY = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Suspects:
-    """Those there are: the last of the coordinates, but for stretch and rate."""
+    """Those there are."""
 
-    names: tuple[str, ...]  # of all coordinates
-    known: Array  # of suspects: where they are unless sought, shape (s,)
-    priors: Array  # information that there was of these before the first sample, shape (s,)
-
-    @property
-    def _first(self) -> int:
-        return len(self.names) - len(self.known)
-
-    @property
-    def places(self) -> tuple[int, ...]:
-        """Places of all suspects."""
-        return tuple(range(self._first, len(self.names)))
+    names: tuple[str, ...]  # of all coordinates, but for stretch and rate
+    places: tuple[int, ...]  # of all suspects
+    named: int  # how many of the first coordinates are named
+    known: Array  # where coordinates are unless sought, shape (p,)
+    priors: Array  # information that there was of these before the first sample, shape (p,)
 
     def sought(self, count: int, suspected: Iterable[int]) -> NDArray[np.bool_]:
         """Return which of so many coordinates are sought, shape (q,)."""
         found = np.ones(count, dtype=np.bool_)
-        found[self._first:len(self.names)] = False
+        found[list(self.places)] = False
         found[list(suspected)] = True
         return found
 
     def at_ease(self, z: Array, suspected: tuple[int, ...]) -> Array:
         """Return coordinates with what is not sought where it is known to be."""
         there = z.copy()
-        there[self._first:len(self.names)] = self.known
+        there[:len(self.names)] = self.known
         return np.where(self.sought(len(z), suspected), z, there)
 
     def forced(self, follows: Array) -> Array:
@@ -61,8 +56,7 @@ class Suspects:
         (1966) 293).
         """
         force = [i for i in self.places if self.names[i] == 'constant_force']
-        return np.square(follows[:, force]) @ (
-            1.0 / self.priors[[i - self._first for i in force]])
+        return np.square(follows[:, force]) @ (1.0 / self.priors[force])
 
     def sets(self) -> list[tuple[int, ...]]:
         """Return all sets of suspects; ratio and time of a branch are sought together."""
@@ -74,7 +68,11 @@ class Suspects:
 
     def ease(self, place: int) -> float:
         """Return what seeking a suspect adds to the evidence, but for its variance."""
-        return 0.5 * math.log(self.priors[place - self._first]) - _PRUDENCE
+        return 0.5 * math.log(self.priors[place]) - self.prudence(place)
+
+    def prudence(self, place: int) -> float:
+        """Return how improbable a suspect is; one that is named is as likely as not."""
+        return _PRUDENCE if place >= self.named else 0.0
 
 
 class Others(NamedTuple):
@@ -93,6 +91,21 @@ class Explained(NamedTuple):
     covariance: Array  # of those that are sought, 0 of the others, shape (q, q)
 
 
+class Gain(NamedTuple):
+    """How the cost goes with usual errors of the gain of the sensor."""
+
+    gradient: float  # downwards
+    cross: Array  # second derivatives by such an error and the coordinates, shape (q,)
+    curvature: float  # second derivative, at least that of what is usual, 1
+
+    def explains(self, found: Explained) -> float:
+        """Return what an error of the gain besides adds to the evidence, if anything."""
+        rest = self.gradient - float(self.cross @ found.step)
+        curvature = max(
+            self.curvature - float(self.cross @ found.covariance @ self.cross), 1.0)
+        return max(0.5 * rest ** 2 / curvature - 0.5 * math.log(curvature), 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class Look:
     """A look at the cost about some coordinates, which is a quadratic there."""
@@ -103,11 +116,12 @@ class Look:
     gradient: Array  # downwards
     low: Array  # least and largest steps
     high: Array
+    gain: Gain
 
     def choose(self, before: tuple[int, ...]) -> tuple[tuple[int, ...], Others]:
         """Return the suspects to be sought in place of those before, and what of others counts."""
         sets = self.suspects.sets()
-        found = self._all(sets)
+        found = self._with_gain(sets, self._all(sets))
         here = sets.index(before)
         best = max(range(len(sets)), key=lambda x: found[x].evidence)
         if found[best].evidence <= found[here].evidence + _CLEARLY:
@@ -121,6 +135,28 @@ class Look:
                 off += weight * apart
                 square += (i != best) * weight * (x.covariance + np.outer(apart, apart))
         return sets[best], Others(1.0 / total, off / total, square / total)
+
+    def _with_gain(
+            self, sets: list[tuple[int, ...]], found: list[Explained]) -> list[Explained]:
+        """
+        Return the same where a gain may be wrong besides.
+
+        What looks like another remanence may be a gain in part, and a force is less probable where
+        a gain in its place explains samples too.
+        """
+        remanence, force = ({i for i in self.suspects.places if self.suspects.names[i] == x}
+                            for x in ('remanence', 'constant_force'))
+        known = dict(zip(sets, found, strict=True))
+
+        def more(suspected: tuple[int, ...]) -> float:
+            if remanence & {*suspected}:
+                return self.gain.explains(known[suspected])
+            if force & {*suspected}:
+                found = self.gain.explains(known[tuple(x for x in suspected if x not in force)])
+                return -min(found, _BESIDES)
+            return 0.0
+
+        return [y._replace(evidence=y.evidence + more(x)) for x, y in known.items()]
 
     def _all(self, sets: list[tuple[int, ...]]) -> list[Explained]:
         """
@@ -157,7 +193,8 @@ class Look:
         return Explained(
             float(gradient @ step - 0.5 * step @ matrix @ step) + 0.5 * float(
                 np.linalg.slogdet(covariance[np.ix_(loose, loose)])[1]) + sum(
-                self.suspects.ease(i) if loose[i] else -_PRUDENCE for i in suspected),
+                self.suspects.ease(i) if loose[i] else -self.suspects.prudence(i)
+                for i in suspected),
             step, covariance)
 
 

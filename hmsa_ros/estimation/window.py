@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from hmsa_ros.estimation.motion import follow, Levels, Motion
 from hmsa_ros.estimation.prior import DEVIATIONS
-from hmsa_ros.estimation.suspects import inverse, Look, optimum, Others, Suspects
+from hmsa_ros.estimation.suspects import Gain, inverse, Look, optimum, Others, Suspects
 from hmsa_ros.identification.fit import loss, weights_of
 from hmsa_ros.identification.quantities import from_coordinate, QUANTITIES, to_coordinate
 from hmsa_ros.identification.response import clip, complete
@@ -76,6 +76,7 @@ class Solution:
     weights: Array  # how far each counts, 0 to 1
     covariance: Array  # of z, about itself
     off: Array  # how far what is expected is from z, shape (q,)
+    sure: float  # how probable it is that no other suspects are wrong than those sought
     variances: Array  # of z, where a constant force and the gain of the sensor may be anything
 
     def at_end(self) -> tuple[Array, Array, Array]:
@@ -114,10 +115,7 @@ class Window:
 
     def values_at(self, z: Array) -> dict[str, Any]:
         """Return the values of all quantities for coordinates."""
-        found = dict(self.values)
-        for name, x in zip(self.free, z.tolist(), strict=False):
-            found[name] = clip(name, from_coordinate(name, x))
-        return complete(found, self.free)
+        return values_at(self.values, self.free, z)
 
     def solve(
             self, z: Array, levels: Levels, noise: float, until: float, here: Trial | None = None
@@ -133,17 +131,20 @@ class Window:
         def descend(z: Array, here: Trial | None = None) -> Found | None:
             return self._descend(z, here, levels, noise, until, prior)
 
+        def look(found: Found) -> Found:
+            return self._look(found, descend, self._gain(found, prior, noise))
+
         found = descend(z, here) or descend(self._at_ease(self.mean))
         if found is None:
             return None
         if len(self.time) >= _MORE * self.weighed or self._is_poor(found, noise):
-            found = self._look(found, descend)
+            found = look(found)
             if self._is_poor(found, noise):
                 # There may be another valley.
                 before = self.suspected, self.others
                 self.suspected = self.suspects.places
                 other = descend(self._at_ease(self.mean))
-                other = other and self._look(other, descend)
+                other = other and look(other)
                 if other is not None and other.here.cost < found.here.cost:
                     found = other
                 else:
@@ -153,7 +154,7 @@ class Window:
         covariance = inverse(found.matrix, found.loose)
         return Solution(
             found.z, found.here.values, motion, by, residual, weights,
-            sure * covariance + square, np.broadcast_to(off, z.shape),
+            sure * covariance + square, np.broadcast_to(off, z.shape), sure,
             np.diag(covariance) + self.suspects.forced(covariance @ found.matrix)
             + self._by_gain(found, prior, noise))
 
@@ -165,12 +166,30 @@ class Window:
             here.motion.stretch[:count] - coordinate_of(self.values['law']).rest)
         return found
 
+    def _pull(
+            self, prior: Array, here: 'Trial | Solution', noise: float, count: int) -> Array:
+        """Return how such an error pulls at coordinates by samples, shape (q,)."""
+        found: Array = prior @ np.broadcast_to(
+            self.leans, self.mean.shape) - here.by[:count].T @ (
+                here.weights[:count] * self._more(here, count)) / noise ** 2
+        return found
+
+    def _gain(self, found: Found, prior: Array, noise: float) -> Gain:
+        """Return how the cost goes with such an error."""
+        here, count = found.here, len(found.here.residual)
+        more, leans = self._more(here, count), np.broadcast_to(self.leans, self.mean.shape)
+        pulled = leans @ prior
+        return Gain(
+            float((here.weights * more) @ here.residual / noise ** 2
+                  + pulled @ (found.z - self.mean)),
+            -self._pull(prior, here, noise, count),
+            1.0 + float(here.weights @ np.square(more) / noise ** 2 + pulled @ leans))
+
     def _leaning(
             self, matrix: Array, loose: NDArray[np.bool_], prior: Array,
             here: 'Trial | Solution', noise: float, count: int) -> Array:
         """Return how far such an error would shift coordinates by samples, shape (q,)."""
-        pull = prior @ np.broadcast_to(self.leans, self.mean.shape) - here.by[:count].T @ (
-            here.weights[:count] * self._more(here, count)) / noise ** 2
+        pull = self._pull(prior, here, noise, count)
         # Rounding would be large in units of the coordinates.
         size, found = np.sqrt(np.diag(matrix)[loose]), np.zeros(len(self.mean))
         found[loose] = np.linalg.solve(
@@ -178,25 +197,26 @@ class Window:
         return found
 
     def _by_gain(self, found: Found, prior: Array, noise: float) -> Array:
-        """Return what the gain of the sensor adds to variances, unless samples exclude it."""
+        """Return what an error of the gain adds to variances, as far as samples allow or show."""
         here = found.here
         leans = self._leaning(
             found.matrix, found.loose, prior, here, noise, len(here.residual))
-        left = self._more(here, len(here.residual)) + here.by @ leans
-        variances: Array = np.square(leans) / (
-            1.0 + float(here.weights @ np.square(left)) / noise ** 2)
+        gain = self._gain(found, prior, noise)
+        curvature = max(gain.curvature + float(gain.cross @ leans), 1.0)
+        variances: Array = np.square(leans) * (1.0 + gain.gradient ** 2 / curvature) / curvature
         return variances
 
     def _is_poor(self, found: Found, noise: float) -> bool:
         """Return whether what is sought explains samples poorly."""
         return loss(found.here.residual, noise, convex=True) > _POOR * len(self.time)
 
-    def _look(self, found: Found, descend: Callable[[Array], Found | None]) -> Found:
+    def _look(
+            self, found: Found, descend: Callable[[Array], Found | None], gain: Gain) -> Found:
         """Choose the suspects to be sought, and return the most probable coordinates then."""
         self.weighed, before = len(self.time), self.suspected
         self.suspected, self.others = Look(
             self.suspects, found.z, found.matrix, found.gradient,
-            *self._room(found.z)).choose(before)
+            *self._room(found.z), gain).choose(before)
         if self.suspected == before:
             return found
         return descend(self._at_ease(found.z)) or found
@@ -311,3 +331,11 @@ class Window:
 def coordinates(values: Mapping[str, float], free: Sequence[str]) -> Array:
     """Return the coordinates of the free parameters."""
     return np.array([to_coordinate(x, values[x]) for x in free], dtype=np.float64)
+
+
+def values_at(values: Mapping[str, Any], free: Sequence[str], z: Array) -> dict[str, Any]:
+    """Return the values of all quantities with those of the coordinates of the free ones."""
+    found = dict(values)
+    for name, x in zip(free, z.tolist(), strict=False):
+        found[name] = clip(name, from_coordinate(name, x))
+    return complete(found, free)
