@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parent.parent
 WAIT_SECONDS = 60.0
 POLL_SECONDS = 0.02
 # Between two looks at a condition while callbacks are served.
-SPIN_SECONDS = 0.003
+SPIN_SECONDS = 0.01
 DOMAINS = range(1, 102)
 _turns = itertools.count(os.getpid())
 

@@ -1,6 +1,7 @@
 """Calibration of delays and statics: blind to the truth of benches that SciPy integrates."""
 
 from dataclasses import replace
+from functools import cache
 import json
 import math
 
@@ -20,6 +21,7 @@ from hmsa_ros.recordings.parameters import entries_of
 NOISE = 1e-3
 
 
+@cache
 def recorded(seed):
     """Return truth, samples, readings of a probe, and levels of a bench drawn at random."""
     random = np.random.default_rng((42, seed))

@@ -40,14 +40,12 @@ class Asking:
     def until(self, *, refused: bool) -> Verdict:
         """Ask until it is refused, as there are several, or until it is not."""
         del self.verdicts[:]
-
-        def got() -> bool:
-            if self.verdicts and self.verdicts[-1].code.startswith('several_') == refused:
-                return True
-            self._setpoint.publish(endpoints.interface_class(topics.SETPOINT.type)(data=1.1))
-            return False
-
-        self._ros.spin_until(got, f'refused {refused}')
+        setpoint = endpoints.interface_class(topics.SETPOINT.type)(data=1.1)
+        again = self._ros.node.create_timer(0.05, lambda: self._setpoint.publish(setpoint))
+        self._ros.spin_until(
+            lambda: self.verdicts and self.verdicts[-1].code.startswith('several_') == refused,
+            f'refused {refused}')
+        again.cancel()
         return self.verdicts[-1]
 
 

@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import asdict, replace
+from functools import cache
 from html.parser import HTMLParser
 import json
 import math
@@ -122,7 +123,18 @@ def parameters(**nodes):
             **{f'actuator.{x}': getattr(actuator, x) for x in ACTUATOR_FIELDS}}.items()}
 
 
-def simulated(
+@cache
+def of_the_paper():
+    """Return the messages of the paper's sequence, which nobody may change."""
+    return tuple(fresh())
+
+
+def simulated(*sequence, **options):
+    """Return the messages of a run."""
+    return fresh(*sequence, **options) if sequence or options else [*of_the_paper()]
+
+
+def fresh(
         sequence=SEQUENCE, *, space='', actuator=ACTUATOR, plant=None, period=PERIOD,
         shaper='two_step', slew=0.0, lag=0.0, noise=0.0, extra=0.0, creep=None, path=()):
     """Return the messages of a run: (log time, topic, type, message); a path if one is given."""
