@@ -523,6 +523,7 @@ class Served:
         for thread in self._threads:
             thread.join(WAIT_SECONDS)
         for node in self.nodes:
+            getattr(node, 'close', lambda: None)()
             node.destroy_node()
         self.nodes.clear()
         rclpy.try_shutdown()

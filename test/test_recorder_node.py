@@ -27,6 +27,8 @@ from hmsa_ros.bag.reader import BagReader, read_messages
 from hmsa_ros.bag.recover import recover
 from hmsa_ros.bag.writer import BagWriter, Topic
 from hmsa_ros.cli import main
+from hmsa_ros.nodes.capture import RawSubscription
+from hmsa_ros.nodes.recorder import Recorder as Recording
 
 pytestmark = pytest.mark.ros
 TALKER = Path(__file__).parent / 'talker.py'
@@ -454,6 +456,50 @@ def test_a_bag_played_in_a_loop_is_recorded_round_by_round(record, start, ros, t
     assert len(reader.files) >= 4
     for file in reader.files[:3]:
         assert values(BagReader(file)) == list(range(200))
+
+
+def test_what_comes_while_messages_are_taken_is_in_the_file_of_its_time(
+        ros, serve, tmp_path, monkeypatch):
+    folder = tmp_path / 'bag'
+    serve(Recording, *(x for y in (
+        f'storage.uri:={folder}', 'storage.flush_period:=0.1', 'record.topics:=[/a]',
+        'use_sim_time:=true') for x in ('-p', y)))
+    clock = ros.publisher(Clock, '/clock', QoSProfile(
+        depth=1, reliability=ReliabilityPolicy.BEST_EFFORT), subscribers=0)
+    publisher = ros.publisher(Float64, '/a', subscribers=0)
+
+    def tick(seconds):
+        message = Clock()
+        message.clock.sec = seconds
+        clock.publish(message)
+
+    ros.spin_until(
+        lambda: tick(100) or publisher.get_subscription_count(), 'the recorder to listen')
+    take, jumped = RawSubscription.take, []
+
+    def late(subscription, *limit):
+        # /a has been taken, and /clock is about to be: rounds end with it.
+        taken = take(subscription, *limit)
+        if subscription.handle.get_topic_name() == '/clock' and not jumped:
+            jumped.append(True)
+            for i in range(3000):
+                publisher.publish(Float64(data=float(i)))
+            tick(50)
+            while not (new := take(subscription)):
+                pass
+            publisher.publish(Float64(data=-1.0))
+            taken += new
+        return taken
+
+    def recorded():
+        return [values(BagReader(x)) for x in sorted(folder.glob('*.mcap'))]
+
+    publisher.publish(Float64(data=-2.0))
+    ros.spin_until(lambda: recorded() == [[-2.0]], 'the first message')
+    monkeypatch.setattr(RawSubscription, 'take', late)
+    tick(100)
+    ros.spin_until(lambda: sum(map(len, recorded())) == 3002, 'all messages')
+    assert recorded() == [[-2.0, *range(3000)], [-1.0]]
 
 
 @pytest.mark.slow

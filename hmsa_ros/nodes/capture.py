@@ -10,6 +10,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 import ctypes
 from functools import cache
+import sys
 import threading
 import time
 from typing import Any, NamedTuple
@@ -172,6 +173,7 @@ class Capture:
         self._lock = threading.Lock()
         self._subscriptions: list[tuple[Any, RawSubscription]] = []
         self._leaving: list[tuple[Any, RawSubscription]] = []
+        self._current: list[tuple[Any, RawSubscription]] = []
         self._changed = True
         self._stopping = False
         self.error: BaseException | None = None
@@ -205,6 +207,10 @@ class Capture:
         with self._lock:
             return [key for key, x in self._subscriptions if x.matched]
 
+    def take_again(self) -> list[tuple[Any, list[Taken]]]:
+        """Take all that has arrived since this round was taken; for ``deliver`` alone."""
+        return self._round(self._current, sys.maxsize)
+
     def stop(self) -> None:
         """Pass on what has arrived so far and end the thread."""
         self._stopping = True
@@ -226,7 +232,7 @@ class Capture:
                 with self._lock:
                     # Read before the last round, so that this round is complete.
                     stopping = self._stopping
-                    subscriptions = [*self._leaving, *self._subscriptions]
+                    self._current = subscriptions = [*self._leaving, *self._subscriptions]
                     leaving = len(self._leaving)
                     self._leaving = []
                     changed, self._changed = self._changed, False
@@ -275,7 +281,8 @@ class Capture:
 
     @staticmethod
     def _round(
-            subscriptions: list[tuple[Any, RawSubscription]]) -> list[tuple[Any, list[Taken]]]:
+            subscriptions: list[tuple[Any, RawSubscription]],
+            limit: int = _BATCH) -> list[tuple[Any, list[Taken]]]:
         """
         Take once from each subscription.
 
@@ -284,7 +291,7 @@ class Capture:
         """
         taken = []
         for key, subscription in reversed(subscriptions):
-            messages = subscription.take()
+            messages = subscription.take(limit)
             if messages:
                 taken.append((key, messages))
         taken.reverse()

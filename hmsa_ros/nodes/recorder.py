@@ -226,26 +226,40 @@ class Recorder(ManagedNode):
 
     def _deliver(self, taken: Sequence[tuple[Any, list[Taken]]]) -> None:
         """Stamp, count and pass on what has been received."""
-        clock = self._sim_time
-        if clock is not None and taken[0][0] is clock:
-            for message in taken[0][1]:
-                try:
-                    now = from_time(decode(message.data, Clock).clock)
-                except BadInputError:
-                    now = -1
-                if now < 0:
-                    clock.ignored += 1
-                    continue
-                before = clock.add(message.received_ns, now, message.publisher)
-                if before is not None:
-                    # What came before the jump belongs to the file so far.
-                    earlier, taken = _parted(taken, message.received_ns)
-                    for key, messages in earlier:
-                        self._take_in(key, messages)
-                    self._begin_anew(before, now)
-            taken = taken[1:]
+        if self._sim_time is not None:
+            taken = self._follow(self._sim_time, taken)
         for key, messages in taken:
             self._take_in(key, messages)
+
+    def _follow(
+            self, clock: SimulatedTime,
+            taken: Sequence[tuple[Any, list[Taken]]]) -> list[tuple[Any, list[Taken]]]:
+        """Take the clock's messages out of others, and in those that came before it jumped."""
+        ticks = [x for key, messages in taken if key is clock for x in messages]
+        rest = [x for x in taken if x[0] is not clock]
+        for message in ticks:
+            try:
+                now = from_time(decode(message.data, Clock).clock)
+            except BadInputError:
+                now = -1
+            if now < 0:
+                clock.ignored += 1
+                continue
+            before = clock.add(message.received_ns, now, message.publisher)
+            if before is None:
+                continue
+            # What came before the jump belongs to the file so far, also what came while this
+            # round was taken, or was too much for it.
+            for key, messages in self._capture.take_again():
+                if key is clock:
+                    ticks += messages
+                else:
+                    rest.append((key, messages))
+            earlier, rest = _parted(rest, message.received_ns)
+            for key, messages in earlier:
+                self._take_in(key, messages)
+            self._begin_anew(before, now)
+        return rest
 
     def _begin_anew(self, before: int, now: int) -> None:
         """Go on in a new file: a simulation began anew, or a bag is played in a loop."""
@@ -374,9 +388,9 @@ class Recorder(ManagedNode):
 def _parted(
         taken: Sequence[tuple[Any, list[Taken]]],
         moment: int) -> tuple[list[tuple[Any, list[Taken]]], list[tuple[Any, list[Taken]]]]:
-    """Part what was received before a moment from the rest, the clock first in the rest."""
-    earlier, rest = [], [taken[0]]
-    for key, messages in taken[1:]:
+    """Part what was received before a moment from the rest."""
+    earlier, rest = [], []
+    for key, messages in taken:
         count = bisect_left(messages, moment, key=lambda message: message.received_ns)
         earlier.append((key, messages[:count]))
         rest.append((key, messages[count:]))
