@@ -1,6 +1,6 @@
 """Feedback: what samples say of the actuators, and models that are learnt from them."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 import math
@@ -13,7 +13,7 @@ from hmsa_ros.control.holds import Hold
 from hmsa_ros.control.learnt import alike, believed, differs, learnt_model, save
 from hmsa_ros.control.ledger import Ledger, Moves
 from hmsa_ros.control.records import EstimateChanged, Output, Settings, Severity
-from hmsa_ros.control.slices import Clock
+from hmsa_ros.control.slices import Clock, SLICE
 from hmsa_ros.control.tracked import Joint
 from hmsa_ros.control.trust import Trust
 from hmsa_ros.errors import BadInputError, HmsaError
@@ -39,7 +39,8 @@ _CHOICE = 3.0
 _LOOK = 3.0
 # How many times as seldom where a joint rings after its last change of level.
 _RINGING = 4
-# How many times as long as the last look took the next one is later, at least.
+# How many times as long as the last look took, and as there are joints, the next one is later at
+# least.
 _IDLE = 4
 # Samples of a natural period that are looked at, and how many fewer at rest.
 _DENSE, _SPARSE = 40, 10
@@ -60,8 +61,10 @@ class Feedback:
 
     def __init__(
             self, group: PlannerGroup, settings: Settings, outputs: list[Output],
-            clock: Clock) -> None:
-        self._group, self._outputs, self._clock = group, outputs, clock
+            clock: Clock, steady: Clock) -> None:
+        self._group, self._outputs, self._clock, self._steady = group, outputs, clock, steady
+        #: Called with a sentence that says why feedback of a joint has ended.
+        self.tell_ended: Callable[[str], None] = lambda words: None
         self._settings = settings
         self._joints: dict[str, Joint] = {}
         self._nominal: dict[str, Model] = {}
@@ -194,8 +197,7 @@ class Feedback:
         lost = joint.lost = joint.coil.measured(
             self._group.planners[name].plan, stamp, flux_density)
         if lost and joint.trust.why != lost and joint.trust.doubt(lost, now, at_once=True):
-            joint.estimator.restart()
-            joint.latest, joint.news = None, True
+            joint.begin_anew()
         joint.add(stamp, math.nan if lost else stretch, now)
 
     def applied(self, name: str, stamp: int, flux_density: float) -> None:
@@ -212,39 +214,64 @@ class Feedback:
     @property
     def wake(self) -> int | None:
         """Time in ns at which to look at samples next; None for never, 0 for now."""
-        if self.mode == 'adapt' and any(x.choosing or x.news for x in self._joints.values()):
+        if any(x.looking or self.mode == 'adapt' and (x.choosing or x.news)
+               for x in self._joints.values()):
             return 0
-        return min((x.next_update for x in self._joints.values() if x.fresh), default=None)
+        return min(
+            (max(x.not_before, 0 if x.audits else x.next_update) if x.fresh else 0
+             for x in self._joints.values() if x.fresh or x.audits), default=None)
+
+    @property
+    def looking(self) -> bool:
+        """Whether a look at samples is under way."""
+        return any(x.looking is not None for x in self._joints.values())
 
     def update(self, now: int) -> bool:
         """
         Process the samples of a joint that have come by a time in ns, and publish the estimate.
 
-        Returned is whether that has taken a while.
+        It goes on for the length of a slice, and where it ended the next time. Returned is whether
+        that has taken a while.
         """
-        busy = False
+        busy, end = False, self._steady() + SLICE
         for name, joint in self._joints.items():
             if joint.choosing is not None:
                 if next(joint.choosing, joint) is joint:
                     joint.choosing, joint.chosen, joint.news = None, True, True
                 busy = True
                 continue
-            if not joint.fresh or now < joint.next_update:
-                continue
+            if joint.looking is None:
+                if joint.audits and not joint.fresh:
+                    self._audit(name, joint)
+                if not joint.fresh or now < joint.not_before or (
+                        now < joint.next_update and not joint.audits):
+                    continue
+                joint.looking, joint.spent = joint.update(
+                    self._group.planners[name].plan, now), 0
             busy = True
-            begun = self._clock()
-            joint.update(self._group.planners[name].plan, now)
-            joint.next_update = now + (
-                _RESTING if self._quiet(name, joint) else max(
-                    min(_UPDATE, round(_OFTEN * joint.unit * NANOSECONDS)) * (
-                        _RINGING if self._rings(name, joint) else 1),
-                    _IDLE * (self._clock() - begun)))
-            if now >= joint.next_tell:
-                joint.next_tell = now + _TELL
-                self._tell(name, joint, now)
+            self._look(name, joint, now, end)
             # Commands go out before the next joint has its turn.
             break
         return busy
+
+    def _look(self, name: str, joint: Joint, now: int, end: int) -> None:
+        """Go on to look at samples until a steady time in ns."""
+        begun = self._clock()
+        while joint.looking is not None and next(joint.looking, joint) is not joint:
+            if self._steady() >= end:
+                joint.spent += self._clock() - begun
+                return
+        joint.looking = None
+        joint.not_before = now + _IDLE * len(self._joints) * (
+            joint.spent + self._clock() - begun)
+        joint.next_update = now + (
+            _RESTING if self._quiet(name, joint)
+            else min(_UPDATE, round(_OFTEN * joint.unit * NANOSECONDS)) * (
+                _RINGING if self._rings(name, joint) else 1))
+        if now >= joint.next_tell:
+            joint.next_tell = now + _TELL
+            self._tell(name, joint, now)
+        self._audit(name, joint)
 
     def _tell(self, name: str, joint: Joint, now: int) -> None:
         found = joint.latest
@@ -334,26 +361,31 @@ class Feedback:
 
     # -- what moves have left ------------------------------------------------------------------
 
-    def audit(self, name: str, hold: Hold) -> str:
-        """Take in samples of a setpoint of a joint; return why that ends feedback, if it does."""
+    def audit(self, name: str, hold: Hold) -> None:
+        """Look at the samples of a setpoint of a joint, once all that have come are looked at."""
         joint = self._joints.get(name)
-        if joint is None or self.mode != 'adapt' or joint.trust.ended or joint.lost:
-            return ''
-        plan = self._group.planners[name].plan
-        if joint.fresh:
-            joint.update(plan, self._clock())
-        if joint.trust.why or joint.estimator.screening.trouble:
+        if joint is not None and self.mode == 'adapt' and not joint.trust.ended and (
+                hold not in joint.audits):
+            joint.audits.append(hold)
+
+    def _audit(self, name: str, joint: Joint) -> None:
+        """Find whether what setpoints have left ends feedback."""
+        plan, audits = self._group.planners[name].plan, joint.audits.copy()
+        joint.audits.clear()
+        for hold in audits:
             # Of a sensor that fails, nothing follows for the move.
-            return ''
-        why = joint.ledger.take(
-            hold, plan, self._nominal[name], joint.moves, self.sensor(name))
-        if not why:
-            joint.trust.confirm(plan.levels[-1].model, joint.ledger.left)
-            return ''
-        joint.trust.end(why)
-        joint.news, joint.fresh = True, True
-        self._ended.append(name)
-        return self.words(name, self._clock())
+            if joint.lost or joint.trust.why or joint.estimator.screening.trouble:
+                return
+            why = joint.ledger.take(
+                hold, plan, self._nominal[name], joint.moves, self.sensor(name))
+            if not why:
+                joint.trust.confirm(plan.levels[-1].model, joint.ledger.left)
+                continue
+            joint.trust.end(why)
+            joint.news, joint.fresh = True, True
+            self._ended.append(name)
+            self.tell_ended(self.words(name, self._clock()))
+            return
 
     def taken_back(self) -> list[str]:
         """Return joints, once, whose plans are to be as if nothing had been learnt."""

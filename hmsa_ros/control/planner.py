@@ -18,8 +18,7 @@ from hmsa_ros.control.corrections import Corrections
 from hmsa_ros.control.feedback import Feedback
 from hmsa_ros.control.following import Following
 from hmsa_ros.control.hearing import Hearing
-from hmsa_ros.control.holds import Hold
-from hmsa_ros.control.planning import Planning, SLICE
+from hmsa_ros.control.planning import Planning
 from hmsa_ros.control.records import (
     Output,
     Request,
@@ -33,7 +32,7 @@ from hmsa_ros.control.records import (
 from hmsa_ros.control.seldom import Seldom
 from hmsa_ros.control.sending import Sending
 from hmsa_ros.control.silence import Silence
-from hmsa_ros.control.slices import Clock, work_on
+from hmsa_ros.control.slices import Clock, SLICE, work_on
 from hmsa_ros.control.takeover import Seen, Takeover
 from hmsa_ros.control.watching import Watch
 from hmsa_ros.model.status import Code, RefusedError
@@ -92,8 +91,9 @@ class PlannerRuntime:
             lambda: unheard() or self.hearing.receipts.words, self._unseen)
         self.sending = Sending(
             group, self.following, self.hearing, self._bulletin.outputs)
-        self.feedback = Feedback(group, settings, self._bulletin.outputs, clock)
-        self._watch.sensor, self._watch.audit = self.feedback.sensor, self._audit
+        self.feedback = Feedback(group, settings, self._bulletin.outputs, clock, steady)
+        self.feedback.tell_ended = self._tell_ended
+        self._watch.sensor, self._watch.audit = self.feedback.sensor, self.feedback.audit
         self.planning = Planning(
             group, self.following, Corrections(group, self.feedback, clock), self._bulletin,
             clock, steady, lambda: self.sending.send(clock()))
@@ -364,7 +364,9 @@ class PlannerRuntime:
         """Do what is due at a time in ns, for some ms at most; return what to pass on."""
         self._begin_anew()
         self._engage()
-        estimated = self._send(now) and self.feedback.update(now)
+        # A request does not wait for the rest of a look.
+        waits = self.feedback.looking and bool(self.planning.requests)
+        estimated = self._send(now) and not waits and self.feedback.update(now)
         if not estimated:
             self._work_on()
         if self._bulletin.preview_again is not None and now >= self._bulletin.preview_again:
@@ -468,13 +470,10 @@ class PlannerRuntime:
             if finding is None:
                 break
 
-    def _audit(self, name: str, hold: Hold) -> None:
-        """Hold what a setpoint has left against feedback."""
-        words = self.feedback.audit(name, hold)
-        if words:
-            self._bulletin.give(Verdict(
-                Severity.WARN, Code.FEEDBACK_ENDED, words, self._bulletin.verdict.request),
-                log=True)
+    def _tell_ended(self, words: str) -> None:
+        """Say why feedback of a joint has ended."""
+        self._bulletin.give(Verdict(
+            Severity.WARN, Code.FEEDBACK_ENDED, words, self._bulletin.verdict.request), log=True)
 
     def report(self) -> tuple[Severity, str, dict[str, object]]:
         """Return how commands fare: severity, a sentence and counters."""

@@ -8,14 +8,12 @@ from hmsa_ros.control.bulletin import Bulletin
 from hmsa_ros.control.corrections import Corrections
 from hmsa_ros.control.following import Following
 from hmsa_ros.control.records import Note, Request, Severity, Stop, Verdict
-from hmsa_ros.control.slices import Clock, Work, work_on
+from hmsa_ros.control.slices import Clock, SLICE, Work, work_on
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.timeline import Draft
 
-#: How long planning goes on before commands and requests are served again, in ns.
-SLICE = 4_000_000
 # Levels and setpoints of replaced plans that are freed at a time.
 _FREED = 2_000
 

@@ -12,6 +12,8 @@ from hmsa_ros.planning.timeline import Draft
 
 #: Tells the time of the stamps in ns.
 Clock = Callable[[], int]
+#: How long work goes on before commands and requests are served again, in ns.
+SLICE = 4_000_000
 # Points of a trajectory that are read between two pauses.
 _READ = 100
 # How much longer than estimated or measured planning may take the next time.

@@ -5,12 +5,14 @@ from dataclasses import dataclass, field, replace
 import math
 
 from hmsa_ros.control.field import Field
+from hmsa_ros.control.holds import Hold
 from hmsa_ros.control.ledger import Ledger, Moves
 from hmsa_ros.control.trust import Trust
 from hmsa_ros.estimation import Estimate, Estimator
 from hmsa_ros.estimation.motion import held
 from hmsa_ros.estimation.words import sentence
 from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.drafting import Steps
 from hmsa_ros.planning.timeline import Model, Plan
 
 # Levels before those of the samples that count: the field of a coil that lags remembers them.
@@ -31,6 +33,7 @@ class Joint:
     latest: Estimate | None = None
     newest: int = 0  # time of the newest sample
     next_update: int = 0  # when to look at samples
+    not_before: int = 0  # so that looks take a share of the time only
     next_tell: int = 0  # when to tell the estimate
     next_choice: int = 0  # when to choose the parameters to plan with
     used: Model | None = None  # what was chosen; None for what the planner has
@@ -40,6 +43,9 @@ class Joint:
     amplitude: float = 0.0  # largest of the vibration since the last arrival
     setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place of the setpoint under way
     fresh: bool = False  # whether there are samples that have not been looked at
+    looking: Iterator[None] | None = None  # pieces of the look at them under way
+    spent: int = 0  # on that
+    audits: list[Hold] = field(default_factory=list)  # setpoints to be looked at after it
     lost: str = ''  # why the field is not as commanded; empty where it is
     moves: Moves = field(default_factory=Moves)  # those of the plan in force
     news: bool = False  # whether the latest estimate has not been held against the plan yet
@@ -69,12 +75,12 @@ class Joint:
         self.estimator.set_levels([
             (x.stamp, x.flux_density) for x in plan.levels[first:plan.place(until) + 1]])
 
-    def update(self, plan: Plan, now: int) -> Estimate | None:
-        """Take samples into account that have come; return what is believed of a time."""
+    def update(self, plan: Plan, now: int) -> Steps[None]:
+        """Take samples into account that have come, and find what is believed of a time."""
         self.fresh = False
         self.take_levels(plan, max(now, self.newest))
         screening, before = self.estimator.screening, self.estimator.screening.lost
-        found = self.estimator.update(now)
+        found = yield from self.estimator.updating(now)
         self.note_start(plan, now)
         trouble = screening.trouble if found is None else found.trouble
         if screening.lost > before and not self.trust.acts:
@@ -89,7 +95,11 @@ class Joint:
         if found is not None and self.trust.why:
             found = replace(found, trusted=False, trouble=self.trust.why)
         self.latest, self.news = found, True
-        return found
+
+    def begin_anew(self) -> None:
+        """Forget what has been learnt, and the look under way."""
+        self.estimator.restart()
+        self.latest, self.looking, self.news = None, None, True
 
     def note_start(self, plan: Plan, now: int) -> None:
         """Remember where the joint was before the setpoint under way at a time."""

@@ -93,7 +93,7 @@ class PlannerNode(ManagedNode):
             if lost := unheld(actuator_from(self._settings.of(name)).nondimensional):
                 self.get_logger().warning(f'joint {name}: {lost}')
         self._channels = {x: JointChannel(
-            self, x, names, self._runtime, self._serve, linked=self.linked) for x in names}
+            self, x, names, self._runtime, self._serve_soon, linked=self.linked) for x in names}
         if not self.linked:
             self._newest = endpoints.listen(self, _NEWEST)
         self._plan, self._status, self._estimate = (
@@ -241,6 +241,13 @@ class PlannerNode(ManagedNode):
         self._take(self._runtime.tick(self.now()))
         if not self.linked:
             self._listen()
+            self._pace()
+
+    def _serve_soon(self) -> None:
+        """Serve within a period: news that may come in crowds are not served one by one."""
+        if self._clock_reader.simulated:
+            self._serve()
+        elif self._channels:
             self._pace()
 
     def _pace(self) -> None:
