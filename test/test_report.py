@@ -1184,6 +1184,25 @@ def test_a_level_that_took_effect_before_its_time_begins_no_request(tmp_path):
     assert [str(x.verdict) for x in part.evaluation.findings] == ['arrived'] * 3
 
 
+def test_a_plan_that_is_published_late_begins_with_what_was_sent_for_it(tmp_path):
+    asked, planned, said, *others = simulated()
+    points, passed = planned[-1].points, 1
+
+    def after(point):
+        return point.time_from_start.sec * NANOSECONDS + point.time_from_start.nanosec
+
+    begin = planned[-1].header.stamp.sec * NANOSECONDS + planned[-1].header.stamp.nanosec
+    left = trajectory(begin + after(points[passed]), [
+        (after(x) - after(points[passed]), x.positions[0], x.velocities[0], x.effort[0])
+        for x in points[passed:]])
+    found = [one(
+        tmp_path / name, [asked, (*planned[:-1], plan), said, *others],
+        **parameters(planner=ACTUATOR, plant=ACTUATOR)).evaluation.findings
+        for name, plan in (('whole', planned[-1]), ('left', left))]
+    assert [str(x.verdict) for x in found[1]] == ['arrived'] * 3
+    assert [x.setpoint for x in found[1]] == [x.setpoint for x in found[0]]
+
+
 @pytest.mark.parametrize('order', ['before', 'after'])
 def test_a_plan_between_the_same_ticks_as_its_request_is_the_one_for_it(tmp_path, order):
     asked, planned, said, *others = simulated()

@@ -41,7 +41,7 @@ _LOOK = 3.0
 _RINGING = 4
 # How many times as long as the last look took, and as there are joints, the next one is later at
 # least.
-_IDLE = 4
+_IDLE = 6
 # Samples of a natural period that are looked at, and how many fewer at rest.
 _DENSE, _SPARSE = 40, 10
 # Periods after the last change of level from which on a joint rests.
@@ -214,7 +214,7 @@ class Feedback:
     @property
     def wake(self) -> int | None:
         """Time in ns at which to look at samples next; None for never, 0 for now."""
-        if any(x.looking or self.mode == 'adapt' and (x.choosing or x.news)
+        if any(x.looking or x.ready or self.mode == 'adapt' and (x.choosing or x.news)
                for x in self._joints.values()):
             return 0
         return min(
@@ -224,7 +224,7 @@ class Feedback:
     @property
     def looking(self) -> bool:
         """Whether a look at samples is under way."""
-        return any(x.looking is not None for x in self._joints.values())
+        return any(x.looking is not None or x.ready for x in self._joints.values())
 
     def update(self, now: int) -> bool:
         """
@@ -240,16 +240,21 @@ class Feedback:
                     joint.choosing, joint.chosen, joint.news = None, True, True
                 busy = True
                 continue
-            if joint.looking is None:
-                if joint.audits and not joint.fresh:
-                    self._audit(name, joint)
-                if not joint.fresh or now < joint.not_before or (
-                        now < joint.next_update and not joint.audits):
-                    continue
+            if joint.ready:
+                joint.ready -= 1
+                self._audit(name, joint, joint.audits.pop(0))
+            elif joint.looking is not None:
+                self._look(name, joint, now, end)
+            elif joint.audits and not joint.fresh:
+                joint.ready = len(joint.audits)
+            elif joint.fresh and now >= max(
+                    joint.not_before, 0 if joint.audits else joint.next_update):
                 joint.looking, joint.spent = joint.update(
                     self._group.planners[name].plan, now), 0
+                self._look(name, joint, now, end)
+            else:
+                continue
             busy = True
-            self._look(name, joint, now, end)
             # Commands go out before the next joint has its turn.
             break
         return busy
@@ -271,7 +276,7 @@ class Feedback:
         if now >= joint.next_tell:
             joint.next_tell = now + _TELL
             self._tell(name, joint, now)
-        self._audit(name, joint)
+        joint.ready = len(joint.audits)
 
     def _tell(self, name: str, joint: Joint, now: int) -> None:
         found = joint.latest
@@ -368,24 +373,21 @@ class Feedback:
                 hold not in joint.audits):
             joint.audits.append(hold)
 
-    def _audit(self, name: str, joint: Joint) -> None:
-        """Find whether what setpoints have left ends feedback."""
-        plan, audits = self._group.planners[name].plan, joint.audits.copy()
-        joint.audits.clear()
-        for hold in audits:
+    def _audit(self, name: str, joint: Joint, hold: Hold) -> None:
+        """Find whether what a setpoint has left ends feedback."""
+        if joint.lost or joint.trust.ended or joint.trust.why or (
+                joint.estimator.screening.trouble):
             # Of a sensor that fails, nothing follows for the move.
-            if joint.lost or joint.trust.why or joint.estimator.screening.trouble:
-                return
-            why = joint.ledger.take(
-                hold, plan, self._nominal[name], joint.moves, self.sensor(name))
-            if not why:
-                joint.trust.confirm(plan.levels[-1].model, joint.ledger.left)
-                continue
-            joint.trust.end(why)
-            joint.news, joint.fresh = True, True
-            self._ended.append(name)
-            self.tell_ended(self.words(name, self._clock()))
             return
+        plan = self._group.planners[name].plan
+        why = joint.ledger.take(hold, plan, self._nominal[name], joint.moves, self.sensor(name))
+        if not why:
+            joint.trust.confirm(plan.levels[-1].model, joint.ledger.left)
+            return
+        joint.trust.end(why)
+        joint.news, joint.fresh = True, True
+        self._ended.append(name)
+        self.tell_ended(self.words(name, self._clock()))
 
     def taken_back(self) -> list[str]:
         """Return joints, once, whose plans are to be as if nothing had been learnt."""

@@ -42,6 +42,8 @@ class Hold:
         self.over = False
         self.untold = False  # whether it is missed, which nobody has been told
         self.news = False  # whether samples have been judged that nobody has looked at
+        # What was asked and found last.
+        self._answer: tuple[Setpoint, Finding] | None = None
         self._last, self._end, self._goal = last, setpoint.end, goal
         self._samples: dict[int, float] = {}
         self._moving: set[int] = set()  # parts of the move of which there is one
@@ -159,6 +161,7 @@ class Hold:
         found, self.news = self.judged(
             setpoint, self._goal or tolerances, sensor=sensor, until=self.due), bool(
                 self._samples)
+        self._answer = setpoint, found
         self.over = self.due >= self._closes or self.due >= self._enough and not (
             found.open or found.failed and self.due < self._grace)
         due = self._begin + max(2 * after, self._length)
@@ -197,6 +200,12 @@ class Hold:
             return False
         self.due = self._closes
         return True
+
+    def shown(self, setpoint: Setpoint, *, sensor: Sensor) -> Finding:
+        """Return what `judge` has found of a setpoint, or find it."""
+        if self._answer is not None and self._answer[0] == setpoint:
+            return self._answer[1]
+        return self.judged(setpoint, sensor=sensor)
 
     def judged(
             self, setpoint: Setpoint, tolerances: Tolerances = _TOLERANCES, *,

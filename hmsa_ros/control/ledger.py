@@ -53,13 +53,13 @@ class Ledger:
         corrected = [x for x in moves.corrected if x >= setpoint.begins]
         later = [x for x in corrected if x >= asked]
         learnt = moves.learnt or len(later) < len(corrected)
-        early = hold.judged(
+        early = hold.shown(
             replace(setpoint, moved=None, end=later[0], held=False) if later
             else replace(setpoint, moved=None), sensor=sensor)
         if not learnt and math.isfinite(early.vibration):
             self._without = max(early.vibration / setpoint.step, _or(self._without, 0.0))
         arrival = setpoint.moved or asked
-        found = early if not later and arrival == setpoint.arrival else hold.judged(
+        found = early if not later and arrival == setpoint.arrival else hold.shown(
             replace(setpoint, arrival=arrival, moved=None), sensor=sensor)
         if not math.isfinite(found.offset):
             return ''

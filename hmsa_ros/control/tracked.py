@@ -45,7 +45,8 @@ class Joint:
     fresh: bool = False  # whether there are samples that have not been looked at
     looking: Iterator[None] | None = None  # pieces of the look at them under way
     spent: int = 0  # on that
-    audits: list[Hold] = field(default_factory=list)  # setpoints to be looked at after it
+    audits: list[Hold] = field(default_factory=list)  # setpoints to be looked at after one
+    ready: int = 0  # how many of these follow it now
     lost: str = ''  # why the field is not as commanded; empty where it is
     moves: Moves = field(default_factory=Moves)  # those of the plan in force
     news: bool = False  # whether the latest estimate has not been held against the plan yet

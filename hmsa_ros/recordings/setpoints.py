@@ -94,13 +94,29 @@ def _acts(run: Run, levels: Sequence[Level]) -> list[_Act]:
 def _begin(run: Run, request: RecordedRequest, levels: Sequence[Level]) -> int:
     """Return from when on a request is carried out."""
     place = next((i for i, x in enumerate(run.plans) if x and x[0].sent >= request.sent), None)
-    begin = None if place is None else _new(run, place)
+    begin = None
+    if place is not None:
+        begin = _under_way(run, place, [x for x in levels if x.sent >= request.sent])
+        if begin is None:
+            begin = _new(run, place)
     if begin is None:
         begin = next((x.stamp for x in levels if x.sent >= request.sent), None)
     if begin is None:
         begin = request.stamp or request.sent + round(
             run.number('planner.lead_time') * NANOSECONDS)
     return begin
+
+
+def _under_way(run: Run, place: int, levels: Sequence[Level]) -> int | None:
+    """
+    Return the first stamp of a plan that begins with a level that was sent for it already.
+
+    A plan that is published late holds what is left of it. ``levels`` are those that were sent
+    since it was requested; None is returned for a plan that begins otherwise.
+    """
+    old = {(x.stamp, x.flux_density) for x in (run.plans[place - 1] if place else ())}
+    stamps = [x.stamp for x in levels if (x.stamp, x.flux_density) not in old]
+    return stamps[0] if run.plans[place][0].stamp in stamps else None
 
 
 def _plan_at(run: Run, sent: int) -> int | None:
