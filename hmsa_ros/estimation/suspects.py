@@ -5,8 +5,9 @@ A suspect stays where it was given unless the evidence pays for it, and what is 
 mixture over all sets of suspects there may be.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 import itertools
 import math
 from typing import NamedTuple
@@ -58,13 +59,24 @@ class Suspects:
         force = [i for i in self.places if self.names[i] == 'constant_force']
         return np.square(follows[:, force]) @ (1.0 / self.priors[force])
 
+    @cached_property
     def sets(self) -> list[tuple[int, ...]]:
-        """Return all sets of suspects; ratio and time of a branch are sought together."""
+        """All sets of suspects; ratio and time of a branch are sought together."""
         groups: dict[str, list[int]] = {}
         for i in self.places:
             groups.setdefault(self.names[i].partition('_')[0], []).append(i)
         return [tuple(itertools.chain(*x)) for count in range(len(groups) + 1)
                 for x in itertools.combinations(groups.values(), count)]
+
+    @cached_property
+    def seeking(self) -> NDArray[np.bool_]:
+        """Which coordinates are sought with each set, shape (n, p)."""
+        return np.array([self.sought(len(self.names), x) for x in self.sets])
+
+    @cached_property
+    def eases(self) -> Array:
+        """What seeking each set adds to the evidence, shape (n,)."""
+        return np.array([sum(map(self.ease, x)) for x in self.sets])
 
     def ease(self, place: int) -> float:
         """Return what seeking a suspect adds to the evidence, but for its variance."""
@@ -98,12 +110,13 @@ class Gain(NamedTuple):
     cross: Array  # second derivatives by such an error and the coordinates, shape (q,)
     curvature: float  # second derivative, at least that of what is usual, 1
 
-    def explains(self, found: Explained) -> float:
-        """Return what an error of the gain besides adds to the evidence, if anything."""
-        rest = self.gradient - float(self.cross @ found.step)
-        curvature = max(
-            self.curvature - float(self.cross @ found.covariance @ self.cross), 1.0)
-        return max(0.5 * rest ** 2 / curvature - 0.5 * math.log(curvature), 0.0)
+    def explains(self, found: Sequence[Explained]) -> Array:
+        """Return what an error of the gain besides adds to each evidence, if anything."""
+        rest = self.gradient - np.array([x.step for x in found]) @ self.cross
+        curvature = np.maximum(self.curvature - (
+            np.array([x.covariance for x in found]) @ self.cross) @ self.cross, 1.0)
+        more: Array = np.maximum(0.5 * rest ** 2 / curvature - 0.5 * np.log(curvature), 0.0)
+        return more
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +133,8 @@ class Look:
 
     def choose(self, before: tuple[int, ...]) -> tuple[tuple[int, ...], Others]:
         """Return the suspects to be sought in place of those before, and what of others counts."""
-        sets = self.suspects.sets()
-        found = self._with_gain(sets, self._all(sets))
+        sets = self.suspects.sets
+        found = self._with_gain(self._all())
         here = sets.index(before)
         best = max(range(len(sets)), key=lambda x: found[x].evidence)
         if found[best].evidence <= found[here].evidence + _CLEARLY:
@@ -136,8 +149,7 @@ class Look:
                 square += (i != best) * weight * (x.covariance + np.outer(apart, apart))
         return sets[best], Others(1.0 / total, off / total, square / total)
 
-    def _with_gain(
-            self, sets: list[tuple[int, ...]], found: list[Explained]) -> list[Explained]:
+    def _with_gain(self, found: list[Explained]) -> list[Explained]:
         """
         Return the same where a gain may be wrong besides.
 
@@ -146,43 +158,51 @@ class Look:
         """
         remanence, force = ({i for i in self.suspects.places if self.suspects.names[i] == x}
                             for x in ('remanence', 'constant_force'))
-        known = dict(zip(sets, found, strict=True))
+        explains: dict[tuple[int, ...], float] = dict(
+            zip(self.suspects.sets, self.gain.explains(found).tolist(), strict=True))
 
         def more(suspected: tuple[int, ...]) -> float:
             if remanence & {*suspected}:
-                return self.gain.explains(known[suspected])
+                return explains[suspected]
             if force & {*suspected}:
-                found = self.gain.explains(known[tuple(x for x in suspected if x not in force)])
-                return -min(found, _BESIDES)
+                return -min(explains[tuple(x for x in suspected if x not in force)], _BESIDES)
             return 0.0
 
-        return [y._replace(evidence=y.evidence + more(x)) for x, y in known.items()]
+        return [x._replace(evidence=x.evidence + more(y))
+                for x, y in zip(found, self.suspects.sets, strict=True)]
 
-    def _all(self, sets: list[tuple[int, ...]]) -> list[Explained]:
+    def _all(self) -> list[Explained]:
         """
         Return what samples say if sets of suspects are sought.
 
         The cost and its derivatives are those at z (D. J. C. MacKay, Neural Comput. 4 (1992) 415).
         """
-        count = len(self.z)
+        sets, sought = self.suspects.sets, self.suspects.seeking
+        sought = np.pad(
+            sought, ((0, 0), (0, len(self.z) - sought.shape[1])), constant_values=True)
         rest = self.suspects.at_ease(self.z, ()) - self.z
-        sought = np.array([self.suspects.sought(count, x) for x in sets])
         both = sought[:, :, None] & sought[:, None, :]
-        matrix = np.where(both, self.matrix, np.eye(count))
+        matrix = np.where(both, self.matrix, np.eye(len(self.z)))
         there = np.where(sought, 0.0, rest)
         covariance = np.linalg.inv(matrix)
         pull = np.where(sought, self.gradient - there @ self.matrix, 0.0)
         step = there + np.einsum('kij,kj->ki', covariance, pull)
         evidence = step @ self.gradient - 0.5 * np.einsum(
-            'ki,ij,kj->k', step, self.matrix, step) - 0.5 * np.linalg.slogdet(matrix)[1] + [
-            sum(map(self.suspects.ease, x)) for x in sets]
+            'ki,ki->k', step @ self.matrix, step) - 0.5 * np.linalg.slogdet(
+                matrix)[1] + self.suspects.eases
         covariance = np.where(both, covariance, 0.0)
         beyond = np.any((step < self.low - 1e-12) | (step > self.high + 1e-12), axis=1)
-        least = np.max(evidence[~beyond], initial=-math.inf) + math.log(_UNLIKELY)
-        return [
-            self._bounded(sets[i], sought[i], rest) if beyond[i] and evidence[i] > least
-            else Explained(-math.inf if beyond[i] else float(evidence[i]), step[i], covariance[i])
-            for i in range(len(sets))]
+        found = [Explained(-math.inf if beyond[i] else float(evidence[i]), step[i], covariance[i])
+                 for i in range(len(sets))]
+        most = max(x.evidence for x in found)
+        # Within bounds samples hardly say more.
+        for i in np.argsort(-evidence).tolist():
+            if evidence[i] <= most + math.log(_UNLIKELY):
+                break
+            if beyond[i]:
+                found[i] = self._bounded(sets[i], sought[i], rest)
+                most = max(most, found[i].evidence)
+        return found
 
     def _bounded(
             self, suspected: tuple[int, ...], sought: NDArray[np.bool_], rest: Array) -> Explained:
