@@ -42,6 +42,9 @@ _RINGING = 4
 # How many times as long as the last look took, and as there are joints, the next one is later at
 # least.
 _IDLE = 6
+# How many times as seldom at most where looks have kept commands waiting, and how it becomes less
+# with each look.
+_SELDOM, _OFTENER = 32.0, 0.8
 # Samples of a natural period that are looked at, and how many fewer at rest.
 _DENSE, _SPARSE = 40, 10
 # Periods after the last change of level from which on a joint rests.
@@ -69,6 +72,7 @@ class Feedback:
         self._joints: dict[str, Joint] = {}
         self._nominal: dict[str, Model] = {}
         self.corrections = 0  # plans that were corrected
+        self._seldom = 1.0  # how many times as seldom samples are looked at
         self._ended: list[str] = []  # joints whose plans are to be taken back
         self.restart()
 
@@ -222,9 +226,16 @@ class Feedback:
              for x in self._joints.values() if x.fresh or x.audits), default=None)
 
     @property
-    def looking(self) -> bool:
-        """Whether a look at samples is under way."""
-        return any(x.looking is not None or x.ready for x in self._joints.values())
+    def takes_long(self) -> bool:
+        """Whether a look at samples is under way, or has taken longer than a slice."""
+        return any(x.looking is not None or x.ready or x.spent > SLICE
+                   for x in self._joints.values())
+
+    def give_way(self, now: int) -> None:
+        """Look seldom from a time in ns on: commands have been kept waiting."""
+        self._seldom = min(2.0 * self._seldom, _SELDOM)
+        for joint in self._joints.values():
+            joint.not_before = max(joint.not_before, now + round(self._seldom * _RESTING))
 
     def update(self, now: int) -> bool:
         """
@@ -267,8 +278,9 @@ class Feedback:
                 joint.spent += self._clock() - begun
                 return
         joint.looking = None
-        joint.not_before = now + _IDLE * len(self._joints) * (
-            joint.spent + self._clock() - begun)
+        joint.spent += self._clock() - begun
+        joint.not_before = now + round(_IDLE * len(self._joints) * self._seldom * joint.spent)
+        self._seldom = max(_OFTENER * self._seldom, 1.0)
         joint.next_update = now + (
             _RESTING if self._quiet(name, joint)
             else min(_UPDATE, round(_OFTEN * joint.unit * NANOSECONDS)) * (

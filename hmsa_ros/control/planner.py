@@ -364,8 +364,8 @@ class PlannerRuntime:
         """Do what is due at a time in ns, for some ms at most; return what to pass on."""
         self._begin_anew()
         self._engage()
-        # A request does not wait for the rest of a look.
-        waits = self.feedback.looking and bool(self.planning.requests)
+        # A request does not wait for a look.
+        waits = self.feedback.takes_long and bool(self.planning.requests)
         estimated = self._send(now) and not waits and self.feedback.update(now)
         if not estimated:
             self._work_on()
@@ -392,6 +392,9 @@ class PlannerRuntime:
         if self.following.astray:
             # Before more of a plan is sent that does not hold.
             self._work_on()
+        if any(x.next_stamp is not None and x.next_stamp < now
+               for x in self.group.planners.values()):
+            self.feedback.give_way(now)
         self.sending.send(now)
         if self.settings.heartbeat_period and now >= self.sending.next_beat:
             self._beat(now)

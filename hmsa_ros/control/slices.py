@@ -18,6 +18,8 @@ SLICE = 4_000_000
 _READ = 100
 # How much longer than estimated or measured planning may take the next time.
 _MARGIN = 3
+# How many times as long it takes until the first commands have gone out.
+_READY = 1.5
 
 
 @dataclass(eq=False)
@@ -114,6 +116,6 @@ def in_time(
         if not drafts:
             return drafts, began + later
         spent = clock() - began
-        if min(x.begin for x in drafts.values()) >= began + spent:
+        if min(x.begin for x in drafts.values()) >= began + _READY * spent:
             return drafts, began + later
         later = max(_MARGIN * spent, later)

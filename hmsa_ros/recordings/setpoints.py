@@ -25,6 +25,8 @@ SAME = 1e-6
 # Rest, to the precision of a planner, and of levels that follow creep: shares of the step, and of
 # the step in the time of a radian.
 _AT_REST = ((0.0, 1e-3), (2e-3, 1e-2))
+# A field in T that is none.
+_NO_FIELD = 1e-9
 # Codes of plans that were made anew in need; feedback corrects others.
 _NEEDED = {'replanned', 'saturated'}
 
@@ -111,12 +113,22 @@ def _under_way(run: Run, place: int, levels: Sequence[Level]) -> int | None:
     """
     Return the first stamp of a plan that begins with a level that was sent for it already.
 
-    A plan that is published late holds what is left of it. ``levels`` are those that were sent
-    since it was requested; None is returned for a plan that begins otherwise.
+    It holds what is left of it then. ``levels`` are those that were sent since it was requested.
     """
+    plan = run.plans[place]
     old = {(x.stamp, x.flux_density) for x in (run.plans[place - 1] if place else ())}
-    stamps = [x.stamp for x in levels if (x.stamp, x.flux_density) not in old]
-    return stamps[0] if run.plans[place][0].stamp in stamps else None
+    new = [x for x in levels if (x.stamp, x.flux_density) not in old]
+    # Who takes over sends what is in force.
+    if new and _in_force(run, new[0]):
+        del new[0]
+    return new[0].stamp if plan[0].stamp in {x.stamp for x in new} else None
+
+
+def _in_force(run: Run, level: Level) -> bool:
+    """Return whether a level is the field that was measured last before its time."""
+    place = int(np.searchsorted(run.time, level.stamp)) - 1
+    return place >= 0 and math.isclose(
+        level.flux_density, run.flux_density[place], rel_tol=ROUNDED, abs_tol=_NO_FIELD)
 
 
 def _plan_at(run: Run, sent: int) -> int | None:
@@ -131,7 +143,8 @@ def _new(run: Run, place: int | None) -> int | None:
     plan, before = run.plans[place], run.plans[place - 1] if place else ()
     if not before and len(plan) > 1 and (
             plan[0].stamp < plan[0].sent or _uncommanded(run, plan[0])) and (
-            abs(float(balance(run, plan[:1])[0]) - plan[0].stretch) <= ROUNDED):
+            abs(float(balance(run, plan[:1])[0]) - plan[0].stretch) <= ROUNDED
+            or _in_force(run, plan[0])):
         # It was in force, and holds what was there.
         plan = plan[1:]
     fresh = _fresh(plan, before)
@@ -246,6 +259,9 @@ def _arrivals(
                 setpoint.end is not None and fresh >= setpoint.end):
             continue
         new = [x for x in plan[begun:] if x.stamp >= fresh]
+        if begun and not _within(new, setpoint) and _rest(run, plan[:1], setpoint) is not None:
+            # It rests there, and no level changes that.
+            continue
         found = _rest(run, new, setpoint)
         if found is None and arrival is not None:
             # One that is left out makes room for the next.
