@@ -376,7 +376,7 @@ class PlannerRuntime:
                 self._watch.open or self._bulletin.unheard or self._bulletin.unseen
                 or self.hearing.receipts or self._bulletin.next_change is not None):
             self._bulletin.look_for_listeners()
-            if not (estimated or self.planning.requests):
+            if not (estimated or waits):
                 self._judge(now)
         self._begin_anew()
         return self._taken()
