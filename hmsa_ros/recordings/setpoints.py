@@ -25,8 +25,8 @@ SAME = 1e-6
 # Rest, to the precision of a planner, and of levels that follow creep: shares of the step, and of
 # the step in the time of a radian.
 _AT_REST = ((0.0, 1e-3), (2e-3, 1e-2))
-# A field in T that is none.
-_NO_FIELD = 1e-9
+# A field in T that is none, and how much earlier than its time in ns a level takes effect at most.
+_NO_FIELD, _EARLY = 1e-9, 100_000
 # Codes of plans that were made anew in need; feedback corrects others.
 _NEEDED = {'replanned', 'saturated'}
 
@@ -121,7 +121,11 @@ def _under_way(run: Run, place: int, levels: Sequence[Level]) -> int | None:
     # Who takes over sends what is in force.
     if new and _in_force(run, new[0]):
         del new[0]
-    return new[0].stamp if plan[0].stamp in {x.stamp for x in new} else None
+    # One that comes late takes effect later than its time.
+    return new[0].stamp if any(
+        x.stamp <= plan[0].stamp + _EARLY and math.isclose(
+            x.flux_density, plan[0].flux_density, rel_tol=ROUNDED, abs_tol=_NO_FIELD)
+        for x in new) else None
 
 
 def _in_force(run: Run, level: Level) -> bool:
