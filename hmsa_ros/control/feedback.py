@@ -221,9 +221,8 @@ class Feedback:
         if any(x.looking or x.ready or self.mode == 'adapt' and (x.choosing or x.news)
                for x in self._joints.values()):
             return 0
-        return min(
-            (max(x.not_before, 0 if x.audits else x.next_update) if x.fresh else 0
-             for x in self._joints.values() if x.fresh or x.audits), default=None)
+        return min((x.next_look if x.fresh else 0 for x in self._joints.values()
+                    if x.fresh or x.audits), default=None)
 
     @property
     def takes_long(self) -> bool:
@@ -258,8 +257,7 @@ class Feedback:
                 self._look(name, joint, now, end)
             elif joint.audits and not joint.fresh:
                 joint.ready = len(joint.audits)
-            elif joint.fresh and now >= max(
-                    joint.not_before, 0 if joint.audits else joint.next_update):
+            elif joint.fresh and now >= joint.next_look:
                 joint.looking, joint.spent = joint.update(
                     self._group.planners[name].plan, now), 0
                 self._look(name, joint, now, end)

@@ -392,10 +392,10 @@ class PlannerRuntime:
         if self.following.astray:
             # Before more of a plan is sent that does not hold.
             self._work_on()
-        if any(x.next_stamp is not None and x.next_stamp < now
-               for x in self.group.planners.values()):
-            self.feedback.give_way(now)
+        late = self.following.lateness.count
         self.sending.send(now)
+        if self.following.lateness.count > late:
+            self.feedback.give_way(now)
         if self.settings.heartbeat_period and now >= self.sending.next_beat:
             self._beat(now)
         return True

@@ -57,6 +57,11 @@ class Joint:
         return float(self.estimator.prior.values['time_unit'])
 
     @property
+    def next_look(self) -> int:
+        """When to look at samples, a time in ns; one that an audit follows is due at once."""
+        return max(self.not_before, 0 if self.audits else self.next_update)
+
+    @property
     def acts(self) -> bool:
         """Whether there is an estimate to act upon."""
         return self.latest is not None and self.latest.trusted and self.trust.acts

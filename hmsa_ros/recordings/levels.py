@@ -12,8 +12,8 @@ from hmsa_ros.model.units import NANOSECONDS
 
 #: By how much hardware may round a level, as a share of the largest.
 ROUNDED = 1e-3
-# By how much the clock of a device may be off in the stamps of what took effect, in ns.
-_ROUNDED_STAMP = 100_000
+#: By how much the clock of a device may be off in the stamps of what took effect, in ns.
+ROUNDED_STAMP = 100_000
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def lateness_of(
         until = next(
             (x.stamp for x in standing[i + 1:] if same(x, command)), math.inf)
         when = [x.stamp for x in applied if same(x, command)
-                and command.stamp - _ROUNDED_STAMP <= x.stamp < until - _ROUNDED_STAMP]
+                and command.stamp - ROUNDED_STAMP <= x.stamp < until - ROUNDED_STAMP]
         if when:
             result[places[command]] = (min(when) - command.stamp) / NANOSECONDS
         elif command.stamp < last and not (before and same(before, command)):

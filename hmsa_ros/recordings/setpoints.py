@@ -16,7 +16,13 @@ from hmsa_ros.judge.records import Setpoint
 from hmsa_ros.model.equations import Array, equilibrium_stretch, natural_frequency, stretch_limits
 from hmsa_ros.model.law import critical_zeta
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.recordings.levels import in_force, Level, ROUNDED, without_repeats
+from hmsa_ros.recordings.levels import (
+    in_force,
+    Level,
+    ROUNDED,
+    ROUNDED_STAMP,
+    without_repeats,
+)
 from hmsa_ros.recordings.record import RecordedRequest, Run
 from hmsa_ros.recordings.topics import COMMAND
 
@@ -25,8 +31,8 @@ SAME = 1e-6
 # Rest, to the precision of a planner, and of levels that follow creep: shares of the step, and of
 # the step in the time of a radian.
 _AT_REST = ((0.0, 1e-3), (2e-3, 1e-2))
-# A field in T that is none, and how much earlier than its time in ns a level takes effect at most.
-_NO_FIELD, _EARLY = 1e-9, 100_000
+# A field in T that is none.
+_NO_FIELD = 1e-9
 # Codes of plans that were made anew in need; feedback corrects others.
 _NEEDED = {'replanned', 'saturated'}
 
@@ -123,7 +129,7 @@ def _under_way(run: Run, place: int, levels: Sequence[Level]) -> int | None:
         del new[0]
     # One that comes late takes effect later than its time.
     return new[0].stamp if any(
-        x.stamp <= plan[0].stamp + _EARLY and math.isclose(
+        x.stamp <= plan[0].stamp + ROUNDED_STAMP and math.isclose(
             x.flux_density, plan[0].flux_density, rel_tol=ROUNDED, abs_tol=_NO_FIELD)
         for x in new) else None
 
