@@ -99,12 +99,14 @@ class Rig:
         return next(iter(self.plants.values()))
 
     def tick(self):
-        new = self.runtime.tick(self.now)
+        begin = self.now
+        new = self.runtime.tick(begin)
         self.outputs += new
         for x in new:
             if isinstance(x, Send):
-                self.sent.append((self.now, x))
-                self.wire.append((self.now + self.transport, x))
+                # A tick sends first; what takes time comes after it.
+                self.sent.append((begin, x))
+                self.wire.append((begin + self.transport, x))
         return new
 
     def deliver(self):
