@@ -599,10 +599,10 @@ def test_a_sample_that_cannot_be_read_is_ignored(serve, monkeypatch, data):
     node = serve(PlannerNode).nodes[0]
     monkeypatch.setattr(node._runtime, 'looks_at', lambda stamp: True)
     seen = []
-    monkeypatch.setattr(node._runtime, 'observed', lambda *sample: seen.append(sample))
-    node._on_sample(data)
+    monkeypatch.setattr(node._runtime, 'observed', lambda *sample, came: seen.append(sample))
+    node._take_sample(data, 0)
     assert not seen
-    node._on_sample(serialize_message(JointState(name=['actuator'], position=[1.1])))
+    node._take_sample(serialize_message(JointState(name=['actuator'], position=[1.1])), 0)
     assert [x[0] for x in seen] == ['actuator']
 
 

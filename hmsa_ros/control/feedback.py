@@ -171,9 +171,7 @@ class Feedback:
 
     def looks_at(self, stamp: int) -> bool:
         """Return whether a sample with a stamp in ns is of use."""
-        return any(
-            not joint.newest <= stamp < joint.newest + self._cell(name, joint)
-            for name, joint in self._joints.items())
+        return any(not x.newest <= stamp < x.next_sample for x in self._joints.values())
 
     def _cell(self, name: str, joint: Joint) -> int:
         """Return how far apart in ns samples are to be."""
@@ -192,17 +190,21 @@ class Feedback:
         return joint.newest > last + round(3.0 * joint.unit * NANOSECONDS)
 
     def add(
-            self, name: str, stamp: int, stretch: float, flux_density: float = math.nan) -> None:
-        """Take in stretch and field in T measured at a stamp in ns; samples come in any order."""
+            self, name: str, stamp: int, stretch: float, flux_density: float, now: int) -> None:
+        """
+        Take in stretch and field in T measured at a stamp, which come at a time, both in ns.
+
+        Samples come in any order; those between others that are close enough are of no use.
+        """
         joint = self._joints.get(name)
-        if joint is None:
+        if joint is None or joint.newest <= stamp < joint.next_sample:
             return
-        now = self._clock()
         lost = joint.lost = joint.coil.measured(
             self._group.planners[name].plan, stamp, flux_density)
         if lost and joint.trust.why != lost and joint.trust.doubt(lost, now, at_once=True):
             joint.begin_anew()
         joint.add(stamp, math.nan if lost else stretch, now)
+        joint.next_sample = joint.newest + self._cell(name, joint)
 
     def applied(self, name: str, stamp: int, flux_density: float) -> None:
         """Take in that a level in T has taken effect at a stamp in ns, before the plan does."""
@@ -409,13 +411,14 @@ class Feedback:
         joint = self._joints.get(name)
         if joint is not None:
             joint.moves = Moves(not alike(model, self._nominal[name]), expected)
-            joint.next_update = joint.waits = 0
+            joint.next_update = joint.next_sample = joint.waits = 0
 
     def corrected(self, name: str, stamp: int, expected: float) -> None:
         """Take in that a plan was corrected from a stamp in ns on."""
         self.corrections += 1
         joint = self._joints.get(name)
         if joint is not None:
+            joint.next_sample = 0
             joint.moves.corrected.append(stamp)
             joint.moves.expected = expected
 

@@ -219,15 +219,19 @@ class PlannerRuntime:
 
     def observed(
             self, joint: str, stamp: int, stretch: float, rate: float,
-            flux_density: float) -> None:
-        """Take in a sample: stamp in ns, stretch, rate in 1/s and flux density in T."""
+            flux_density: float, *, came: int | None = None) -> None:
+        """
+        Take in a sample: stamp in ns, stretch, rate in 1/s and flux density in T.
+
+        Where it waited to be read, `came` is the time in ns of its arrival.
+        """
+        came = self._clock() if came is None else came - self._stepped
         if self._takeover.waiting or not self._takeover.engaged:
             self._takeover.observe(joint, Seen(
                 stamp, stretch, rate, flux_density,
-                None if self.one_clock() else self._clock() - stamp))
+                None if self.one_clock() else came - stamp))
         self._watch.add(joint, stamp, stretch)
-        if self.feedback.looks_at(stamp):
-            self.feedback.add(joint, stamp, stretch, flux_density)
+        self.feedback.add(joint, stamp, stretch, flux_density, came)
 
     def clock_set(self, by: int) -> None:
         """Take in that the clock was set ahead by some ns, and that what is planned goes on."""

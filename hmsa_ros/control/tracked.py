@@ -32,6 +32,7 @@ class Joint:
     start: float  # stretch before the setpoint under way
     latest: Estimate | None = None
     newest: int = 0  # time of the newest sample
+    next_sample: int = 0  # time from which on another one is of use
     next_update: int = 0  # when to look at samples
     not_before: int = 0  # so that looks take a share of the time only
     next_tell: int = 0  # when to tell the estimate

@@ -10,7 +10,6 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 
 from hmsa_ros.control import records
@@ -23,7 +22,7 @@ from hmsa_ros.model.actuators import unheld
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
-from hmsa_ros.nodes.capture import decode, RawSubscription
+from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
 from hmsa_ros.nodes.cdr import read_trajectory, stamp_of
 from hmsa_ros.nodes.channel import JointChannel
 from hmsa_ros.nodes.managed import ManagedNode
@@ -50,6 +49,9 @@ _SAMPLES = replace(topics.JOINT_STATES, qos=topics.Quality(1000, reliable=False)
 _NEWEST = replace(topics.JOINT_STATES, qos=topics.Quality(20, reliable=False))
 # How long samples are listened to after they were wanted last: a subscription takes time to match.
 _LINGER_NS = 2 * NANOSECONDS
+# How seldom they are read, and how many at once, before commands have their turn again. For an
+# executor to call for each of a thousand a second takes longer than reading it does.
+_READ_NS, _AT_ONCE = 10_000_000, 100
 
 
 class PlannerNode(ManagedNode):
@@ -65,9 +67,9 @@ class PlannerNode(ManagedNode):
         self._steps = StepWatch()
         self._runtime = self._new_runtime()
         self._channels: dict[str, JointChannel] = {}
-        self._samples: Subscription | None = None
+        self._samples: RawSubscription | None = None
         self._newest: RawSubscription | None = None
-        self._listen_until = 0
+        self._listen_until = self._read = 0
         self._crowded = ''
         self._action: FollowJointTrajectory | None = None
         check_names(self)
@@ -154,10 +156,10 @@ class PlannerNode(ManagedNode):
         self._presence.close()
         self._poll.cancel()
         self._channels = {}
-        self._samples = None
-        if self._newest is not None:
-            self._newest.destroy()
-            self._newest = None
+        for subscription in (self._samples, self._newest):
+            if subscription is not None:
+                subscription.destroy()
+        self._samples = self._newest = None
 
     # -- in ------------------------------------------------------------------------------------
 
@@ -175,7 +177,18 @@ class PlannerNode(ManagedNode):
         self._serve()
         return verdict.severity < records.Severity.ERROR, verdict.message
 
-    def _on_sample(self, data: bytes) -> None:
+    def _read_samples(self) -> bool:
+        """Take in samples that have come, as far as they are of use; return if more may wait."""
+        if self._samples is None:
+            return False
+        now, before, self._read = self.now(), self._read, monotonic_ns()
+        samples = self._samples.take(_AT_ONCE)
+        for taken in samples:
+            # The clock may have been set meanwhile.
+            self._take_sample(taken.data, now - min(self._ago(taken), self._read - before))
+        return len(samples) == _AT_ONCE
+
+    def _take_sample(self, data: bytes, came: int) -> None:
         # Most of a thousand samples a second are of no use, and reading them takes time. Those of
         # two plants are not of one actuator.
         if self._runtime.crowded or not self._runtime.looks_at(stamp_of(data)):
@@ -186,7 +199,11 @@ class PlannerNode(ManagedNode):
             self.get_logger().error(f'sample ignored: {error}', throttle_duration_sec=1.0)
             return
         for name, stamp, values in conversions.from_samples(message):
-            self._runtime.observed(name, stamp, *values)
+            self._runtime.observed(name, stamp, *values, came=came)
+
+    def _ago(self, taken: Taken) -> int:
+        """Return how long ago in ns a message came, by the node's clock."""
+        return 0 if self._one_clock() else max(time_ns() - taken.received_ns, 0)
 
     def _glance(self) -> Iterator[tuple[str, Seen]]:
         """Yield the newest samples, if there are new ones, without having to read them all."""
@@ -203,8 +220,7 @@ class PlannerNode(ManagedNode):
                     missing.discard(name)
                     yield name, Seen(
                         stamp, *values,
-                        lag=None if self._one_clock() else (
-                            self.now() - (time_ns() - taken.received_ns) - stamp))
+                        lag=None if self._one_clock() else self.now() - self._ago(taken) - stamp)
 
     def _one_clock(self) -> bool:
         """Return whether one clock tells the times of all nodes."""
@@ -241,7 +257,7 @@ class PlannerNode(ManagedNode):
         self._take(self._runtime.tick(self.now()))
         if not self.linked:
             self._listen()
-            self._pace()
+            self._pace(soon=self._read_samples())
 
     def _serve_soon(self) -> None:
         """Serve within a period: news that may come in crowds are not served one by one."""
@@ -250,15 +266,18 @@ class PlannerNode(ManagedNode):
         elif self._channels:
             self._pace()
 
-    def _pace(self) -> None:
-        """Have the runtime served again when there is something to do next."""
-        wake = self._runtime.wake
-        if wake is None and not self._clock_reader.simulated:
+    def _pace(self, *, soon: bool = False) -> None:
+        """Have the runtime served again when there is something to do next, or soon."""
+        wake, longest = self._runtime.wake, _LONGEST_POLL_NS
+        if self._samples is not None:
+            longest = _POLL_NS if soon else _READ_NS
+        elif wake is None and not self._clock_reader.simulated:
             self._poll.cancel()
             return
         period = _POLL_NS
-        if wake is not None and not self._clock_reader.simulated:
-            period = min(max(wake - self.now(), _POLL_NS), _LONGEST_POLL_NS)
+        if not self._clock_reader.simulated:
+            period = longest if wake is None else min(
+                max(wake - self.now(), _POLL_NS), longest)
         if period != self._poll.timer_period_ns or self._poll.is_canceled():
             self._poll.timer_period_ns = period
             self._poll.reset()
@@ -269,9 +288,9 @@ class PlannerNode(ManagedNode):
         if wanted:
             self._listen_until = monotonic_ns() + _LINGER_NS
         if wanted and self._samples is None:
-            self._samples = endpoints.subscribe(self, _SAMPLES, self._on_sample, raw=True)
+            self._samples = endpoints.listen(self, _SAMPLES)
         elif self._samples is not None and monotonic_ns() > self._listen_until:
-            self.destroy_subscription(self._samples)
+            self._samples.destroy()
             self._samples = None
 
     # -- out -----------------------------------------------------------------------------------
