@@ -219,6 +219,19 @@ def test_moves_make_up_for_a_constant_force_once_samples_show_it(named, bound):
     assert 'constant force about 0.03' in estimates(loop)[-1].message
 
 
+def test_where_a_bias_of_the_sensor_may_hide_a_force_no_arrival_is_claimed():
+    loop = Loop(1.0, 5e-4, delay=2 * MS, heartbeat_period=0, feedback='adapt')
+    loop.spoil = lambda samples: [(x, y - 2.8e-3) for x, y in samples]
+    loop.device.push(0, 0, 0.04)
+    loop.now += 400 * MS
+    loop.device.advance(loop.now)
+    list(loop.device.samples())
+    truth = loop.run((1.12, 500 * MS))
+    # Samples show a third of it, which is within the tolerance.
+    assert left(truth, 700, 900, 1.12, 0.12)[1] > 0.03
+    assert (loop.status.worst.verdict, codes(loop)[-1]) == ('undecided', 'undecided')
+
+
 def test_an_actuator_that_is_as_known_is_left_alone():
     loop, plain = (Loop(1.0, 1e-3, heartbeat_period=0, feedback=x) for x in ('adapt', 'off'))
     truth = loop.run((1.4, 300 * MS))

@@ -23,6 +23,7 @@ from hmsa_ros.estimation.words import differences
 from hmsa_ros.identification.known import Known
 from hmsa_ros.judge.records import Sensor
 from hmsa_ros.model.equations import equilibrium_stretch
+from hmsa_ros.model.laws.coordinate import coordinate_of
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Believed, Planner
@@ -357,7 +358,7 @@ class Feedback:
         """
         Return what was found of the sensor of a joint; one as given where nothing was.
 
-        A bias that shows may be a force as well: what that leaves open of it counts.
+        What a force leaves open of a bias counts.
         """
         found = self.latest(name)
         if found is None:
@@ -365,8 +366,7 @@ class Feedback:
         prior = np.diag(self._joints[name].estimator.prior.covariance)
         sure = np.diag(found.covariance)
         known = [x for i, x in enumerate(found.free) if x in _SENSOR and (
-            sure[i] < _FOUND**2 * prior[i]) and (
-            x != 'stretch_bias' or abs(found.values[x]) > _SHOWS * math.sqrt(sure[i]))]
+            _shows_bias(found) if x == 'stretch_bias' else sure[i] < _FOUND**2 * prior[i])]
         figures = {_SENSOR[x]: found.values[x] for x in known} | {
             f'{_SENSOR[x]}_std': found.deviations[x] for x in known}
         together = 0.0
@@ -506,3 +506,20 @@ class Feedback:
                 joint.used = model
                 if not alike(model, planner.model):
                     planner.take_model(model)
+
+
+def _shows_bias(found: Estimate) -> bool:
+    """
+    Return whether samples show that a sensor may have a bias.
+
+    Either it is known not to be 0, or the block is seen beside its rest without field, where a
+    force may hide the larger part of a bias.
+    """
+    at = rest(found.values, found.free, 0.0)
+    if at is None:
+        return False
+    value, covariance = found.values['stretch_bias'], found.covariance[:-2, :-2]
+    itself = np.array([float(x == 'stretch_bias') for x in found.free])
+    shown = at[0] + value - coordinate_of(found.values['law']).rest
+    return any(abs(off) > _SHOWS * math.sqrt(max(float(by @ covariance @ by), 0.0))
+               for off, by in ((value, itself), (shown, itself + at[2])))
