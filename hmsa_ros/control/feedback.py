@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from hmsa_ros.control.aside import Doing, here, Pieces
 from hmsa_ros.control.choice import clearly_better
 from hmsa_ros.control.field import Field
 from hmsa_ros.control.holds import Hold
@@ -69,6 +70,8 @@ class Feedback:
         self._group, self._outputs, self._clock, self._steady = group, outputs, clock, steady
         #: Called with a sentence that says why feedback of a joint has ended.
         self.tell_ended: Callable[[str], None] = lambda words: None
+        #: Does what takes long.
+        self.doing: Doing = here
         self._settings = settings
         self._joints: dict[str, Joint] = {}
         self._nominal: dict[str, Model] = {}
@@ -247,22 +250,26 @@ class Feedback:
         that has taken a while.
         """
         busy, end = False, self._steady() + SLICE
-        for name, joint in self._joints.items():
+        # A look that is under way is ended before the next one, which has waited longest.
+        for name, joint in sorted(
+                self._joints.items(), key=lambda x: (x[1].looking is None, x[1].next_look)):
             if joint.choosing is not None:
-                if next(joint.choosing, joint) is joint:
+                found = next(joint.choosing, joint)
+                if found is joint:
                     joint.choosing, joint.chosen, joint.news = None, True, True
-                busy = True
+                busy |= found is not True
                 continue
             if joint.ready:
                 joint.ready -= 1
                 self._audit(name, joint, joint.audits.pop(0))
             elif joint.looking is not None:
-                self._look(name, joint, now, end)
+                busy |= self._look(name, joint, now, end)
+                break
             elif joint.audits and not joint.fresh:
                 joint.ready = len(joint.audits)
             elif joint.fresh and now >= joint.next_look:
                 joint.looking, joint.spent = joint.update(
-                    self._group.planners[name].plan, now), 0
+                    self._group.planners[name].plan, now, self.doing), 0
                 self._look(name, joint, now, end)
             else:
                 continue
@@ -271,14 +278,14 @@ class Feedback:
             break
         return busy
 
-    def _look(self, name: str, joint: Joint, now: int, end: int) -> None:
-        """Go on to look at samples until a steady time in ns."""
+    def _look(self, name: str, joint: Joint, now: int, end: int) -> bool:
+        """Go on to look at samples until a steady time in ns; return whether that took a while."""
         begun = self._clock()
-        while joint.looking is not None and next(joint.looking, joint) is not joint:
-            if self._steady() >= end:
+        while joint.looking is not None and (found := next(joint.looking, joint)) is not joint:
+            if found or self._steady() >= end:
                 joint.spent += self._clock() - begun
-                return
-        joint.looking = None
+                return found is not True
+        joint.looked()
         joint.spent += self._clock() - begun
         joint.not_before = now + round(_IDLE * len(self._joints) * self._seldom * joint.spent)
         self._seldom = max(_OFTENER * self._seldom, 1.0)
@@ -290,6 +297,7 @@ class Feedback:
             joint.next_tell = now + _TELL
             self._tell(name, joint, now)
         joint.ready = len(joint.audits)
+        return True
 
     def _tell(self, name: str, joint: Joint, now: int) -> None:
         found = joint.latest
@@ -443,16 +451,17 @@ class Feedback:
         cautious = self.mode == 'adapt' and self._settings.feedback_cautious
         return self._settings.feedback_tolerance if cautious else math.inf
 
-    def _choose(self, name: str, joint: Joint, latest: Estimate) -> Iterator[None]:
+    def _choose(self, name: str, joint: Joint, latest: Estimate) -> Pieces[None]:
         """Plan with what is learnt, once that is clearly better, or while a move waits for it."""
         planner = self._group.planners[name]
         used, segments = joint.used or planner.model, planner.plan.segments
         model, waits = used, latest.time < joint.waits
         if differs(used, latest):
             learnt = self._learnt(name, used)
-            if (yield from clearly_better(
-                    latest, learnt, used, joint.start, segments[-1].stretch,
-                    given=used == self._nominal[name], shown=not waits)):
+            better = partial(
+                clearly_better, given=used == self._nominal[name], shown=not waits)
+            if (yield from self.doing(
+                    better, latest, learnt, used, joint.start, segments[-1].stretch)):
                 model = learnt
         if not joint.acts:
             return

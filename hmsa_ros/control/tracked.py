@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 import math
 
+from hmsa_ros.control.aside import Doing, Pieces
 from hmsa_ros.control.field import Field
 from hmsa_ros.control.holds import Hold
 from hmsa_ros.control.ledger import Ledger, Moves
@@ -38,13 +39,15 @@ class Joint:
     next_tell: int = 0  # when to tell the estimate
     next_choice: int = 0  # when to choose the parameters to plan with
     used: Model | None = None  # what was chosen; None for what the planner has
-    choosing: Iterator[None] | None = None  # pieces of the choice under way
+    choosing: Iterator[bool | None] | None = None  # pieces of the choice under way
     chosen: bool = False  # whether that was made since the latest estimate
     waits: int = 0  # arrival of a move that takes longer, so that it can be corrected
     amplitude: float = 0.0  # largest of the vibration since the last arrival
     setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place of the setpoint under way
     fresh: bool = False  # whether there are samples that have not been looked at
-    looking: Iterator[None] | None = None  # pieces of the look at them under way
+    looking: Iterator[bool | None] | None = None  # pieces of the look at them under way
+    # Samples that came meanwhile: stamp, stretch, and when.
+    waiting: list[tuple[int, float, int]] = field(default_factory=list)
     spent: int = 0  # on that
     audits: list[Hold] = field(default_factory=list)  # setpoints to be looked at after one
     ready: int = 0  # how many of these follow it now
@@ -70,11 +73,21 @@ class Joint:
     def add(self, stamp: int, stretch: float, now: int) -> None:
         """Take in a stretch measured at a stamp, which is not ahead of the clock."""
         self.fresh = True
-        if stamp > now + _AHEAD * self.unit * NANOSECONDS:
+        if not self._is_ahead(stamp, now):
+            self.newest = max(self.newest, min(stamp, now))
+        if self.looking is None:
+            self._take(stamp, stretch, now)
+        else:
+            self.waiting.append((stamp, stretch, now))
+
+    def _is_ahead(self, stamp: int, now: int) -> bool:
+        return stamp > now + _AHEAD * self.unit * NANOSECONDS
+
+    def _take(self, stamp: int, stretch: float, now: int) -> None:
+        if self._is_ahead(stamp, now):
             self.estimator.screening.refuse_ahead((stamp - now) / NANOSECONDS)
-            return
-        self.estimator.sample(stamp, stretch)
-        self.newest = max(self.newest, min(stamp, now))
+        else:
+            self.estimator.sample(stamp, stretch)
 
     def take_levels(self, plan: Plan, until: int) -> None:
         """Have the estimator know the levels of a plan that count until a time."""
@@ -82,12 +95,14 @@ class Joint:
         self.estimator.set_levels([
             (x.stamp, x.flux_density) for x in plan.levels[first:plan.place(until) + 1]])
 
-    def update(self, plan: Plan, now: int) -> Steps[None]:
+    def update(self, plan: Plan, now: int, doing: Doing) -> Pieces[None]:
         """Take samples into account that have come, and find what is believed of a time."""
         self.fresh = False
         self.take_levels(plan, max(now, self.newest))
-        screening, before = self.estimator.screening, self.estimator.screening.lost
-        found = yield from self.estimator.updating(now)
+        before = self.estimator.screening.lost
+        estimator, found = yield from doing(_updated, self.estimator, now)
+        estimator.learning, self.estimator = self.estimator.learning, estimator
+        screening = estimator.screening
         self.note_start(plan, now)
         trouble = screening.trouble if found is None else found.trouble
         if screening.lost > before and not self.trust.acts:
@@ -106,7 +121,15 @@ class Joint:
     def begin_anew(self) -> None:
         """Forget what has been learnt, and the look under way."""
         self.estimator.restart()
-        self.latest, self.looking, self.news = None, None, True
+        self.latest, self.news = None, True
+        self.looked()
+
+    def looked(self) -> None:
+        """End the look under way, and take in the samples that came meanwhile."""
+        self.looking = None
+        for sample in self.waiting:
+            self._take(*sample)
+        self.waiting.clear()
 
     def note_start(self, plan: Plan, now: int) -> None:
         """Remember where the joint was before the setpoint under way at a time."""
@@ -174,3 +197,9 @@ class Joint:
             'unreadable': screening.unreadable, 'repeated': screening.repeated,
             'too_late': screening.late, 'ahead_of_clock': screening.ahead,
             'new_beginnings': self.trust.beginnings, 'ended': self.trust.ended}
+
+
+def _updated(estimator: Estimator, now: int) -> Steps[tuple[Estimator, Estimate | None]]:
+    """Return an estimator with its samples taken into account, and what it believes of a time."""
+    found = yield from estimator.updating(now)
+    return estimator, found

@@ -13,6 +13,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from hmsa_ros.control import records
+from hmsa_ros.control.aside import Aside
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.takeover import Seen
 from hmsa_ros.errors import BadInputError, BagError
@@ -63,6 +64,7 @@ class PlannerNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__(topics.PLANNER)
         self._settings = declare_joints(self, PARAMETERS, OWN)
+        self._aside = Aside(self.get_logger().warning)
         self._clock_reader = NewestClock(self)
         self._steps = StepWatch()
         self._runtime = self._new_runtime()
@@ -82,6 +84,9 @@ class PlannerNode(ManagedNode):
             observable=self._observable, unheard=self._unheard, glance=self._glance,
             found=lambda joint: self._channels[joint].found)
         runtime.one_clock = self._one_clock
+        runtime.feedback.doing = self._aside
+        if runtime.feedback.on:
+            self._aside.start()
         runtime.hearing.reporters = lambda joint: self._channels[joint].reporters
         return runtime
 
@@ -152,6 +157,7 @@ class PlannerNode(ManagedNode):
 
     def cleanup(self) -> None:
         """Forget the plans."""
+        self._aside.close()
         self._jump.unregister()
         self._presence.close()
         self._poll.cancel()
@@ -160,6 +166,10 @@ class PlannerNode(ManagedNode):
             if subscription is not None:
                 subscription.destroy()
         self._samples = self._newest = None
+
+    def close(self) -> None:
+        """End the process that estimates."""
+        self._aside.close()
 
     # -- in ------------------------------------------------------------------------------------
 

@@ -1,0 +1,109 @@
+"""Work in a process beside the planner: same results, whatever becomes of either process."""
+
+from dataclasses import replace
+import os
+import select
+import signal
+import subprocess
+import sys
+
+from bench_oracle import Bench, Plant
+import numpy as np
+import pytest
+
+from hmsa_ros.control.aside import Aside, here
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.planning.drafting import finish
+
+MS = 1_000_000
+
+
+def whose(value, gate=None):
+    """Return a value, once somebody writes to a pipe, and which process has returned it."""
+    yield
+    if gate is not None:
+        gate.read_text()
+    return value, os.getpid()
+
+
+def ends(parent):
+    """End whatever process it is in, but not the parent."""
+    yield
+    if os.getpid() != parent:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return 'here'
+
+
+@pytest.fixture
+def aside():
+    told = []
+    found = Aside(told.append)
+    found.told = told
+    yield found
+    found.close()
+
+
+def test_each_gets_the_answer_to_what_it_asked_in_whatever_order_they_look(aside, tmp_path):
+    gate = tmp_path / 'gate'
+    os.mkfifo(gate)
+    finish(aside(whose, 'ready'))
+    first, second = aside(whose, 1, gate), aside(whose, 2)
+    assert next(first)
+    assert next(second)
+    gate.write_text('')
+    # Nobody looks for the first while the second waits.
+    (two, there), (one, _) = finish(second), finish(first)
+    assert (one, two) == (1, 2)
+    assert there != os.getpid()
+    left = aside(whose, 'left', gate)
+    assert next(left)
+    left.close()
+    gate.write_text('')
+    assert finish(aside(whose, 3)) == (3, there)
+    assert not aside.told
+
+
+def test_a_process_that_ends_is_done_without_and_said_once(aside):
+    assert finish(aside(ends, os.getpid())) == 'here'
+    assert finish(aside(whose, 3)) == (3, os.getpid())
+    words, = aside.told
+    assert 'the planner estimates itself' in words
+
+
+def test_it_ends_with_the_planner_however_that_ends_and_not_by_ctrl_c(tmp_path):
+    script = tmp_path / 'planner.py'
+    script.write_text(
+        'import time\n'
+        'from hmsa_ros.control.aside import Aside, finish\n'
+        'from test_aside import whose\n'
+        'aside = Aside(print)\n'
+        'print(finish(aside(whose, 1))[1], flush=True)\n'
+        'time.sleep(600)\n')
+    with subprocess.Popen(
+            [sys.executable, script], stdout=subprocess.PIPE, text=True,
+            env={**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, sys.path))}) as planner:
+        process = os.pidfd_open(int(planner.stdout.readline()))
+        signal.pidfd_send_signal(process, signal.SIGINT)
+        end = select.poll()
+        end.register(process)
+        assert not end.poll(500)
+        planner.kill()
+    assert end.poll(60_000)
+
+
+def test_what_is_learnt_is_the_same_in_either_process(aside):
+    sent = {}
+    for name, doing in (('here', here), ('aside', aside)):
+        def at_once(work, *arguments, doing=doing):
+            return finish(doing(work, *arguments))
+            yield
+
+        block = paper_actuator()
+        stiffer = replace(block, shear_modulus=1.1 * block.shear_modulus)
+        bench = Bench(Plant(stiffer), block, 1e-3, seed=1)
+        bench.runtime.feedback.doing = at_once
+        for target in (1.3, 1.1, 1.25):
+            bench.move(target, 200 * MS)
+        assert 'plans use it' in bench.message
+        sent[name] = np.array(bench.sent)
+    assert np.array_equal(sent['here'], sent['aside'])
