@@ -246,7 +246,8 @@ def scan(
     tried: list[tuple[float, float, dict[str, float]]] = []
     timed = seeks_time(values, free)
     factors = np.geomspace(1.0 / _SCAN_RANGE, _SCAN_RANGE, _SCAN_POINTS) if timed else np.ones(1)
-    units = np.maximum(factors * values['time_unit'], shortest)
+    # Once each: samples far apart make many of them the shortest.
+    units = np.unique(np.maximum(factors * values['time_unit'], shortest))
     for decay in _SCAN_DECAYS if 'damping_coefficient' in free else (0.0,):
         for candidate in at_units(values, free, units, decay, found):
             response = respond(part, candidate, (), rtol=1e-5)
