@@ -70,8 +70,18 @@ def pytest_runtest_makereport(
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Return a worker a core: the nodes of a test must keep up with real time."""
-    return os.cpu_count() or 1
+    """Return three workers for two cores: a test with nodes mostly waits for them."""
+    return max(3 * (os.cpu_count() or 1) // 2, 2)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Look for no garbage among what stays: modules and tests while they are found, nor later."""
+    gc.disable()
+    result = yield
+    gc.enable()
+    gc.freeze()
+    return result
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -79,7 +89,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """
     Say what each worker takes at once: a test that runs nodes, or all others of a module.
 
-    Long tests begin first.
+    Long tests begin first. The others alternate, so that while nodes are waited for, something is
+    computed; and end with those that run nodes, since they are short.
     """
     for item in items:
         if 'ros_domain_id' in getattr(item, 'fixturenames', ()):
@@ -88,9 +99,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             continue
         item.add_marker(pytest.mark.xdist_group(item.path.stem))
     if 'PYTEST_XDIST_WORKER' in os.environ:
+        with_nodes = [x for x in items if x.get_closest_marker('ros')]
+        modules = list(dict.fromkeys(x.path for x in items if not x.get_closest_marker('ros')))
+        place = {x: i / len(with_nodes) for i, x in enumerate(with_nodes)} | {
+            x: 0.9 * i / len(modules) for i, x in enumerate(modules)}
         items.sort(key=lambda item: (
             not any(item.get_closest_marker(x) for x in ('long', 'slow')),
-            bool(item.get_closest_marker('ros'))))
+            place.get(item, place.get(item.path, 0.0))))
 
 
 def bound(kind: Any, qos: Any = 1000) -> tuple[Any, Any]:
