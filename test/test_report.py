@@ -63,7 +63,7 @@ ACTUATOR = paper_actuator()
 UNIT = ACTUATOR.time_unit
 SEQUENCE = ((1.1, 10.0), (1.2, 10.0), (1.4, 10.0))
 START = 2 * NANOSECONDS
-PERIOD = 50_000
+PERIOD = 100_000
 LEAD = 5_000_000
 # What the integration leaves of a motion that has come to rest, as a share of the step.
 ROUNDING = 1e-6
@@ -500,7 +500,7 @@ def test_the_plan_predicts_a_plant_that_is_as_planned(tmp_path, slew, lag):
         known |= {'planner.coil_time_constant': str(lag), 'plant.coil_time_constant': str(lag)}
     part = one(tmp_path / 'bag', simulated(slew=slew, lag=lag), **known)
     difference = part.run.stretch - part.evaluation.planned.at(part.evaluation.time).stretch
-    assert np.count_nonzero(np.isfinite(difference)) > 2000
+    assert np.count_nonzero(np.isfinite(difference)) > 1000
     assert np.nanmax(np.abs(difference)) < SAME
     points = plan_points(part.run, part.evaluation)
     assert [x.planned for x in points] == [x.commanded for x in points]
@@ -911,7 +911,7 @@ def test_a_request_that_is_not_a_number_hides_no_setpoint(tmp_path):
 
 
 @pytest.mark.parametrize(('samples', 'levels', 'setpoints'), [
-    (1, [0.02, 0.035], 0), (100, [0.02, 0.035], 0), (2000, [1e300], 1), (2000, [], 0)])
+    (1, [0.02, 0.035], 0), (100, [0.02, 0.035], 0), (1000, [1e300], 1), (1000, [], 0)])
 def test_odd_recordings_are_shown_for_what_they_are(tmp_path, samples, levels, setpoints):
     messages = [x for x in simulated() if x[1] == '/joint_states'][:samples]
     messages += [
