@@ -5,7 +5,7 @@ A suspect stays where it was given unless the evidence pays for it, and what is 
 mixture over all sets of suspects there may be.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 import itertools
@@ -74,17 +74,30 @@ class Suspects:
         return np.array([self.sought(len(self.names), x) for x in self.sets])
 
     @cached_property
-    def eases(self) -> Array:
-        """What seeking each set adds to the evidence, shape (n,)."""
-        return np.array([sum(map(self.ease, x)) for x in self.sets])
+    def forceless(self) -> NDArray[np.int64]:
+        """Place of each set's own without a force, shape (n,)."""
+        places = {x: i for i, x in enumerate(self.sets)}
+        return np.array([
+            places[tuple(i for i in x if self.names[i] != 'constant_force')] for x in self.sets])
 
-    def ease(self, place: int) -> float:
-        """Return what seeking a suspect adds to the evidence, but for its variance."""
-        return 0.5 * math.log(self.priors[place]) - self.prudence(place)
+    @cached_property
+    def with_remanence(self) -> NDArray[np.bool_]:
+        """Which sets have the remanence, shape (n,)."""
+        return np.array([any(self.names[i] == 'remanence' for i in x) for x in self.sets])
 
-    def prudence(self, place: int) -> float:
-        """Return how improbable a suspect is; one that is named is as likely as not."""
-        return _PRUDENCE if place >= self.named else 0.0
+    @cached_property
+    def prudence(self) -> Array:
+        """How improbable each suspect is, 0 of the rest, shape (p,); named: as likely as not."""
+        found = np.zeros(len(self.names))
+        found[list(self.places)] = [_PRUDENCE if x >= self.named else 0.0 for x in self.places]
+        return found
+
+    @cached_property
+    def ease(self) -> Array:
+        """What seeking each suspect adds to the evidence, but for its variance, shape (p,)."""
+        found, places = np.zeros(len(self.names)), list(self.places)
+        found[places] = 0.5 * np.log(self.priors[places]) - self.prudence[places]
+        return found
 
 
 class Others(NamedTuple):
@@ -96,11 +109,11 @@ class Others(NamedTuple):
 
 
 class Explained(NamedTuple):
-    """What samples say if some suspects are sought."""
+    """What samples say if some suspects are sought, of n sets of them."""
 
-    evidence: float  # logarithm of how probable samples are, but for a constant
-    step: Array  # to the most probable coordinates
-    covariance: Array  # of those that are sought, 0 of the others, shape (q, q)
+    evidence: Array  # logarithm of how probable samples are, but for a constant, shape (n,)
+    step: Array  # to the most probable coordinates, shape (n, q)
+    loose: NDArray[np.bool_]  # which of them vary, shape (n, q)
 
 
 class Gain(NamedTuple):
@@ -110,11 +123,11 @@ class Gain(NamedTuple):
     cross: Array  # second derivatives by such an error and the coordinates, shape (q,)
     curvature: float  # second derivative, at least that of what is usual, 1
 
-    def explains(self, found: Sequence[Explained]) -> Array:
+    def explains(self, found: Explained, matrix: Array) -> Array:
         """Return what an error of the gain besides adds to each evidence, if anything."""
-        rest = self.gradient - np.array([x.step for x in found]) @ self.cross
-        curvature = np.maximum(self.curvature - (
-            np.array([x.covariance for x in found]) @ self.cross) @ self.cross, 1.0)
+        rest = self.gradient - found.step @ self.cross
+        leans = _solution(matrix, self.cross, np.zeros_like(found.step), found.loose)
+        curvature = np.maximum(self.curvature - leans @ self.cross, 1.0)
         more: Array = np.maximum(0.5 * rest ** 2 / curvature - 0.5 * np.log(curvature), 0.0)
         return more
 
@@ -134,95 +147,97 @@ class Look:
     def choose(self, before: tuple[int, ...]) -> tuple[tuple[int, ...], Others]:
         """Return the suspects to be sought in place of those before, and what of others counts."""
         sets = self.suspects.sets
-        found = self._with_gain(self._all())
-        here = sets.index(before)
-        best = max(range(len(sets)), key=lambda x: found[x].evidence)
-        if found[best].evidence <= found[here].evidence + _CLEARLY:
+        found = self._all()
+        evidence = found.evidence + self._by_gain(found)
+        here, best = sets.index(before), int(np.argmax(evidence))
+        if evidence[best] <= evidence[here] + _CLEARLY:
             best = here
-        total, off, square = 0.0, np.zeros_like(self.z), np.zeros_like(self.matrix)
-        for i, x in enumerate(found):
-            weight = math.exp(min(x.evidence - found[best].evidence, _CLEARLY))
-            if weight > _UNLIKELY:
-                total += weight
-                apart = x.step - found[best].step
-                off += weight * apart
-                square += (i != best) * weight * (x.covariance + np.outer(apart, apart))
-        return sets[best], Others(1.0 / total, off / total, square / total)
+        weight = np.exp(np.minimum(evidence - evidence[best], _CLEARLY))
+        counts = np.flatnonzero(weight > _UNLIKELY)
+        weight, total = weight[counts], float(np.sum(weight[counts]))
+        apart = found.step[counts] - found.step[best]
+        square = np.einsum(
+            'k,kij->ij', weight * (counts != best), inverse(self.matrix, found.loose[counts]))
+        return sets[best], Others(
+            1.0 / total, weight @ apart / total,
+            (square + (weight[:, None] * apart).T @ apart) / total)
 
-    def _with_gain(self, found: list[Explained]) -> list[Explained]:
+    def _by_gain(self, found: Explained) -> Array:
         """
-        Return the same where a gain may be wrong besides.
+        Return what is added to each evidence where a gain may be wrong besides.
 
         What looks like another remanence may be a gain in part, and a force is less probable where
         a gain in its place explains samples too.
         """
-        remanence, force = ({i for i in self.suspects.places if self.suspects.names[i] == x}
-                            for x in ('remanence', 'constant_force'))
-        explains: dict[tuple[int, ...], float] = dict(
-            zip(self.suspects.sets, self.gain.explains(found).tolist(), strict=True))
+        explains, forceless = self.gain.explains(found, self.matrix), self.suspects.forceless
+        more: Array = np.where(self.suspects.with_remanence, explains, np.where(
+            forceless != np.arange(len(forceless)), -np.minimum(explains[forceless], _BESIDES),
+            0.0))
+        return more
 
-        def more(suspected: tuple[int, ...]) -> float:
-            if remanence & {*suspected}:
-                return explains[suspected]
-            if force & {*suspected}:
-                return -min(explains[tuple(x for x in suspected if x not in force)], _BESIDES)
-            return 0.0
-
-        return [x._replace(evidence=x.evidence + more(y))
-                for x, y in zip(found, self.suspects.sets, strict=True)]
-
-    def _all(self) -> list[Explained]:
+    def _all(self) -> Explained:
         """
         Return what samples say if sets of suspects are sought.
 
         The cost and its derivatives are those at z (D. J. C. MacKay, Neural Comput. 4 (1992) 415).
         """
-        sets, sought = self.suspects.sets, self.suspects.seeking
+        sought = self.suspects.seeking
         sought = np.pad(
             sought, ((0, 0), (0, len(self.z) - sought.shape[1])), constant_values=True)
         rest = self.suspects.at_ease(self.z, ()) - self.z
-        both = sought[:, :, None] & sought[:, None, :]
-        matrix = np.where(both, self.matrix, np.eye(len(self.z)))
-        there = np.where(sought, 0.0, rest)
-        covariance = np.linalg.inv(matrix)
-        pull = np.where(sought, self.gradient - there @ self.matrix, 0.0)
-        step = there + np.einsum('kij,kj->ki', covariance, pull)
-        evidence = step @ self.gradient - 0.5 * np.einsum(
-            'ki,ki->k', step @ self.matrix, step) - 0.5 * np.linalg.slogdet(
-                matrix)[1] + self.suspects.eases
-        covariance = np.where(both, covariance, 0.0)
-        beyond = np.any((step < self.low - 1e-12) | (step > self.high + 1e-12), axis=1)
-        found = [Explained(-math.inf if beyond[i] else float(evidence[i]), step[i], covariance[i])
-                 for i in range(len(sets))]
-        most = max(x.evidence for x in found)
+        found = self._explained(
+            np.where(sought, 0.0, rest), sought, self.suspects.seeking @ self.suspects.ease)
+        evidence = found.evidence.copy()
+        beyond = np.any(
+            (found.step < self.low - 1e-12) | (found.step > self.high + 1e-12), axis=1)
+        found.evidence[beyond] = -math.inf
+        most = float(np.max(found.evidence))
         # Within bounds samples hardly say more.
-        for i in np.argsort(-evidence).tolist():
-            if evidence[i] <= most + math.log(_UNLIKELY):
+        places = np.flatnonzero(beyond & (evidence > most + math.log(_UNLIKELY)))
+        bounded = self._bounded(sought[places], rest)
+        for i in np.argsort(-evidence[places]).tolist():
+            if evidence[places[i]] <= most + math.log(_UNLIKELY):
                 break
-            if beyond[i]:
-                found[i] = self._bounded(sets[i], sought[i], rest)
-                most = max(most, found[i].evidence)
+            for those, one in zip(found, bounded, strict=True):
+                those[places[i]] = one[i]
+            most = max(most, float(bounded.evidence[i]))
         return found
 
-    def _bounded(
-            self, suspected: tuple[int, ...], sought: NDArray[np.bool_], rest: Array) -> Explained:
+    def _bounded(self, sought: NDArray[np.bool_], rest: Array) -> Explained:
         """Return as `_all` where the most probable coordinates are within bounds."""
-        matrix, gradient = self.matrix, self.gradient
-        step, loose = optimum(matrix, gradient, rest, sought, self.low, self.high)
-        covariance = inverse(matrix, loose)
-        return Explained(
-            float(gradient @ step - 0.5 * step @ matrix @ step) + 0.5 * float(
-                np.linalg.slogdet(covariance[np.ix_(loose, loose)])[1]) + sum(
-                self.suspects.ease(i) if loose[i] else -self.suspects.prudence(i)
-                for i in suspected),
-            step, covariance)
+        step, loose = optimum(
+            self.matrix, self.gradient, np.broadcast_to(rest, sought.shape), sought, self.low,
+            self.high)
+        count = len(self.suspects.names)
+        return self._explained(np.where(loose, 0.0, step), loose, np.sum(np.where(
+            loose[:, :count], self.suspects.ease, np.where(
+                sought[:, :count], -self.suspects.prudence, 0.0)), axis=1))
+
+    def _explained(self, there: Array, loose: NDArray[np.bool_], eases: Array) -> Explained:
+        """Return what samples say where what does not vary is there."""
+        step = _solution(self.matrix, self.gradient, there, loose)
+        return Explained(step @ self.gradient - 0.5 * np.einsum(
+            'ki,ki->k', step @ self.matrix, step) - 0.5 * np.linalg.slogdet(
+                _part(self.matrix, loose))[1] + eases, step, loose)
+
+
+def _part(matrix: Array, loose: NDArray[np.bool_]) -> Array:
+    """Return what varies of a matrix, the identity elsewhere; shape (..., q, q)."""
+    return np.where(loose[..., :, None] & loose[..., None, :], matrix, np.eye(len(matrix)))
+
+
+def _solution(matrix: Array, gradient: Array, there: Array, loose: NDArray[np.bool_]) -> Array:
+    """Return the steps to the optimum of a quadratic where what does not vary is there."""
+    pull = np.where(loose, gradient - there @ matrix, there)
+    found: Array = np.linalg.solve(_part(matrix, loose), pull[..., None])[..., 0]
+    return found
 
 
 def inverse(matrix: Array, sought: NDArray[np.bool_]) -> Array:
-    """Return the inverse of what is sought, 0 elsewhere."""
-    found, places = np.zeros_like(matrix), np.flatnonzero(sought)
-    inner = np.linalg.inv(matrix[places[:, None], places])
-    found[places[:, None], places] = 0.5 * (inner + inner.T)
+    """Return the inverse of what is sought, 0 elsewhere; of shape (..., q) all at once."""
+    inner = np.linalg.inv(_part(matrix, sought))
+    found: Array = np.where(
+        sought[..., :, None] & sought[..., None, :], 0.5 * (inner + inner.swapaxes(-1, -2)), 0.0)
     return found
 
 
@@ -232,17 +247,15 @@ def optimum(
     """
     Return the step to the optimum of a quadratic within bounds, and what varies there.
 
-    What is not sought takes the step given. What would go too far goes as far as it may.
+    What is not sought takes the step given. What would go too far goes as far as it may. Steps
+    may be several, of shape (..., q).
     """
-    step, loose = step.copy(), sought.copy()
+    loose = sought.copy()
     while True:
-        places = np.flatnonzero(loose)
-        step[places] = 0.0
-        step[places] = np.linalg.solve(
-            matrix[places[:, None], places], gradient[places] - matrix[places] @ step)
+        step = _solution(matrix, gradient, np.where(loose, 0.0, step), loose)
         bounded = np.minimum(np.maximum(step, low), high)
         beyond = loose & (np.abs(bounded - step) > 1e-12)
         if not beyond.any():
             return step, loose
-        step[beyond] = bounded[beyond]
+        step = np.where(beyond, bounded, step)
         loose &= ~beyond
