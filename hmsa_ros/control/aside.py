@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Generator
 from multiprocessing.connection import Connection, Pipe
+import os
 import signal
 import subprocess
 import sys
@@ -19,6 +20,8 @@ Doing = Callable[..., Pieces[Any]]
 _WORKER = (
     'import sys; sys.path[:] = {!r}; import hmsa_ros.control.feedback; '
     'from hmsa_ros.control.aside import serve; serve({})')
+# By how much it gives way to whoever sends and obeys commands.
+_NICE = 5
 
 
 def here(work: Callable[..., Steps[T]], *arguments: object) -> Pieces[T]:
@@ -119,6 +122,7 @@ class _Worker:
 
 def serve(place: int) -> None:
     """Do the work that comes by a line, a file descriptor, and answer, until it is cut."""
+    os.nice(_NICE)
     line, answer = Connection(place), None
     while True:
         try:
