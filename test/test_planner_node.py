@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 import math
+import threading
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -20,6 +21,7 @@ from hmsa_ros.errors import HmsaError
 from hmsa_ros.identification.files import errors_from
 from hmsa_ros.interfaces import topics
 from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.nodes.capture import Taken
 from hmsa_ros.nodes.conversions import from_command, from_time, to_time, to_trajectory
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.planning.drafting import finish
@@ -600,10 +602,37 @@ def test_a_sample_that_cannot_be_read_is_ignored(serve, monkeypatch, data):
     monkeypatch.setattr(node._runtime, 'looks_at', lambda stamp: True)
     seen = []
     monkeypatch.setattr(node._runtime, 'observed', lambda *sample, came: seen.append(sample))
-    node._take_sample(data, 0)
+
+    def take(message):
+        node._take_sample(Taken(0, 0, 0, b'', message), 0)
+    take(data)
     assert not seen
-    node._take_sample(serialize_message(JointState(name=['actuator'], position=[1.1])), 0)
+    take(serialize_message(JointState(name=['actuator'], position=[1.1])))
     assert [x[0] for x in seen] == ['actuator']
+
+
+def test_samples_that_wait_to_be_read_came_before_and_not_before_they_were_made(
+        ros, serve, monkeypatch):
+    node = serve(PlannerNode, '-p', 'feedback:=observe').nodes[0]
+    runtime, seen = node._runtime, []
+
+    def take_long(name, stamp, *values, came):
+        seen.append((stamp, came, node.now()))
+        threading.Event().wait(5e-3)
+    monkeypatch.setattr(runtime, 'looks_at', lambda stamp: True)
+    monkeypatch.setattr(runtime, 'observed', take_long)
+    publisher = ros.publisher(topics.JOINT_STATES.type, 'joint_states', topics.SAMPLES)
+
+    def is_seen():
+        for _ in range(20):
+            message = JointState(name=['actuator'], position=[1.1])
+            message.header.stamp = ros.node.get_clock().now().to_msg()
+            publisher.publish(message)
+        return len(seen) > 100
+    ros.spin_until(is_seen, 'samples')
+    stamp, came, read = np.array(seen).T
+    assert np.all((stamp <= came) & (came <= read))
+    assert np.max(read - came) > 50e6
 
 
 def test_diagnostics_count_what_was_sent_and_refused(bench):

@@ -191,23 +191,27 @@ class PlannerNode(ManagedNode):
         """Take in samples that have come, as far as they are of use; return if more may wait."""
         if self._samples is None:
             return False
-        now, before, self._read = self.now(), self._read, monotonic_ns()
+        before, self._read = self._read, monotonic_ns()
         samples = self._samples.take(_AT_ONCE)
         for taken in samples:
-            # The clock may have been set meanwhile.
-            self._take_sample(taken.data, now - min(self._ago(taken), self._read - before))
+            self._take_sample(taken, before)
         return len(samples) == _AT_ONCE
 
-    def _take_sample(self, data: bytes, came: int) -> None:
+    def _take_sample(self, taken: Taken, after: int) -> None:
+        """Take in a sample that came after a steady time in ns."""
         # Most of a thousand samples a second are of no use, and reading them takes time. Those of
         # two plants are not of one actuator.
-        if self._runtime.crowded or not self._runtime.looks_at(stamp_of(data)):
+        if self._runtime.crowded or not self._runtime.looks_at(stamp_of(taken.data)):
             return
         try:
-            message = decode(data, JointState)
+            message = decode(taken.data, JointState)
         except BadInputError as error:
             self.get_logger().error(f'sample ignored: {error}', throttle_duration_sec=1.0)
             return
+        # The clock may have been set since it came. It is read last, so that no pause in between
+        # makes a sample come before it was made.
+        ago = min(self._ago(taken), monotonic_ns() - after)
+        came = self.now() - ago
         for name, stamp, values in conversions.from_samples(message):
             self._runtime.observed(name, stamp, *values, came=came)
 
