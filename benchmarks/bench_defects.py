@@ -22,7 +22,7 @@ from scipy.stats import binom
 from benchmarks.defects import away, measured, motion, PERIOD, plants, Sensor, sequence
 from benchmarks.sheet import Sheet
 from hmsa_ros.errors import HmsaError
-from hmsa_ros.identification import identify
+from hmsa_ros.identification.identify import identify
 from hmsa_ros.identification.quantities import DEFAULT_FREE
 from hmsa_ros.identification.result import Estimate
 

@@ -10,8 +10,9 @@ from scipy.stats import binom, chi2
 
 from benchmarks.fits import Fitted, with_casadi, with_scipy
 from benchmarks.sheet import Sheet
-from hmsa_ros.identification import identify, Recording
+from hmsa_ros.identification.identify import identify
 from hmsa_ros.identification.quantities import DEFAULT_FREE, derivative, values_of
+from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import respond
 from hmsa_ros.model.equations import Array, elastic_force
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator

@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 from scipy.signal import lfilter
 
-from hmsa_ros.identification import Recording
+from hmsa_ros.identification.recording import Recording
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 
 Array = NDArray[np.float64]

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.constants import mu_0
 from scipy.optimize import least_squares
 
-from hmsa_ros.identification import Recording
 from hmsa_ros.identification.quantities import from_coordinate, to_coordinate
+from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import respond
 from hmsa_ros.model.equations import Array
 

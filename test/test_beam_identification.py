@@ -21,11 +21,11 @@ import pytest
 from benchmarks.beam_segments import Chain
 from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification import identify, Recording
 from hmsa_ros.identification.excitation import Bounds, Designer, excite
 from hmsa_ros.identification.files import read_belief
+from hmsa_ros.identification.identify import identify
 from hmsa_ros.identification.quantities import derivative, values_of
-from hmsa_ros.identification.recording import Course
+from hmsa_ros.identification.recording import Course, Recording
 from hmsa_ros.identification.response import respond
 from hmsa_ros.model import equations
 from hmsa_ros.model.laws.coordinate import DEFLECTION

@@ -12,8 +12,8 @@ import sympy
 from hmsa_ros import motion
 from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification import identify
 from hmsa_ros.identification.files import read_belief
+from hmsa_ros.identification.identify import identify
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.interfaces.actuator import actuator_from, parameters_of
 from hmsa_ros.interfaces.parameters import BLOCK

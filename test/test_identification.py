@@ -9,13 +9,15 @@ from scipy.signal import lfilter
 
 from benchmarks.bench_identification import levels_of
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification import identify, profile, Recording
+from hmsa_ros.identification.identify import identify
+from hmsa_ros.identification.intervals import profile
 from hmsa_ros.identification.quantities import (
     DEFAULT_FREE,
     from_coordinate,
     to_coordinate,
     values_of,
 )
+from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import respond
 from hmsa_ros.planning.two_step import plan_two_step
 

@@ -10,9 +10,10 @@ import yaml
 
 from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification import identify, Recording
+from hmsa_ros.identification.identify import identify
 from hmsa_ros.identification.known import Known
 from hmsa_ros.identification.quantities import check_free
+from hmsa_ros.identification.recording import Recording
 from hmsa_ros.interfaces.actuator import actuator_from, parameters_of
 
 NOISE = 1e-3

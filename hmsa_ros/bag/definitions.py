@@ -14,11 +14,13 @@ import os
 from pathlib import Path
 import re
 import sys
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.bag import limits
-from hmsa_ros.bag.topics import Topic
 from hmsa_ros.errors import BagError
+
+if TYPE_CHECKING:  # slow to load, and no use to a node that records nothing
+    from hmsa_ros.bag.topics import Topic
 
 # Types that are part of the language of .msg files and have no file of their own.
 _BUILTIN = frozenset((
@@ -117,7 +119,7 @@ def type_hash(type_name: str) -> str:
 _NESTED = re.compile(r'^\s*(?:[A-Z]\w*|\w+/[\w/]+)\s*\[', re.MULTILINE)
 
 
-def make_decoder(info: Topic) -> Callable[[bytes], Any]:
+def make_decoder(info: 'Topic') -> Callable[[bytes], Any]:
     """Return what decodes a topic's payloads; both raise `BagError` where it cannot be done."""
     from mcap.records import Schema
     from mcap_ros2.decoder import DecoderFactory

@@ -21,8 +21,8 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import check_targets, json_text, write_text
 
 if TYPE_CHECKING:
-    from hmsa_ros.identification import Recording
     from hmsa_ros.identification.files import Belief
+    from hmsa_ros.identification.recording import Recording
 
 
 def add_parser(subparsers: Any) -> None:

@@ -1,7 +1,6 @@
 """Work that another process does, so that commands do not wait for it."""
 
 from collections.abc import Callable, Generator
-from multiprocessing.connection import Connection, Pipe
 import os
 import signal
 import subprocess
@@ -81,6 +80,8 @@ class _Worker:
     """The process, and what it was asked."""
 
     def __init__(self) -> None:
+        from multiprocessing.connection import Pipe  # slow to load, and seldom of use
+
         self._line, its = Pipe()
         # It ends with the line, not with the signal that a terminal sends to all.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -123,6 +124,8 @@ class _Worker:
 def serve(place: int) -> None:
     """Do the work that comes by a line, a file descriptor, and answer, until it is cut."""
     os.nice(_NICE)
+    from multiprocessing.connection import Connection
+
     line, answer = Connection(place), None
     while True:
         try:
