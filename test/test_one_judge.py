@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import lru_cache
 import math
 from pathlib import Path
 import random
@@ -152,12 +153,19 @@ class Drawn:
         return found
 
 
+@lru_cache(maxsize=8)
+def carried_out(seed: int) -> tuple[Drawn, Run]:
+    """Return an experiment, and what a recorder would have seen of it."""
+    drawn = Drawn(seed)
+    return drawn, drawn.carry_out()
+
+
 def said(seeds: Iterable[int]) -> set[str]:
     """Hold what is said online against what is said of the record; return all verdicts."""
     seen = set()
     for seed in seeds:
-        drawn = Drawn(seed)
-        offline = {x.setpoint.number: str(x.verdict) for x in findings_of(drawn.carry_out())}
+        drawn, run = carried_out(seed)
+        offline = {x.setpoint.number: str(x.verdict) for x in findings_of(run)}
         assert offline == drawn.online, seed
         seen |= set(offline.values())
     return seen
@@ -171,7 +179,7 @@ def test_status_and_record_have_the_same_verdicts():
 @pytest.mark.parametrize('behind', [-1, 1])
 def test_a_recorder_whose_clock_lags_shows_the_same_setpoints(behind):
     for seed in range(4):
-        run = Drawn(seed).carry_out()
+        _, run = carried_out(seed)
         # Plans begin with the level in force, as of the time of the planner.
         first = Level(START + behind * MS, 0.0, START, 1.0, 0.0)
         shown = replace(run, plans=((first, *run.plans[0]), *run.plans[1:]))
