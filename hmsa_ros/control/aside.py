@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Generator
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -15,6 +16,8 @@ Pieces = Generator[bool | None, None, T]
 #: Does work, whose arguments and result can be pickled, here or in another process.
 Doing = Callable[..., Pieces[Any]]
 
+#: How often to look for answers, in ns.
+ANSWER = 5_000_000
 # Whatever work is made of is imported before the first.
 _WORKER = (
     'import sys; sys.path[:] = {!r}; import hmsa_ros.control.feedback; '
@@ -26,6 +29,12 @@ _NICE = 5
 def here(work: Callable[..., Steps[T]], *arguments: object) -> Pieces[T]:
     """Do work in this process, in its own pieces."""
     return (yield from work(*arguments))
+
+
+def whole(work: Callable[..., T], *arguments: object) -> Steps[T]:
+    """Do work that has no pieces."""
+    yield from ()
+    return work(*arguments)
 
 
 class Aside:
@@ -92,6 +101,9 @@ class _Worker:
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             its.close()
+        # Its own method makes a new one each time, which takes ten times as long.
+        self._look = select.poll()
+        self._look.register(self._line, select.POLLIN)
         # What takes the answer that it owes; the first one says that it is ready.
         self._owed: list[Any] | None = []
 
@@ -109,7 +121,7 @@ class _Worker:
 
     def _owes(self) -> bool:
         """Take an answer that has come, whoever waits for it; return whether one is to come."""
-        if self._owed is not None and self._line.poll():
+        if self._owed is not None and self._look.poll(0):
             self._owed.append(self._line.recv())
             self._owed = None
         return self._owed is not None

@@ -4,10 +4,11 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 import math
+from typing import Any
 
 import numpy as np
 
-from hmsa_ros.control.aside import Doing, here, Pieces
+from hmsa_ros.control.aside import ANSWER, Doing, here, Pieces
 from hmsa_ros.control.choice import clearly_better
 from hmsa_ros.control.field import Field
 from hmsa_ros.control.holds import Hold
@@ -76,6 +77,7 @@ class Feedback:
         self._joints: dict[str, Joint] = {}
         self._nominal: dict[str, Model] = {}
         self.corrections = 0  # plans that were corrected
+        self._waits = False  # whether all that is under way is done elsewhere
         self._seldom = 1.0  # how many times as seldom samples are looked at
         self._ended: list[str] = []  # joints whose plans are to be taken back
         self.restart()
@@ -89,6 +91,10 @@ class Feedback:
     def on(self) -> bool:
         """Whether samples count."""
         return self.mode != 'off'
+
+    def do(self, *work: Any) -> Pieces[Any]:
+        """Do work as what takes long is done, where samples count."""
+        return (self.doing if self.on else here)(*work)
 
     def restart(self) -> None:
         """Forget what was learnt: plan with what is given, from what is predicted."""
@@ -226,7 +232,7 @@ class Feedback:
         """Time in ns at which to look at samples next; None for never, 0 for now."""
         if any(x.looking or x.ready or self.mode == 'adapt' and (x.choosing or x.news)
                for x in self._joints.values()):
-            return 0
+            return self._clock() + ANSWER if self._waits else 0
         return min((x.next_look if x.fresh else 0 for x in self._joints.values()
                     if x.fresh or x.audits), default=None)
 
@@ -260,8 +266,12 @@ class Feedback:
                 busy |= found is not True
                 continue
             if joint.ready:
-                joint.ready -= 1
-                self._audit(name, joint, joint.audits.pop(0))
+                joint.auditing = joint.auditing or self._audit(name, joint, joint.audits.pop(0))
+                found = next(joint.auditing, joint)
+                if found is joint:
+                    joint.auditing, joint.ready = None, joint.ready - 1
+                elif found:
+                    continue
             elif joint.looking is not None:
                 busy |= self._look(name, joint, now, end)
                 break
@@ -276,6 +286,7 @@ class Feedback:
             busy = True
             # Commands go out before the next joint has its turn.
             break
+        self._waits = not busy
         return busy
 
     def _look(self, name: str, joint: Joint, now: int, end: int) -> bool:
@@ -371,7 +382,13 @@ class Feedback:
         found = self.latest(name)
         if found is None:
             return Sensor()
-        prior = np.diag(self._joints[name].estimator.prior.covariance)
+        joint = self._joints[name]
+        if joint.sensor is None or joint.sensor[0] is not found:
+            joint.sensor = found, self._sensor(joint, found)
+        return joint.sensor[1]
+
+    def _sensor(self, joint: Joint, found: Estimate) -> Sensor:
+        prior = np.diag(joint.estimator.prior.covariance)
         sure = np.diag(found.covariance)
         known = [x for i, x in enumerate(found.free) if x in _SENSOR and (
             _shows_bias(found) if x == 'stretch_bias' else sure[i] < _FOUND**2 * prior[i])]
@@ -393,14 +410,15 @@ class Feedback:
                 hold not in joint.audits):
             joint.audits.append(hold)
 
-    def _audit(self, name: str, joint: Joint, hold: Hold) -> None:
+    def _audit(self, name: str, joint: Joint, hold: Hold) -> Pieces[None]:
         """Find whether what a setpoint has left ends feedback."""
         if joint.lost or joint.trust.ended or joint.trust.why or (
                 joint.estimator.screening.trouble):
             # Of a sensor that fails, nothing follows for the move.
             return
         plan = self._group.planners[name].plan
-        why = joint.ledger.take(hold, plan, self._nominal[name], joint.moves, self.sensor(name))
+        why = yield from joint.ledger.take(
+            hold, plan, self._nominal[name], joint.moves, self.sensor(name))
         if not why:
             joint.trust.confirm(plan.levels[-1].model, joint.ledger.left)
             return

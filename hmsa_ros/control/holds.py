@@ -1,9 +1,11 @@
 """Samples of one setpoint, and when there are enough of them to judge it."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
+from hmsa_ros.control.aside import ANSWER, Doing, here, Pieces, whole
 from hmsa_ros.judge.judging import ENOUGH, judge, look_length, rests_from
 from hmsa_ros.judge.records import (
     Finding,
@@ -32,11 +34,13 @@ class Hold:
     """
     Gathers the samples of a setpoint that count, and judges it when they are there.
 
-    ``found`` is the newest finding; once ``over``, no more samples are waited for.
+    ``found`` is the newest finding; once ``over``, no more samples are waited for. ``doing`` does
+    the judging.
     """
 
     def __init__(
-            self, setpoint: Setpoint, *, last: bool, goal: GoalTolerances | None = None) -> None:
+            self, setpoint: Setpoint, *, last: bool, goal: GoalTolerances | None = None,
+            doing: Doing = here) -> None:
         self.setpoint = replace(setpoint, held=last)
         self.found: Finding | None = None
         self.over = False
@@ -44,6 +48,8 @@ class Hold:
         self.news = False  # whether samples have been judged that nobody has looked at
         # What was asked and found last.
         self._answer: tuple[Setpoint, Finding] | None = None
+        self._doing = doing
+        self._judging: Pieces[Finding | None] | None = None
         self._last, self._end, self._goal = last, setpoint.end, goal
         self._samples: dict[int, float] = {}
         self._moving: set[int] = set()  # parts of the move of which there is one
@@ -57,6 +63,7 @@ class Hold:
 
     def _begin_at(self, begin: int) -> None:
         setpoint = self.setpoint
+        self._judging = None
         self._begin, self._length = begin, look_length(setpoint)
         # The last one is held on, so that there is always time for a look, at rare samples too.
         least = begin + 2 * self._length if self._last else begin
@@ -88,6 +95,7 @@ class Hold:
         """Take in that the setpoint is not carried out, whatever samples have shown by now."""
         if self.found is None or self.found.verdict is not Code.MISSED:
             self.found, self.over, self.untold = missed(self.setpoint, reason), True, True
+            self._judging = None
 
     # -- samples -------------------------------------------------------------------------------
 
@@ -149,8 +157,20 @@ class Hold:
         if self.untold:
             self.untold = False
             return self.found
-        if self.over or not self._ready(now, steady, observable=observable):
-            return None
+        if self._judging is None:
+            if self.over or not self._ready(now, steady, observable=observable):
+                return None
+            self._judging = self._judge(tolerances, sensor)
+        try:
+            next(self._judging)
+        except StopIteration as end:
+            self._judging = None
+            found: Finding | None = end.value
+            return found
+        return None
+
+    def _judge(self, tolerances: Tolerances, sensor: Sensor) -> Pieces[Finding | None]:
+        """Judge the samples up to when that was due; return what has changed by that."""
         # By samples up to now that was due, whenever it is looked at.
         after, setpoint = self.due - self._begin, self.setpoint
         if self._grace > self._begin:
@@ -158,9 +178,9 @@ class Hold:
             setpoint = replace(setpoint, end=None, moved=(
                 self._begin + after // 2 if self.due < self._closes
                 else self._closes - 2 * self._length))
-        found, self.news = self.judged(
-            setpoint, self._goal or tolerances, sensor=sensor, until=self.due), bool(
-                self._samples)
+        found = yield from self.judged(
+            setpoint, self._goal or tolerances, sensor=sensor, until=self.due)
+        self.news = bool(self._samples)
         self._answer = setpoint, found
         self.over = self.due >= self._closes or self.due >= self._enough and not (
             found.open or found.failed and self.due < self._grace)
@@ -179,6 +199,8 @@ class Hold:
         """Return when to judge next, a time in ns; 0 for now."""
         if self.untold:
             return 0
+        if self._judging is not None:
+            return now + ANSWER
         return self._begin if now < self._begin else self.due if now < self.due else 0
 
     def _ready(self, now: int, steady: int, *, observable: bool) -> bool:
@@ -201,15 +223,15 @@ class Hold:
         self.due = self._closes
         return True
 
-    def shown(self, setpoint: Setpoint, *, sensor: Sensor) -> Finding:
+    def shown(self, setpoint: Setpoint, *, sensor: Sensor) -> Pieces[Finding]:
         """Return what `judge` has found of a setpoint, or find it."""
         if self._answer is not None and self._answer[0] == setpoint:
             return self._answer[1]
-        return self.judged(setpoint, sensor=sensor)
+        return (yield from self.judged(setpoint, sensor=sensor))
 
     def judged(
             self, setpoint: Setpoint, tolerances: Tolerances = _TOLERANCES, *,
-            sensor: Sensor, until: int | None = None) -> Finding:
+            sensor: Sensor, until: int | None = None) -> Pieces[Finding]:
         """Judge the samples that have come, up to a time in ns, as those of a setpoint."""
         samples = self._samples if until is None else {
             x: y for x, y in self._samples.items() if x <= until}
@@ -220,4 +242,6 @@ class Hold:
                     'clock') or '')
         stamps = np.fromiter(samples, dtype=np.int64, count=len(samples))
         values = np.fromiter(samples.values(), dtype=np.float64, count=len(stamps))
-        return judge(stamps, values, setpoint, tolerances, sensor=sensor)
+        finding: Finding = yield from self._doing(
+            whole, partial(judge, sensor=sensor), stamps, values, setpoint, tolerances)
+        return finding

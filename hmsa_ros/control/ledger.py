@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field, replace
 import math
 
+from hmsa_ros.control.aside import Pieces
 from hmsa_ros.control.holds import Hold
 from hmsa_ros.judge.records import Finding, Sensor, Setpoint
 from hmsa_ros.model.equations import equilibrium_stretch
@@ -40,7 +41,8 @@ class Ledger:
         self._without = math.nan  # largest vibration of a move in open loop, as such a share
 
     def take(
-            self, hold: Hold, plan: Plan, given: Model, moves: Moves, sensor: Sensor) -> str:
+            self, hold: Hold, plan: Plan, given: Model, moves: Moves,
+            sensor: Sensor) -> Pieces[str]:
         """
         Take in samples of a setpoint; return why feedback has made it worse, empty if it has not.
 
@@ -53,14 +55,14 @@ class Ledger:
         corrected = [x for x in moves.corrected if x >= setpoint.begins]
         later = [x for x in corrected if x >= asked]
         learnt = moves.learnt or len(later) < len(corrected)
-        early = hold.shown(
+        early = yield from hold.shown(
             replace(setpoint, moved=None, end=later[0], held=False) if later
             else replace(setpoint, moved=None), sensor=sensor)
         if not learnt and math.isfinite(early.vibration):
             self._without = max(early.vibration / setpoint.step, _or(self._without, 0.0))
         arrival = setpoint.moved or asked
-        found = early if not later and arrival == setpoint.arrival else hold.shown(
-            replace(setpoint, arrival=arrival, moved=None), sensor=sensor)
+        found = early if not later and arrival == setpoint.arrival else (yield from hold.shown(
+            replace(setpoint, arrival=arrival, moved=None), sensor=sensor))
         if not math.isfinite(found.offset):
             return ''
         self.left = (abs(found.offset) + _or(found.vibration, 0.0)) / setpoint.step

@@ -94,6 +94,7 @@ class PlannerRuntime:
         self.feedback = Feedback(group, settings, self._bulletin.outputs, clock, steady)
         self.feedback.tell_ended = self._tell_ended
         self._watch.sensor, self._watch.audit = self.feedback.sensor, self.feedback.audit
+        self._watch.doing = self.feedback.do
         self.planning = Planning(
             group, self.following, Corrections(group, self.feedback, clock), self._bulletin,
             clock, steady, lambda: self.sending.send(clock()))

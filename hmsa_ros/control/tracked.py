@@ -12,6 +12,7 @@ from hmsa_ros.control.trust import Trust
 from hmsa_ros.estimation import Estimate, Estimator
 from hmsa_ros.estimation.motion import held
 from hmsa_ros.estimation.words import sentence
+from hmsa_ros.judge.records import Sensor
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.drafting import Steps
 from hmsa_ros.planning.timeline import Model, Plan
@@ -34,6 +35,8 @@ class Joint:
     latest: Estimate | None = None
     newest: int = 0  # time of the newest sample
     next_sample: int = 0  # time from which on another one is of use
+    # What was found of its sensor, and by which estimate.
+    sensor: tuple[Estimate, Sensor] | None = None
     next_update: int = 0  # when to look at samples
     not_before: int = 0  # so that looks take a share of the time only
     next_tell: int = 0  # when to tell the estimate
@@ -51,6 +54,7 @@ class Joint:
     spent: int = 0  # on that
     audits: list[Hold] = field(default_factory=list)  # setpoints to be looked at after one
     ready: int = 0  # how many of these follow it now
+    auditing: Iterator[bool | None] | None = None  # pieces of the look at the first of them
     lost: str = ''  # why the field is not as commanded; empty where it is
     moves: Moves = field(default_factory=Moves)  # those of the plan in force
     news: bool = False  # whether the latest estimate has not been held against the plan yet

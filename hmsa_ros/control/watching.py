@@ -4,6 +4,7 @@ from bisect import bisect_left, insort
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
+from hmsa_ros.control.aside import Doing, here
 from hmsa_ros.control.holds import AHEAD, Hold
 from hmsa_ros.control.slices import Clock
 from hmsa_ros.judge.records import (
@@ -112,6 +113,8 @@ class Watch:
         self.sensor: Callable[[str], Sensor] = lambda name: Sensor()
         #: Looks at the samples of a setpoint of a joint, as soon as they have been judged.
         self.audit: Callable[[str, Hold], None] = lambda name, hold: None
+        #: Does the judging.
+        self.doing: Doing = here
         #: By joint, what counts as having arrived at the end of the newest request.
         self.goals: Mapping[str, GoalTolerances] = {}
         self._joints: dict[str, _Joint] = {}
@@ -251,7 +254,8 @@ class Watch:
         """Return what gathers samples of a setpoint."""
         last = number + 1 == joint.count
         hold = Hold(
-            self._setpoint(name, joint, number), last=last, goal=joint.goal if last else None)
+            self._setpoint(name, joint, number), last=last, goal=joint.goal if last else None,
+            doing=self.doing)
         _keep_up(hold, joint)
         return hold
 
