@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 import math
+from typing import TypeVar
 
 import numpy as np
 
@@ -34,6 +35,7 @@ from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Planner
 from hmsa_ros.planning.timeline import Draft, Model, Plan, PlannedLevel
 
+T = TypeVar('T')
 # A correction gains at least this share of the step, less while a move has time for corrections:
 # what rests is not to be moved for little.
 _GAIN, _LITTLE = 5e-4, 5e-5
@@ -125,7 +127,22 @@ class Corrections:
 
     def _work(self, name: str, steps: Callable[[int], Steps[Mapping[str, Draft]]]) -> Work:
         joints = frozenset([name])
-        return Work(joints, in_time(steps, self._group, joints, self._clock), corrects=True)
+        work = in_time(steps, self._group, joints, self._clock)
+        return Work(joints, self._timed(name, work), corrects=True)
+
+    def _timed(self, name: str, steps: Steps[T]) -> Steps[T]:
+        """Do work, and let commands have their share of the time after it."""
+        spent = 0
+        while True:
+            begun = self._clock()
+            try:
+                next(steps)
+            except StopIteration as end:
+                self._feedback.spent(name, spent + self._clock() - begun)
+                result: T = end.value
+                return result
+            spent += self._clock() - begun
+            yield
 
     def _take_back(self, name: str, now: int) -> Steps[Mapping[str, Draft]]:
         """Go on by the model in force, whatever was corrected before."""

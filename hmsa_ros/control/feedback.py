@@ -42,8 +42,8 @@ _CHOICE = 3.0
 _LOOK = 3.0
 # How many times as seldom where a joint rings after its last change of level.
 _RINGING = 4
-# How many times as long as the last look took, and as there are joints, the next one is later at
-# least.
+# How many times as long as a look or a correction took, and as there are joints, the next look is
+# later at least.
 _IDLE = 6
 # How many times as seldom at most where looks have kept commands waiting, and how it becomes less
 # with each look.
@@ -248,6 +248,13 @@ class Feedback:
         for joint in self._joints.values():
             joint.not_before = max(joint.not_before, now + round(self._seldom * _RESTING))
 
+    def spent(self, name: str, time: int) -> None:
+        """Take in that work for a joint has taken a time in ns: the next look comes later."""
+        joint = self._joints.get(name)
+        if joint is not None:
+            rest = round(_IDLE * len(self._joints) * self._seldom * time)
+            joint.not_before = max(joint.not_before, self._clock() + rest)
+
     def update(self, now: int) -> bool:
         """
         Process the samples of a joint that have come by a time in ns, and publish the estimate.
@@ -298,7 +305,7 @@ class Feedback:
                 return found is not True
         joint.looked()
         joint.spent += self._clock() - begun
-        joint.not_before = now + round(_IDLE * len(self._joints) * self._seldom * joint.spent)
+        self.spent(name, joint.spent)
         self._seldom = max(_OFTENER * self._seldom, 1.0)
         joint.next_update = now + (
             _RESTING if self._quiet(name, joint)

@@ -1,5 +1,7 @@
 """Commands that are handed out in time, and signs of life between them."""
 
+from collections.abc import Callable
+
 from hmsa_ros.control.following import Following
 from hmsa_ros.control.hearing import Hearing
 from hmsa_ros.control.records import Output, Send
@@ -16,6 +18,8 @@ class Sending:
             self, group: PlannerGroup, following: Following, hearing: Hearing,
             outputs: list[Output]) -> None:
         self._group, self._following, self._outputs = group, following, outputs
+        #: Takes a command at once: whatever else there is to do comes after it.
+        self.deliver: Callable[[Send], None] = outputs.append
         self._hearing = hearing
         self.sent = self.heartbeats = 0
         self.next_beat = 0  # time in ns of the next sign of life
@@ -33,7 +37,7 @@ class Sending:
                 self._outputs += self._following.sent(name, level.stamp, now)
 
     def _hand_out(self, name: str, stamp: int, flux_density: float, now: int) -> None:
-        self._outputs.append(Send(name, stamp, flux_density))
+        self.deliver(Send(name, stamp, flux_density))
         self._hearing.receipts.sent(name, stamp, now)
 
     def acknowledge(self, name: str, now: int) -> None:

@@ -52,7 +52,7 @@ _NEWEST = replace(topics.JOINT_STATES, qos=topics.Quality(20, reliable=False))
 _LINGER_NS = 2 * NANOSECONDS
 # How seldom they are read, and how many at once, before commands have their turn again. For an
 # executor to call for each of a thousand a second takes longer than reading it does.
-_READ_NS, _AT_ONCE = 10_000_000, 100
+_READ_NS, _AT_ONCE = 10_000_000, 25
 
 
 class PlannerNode(ManagedNode):
@@ -84,6 +84,7 @@ class PlannerNode(ManagedNode):
             observable=self._observable, unheard=self._unheard, glance=self._glance,
             found=lambda joint: self._channels[joint].found)
         runtime.one_clock = self._one_clock
+        runtime.sending.deliver = lambda command: self._take((command,))
         runtime.feedback.doing = self._aside
         if runtime.feedback.on:
             self._aside.start()
