@@ -1287,6 +1287,26 @@ def test_a_setpoint_that_a_new_plan_leaves_out_is_missed(tmp_path):
     assert 'missed' in [x['verdict'][1] for x in Page(page([part])).table('setpoint-table')]
 
 
+def test_a_setpoint_that_is_over_is_not_left_out_by_a_new_plan(tmp_path):
+    messages = simulated(((1.1, 40.0), (1.2, 40.0), (1.3, 40.0)), period=500_000)
+    plan, = (x for _, topic, _, x in messages if topic.endswith('plan'))
+    begin = plan.header.stamp.sec * NANOSECONDS + plan.header.stamp.nanosec
+    levels = [(begin + x.time_from_start.sec * NANOSECONDS + x.time_from_start.nanosec,
+               x.positions[0], 0.0, x.effort[0]) for x in plan.points]
+    held = levels[3]
+    # Held by another level, for which another correction left no time.
+    superseded = held[0] + 20_000_000, held[1], 0.0, 1.001 * held[3]
+    plans = [held, superseded, *levels[4:]], levels[4:]
+
+    def anew(plan):
+        return trajectory(plan[0][0], [(x[0] - plan[0][0], *x[1:]) for x in plan])
+    part = one(tmp_path / 'bag', [*messages, *(x for plan in plans for x in (
+        (plan[0][0] + 1000, '/planner/plan', TYPES[PLAN], anew(plan)),
+        (plan[0][0] + 2000, '/planner/status', TYPES[STATUS], status(0, 'corrected', 'anew'))))],
+        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert [str(x.verdict) for x in part.evaluation.findings] == ['arrived'] * 3
+
+
 def test_a_stop_after_a_refused_request_does_not_carry_it_out(tmp_path):
     asked, planned, said, *others = simulated(extra=0.1)
     asked[-1].header.frame_id = 'mine'

@@ -261,6 +261,7 @@ def _arrivals(
     """Yield when plans were shown that change a setpoint, and when each arrives at it."""
     before: Sequence[Level] = ()
     arrival = None
+    rests: set[int] = set()  # stamps of the levels that bring it to rest, by any plan
     for plan in plans:
         fresh, begun = _fresh(plan, before, sent), _begun(plan, before)
         goes_on = before and fresh > before[-1].stamp and not last
@@ -272,10 +273,16 @@ def _arrivals(
         if begun and not _within(new, setpoint) and _rest(run, plan[:1], setpoint) is not None:
             # It rests there, and no level changes that.
             continue
+        if setpoint.end is not None and plan[0].stamp >= setpoint.end and any(
+                x in (sent or ()) for x in rests):
+            # It was carried out, and is over.
+            continue
         found = _rest(run, new, setpoint)
         if found is None and arrival is not None:
             # One that is left out makes room for the next.
             found = _rest(run, new, replace(setpoint, begins=earliest))
+        if found is not None:
+            rests.add(max((x.stamp for x in plan if x.stamp <= found), default=found))
         if found is not None or arrival is not None:
             yield plan[0].sent, found
         arrival = found if found is not None else arrival
