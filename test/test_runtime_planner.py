@@ -237,6 +237,19 @@ def test_some_joints_only_if_allowed_and_one_by_its_own_target():
     assert max(rig.residual(1.3), rig.residual(1.4, 'b')) < 0.3 * RESIDUAL
 
 
+def test_what_is_done_with_a_plan_before_it_is_taken_makes_no_command_late(monkeypatch):
+    rig = Rig()
+
+    def cautious(drafts):
+        rig.now += 2 * LEAD
+        return drafts
+    monkeypatch.setattr(rig.runtime.planning._corrections, 'cautious', cautious)
+    rig.runtime.request(trajectory(*SEQUENCE))
+    rig.run(rig.now + 20 * LEAD)
+    assert len(rig.sent) >= 2 * len(SEQUENCE)
+    assert all(command.stamp >= now for now, command in rig.sent)
+
+
 # -- long trajectories --------------------------------------------------------------------------
 
 

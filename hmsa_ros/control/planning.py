@@ -7,7 +7,7 @@ from dataclasses import replace
 from hmsa_ros.control.bulletin import Bulletin
 from hmsa_ros.control.corrections import Corrections
 from hmsa_ros.control.following import Following
-from hmsa_ros.control.records import Note, Request, Severity, Stop, Verdict
+from hmsa_ros.control.records import Note, Request, Severity, Verdict
 from hmsa_ros.control.slices import Clock, SLICE, Work, work_on
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.status import Code, RefusedError
@@ -57,7 +57,7 @@ class Planning:
 
     def add(self, request: Request, *, engaged: bool) -> Work:
         """Take a checked request; one that replaces all that waits comes first once engaged."""
-        work = work_on(request, self._group, self._clock)
+        work = work_on(request, self._group, self._clock, self._corrections.cautious)
         if engaged and work.replaces(self._queue):
             self._queue.appendleft(work)
         else:
@@ -126,8 +126,6 @@ class Planning:
     def _answer(self, request: Request, drafts: Mapping[str, Draft], now: int) -> None:
         """Begin to carry out a request."""
         self._following.dropped(drafts)
-        if not isinstance(request, Stop):
-            drafts = self._corrections.cautious(drafts)
         changed = self._group.take(drafts, now)
         self._bulletin.take_goals(request)
         # First, since reporting takes time.

@@ -12,6 +12,8 @@ from hmsa_ros.planning.timeline import Draft
 
 #: Tells the time of the stamps in ns.
 Clock = Callable[[], int]
+# What is done with drafts by joint before they are taken.
+Then = Callable[[Mapping[str, Draft]], Mapping[str, Draft]]
 #: How long work goes on before commands and requests are served again, in ns.
 SLICE = 4_000_000
 # Points of a trajectory that are read between two pauses.
@@ -20,6 +22,10 @@ _READ = 100
 _MARGIN = 3
 # How many times as long it takes until the first commands have gone out.
 _READY = 1.5
+
+
+def _as_drafted(drafts: Mapping[str, Draft]) -> Mapping[str, Draft]:
+    return drafts
 
 
 @dataclass(eq=False)
@@ -44,24 +50,25 @@ class Work:
             x.joints <= self.joints or x.joints.isdisjoint(self.joints) for x in others)
 
 
-def work_on(request: Request, group: PlannerGroup, clock: Clock) -> Work:
-    """Return the work that a request of joints of a group makes."""
+def work_on(
+        request: Request, group: PlannerGroup, clock: Clock, then: Then = _as_drafted) -> Work:
+    """Return the work that a request of joints of a group makes; see `in_time`."""
     if isinstance(request, Trajectory):
         return Work(
-            frozenset(request.joints), _trajectory(request, group, clock), request)
+            frozenset(request.joints), _trajectory(request, group, clock, then), request)
     if isinstance(request, Target):
         joints = frozenset([request.joint])
         steps = in_time(
             lambda now: group.draft_setpoint(request.joint, request.stretch, now),
-            group, joints, clock)
+            group, joints, clock, then=then)
         return Work(joints, steps, request)
     joints = frozenset(group.planners)
     return Work(joints, in_time(group.draft_stop, group, joints, clock), request)
 
 
 def _trajectory(
-        request: Trajectory, group: PlannerGroup,
-        clock: Clock) -> Steps[tuple[Mapping[str, Draft], int]]:
+        request: Trajectory, group: PlannerGroup, clock: Clock,
+        then: Then) -> Steps[tuple[Mapping[str, Draft], int]]:
     """Read the points, then plan."""
     points: dict[str, list[tuple[Any, int]]] = {name: [] for name in request.joints}
     for number, (stretches, time) in enumerate(
@@ -75,18 +82,18 @@ def _trajectory(
             points, request.stamp, now, raw=request.raw, path=request.path is not None), group,
         frozenset(request.joints), clock,
         # The work of a path is not in proportion to its points.
-        1 if request.path is not None else request.count * len(request.joints)))
+        1 if request.path is not None else request.count * len(request.joints), then))
 
 
 def in_time(
         make: Callable[[int], Steps[Mapping[str, Draft]]], group: PlannerGroup,
-        joints: frozenset[str], clock: Clock,
-        size: int = 1) -> Steps[tuple[Mapping[str, Draft], int]]:
+        joints: frozenset[str], clock: Clock, size: int = 1,
+        then: Then = _as_drafted) -> Steps[tuple[Mapping[str, Draft], int]]:
     """
     Return drafts, and the time in ns they are for, which has not come yet when they are ready.
 
     If what is going to happen to the joints changes meanwhile, it begins anew. The size is about
-    how many pauses it makes.
+    how many pauses it makes. What is done with drafts `then` belongs to the work.
     """
     planners = [group.planners[x] for x in sorted(joints)]
     lead = planners[0].options.lead_time
@@ -115,6 +122,7 @@ def in_time(
             continue
         if not drafts:
             return drafts, began + later
+        drafts = then(drafts)
         spent = clock() - began
         if min(x.begin for x in drafts.values()) >= began + _READY * spent:
             return drafts, began + later
