@@ -12,6 +12,7 @@ from hmsa_ros.control.records import Note, Send, Settings, StatusChanged, Trajec
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.judge import judging
+from hmsa_ros.judge.records import Setpoint
 from hmsa_ros.model.actuators import Setup
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.planning.group import PlannerGroup
@@ -357,3 +358,12 @@ def test_judging_several_joints_does_not_keep_commands_waiting(monkeypatch):
             runtime.observed(name, now, 1.0 if now < START + 100 * MS else 1.2, 0.0, math.nan)
     assert len(judged) >= 4
     assert len(set(judged)) == len(judged)
+
+
+def test_a_setpoint_that_a_plan_comes_back_to_is_not_missed():
+    setpoint = Setpoint(1.2, 1.0, START, START + 10 * MS, None, 600.0, 30.0)
+    hold = holds.Hold(setpoint, last=True)
+    hold.miss('left out')
+    hold.move(setpoint.arrival, corrected=True)
+    assert hold.found is None
+    assert not hold.over

@@ -80,7 +80,8 @@ class Hold:
         """Take in that another plan arrives at a time in ns, perhaps one corrected on the way."""
         # What is held on is corrected as long as it is.
         end = None if corrected and self._last else self._end
-        if arrival == self._begin:
+        if arrival == self._begin and (
+                self.found is None or self.found.verdict is not Code.MISSED):
             self.setpoint = replace(self.setpoint, end=end)
             return
         self.setpoint = replace(
