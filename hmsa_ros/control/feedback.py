@@ -6,8 +6,6 @@ from functools import partial
 import math
 from typing import Any
 
-import numpy as np
-
 from hmsa_ros.control.aside import ANSWER, Doing, here, Pieces
 from hmsa_ros.control.choice import clearly_better
 from hmsa_ros.control.field import Field
@@ -15,6 +13,7 @@ from hmsa_ros.control.holds import Hold
 from hmsa_ros.control.learnt import alike, believed, differs, learnt_model, save
 from hmsa_ros.control.ledger import Ledger, Moves
 from hmsa_ros.control.records import EstimateChanged, Output, Settings, Severity
+from hmsa_ros.control.sensing import sensor_of
 from hmsa_ros.control.slices import Clock, SLICE
 from hmsa_ros.control.tracked import Joint
 from hmsa_ros.control.trust import Trust
@@ -25,7 +24,6 @@ from hmsa_ros.estimation.words import differences
 from hmsa_ros.identification.known import Known
 from hmsa_ros.judge.records import Sensor
 from hmsa_ros.model.equations import equilibrium_stretch
-from hmsa_ros.model.laws.coordinate import coordinate_of
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Believed, Planner
@@ -52,12 +50,6 @@ _SELDOM, _OFTENER = 32.0, 0.8
 _DENSE, _SPARSE = 40, 10
 # Periods after the last change of level from which on a joint rests.
 _QUIET = 12.0
-# What the judge calls figures of a sensor, and the share of what was not known of one before
-# below which it has been found.
-_SENSOR = {'stretch_bias': 'bias', 'stretch_gain': 'gain', 'sensor_latency': 'latency'}
-_FOUND = 0.3
-# A bias of fewer deviations does not show.
-_SHOWS = 3.0
 # States further ahead than so many units of time are those of rest.
 _AHEAD = 100.0
 
@@ -391,22 +383,8 @@ class Feedback:
             return Sensor()
         joint = self._joints[name]
         if joint.sensor is None or joint.sensor[0] is not found:
-            joint.sensor = found, self._sensor(joint, found)
+            joint.sensor = found, sensor_of(found, joint.estimator.prior)
         return joint.sensor[1]
-
-    def _sensor(self, joint: Joint, found: Estimate) -> Sensor:
-        prior = np.diag(joint.estimator.prior.covariance)
-        sure = np.diag(found.covariance)
-        known = [x for i, x in enumerate(found.free) if x in _SENSOR and (
-            _shows_bias(found) if x == 'stretch_bias' else sure[i] < _FOUND**2 * prior[i])]
-        figures = {_SENSOR[x]: found.values[x] for x in known} | {
-            f'{_SENSOR[x]}_std': found.deviations[x] for x in known}
-        together = 0.0
-        if 'stretch_bias' in known and 'stretch_gain' in known:
-            pair = [found.free.index(x) for x in ('stretch_bias', 'stretch_gain')]
-            (one, both), (_, two) = found.covariance[np.ix_(pair, pair)]
-            together = float(both / math.sqrt(one * two))
-        return Sensor(**figures, together=together)
 
     # -- what moves have left ------------------------------------------------------------------
 
@@ -540,20 +518,3 @@ class Feedback:
                 joint.used = model
                 if not alike(model, planner.model):
                     planner.take_model(model)
-
-
-def _shows_bias(found: Estimate) -> bool:
-    """
-    Return whether samples show that a sensor may have a bias.
-
-    Either it is known not to be 0, or the block is seen beside its rest without field, where a
-    force may hide the larger part of a bias.
-    """
-    at = rest(found.values, found.free, 0.0)
-    if at is None:
-        return False
-    value, covariance = found.values['stretch_bias'], found.covariance[:-2, :-2]
-    itself = np.array([float(x == 'stretch_bias') for x in found.free])
-    shown = at[0] + value - coordinate_of(found.values['law']).rest
-    return any(abs(off) > _SHOWS * math.sqrt(max(float(by @ covariance @ by), 0.0))
-               for off, by in ((value, itself), (shown, itself + at[2])))
