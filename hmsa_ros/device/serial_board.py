@@ -123,10 +123,10 @@ class Board(OnLine):
     # -- the line ------------------------------------------------------------------------------
 
     def _ask(
-            self, verb: str, *values: int, patience: float = math.nan,
+            self, verb: str, *values: int, patience: float | None = None,
             count: int = 0) -> list[int]:
         """Return at least so many values that the board answers; ask again where it does not."""
-        patience = _PATIENCE if math.isnan(patience) else patience
+        patience = _PATIENCE if patience is None else patience
         until = monotonic() + patience
         answer: _Answer | None = None
         while True:
