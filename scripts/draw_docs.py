@@ -249,7 +249,7 @@ def beam(path: Path) -> None:
             shapes.plot(*centreline(deflection, 41), **look.line())
             flux = 1e3 * float(elastic_force(deflection, strip.nondimensional)) * unit
             x, y = (part[-1] for part in centreline(deflection, 41))
-            shapes.annotate(f'{flux:.1f} mT', (x + 0.02, y), color=look.colour, fontsize='small')
+            shapes.annotate(f'{flux:.1f} mT', (x + 0.02, y), fontsize='small')
         shapes.plot([0.0, 0.0], [-0.08, 0.08], color='black', linewidth=3.0)
         shapes.set_aspect('equal')
         shapes.set_xlim(-0.05, 1.35)
@@ -299,8 +299,8 @@ def dielectric(path: Path) -> None:
             move.plot(1e3 * seen.times, seen.stretches, label=label, **look)
         move.legend(loc='lower right')
         position = style.axis('capacitance ratio', 'C/C_0')
-        style.finish(held, position, style.axis('holding voltage', 'U', 'V'), 'a')
-        style.finish(volts, style.axis('time', 't', 'ms'), style.axis('voltage', 'U', 'V'), 'b')
+        style.finish(held, position, style.axis('holding voltage', 'V', 'V'), 'a')
+        style.finish(volts, style.axis('time', 't', 'ms'), style.axis('voltage', 'V', 'V'), 'b')
         style.finish(move, style.axis('time', 't', 'ms'), position, 'c')
 
 
