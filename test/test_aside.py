@@ -11,7 +11,7 @@ from bench_oracle import Bench, Plant
 import numpy as np
 import pytest
 
-from hmsa_ros.control.aside import Aside, here
+from hmsa_ros.control.aside import Aside, goes_on, here
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.planning.drafting import finish
 
@@ -20,7 +20,6 @@ MS = 1_000_000
 
 def whose(value, gate=None):
     """Return a value, once somebody writes to a pipe, and which process has returned it."""
-    yield
     if gate is not None:
         gate.read_text()
     return value, os.getpid()
@@ -28,7 +27,6 @@ def whose(value, gate=None):
 
 def ends(parent):
     """End whatever process it is in, but not the parent."""
-    yield
     if os.getpid() != parent:
         os.kill(os.getpid(), signal.SIGKILL)
     return 'here'
@@ -48,15 +46,15 @@ def test_each_gets_the_answer_to_what_it_asked_in_whatever_order_they_look(aside
     os.mkfifo(gate)
     finish(aside(whose, 'ready'))
     first, second = aside(whose, 1, gate), aside(whose, 2)
-    assert next(first)
-    assert next(second)
+    assert goes_on(first)
+    assert goes_on(second)
     gate.write_text('')
     # Nobody looks for the first while the second waits.
     (two, there), (one, _) = finish(second), finish(first)
     assert (one, two) == (1, 2)
     assert there != os.getpid()
     left = aside(whose, 'left', gate)
-    assert next(left)
+    assert goes_on(left)
     left.close()
     gate.write_text('')
     assert finish(aside(whose, 3)) == (3, there)
@@ -74,7 +72,8 @@ def test_it_ends_with_the_planner_however_that_ends_and_not_by_ctrl_c(tmp_path):
     script = tmp_path / 'planner.py'
     script.write_text(
         'import time\n'
-        'from hmsa_ros.control.aside import Aside, finish\n'
+        'from hmsa_ros.control.aside import Aside\n'
+        'from hmsa_ros.planning.drafting import finish\n'
         'from test_aside import whose\n'
         'aside = Aside(print)\n'
         'print(finish(aside(whose, 1))[1], flush=True)\n'

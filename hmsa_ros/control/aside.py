@@ -1,6 +1,6 @@
 """Work that another process does, so that commands do not wait for it."""
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 import os
 import select
 import signal
@@ -8,13 +8,11 @@ import subprocess
 import sys
 from typing import Any, TypeVar
 
-from hmsa_ros.planning.drafting import finish, Steps
-
 T = TypeVar('T')
-#: Work in pieces, with true after a piece where there is nothing to do but wait.
-Pieces = Generator[bool | None, None, T]
+#: Yields while an answer is waited for, and returns it.
+Awaited = Generator[None, None, T]
 #: Does work, whose arguments and result can be pickled, here or in another process.
-Doing = Callable[..., Pieces[Any]]
+Doing = Callable[..., Awaited[Any]]
 
 #: How often to look for answers, in ns.
 ANSWER = 5_000_000
@@ -26,15 +24,15 @@ _WORKER = (
 _NICE = 5
 
 
-def here(work: Callable[..., Steps[T]], *arguments: object) -> Pieces[T]:
-    """Do work in this process, in its own pieces."""
-    return (yield from work(*arguments))
-
-
-def whole(work: Callable[..., T], *arguments: object) -> Steps[T]:
-    """Do work that has no pieces."""
+def here(work: Callable[..., T], *arguments: object) -> Awaited[T]:
+    """Do work in this process, at once."""
     yield from ()
     return work(*arguments)
+
+
+def goes_on(work: Iterator[None]) -> bool:
+    """Go on with work; return whether its answer is waited for."""
+    return next(work, work) is not work
 
 
 class Aside:
@@ -50,7 +48,7 @@ class Aside:
         self._worker: _Worker | None = None
         self._lost = False
 
-    def __call__(self, work: Callable[..., Steps[T]], *arguments: object) -> Pieces[T]:
+    def __call__(self, work: Callable[..., T], *arguments: object) -> Awaited[T]:
         """Return the result of work."""
         self.start()
         if self._worker is not None:
@@ -59,7 +57,7 @@ class Aside:
                 return result
             except (OSError, EOFError):
                 self._lose()
-        return (yield from work(*arguments))
+        return work(*arguments)
 
     def start(self) -> None:
         """Start the process, if it does not run."""
@@ -107,16 +105,16 @@ class _Worker:
         # What takes the answer that it owes; the first one says that it is ready.
         self._owed: list[Any] | None = []
 
-    def result(self, work: object, arguments: object) -> Pieces[Any]:
+    def result(self, work: object, arguments: object) -> Awaited[Any]:
         """Return the result of work, once what was asked for before is done."""
         while self._owes():
-            yield True
+            yield
         answer: list[Any] = []
         self._owed = answer
         self._line.send((work, arguments))
         while not answer:
             if self._owes():
-                yield True
+                yield
         return answer[0]
 
     def _owes(self) -> bool:
@@ -146,4 +144,4 @@ def serve(place: int) -> None:
         except (EOFError, OSError):
             return
         # An error ends the process: whoever asked meets it in its own.
-        answer = finish(work(*arguments))
+        answer = work(*arguments)

@@ -6,7 +6,7 @@ worked out with the exact motion over all that samples leave open, so that an es
 known well before it takes the place of what is in use.
 """
 
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 import math
 
@@ -37,26 +37,23 @@ _STEP = 0.15
 
 def clearly_better(
         estimate: Estimate, model: Model, used: Model, start: float, target: float, *,
-        given: bool, shown: bool) -> Generator[None, None, bool]:
+        given: bool, shown: bool) -> bool:
     """
     Return whether moves planned with a model are expected to leave clearly less than with another.
 
     The joint went from the start to the target, and is tried on the way back and further on. What
     is given may be right: it is left for what is clearly better alone, and for what is much better
-    unless samples have shown an arrival. Pauses after each piece.
+    unless samples have shown an arrival.
     """
     step = math.copysign(max(abs(target - start), _STEP), target - start)
     pairs: list[list[Outcome]] = []
     for to in (target - step, target + 0.7 * step):
         pair = []
         for each in (used, model):
-            course = _planned(each, target, to)
-            yield
-            left = _left(estimate, course, each.options.slew_limit)
+            left = _left(estimate, _planned(each, target, to), each.options.slew_limit)
             if left is None:
                 break
             pair.append(_shared(left, abs(to - target)))
-            yield
         else:
             pairs.append(pair)
     if not pairs:

@@ -6,7 +6,7 @@ from functools import partial
 import math
 from typing import Any
 
-from hmsa_ros.control.aside import ANSWER, Doing, here, Pieces
+from hmsa_ros.control.aside import ANSWER, Awaited, Doing, goes_on, here
 from hmsa_ros.control.choice import clearly_better
 from hmsa_ros.control.field import Field
 from hmsa_ros.control.holds import Hold
@@ -14,7 +14,7 @@ from hmsa_ros.control.learnt import alike, believed, differs, learnt_model, save
 from hmsa_ros.control.ledger import Ledger, Moves
 from hmsa_ros.control.records import EstimateChanged, Output, Settings, Severity
 from hmsa_ros.control.sensing import sensor_of
-from hmsa_ros.control.slices import Clock, SLICE
+from hmsa_ros.control.slices import Clock
 from hmsa_ros.control.tracked import Joint
 from hmsa_ros.control.trust import Trust
 from hmsa_ros.errors import BadInputError, HmsaError
@@ -59,8 +59,8 @@ class Feedback:
 
     def __init__(
             self, group: PlannerGroup, settings: Settings, outputs: list[Output],
-            clock: Clock, steady: Clock) -> None:
-        self._group, self._outputs, self._clock, self._steady = group, outputs, clock, steady
+            clock: Clock) -> None:
+        self._group, self._outputs, self._clock = group, outputs, clock
         #: Called with a sentence that says why feedback of a joint has ended.
         self.tell_ended: Callable[[str], None] = lambda words: None
         #: Does what takes long.
@@ -69,7 +69,6 @@ class Feedback:
         self._joints: dict[str, Joint] = {}
         self._nominal: dict[str, Model] = {}
         self.corrections = 0  # plans that were corrected
-        self._waits = False  # whether all that is under way is done elsewhere
         self._seldom = 1.0  # how many times as seldom samples are looked at
         self._ended: list[str] = []  # joints whose plans are to be taken back
         self.restart()
@@ -84,7 +83,7 @@ class Feedback:
         """Whether samples count."""
         return self.mode != 'off'
 
-    def do(self, *work: Any) -> Pieces[Any]:
+    def do(self, *work: Any) -> Awaited[Any]:
         """Do work as what takes long is done, where samples count."""
         return (self.doing if self.on else here)(*work)
 
@@ -222,17 +221,13 @@ class Feedback:
     @property
     def wake(self) -> int | None:
         """Time in ns at which to look at samples next; None for never, 0 for now."""
-        if any(x.looking or x.ready or self.mode == 'adapt' and (x.choosing or x.news)
-               for x in self._joints.values()):
-            return self._clock() + ANSWER if self._waits else 0
-        return min((x.next_look if x.fresh else 0 for x in self._joints.values()
-                    if x.fresh or x.audits), default=None)
-
-    @property
-    def takes_long(self) -> bool:
-        """Whether a look at samples is under way, or has taken longer than a slice."""
-        return any(x.looking is not None or x.ready or x.spent > SLICE
-                   for x in self._joints.values())
+        joints = self._joints.values()
+        if any(x.looking or x.choosing or x.auditing for x in joints):
+            return self._clock() + ANSWER
+        if any(x.ready or self.mode == 'adapt' and x.news for x in joints):
+            return 0
+        return min((x.next_look if x.fresh else 0 for x in joints if x.fresh or x.audits),
+                   default=None)
 
     def give_way(self, now: int) -> None:
         """Look seldom from a time in ns on: commands have been kept waiting."""
@@ -251,50 +246,42 @@ class Feedback:
         """
         Process the samples of a joint that have come by a time in ns, and publish the estimate.
 
-        It goes on for the length of a slice, and where it ended the next time. Returned is whether
-        that has taken a while.
+        Returned is whether that has taken a while.
         """
-        busy, end = False, self._steady() + SLICE
+        busy = False
         # A look that is under way is ended before the next one, which has waited longest.
         for name, joint in sorted(
                 self._joints.items(), key=lambda x: (x[1].looking is None, x[1].next_look)):
             if joint.choosing is not None:
-                found = next(joint.choosing, joint)
-                if found is joint:
+                if not goes_on(joint.choosing):
                     joint.choosing, joint.chosen, joint.news = None, True, True
-                busy |= found is not True
+                    busy = True
                 continue
             if joint.ready:
                 joint.auditing = joint.auditing or self._audit(name, joint, joint.audits.pop(0))
-                found = next(joint.auditing, joint)
-                if found is joint:
-                    joint.auditing, joint.ready = None, joint.ready - 1
-                elif found:
+                if goes_on(joint.auditing):
                     continue
+                joint.auditing, joint.ready = None, joint.ready - 1
             elif joint.looking is not None:
-                busy |= self._look(name, joint, now, end)
-                break
+                return self._look(name, joint, joint.looking, now) or busy
             elif joint.audits and not joint.fresh:
                 joint.ready = len(joint.audits)
             elif joint.fresh and now >= joint.next_look:
                 joint.looking, joint.spent = joint.update(
                     self._group.planners[name].plan, now, self.doing), 0
-                self._look(name, joint, now, end)
+                self._look(name, joint, joint.looking, now)
             else:
                 continue
-            busy = True
             # Commands go out before the next joint has its turn.
-            break
-        self._waits = not busy
+            return True
         return busy
 
-    def _look(self, name: str, joint: Joint, now: int, end: int) -> bool:
-        """Go on to look at samples until a steady time in ns; return whether that took a while."""
+    def _look(self, name: str, joint: Joint, looking: Iterator[None], now: int) -> bool:
+        """Go on with a look at samples; return whether it has ended, which takes a while."""
         begun = self._clock()
-        while joint.looking is not None and (found := next(joint.looking, joint)) is not joint:
-            if found or self._steady() >= end:
-                joint.spent += self._clock() - begun
-                return found is not True
+        if goes_on(looking):
+            joint.spent += self._clock() - begun
+            return False
         joint.looked()
         joint.spent += self._clock() - begun
         self.spent(name, joint.spent)
@@ -395,7 +382,7 @@ class Feedback:
                 hold not in joint.audits):
             joint.audits.append(hold)
 
-    def _audit(self, name: str, joint: Joint, hold: Hold) -> Pieces[None]:
+    def _audit(self, name: str, joint: Joint, hold: Hold) -> Awaited[None]:
         """Find whether what a setpoint has left ends feedback."""
         if joint.lost or joint.trust.ended or joint.trust.why or (
                 joint.estimator.screening.trouble):
@@ -454,7 +441,7 @@ class Feedback:
         cautious = self.mode == 'adapt' and self._settings.feedback_cautious
         return self._settings.feedback_tolerance if cautious else math.inf
 
-    def _choose(self, name: str, joint: Joint, latest: Estimate) -> Pieces[None]:
+    def _choose(self, name: str, joint: Joint, latest: Estimate) -> Awaited[None]:
         """Plan with what is learnt, once that is clearly better, or while a move waits for it."""
         planner = self._group.planners[name]
         used, segments = joint.used or planner.model, planner.plan.segments

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from hmsa_ros.control.aside import ANSWER, Doing, here, Pieces, whole
+from hmsa_ros.control.aside import ANSWER, Awaited, Doing, here
 from hmsa_ros.judge.judging import ENOUGH, judge, look_length, rests_from
 from hmsa_ros.judge.records import (
     Finding,
@@ -49,7 +49,7 @@ class Hold:
         # What was asked and found last.
         self._answer: tuple[Setpoint, Finding] | None = None
         self._doing = doing
-        self._judging: Pieces[Finding | None] | None = None
+        self._judging: Awaited[Finding | None] | None = None
         self._last, self._end, self._goal = last, setpoint.end, goal
         self._samples: dict[int, float] = {}
         self._moving: set[int] = set()  # parts of the move of which there is one
@@ -170,7 +170,7 @@ class Hold:
             return found
         return None
 
-    def _judge(self, tolerances: Tolerances, sensor: Sensor) -> Pieces[Finding | None]:
+    def _judge(self, tolerances: Tolerances, sensor: Sensor) -> Awaited[Finding | None]:
         """Judge the samples up to when that was due; return what has changed by that."""
         # By samples up to now that was due, whenever it is looked at.
         after, setpoint = self.due - self._begin, self.setpoint
@@ -224,7 +224,7 @@ class Hold:
         self.due = self._closes
         return True
 
-    def shown(self, setpoint: Setpoint, *, sensor: Sensor) -> Pieces[Finding]:
+    def shown(self, setpoint: Setpoint, *, sensor: Sensor) -> Awaited[Finding]:
         """Return what `judge` has found of a setpoint, or find it."""
         if self._answer is not None and self._answer[0] == setpoint:
             return self._answer[1]
@@ -232,7 +232,7 @@ class Hold:
 
     def judged(
             self, setpoint: Setpoint, tolerances: Tolerances = _TOLERANCES, *,
-            sensor: Sensor, until: int | None = None) -> Pieces[Finding]:
+            sensor: Sensor, until: int | None = None) -> Awaited[Finding]:
         """Judge the samples that have come, up to a time in ns, as those of a setpoint."""
         samples = self._samples if until is None else {
             x: y for x, y in self._samples.items() if x <= until}
@@ -244,5 +244,5 @@ class Hold:
         stamps = np.fromiter(samples, dtype=np.int64, count=len(samples))
         values = np.fromiter(samples.values(), dtype=np.float64, count=len(stamps))
         finding: Finding = yield from self._doing(
-            whole, partial(judge, sensor=sensor), stamps, values, setpoint, tolerances)
+            partial(judge, sensor=sensor), stamps, values, setpoint, tolerances)
         return finding

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 import math
 
-from hmsa_ros.control.aside import Pieces
+from hmsa_ros.control.aside import Awaited
 from hmsa_ros.control.holds import Hold
 from hmsa_ros.judge.records import Finding, Sensor, Setpoint
 from hmsa_ros.model.equations import equilibrium_stretch
@@ -42,7 +42,7 @@ class Ledger:
 
     def take(
             self, hold: Hold, plan: Plan, given: Model, moves: Moves,
-            sensor: Sensor) -> Pieces[str]:
+            sensor: Sensor) -> Awaited[str]:
         """
         Take in samples of a setpoint; return why feedback has made it worse, empty if it has not.
 

@@ -91,7 +91,7 @@ class PlannerRuntime:
             lambda: unheard() or self.hearing.receipts.words, self._unseen)
         self.sending = Sending(
             group, self.following, self.hearing, self._bulletin.outputs)
-        self.feedback = Feedback(group, settings, self._bulletin.outputs, clock, steady)
+        self.feedback = Feedback(group, settings, self._bulletin.outputs, clock)
         self.feedback.tell_ended = self._tell_ended
         self._watch.sensor, self._watch.audit = self.feedback.sensor, self.feedback.audit
         self._watch.doing = self.feedback.do
@@ -369,9 +369,7 @@ class PlannerRuntime:
         """Do what is due at a time in ns, for some ms at most; return what to pass on."""
         self._begin_anew()
         self._engage()
-        # A request does not wait for a look.
-        waits = self.feedback.takes_long and bool(self.planning.requests)
-        estimated = self._send(now) and not waits and self.feedback.update(now)
+        estimated = self._send(now) and self.feedback.update(now)
         if not estimated:
             self._work_on()
         if self._bulletin.preview_again is not None and now >= self._bulletin.preview_again:
@@ -381,7 +379,7 @@ class PlannerRuntime:
                 self._watch.open or self._bulletin.unheard or self._bulletin.unseen
                 or self.hearing.receipts or self._bulletin.next_change is not None):
             self._bulletin.look_for_listeners()
-            if not (estimated or waits):
+            if not estimated:
                 self._judge(now)
         self._begin_anew()
         return self._taken()

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 import math
 
-from hmsa_ros.control.aside import Doing, Pieces
+from hmsa_ros.control.aside import Awaited, Doing
 from hmsa_ros.control.field import Field
 from hmsa_ros.control.holds import Hold
 from hmsa_ros.control.ledger import Ledger, Moves
@@ -14,7 +14,6 @@ from hmsa_ros.estimation.motion import held
 from hmsa_ros.estimation.words import sentence
 from hmsa_ros.judge.records import Sensor
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.planning.drafting import Steps
 from hmsa_ros.planning.timeline import Model, Plan
 
 # Levels before those of the samples that count: the field of a coil that lags remembers them.
@@ -42,19 +41,19 @@ class Joint:
     next_tell: int = 0  # when to tell the estimate
     next_choice: int = 0  # when to choose the parameters to plan with
     used: Model | None = None  # what was chosen; None for what the planner has
-    choosing: Iterator[bool | None] | None = None  # pieces of the choice under way
+    choosing: Iterator[None] | None = None  # the choice under way
     chosen: bool = False  # whether that was made since the latest estimate
     waits: int = 0  # arrival of a move that takes longer, so that it can be corrected
     amplitude: float = 0.0  # largest of the vibration since the last arrival
     setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place of the setpoint under way
     fresh: bool = False  # whether there are samples that have not been looked at
-    looking: Iterator[bool | None] | None = None  # pieces of the look at them under way
+    looking: Iterator[None] | None = None  # the look at them under way
     # Samples that came meanwhile: stamp, stretch, and when.
     waiting: list[tuple[int, float, int]] = field(default_factory=list)
     spent: int = 0  # on that
     audits: list[Hold] = field(default_factory=list)  # setpoints to be looked at after one
     ready: int = 0  # how many of these follow it now
-    auditing: Iterator[bool | None] | None = None  # pieces of the look at the first of them
+    auditing: Iterator[None] | None = None  # the look at the first of them
     lost: str = ''  # why the field is not as commanded; empty where it is
     moves: Moves = field(default_factory=Moves)  # those of the plan in force
     news: bool = False  # whether the latest estimate has not been held against the plan yet
@@ -99,7 +98,7 @@ class Joint:
         self.estimator.set_levels([
             (x.stamp, x.flux_density) for x in plan.levels[first:plan.place(until) + 1]])
 
-    def update(self, plan: Plan, now: int, doing: Doing) -> Pieces[None]:
+    def update(self, plan: Plan, now: int, doing: Doing) -> Awaited[None]:
         """Take samples into account that have come, and find what is believed of a time."""
         self.fresh = False
         self.take_levels(plan, max(now, self.newest))
@@ -203,7 +202,6 @@ class Joint:
             'new_beginnings': self.trust.beginnings, 'ended': self.trust.ended}
 
 
-def _updated(estimator: Estimator, now: int) -> Steps[tuple[Estimator, Estimate | None]]:
+def _updated(estimator: Estimator, now: int) -> tuple[Estimator, Estimate | None]:
     """Return an estimator with its samples taken into account, and what it believes of a time."""
-    found = yield from estimator.updating(now)
-    return estimator, found
+    return estimator, estimator.update(now)

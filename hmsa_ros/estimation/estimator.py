@@ -21,7 +21,6 @@ from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.planning.drafting import finish, Steps
 from hmsa_ros.planning.timeline import ESTIMATED, Model
 from hmsa_ros.planning.timeline import Options as PlannerOptions
 
@@ -207,10 +206,6 @@ class Estimator:
 
         Levels until then have been taken in. None before the first sample.
         """
-        return finish(self.updating(time))
-
-    def updating(self, time: int) -> Steps[Estimate | None]:
-        """`update` in pieces of some ms; None as well if it has begun anew meanwhile."""
         self._leave_behind(time)
         if self._window is None and not self._pending:
             return None
@@ -221,9 +216,7 @@ class Estimator:
                     + [self._seconds(time), window.begin])
         here = self._take(window, levels, until)
         z = window.mean if self._solution is None else self._solution.z
-        found = yield from window.solve(z, levels, self.noise, until, here)
-        if self._window is not window:
-            return None
+        found = window.solve(z, levels, self.noise, until, here)
         if found is None:
             self.screening.trouble = 'no motion leads through the samples'
             return None
@@ -244,8 +237,7 @@ class Estimator:
         window, found = self._window, self._solution
         if window is None:
             window = self._new_window(time, self.prior.coordinate.rest)
-            found = finish(
-                window.solve(window.mean, self._as_levels(), self.noise, window.begin))
+            found = window.solve(window.mean, self._as_levels(), self.noise, window.begin)
         if found is None:
             return None
         motion = self._follow(

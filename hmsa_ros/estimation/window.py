@@ -24,7 +24,6 @@ from hmsa_ros.identification.quantities import from_coordinate, QUANTITIES, to_c
 from hmsa_ros.identification.response import clip, complete
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import coordinate_of
-from hmsa_ros.planning.drafting import Steps
 
 # Steps of Gauss and Newton at most, halvings of each, and the step, in deviations, that is small.
 _PASSES, _HALVINGS, _SMALL = 4, 4, 0.1
@@ -120,34 +119,33 @@ class Window:
 
     def solve(
             self, z: Array, levels: Levels, noise: float, until: float, here: Trial | None = None
-    ) -> Steps[Solution | None]:
+    ) -> Solution | None:
         """
         Seek the most probable motion from coordinates on; None if none can be followed from there.
 
         The noise is the standard deviation of a sample. The motion is wanted until a time that is
-        not before the last sample. What `simulate` says of the coordinates may be given. It pauses
-        after each simulation.
+        not before the last sample. What `simulate` says of the coordinates may be given.
         """
         prior: Array = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
 
-        def descend(z: Array, here: Trial | None = None) -> Steps[Found | None]:
+        def descend(z: Array, here: Trial | None = None) -> Found | None:
             return self._descend(z, here, levels, noise, until, prior)
 
-        def look(found: Found) -> Steps[Found]:
+        def look(found: Found) -> Found:
             return self._look(found, descend, self._gain(found, prior, noise))
 
-        found = (yield from descend(z, here)) or (yield from descend(self._at_ease(self.mean)))
+        found = descend(z, here) or descend(self._at_ease(self.mean))
         if found is None:
             return None
         if len(self.time) >= _MORE * self.weighed or self._is_poor(found, noise):
-            found = yield from look(found)
+            found = look(found)
             if self._is_poor(found, noise):
                 # There may be another valley.
                 before = self.suspected, self.others
                 self.suspected = self.suspects.places
-                other = yield from descend(self._at_ease(self.mean))
+                other = descend(self._at_ease(self.mean))
                 if other is not None:
-                    other = yield from look(other)
+                    other = look(other)
                 if other is not None and other.here.cost < found.here.cost:
                     found = other
                 else:
@@ -214,8 +212,7 @@ class Window:
         return loss(found.here.residual, noise, convex=True) > _POOR * len(self.time)
 
     def _look(
-            self, found: Found, descend: Callable[[Array], Steps[Found | None]],
-            gain: Gain) -> Steps[Found]:
+            self, found: Found, descend: Callable[[Array], Found | None], gain: Gain) -> Found:
         """Choose the suspects to be sought, and return the most probable coordinates then."""
         self.weighed, before = len(self.time), self.suspected
         self.suspected, self.others = Look(
@@ -223,11 +220,11 @@ class Window:
             *self._room(found.z), gain).choose(before)
         if self.suspected == before:
             return found
-        return (yield from descend(self._at_ease(found.z))) or found
+        return descend(self._at_ease(found.z)) or found
 
     def _descend(
             self, z: Array, here: Trial | None, levels: Levels, noise: float, until: float,
-            prior: Array) -> Steps[Found | None]:
+            prior: Array) -> Found | None:
         """
         Seek the most probable coordinates of what is sought.
 
@@ -249,7 +246,6 @@ class Window:
             there = None
             for _ in range(_HALVINGS if number < _PASSES else 0):
                 there = self.simulate(self._bounded(z + step), levels, noise, until, prior)
-                yield
                 if there is not None and there.cost <= here.cost:
                     break
                 step *= 0.4
