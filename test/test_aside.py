@@ -68,6 +68,14 @@ def test_a_process_that_ends_is_done_without_and_said_once(aside):
     assert 'the planner estimates itself' in words
 
 
+def test_a_process_that_does_not_answer_is_done_without(aside, monkeypatch):
+    _, process = finish(aside(whose, 1))
+    os.kill(process, signal.SIGSTOP)
+    monkeypatch.setattr('hmsa_ros.control.aside._PATIENCE', 0)
+    assert finish(aside(whose, 2)) == (2, os.getpid())
+    assert 'does not answer' in aside.told[0]
+
+
 def test_it_ends_with_the_planner_however_that_ends_and_not_by_ctrl_c(tmp_path):
     script = tmp_path / 'planner.py'
     script.write_text(

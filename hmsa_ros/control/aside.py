@@ -6,6 +6,7 @@ import select
 import signal
 import subprocess
 import sys
+from time import monotonic_ns
 from typing import Any, TypeVar
 
 T = TypeVar('T')
@@ -20,6 +21,8 @@ ANSWER = 5_000_000
 _WORKER = (
     'import sys; sys.path[:] = {!r}; import hmsa_ros.control.feedback; '
     'from hmsa_ros.control.aside import serve; serve({})')
+# How long in ns an answer is waited for: the first takes seconds on a busy machine.
+_PATIENCE = 20_000_000_000
 # By how much it gives way to whoever sends and obeys commands.
 _NICE = 5
 
@@ -71,9 +74,9 @@ class Aside:
         self.close()
         if not self._lost:
             self._tell(
-                'the process that estimates beside the planner has ended, or cannot start: the '
-                'planner estimates itself, and commands may wait for that; see what ended it '
-                '(memory?), and start the planner again')
+                'the process that estimates beside the planner has ended, does not answer, or '
+                'cannot start: the planner estimates itself, and commands may wait for that; see '
+                'what ended it (memory?), and start the planner again')
         self._lost = True
 
     def close(self) -> None:
@@ -107,14 +110,16 @@ class _Worker:
 
     def result(self, work: object, arguments: object) -> Awaited[Any]:
         """Return the result of work, once what was asked for before is done."""
-        while self._owes():
-            yield
+        end = monotonic_ns() + _PATIENCE
         answer: list[Any] = []
-        self._owed = answer
-        self._line.send((work, arguments))
         while not answer:
             if self._owes():
+                if monotonic_ns() > end:
+                    raise TimeoutError
                 yield
+            elif not answer:
+                self._owed = answer
+                self._line.send((work, arguments))
         return answer[0]
 
     def _owes(self) -> bool:
