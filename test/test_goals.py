@@ -9,6 +9,7 @@ import pytest
 from hmsa_ros.control.goals import ErrorCode, Goals, Wish
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import Send, Settings, StatusChanged, Stop, Target, Trajectory
+from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.model.actuators import Setup
 from hmsa_ros.model.parameters import paper_actuator
@@ -32,8 +33,9 @@ class Bench:
         options = Options(flux_density_min=-0.5, flux_density_max=0.5)
         self.runtime = PlannerRuntime(
             PlannerGroup({x: Planner(block, options) for x in joints}),
-            Settings(takeover_timeout=0), clock=lambda: self.now, steady=lambda: self.now,
-            observable=lambda: self.measured)
+            Settings(takeover_timeout=0), Surroundings(
+                clock=lambda: self.now, steady=lambda: self.now,
+                observable=lambda: self.measured))
         self.runtime.active = True
         self.joints, self.truth, self.outcomes = list(joints), [], {}
         self.goals = Goals(self.runtime, self.outcomes.__setitem__)

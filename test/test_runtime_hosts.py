@@ -6,7 +6,7 @@ import pytest
 from test_runtime_planner import HOLD, LEAD, MS, PATIENT, QUIET, Rig, SEQUENCE, START, trajectory
 
 from hmsa_ros.control.records import Severity, Stop, Target
-from hmsa_ros.control.takeover import Seen
+from hmsa_ros.control.surroundings import Seen
 
 BEATING = replace(QUIET, heartbeat_period=200 * MS)
 
@@ -16,7 +16,7 @@ class Bench(Rig):
 
     def __init__(self, *, settings=BEATING, **options):
         super().__init__(settings=settings, **options)
-        self.runtime._glance = self.glance
+        self.runtime.surroundings.glance = self.glance
         self.ahead = 0  # of the device's clock
         self.linked = True
         self.cut = False
@@ -95,7 +95,7 @@ def test_a_device_that_is_not_heard_any_more_is_sent_nothing_and_named():
 
 def test_a_device_that_comes_late_is_not_put_on_a_level_in_one_step():
     rig = Rig(settings=BEATING)
-    rig.runtime._glance = lambda: [('a', Seen(
+    rig.runtime.surroundings.glance = lambda: [('a', Seen(
         rig.now, rig.plant.stretch, rig.plant.rate, rig.plant.flux_density, 0))]
     rig.found = False
     rig.runtime.request(trajectory((1.1, HOLD)))
@@ -138,7 +138,7 @@ def test_a_device_that_begins_anew_is_not_put_on_a_level_in_one_step(outage, beg
 
 def test_a_device_in_slow_motion_is_heard_again_after_a_silence():
     rig = Bench()
-    rig.runtime.one_clock = lambda: True
+    rig.runtime.surroundings.one_clock = lambda: True
     rig.runtime.request(trajectory((1.2, HOLD)))
 
     def pass_slowly(seconds):
@@ -234,7 +234,7 @@ def test_after_a_cut_off_a_request_waits_until_the_device_hears(deaf):
 
 def test_a_device_that_dds_has_lost_and_found_is_not_a_new_one():
     rig = Bench()
-    rig.runtime.hearing.reporters = lambda joint: frozenset({b'one'} if rig.found else ())
+    rig.runtime.surroundings.reporters = lambda joint: frozenset({b'one'} if rig.found else ())
     rig.runtime.request(trajectory((1.2, 400 * MS), (1.4, 60_000 * MS)))
     rig.run(START + 1500 * MS)
     rig.cut_off()

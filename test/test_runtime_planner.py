@@ -17,6 +17,7 @@ from hmsa_ros.control.records import (
     Target,
     Trajectory,
 )
+from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.model.equations import natural_frequency
 from hmsa_ros.model.parameters import paper_actuator
@@ -60,9 +61,9 @@ class Rig:
         self.group = PlannerGroup({
             x: Planner(block, self.options) for x, block in self.blocks.items()})
         self.runtime = PlannerRuntime(
-            self.group, settings, clock=self.clock, steady=self.look,
-            observable=lambda: self.observable, unheard=lambda: self.unheard,
-            found=lambda joint: self.found)
+            self.group, settings, Surroundings(
+                clock=self.clock, steady=self.look, observable=lambda: self.observable,
+                unheard=lambda: self.unheard, found=lambda joint: self.found))
         self.runtime.active = True
         self.plants = {
             x: ActuatorSimulation(block, time=START) for x, block in self.blocks.items()}
@@ -653,7 +654,7 @@ def test_a_device_that_takes_over_from_another_is_sent_no_level_of_before(receip
     if receipts:
         rig.runtime.received('a', rig.now, 0, cut_off=False)
     reporters = {b'old'}
-    rig.runtime.hearing.reporters = lambda joint: frozenset(reporters)
+    rig.runtime.surroundings.reporters = lambda joint: frozenset(reporters)
     rig.runtime.request(trajectory(*SEQUENCE))
     rig.run(START + LEAD + 20 * MS)
     assert rig.status.progress.state != 'idle'

@@ -9,6 +9,7 @@ import pytest
 from hmsa_ros.control import holds
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import Note, Send, Settings, StatusChanged, Trajectory
+from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.judge import judging
@@ -43,8 +44,9 @@ class Loop:
         self.unheard = ''
         self.runtime = PlannerRuntime(
             PlannerGroup({'a': Planner(block, options)}),
-            Settings(takeover_timeout=0, **changes), clock=lambda: self.now,
-            steady=lambda: self.now, observable=lambda: rate > 1, unheard=lambda: self.unheard)
+            Settings(takeover_timeout=0, **changes), Surroundings(
+                clock=lambda: self.now, steady=lambda: self.now,
+                observable=lambda: rate > 1, unheard=lambda: self.unheard))
         self.runtime.active = True
         self.outputs, self.times = [], []
         self.spoil = lambda samples: samples
@@ -347,8 +349,9 @@ def test_judging_several_joints_does_not_keep_commands_waiting(monkeypatch):
     runtime = PlannerRuntime(
         PlannerGroup({x: Planner(block, Options(
             flux_density_min=-0.5, flux_density_max=0.5)) for x in names}),
-        Settings(takeover_timeout=0), clock=lambda: now, steady=lambda: now + cost,
-        observable=lambda: True, unheard=lambda: '')
+        Settings(takeover_timeout=0), Surroundings(
+            clock=lambda: now, steady=lambda: now + cost, observable=lambda: True,
+            unheard=lambda: ''))
     runtime.active = True
     runtime.request(Trajectory(names, [((1.2,) * 4, HOLD)], 1, name='x'))
     while now < START + 3 * HOLD:

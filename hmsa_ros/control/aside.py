@@ -109,7 +109,11 @@ class _Worker:
         self._owed: list[Any] | None = []
 
     def result(self, work: object, arguments: object) -> Awaited[Any]:
-        """Return the result of work, once what was asked for before is done."""
+        """
+        Return the result of work, once what was asked for before is done.
+
+        Raises `OSError` or `EOFError` if there is no answer to come, or none for long.
+        """
         end = monotonic_ns() + _PATIENCE
         answer: list[Any] = []
         while not answer:

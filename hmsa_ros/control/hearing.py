@@ -1,12 +1,12 @@
 """Whether plant or driver hear the planner, what their clocks say, and coils that were cut off."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 import math
 
 from hmsa_ros.control.following import Following
 from hmsa_ros.control.receipts import Offset, Receipts
 from hmsa_ros.control.records import Settings, Severity, Verdict
-from hmsa_ros.control.slices import Clock
+from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.control.takeover import Takeover
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
@@ -25,22 +25,19 @@ class Hearing:
     """
     Follows what devices say of themselves, and draws conclusions for the plans.
 
-    `found` returns whether a joint has a device that reports. ``fresh`` are the joints whose
-    device has come after the last level, and has heard none. ``cut`` are those whose device
-    refuses commands of before a cut-off, ``open`` those whose interlock is, and ``locked`` those
-    that obey nothing but 0 T after that. ``since`` is when a plan began to wait for devices, in
-    ns by the steady clock.
+    ``fresh`` are the joints whose device has come after the last level, and has heard none.
+    ``cut`` are those whose device refuses commands of before a cut-off, ``open`` those whose
+    interlock is, and ``locked`` those that obey nothing but 0 T after that. ``since`` is when a
+    plan began to wait for devices, in ns by the steady clock.
     """
 
     def __init__(
-            self, group: PlannerGroup, following: Following, takeover: Takeover, clock: Clock,
-            steady: Clock, found: Callable[[str], bool]) -> None:
+            self, group: PlannerGroup, following: Following, takeover: Takeover,
+            surroundings: Surroundings) -> None:
         self._group, self._following, self._takeover = group, following, takeover
-        self._clock, self._steady, self._found = clock, steady, found
-        self.receipts = Receipts(steady)
+        self._around = surroundings
+        self.receipts = Receipts(surroundings.steady)
         self._absent: set[str] = set()
-        #: Returns identifiers of who reports applied levels of a joint.
-        self.reporters: Callable[[str], frozenset[bytes]] = lambda joint: frozenset()
         self._reporters: dict[str, frozenset[bytes]] = {}
         self.fresh: set[str] = set()
         self.cut: set[str] = set()
@@ -74,7 +71,7 @@ class Hearing:
 
     def look_for_newcomers(self) -> Verdict | None:
         """Find devices that were not found at the last look; return the verdict on a plan."""
-        here = {x for x in self._group.planners if self._found(x)}
+        here = {x for x in self._group.planners if self._around.found(x)}
         # One that is known, and there again after an outage, is not new.
         come = {x for x in here & self._absent if not self._reporters.get(x)}
         self._absent = self._group.planners.keys() - here
@@ -86,15 +83,15 @@ class Hearing:
 
     def _relieved(self, joint: str) -> bool:
         """Return whether another device took over: before its first receipt, or without any."""
-        before, now = self._reporters.get(joint, frozenset()), self.reporters(joint)
+        before, now = self._reporters.get(joint, frozenset()), self._around.reporters(joint)
         self._reporters[joint] = now or before
         # Where there was none before, it is only found one topic after the other.
         return bool(before and now - before)
 
-    def received(
-            self, joint: str, time: int, command: int, *, comparable: bool) -> Verdict | None:
+    def received(self, joint: str, time: int, command: int) -> Verdict | None:
         """Take in a receipt as `Receipts.received` does; return the verdict on a plan."""
-        anew = self.receipts.received(joint, time, command, self._clock(), comparable=comparable)
+        anew = self.receipts.received(
+            joint, time, command, self._around.clock(), comparable=not self._around.one_clock())
         if not anew or joint not in self._group.planners:
             return None
         self._following.newest.pop(joint, None)
@@ -167,7 +164,7 @@ class Hearing:
 
     def may_acknowledge(self, joint: str) -> bool:
         """Return whether to tell a device that its cut-off is known: seldom, if it is off."""
-        steady = self._steady()
+        steady = self._around.steady()
         level = self._following.newest.get(joint)
         off = joint not in self.open if joint in self.locked else (
             level is not None and level[1] == 0.0)
@@ -196,8 +193,8 @@ class Hearing:
             self.since = None
             return False
         if self.since is None:
-            self.since = self._steady()
-        passed = self._steady() - self.since
+            self.since = self._around.steady()
+        passed = self._around.steady() - self.since
         if not lost:
             return passed <= settings.takeover_timeout
         if passed > _PATIENCE:

@@ -10,6 +10,7 @@ from typing import Protocol
 
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import Output, Send, Settings
+from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import PlannerGroup
@@ -65,8 +66,9 @@ class Loop:
         self.now = device.time  #: in ns
         self.device = device
         self.runtime = PlannerRuntime(
-            group, settings, clock=lambda: self.now, steady=lambda: self.now, unheard=unheard)
-        self.runtime.one_clock = lambda: True
+            group, settings, Surroundings(
+                clock=lambda: self.now, steady=lambda: self.now, one_clock=lambda: True,
+                unheard=unheard))
         self.runtime.active = True
         #: Called with all that the controller says.
         self.tell: Callable[[Output], None] = lambda output: None

@@ -6,11 +6,10 @@ enough, at the latest when `PlannerRuntime.wake` says so, and passes on what tha
 to topics, a loop that has the coil at hand to the coil.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 import math
-from time import monotonic_ns
 
 from hmsa_ros.control.bulletin import Bulletin, LOOK
 from hmsa_ros.control.checks import check_joints, check_ready
@@ -33,7 +32,8 @@ from hmsa_ros.control.seldom import Seldom
 from hmsa_ros.control.sending import Sending
 from hmsa_ros.control.silence import Silence
 from hmsa_ros.control.slices import Clock, SLICE, work_on
-from hmsa_ros.control.takeover import Seen, Takeover
+from hmsa_ros.control.surroundings import Seen, Surroundings
+from hmsa_ros.control.takeover import Takeover
 from hmsa_ros.control.watching import Watch
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
@@ -49,46 +49,30 @@ _WAITING = Verdict(
 
 
 class PlannerRuntime:
-    """
-    Plans requests in slices, sends commands in time and follows their effects.
-
-    Two clocks return ns: `clock` the time of the stamps and of `tick`, `steady` the one that
-    timeouts and the length of a slice are measured by. `observable` returns whether somebody may
-    give samples, and `unheard` why nobody carries out commands (empty where somebody does): the
-    first request waits for both. `found` returns whether a joint has a device that reports.
-    `glance` returns the newest samples by joint, if there are new ones: later requests are held
-    against them.
-    """
+    """Plans requests in slices, sends commands in time and follows their effects."""
 
     def __init__(
-            self, group: PlannerGroup, settings: Settings, *, clock: Clock,
-            steady: Clock = monotonic_ns,
-            observable: Callable[[], bool] = lambda: True,
-            unheard: Callable[[], str] = str,
-            found: Callable[[str], bool] = lambda joint: True,
-            glance: Callable[[], Iterable[tuple[str, Seen]]] = tuple) -> None:
+            self, group: PlannerGroup, settings: Settings, surroundings: Surroundings) -> None:
         self.group = group
         self.settings = settings
         self._prepare()
         self.active = False
         #: Refuses requests, except to stop, while several planners or devices run.
         self.crowded: RefusedError | None = None
-        #: Returns whether one clock tells the times of all nodes, as simulated time does.
-        self.one_clock: Callable[[], bool] = bool
         self.following = Following(group)
         self.clock_jumps = 0
         #: By how many ns the clock was set ahead since `tick` has taken that in.
         self._stepped = 0
-        clock = partial(self._read, clock)
-        self._clock, self._steady, self._observable = clock, steady, observable
-        self._glance = glance
-        self._takeover = Takeover(group, clock, steady, observable, unheard)
-        self._silence = Silence(clock, steady, observable)
-        self._watch = Watch(group, steady, clock)
-        self.hearing = Hearing(group, self.following, self._takeover, clock, steady, found)
+        clock, steady = partial(self._read, surroundings.clock), surroundings.steady
+        around = self.surroundings = replace(surroundings, clock=clock)
+        self._clock, self._steady = clock, steady
+        self._takeover = Takeover(group, around)
+        self._silence = Silence(around)
+        self._watch = Watch(group, around)
+        self.hearing = Hearing(group, self.following, self._takeover, around)
         self._bulletin = Bulletin(
             group, self.following, self._watch, clock, steady,
-            lambda: unheard() or self.hearing.receipts.words, self._unseen)
+            lambda: around.unheard() or self.hearing.receipts.words, self._unseen)
         self.sending = Sending(
             group, self.following, self.hearing, self._bulletin.outputs)
         self.feedback = Feedback(group, settings, self._bulletin.outputs, clock)
@@ -158,7 +142,7 @@ class PlannerRuntime:
             x for x in names if not (later and self.group.planners[x].moves(now)))
 
     def _look_at_samples(self) -> None:
-        for joint, seen in self._glance():
+        for joint, seen in self.surroundings.glance():
             self._takeover.observe(joint, seen)
             self._silence.heard(joint, seen.stamp)
 
@@ -176,7 +160,7 @@ class PlannerRuntime:
         interlock all.
         """
         self.following.seen(time)
-        self._drop(self.hearing.received(joint, time, command, comparable=not self.one_clock()))
+        self._drop(self.hearing.received(joint, time, command))
         self.cut_off(joint, in_force=cut_off or locked, locked=locked)
 
     def cut_off(self, joint: str, *, in_force: bool, locked: bool = False) -> None:
@@ -230,7 +214,7 @@ class PlannerRuntime:
         if self._takeover.waiting or not self._takeover.engaged:
             self._takeover.observe(joint, Seen(
                 stamp, stretch, rate, flux_density,
-                None if self.one_clock() else came - stamp))
+                None if self.surroundings.one_clock() else came - stamp))
         self._watch.add(joint, stamp, stretch)
         self.feedback.add(joint, stamp, stretch, flux_density, came)
 
@@ -467,7 +451,7 @@ class PlannerRuntime:
         """Judge arrivals by what was measured."""
         if not self._watch.open:
             return
-        end, observable = self._steady() + SLICE, self._observable()
+        end, observable = self._steady() + SLICE, self.surroundings.observable()
         while self._steady() < end:
             finding = self._watch.judge(
                 now, self.settings.tolerances, end, observable=observable)

@@ -1,9 +1,8 @@
 """Samples that came before and do not come any more."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
-from hmsa_ros.control.slices import Clock
+from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.model.units import NANOSECONDS
 
 # How long samples may stay away: in ns by the steady clock, and in intervals between them.
@@ -25,12 +24,11 @@ class Silence:
     """
     Notices that samples cease while somebody is still there who publishes them.
 
-    `clock` returns the time of the timestamps in ns, `steady` one that silence is measured by, and
-    `observable` whether joint_states has a publisher: one that ends in order is gone at once.
+    A publisher that ends in order is gone at once.
     """
 
-    def __init__(self, clock: Clock, steady: Clock, observable: Callable[[], bool]) -> None:
-        self._clock, self._steady, self._observable = clock, steady, observable
+    def __init__(self, surroundings: Surroundings) -> None:
+        self._around = surroundings
         self._joints: dict[str, _Joint] = {}
 
     def restart(self) -> None:
@@ -41,16 +39,17 @@ class Silence:
         """Take in that a sample has come that is the newest of a joint."""
         before = self._joints.get(joint)
         self._joints[joint] = _Joint(
-            stamp, self._steady(), self._clock(), 0 if before is None else stamp - before.stamp)
+            stamp, self._around.steady(), self._around.clock(),
+            0 if before is None else stamp - before.stamp)
 
     @property
     def words(self) -> str:
         """Of which joint no samples come any more, in a sentence; empty for none."""
-        steady, now = self._steady(), self._clock()
+        steady, now = self._around.steady(), self._around.clock()
         for name, joint in self._joints.items():
             if not joint.silent and steady - joint.came > _PATIENCE and (
                     now - joint.time > _INTERVALS * joint.interval):
-                joint.silent = self._observable()
+                joint.silent = self._around.observable()
             if joint.silent:
                 return (
                     f'no sample of joint {name} for more than {_PATIENCE / NANOSECONDS:g} s, '

@@ -2,10 +2,9 @@
 
 from collections.abc import Callable, Iterable, Mapping
 import math
-from typing import NamedTuple
 
 from hmsa_ros.control.records import Settings
-from hmsa_ros.control.slices import Clock
+from hmsa_ros.control.surroundings import Seen, Surroundings
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
@@ -25,30 +24,11 @@ _LEAST, _WAY, _MOVING, _ARRIVED = 0.03, 0.5, 0.6, 0.25
 _QUIET = 20.0
 
 
-class Seen(NamedTuple):
-    """A sample of a joint."""
-
-    stamp: int  # in ns
-    stretch: float
-    rate: float  # in 1/s
-    flux_density: float  # in T
-    lag: int | None = None  # how old it was when it came, in ns; None where one clock tells both
-    came: int = 0  # when it came, in ns by the steady clock
-
-
 class Takeover:
-    """
-    Waits for samples of where the joints are before the first request, and goes on from there.
+    """Waits for samples of the joints before the first request, and goes on from them."""
 
-    `clock` returns the time of the stamps in ns, `steady` one that timeouts are measured by,
-    `observable` whether somebody may give samples, and `unheard` why nobody carries out commands.
-    """
-
-    def __init__(
-            self, group: PlannerGroup, clock: Clock, steady: Clock,
-            observable: Callable[[], bool], unheard: Callable[[], str]) -> None:
-        self._group, self._clock, self._steady = group, clock, steady
-        self._observable, self._unheard = observable, unheard
+    def __init__(self, group: PlannerGroup, surroundings: Surroundings) -> None:
+        self._group, self._around = group, surroundings
         #: Returns how old in ns what a device says of itself is when it comes; None if unknown.
         self.lag: Callable[[str], int | None] = lambda joint: None
         self._until: int | None = None
@@ -70,8 +50,8 @@ class Takeover:
         """Wait for samples, if there is somebody to give them or nobody is found yet at all."""
         if self.engaged or self._until is not None:
             return
-        if settings.takeover_timeout and (self._observable() or self._unheard()):
-            self._until = self._steady() + settings.takeover_timeout
+        if settings.takeover_timeout and (self._around.observable() or self._around.unheard()):
+            self._until = self._around.steady() + settings.takeover_timeout
         else:
             self.engaged = True
 
@@ -80,7 +60,7 @@ class Takeover:
         if joint not in self._group.planners or not math.isfinite(
                 seen.stretch + seen.rate + seen.flux_density):
             return
-        last, steady = self._samples.get(joint), self._steady()
+        last, steady = self._samples.get(joint), self._around.steady()
         if last is None or seen.stamp >= last.stamp or steady - last.came > _RECENT:
             self._samples[joint] = seen._replace(came=steady)
 
@@ -106,11 +86,11 @@ class Takeover:
         """
         if self._until is None:
             return []
-        now = self._clock()
+        now = self._around.clock()
         samples = {
             name: x for name, x in self._samples.items()
             if abs(now - x.stamp) <= settings.takeover_max_age}
-        over = self._steady() > self._until
+        over = self._around.steady() > self._until
         for name, seen in self._samples.items():
             if name in samples:
                 self._check_ahead(name, seen)
@@ -119,10 +99,10 @@ class Takeover:
                 self._check_age(name, seen, settings)
                 # Old indeed, and still the newest there is.
                 samples[name] = seen
-        if not over and (len(samples) < len(self._group.planners) or self._unheard()):
+        if not over and (len(samples) < len(self._group.planners) or self._around.unheard()):
             return []
         self._until, self.engaged = None, True
-        observable = self._observable()
+        observable = self._around.observable()
         notes = []
         for name in self._group.planners:
             if name in samples:
@@ -150,9 +130,9 @@ class Takeover:
 
     def _check_age(self, name: str, seen: Seen, settings: Settings) -> None:
         """Refuse a sample that is older or newer than it can be by our clock."""
-        if seen.lag is None and abs(self._clock() - seen.stamp) <= _ANOTHER_CLOCK:
+        if seen.lag is None and abs(self._around.clock() - seen.stamp) <= _ANOTHER_CLOCK:
             return
-        lag = self._clock() - seen.stamp if seen.lag is None else seen.lag
+        lag = self._around.clock() - seen.stamp if seen.lag is None else seen.lag
         known, most = self.lag(name), settings.takeover_max_age
         agrees = known is not None and abs(known) <= most
         if abs(lag) <= most or 0 < lag <= _OLDEST and agrees:
@@ -205,10 +185,10 @@ class Takeover:
             if name not in self._doubted and followed(name):
                 continue
             seen = self._samples.get(name)
-            if seen is None or not self._observable():
+            if seen is None or not self._around.observable():
                 # Nobody shows where it is: as predicted.
                 continue
-            if self._steady() - seen.came > _RECENT or (
+            if self._around.steady() - seen.came > _RECENT or (
                     name in self._doubted and not self._is_new(seen, settings)):
                 if not settings.takeover_timeout:
                     continue
@@ -224,7 +204,7 @@ class Takeover:
 
     def _is_over(self, name: str, seen: Seen, settings: Settings) -> bool:
         """Wait for another sample; say when that has been vain, or refuse to go on without."""
-        steady = self._steady()
+        steady = self._around.steady()
         if self._look_until is None:
             self._look_until = steady + settings.takeover_timeout
         if steady <= self._look_until:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from hmsa_ros.control.aside import Doing, here
 from hmsa_ros.control.holds import AHEAD, Hold
-from hmsa_ros.control.slices import Clock
+from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.judge.records import (
     Finding,
     GoalTolerances,
@@ -107,8 +107,8 @@ class _Joint:
 class Watch:
     """Looks at samples of each setpoint as it was requested, and judges them."""
 
-    def __init__(self, group: PlannerGroup, steady: Clock, clock: Clock) -> None:
-        self._group, self._steady, self._clock = group, steady, clock
+    def __init__(self, group: PlannerGroup, surroundings: Surroundings) -> None:
+        self._group, self._around = group, surroundings
         #: Returns what is known of the sensor of a joint.
         self.sensor: Callable[[str], Sensor] = lambda name: Sensor()
         #: Looks at the samples of a setpoint of a joint, as soon as they have been judged.
@@ -162,7 +162,7 @@ class Watch:
     @property
     def measuring(self) -> bool:
         """Whether samples have come lately."""
-        return self._heard is not None and self._steady() - self._heard < _RECENT
+        return self._heard is not None and self._around.steady() - self._heard < _RECENT
 
     @property
     def findings(self) -> dict[str, Finding]:
@@ -279,10 +279,10 @@ class Watch:
 
     def wants(self, stamp: int) -> bool:
         """Return whether a sample of a time in ns is of use for one of the joints."""
-        steady, wanted = self._steady(), False
+        steady, wanted = self._around.steady(), False
         self._heard = steady
         if self._opens is not None and stamp >= self._opens:
-            self._open_until(min(stamp, self._clock() + AHEAD))
+            self._open_until(min(stamp, self._around.clock() + AHEAD))
         for joint in self._joints.values():
             for hold in joint.holds:
                 wanted |= hold.lacks(stamp, steady)
@@ -293,7 +293,7 @@ class Watch:
         if name not in self._joints:
             return
         if stamp > self._now:
-            self._now = self._clock()
+            self._now = self._around.clock()
         for hold in self._joints[name].holds:
             hold.add(stamp, stretch, self._now)
 
@@ -312,7 +312,7 @@ class Watch:
                 joint.close(joint.newest)
                 return joint.newest
             for hold in joint.holds:
-                if (steady := self._steady()) >= until:
+                if (steady := self._around.steady()) >= until:
                     return None
                 found = hold.judge(
                     now, steady, tolerances, self.sensor(name), observable=observable)

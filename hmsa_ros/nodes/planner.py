@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState
 from hmsa_ros.control import records
 from hmsa_ros.control.aside import Aside
 from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.takeover import Seen
+from hmsa_ros.control.surroundings import Seen, Surroundings
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.actuator import actuator_from
@@ -80,15 +80,14 @@ class PlannerNode(ManagedNode):
 
     def _new_runtime(self) -> PlannerRuntime:
         runtime = PlannerRuntime(
-            group_from(self._settings), settings_from(self._settings), clock=self.now,
-            observable=self._observable, unheard=self._unheard, glance=self._glance,
-            found=lambda joint: self._channels[joint].found)
-        runtime.one_clock = self._one_clock
+            group_from(self._settings), settings_from(self._settings), Surroundings(
+                self.now, one_clock=self._one_clock, observable=self._observable,
+                unheard=self._unheard, found=lambda joint: self._channels[joint].found,
+                reporters=lambda joint: self._channels[joint].reporters, glance=self._glance))
         runtime.sending.deliver = lambda command: self._take((command,))
         runtime.feedback.doing = self._aside
         if runtime.feedback.on:
             self._aside.start()
-        runtime.hearing.reporters = lambda joint: self._channels[joint].reporters
         return runtime
 
     # -- states --------------------------------------------------------------------------------
