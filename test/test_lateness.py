@@ -201,9 +201,9 @@ def test_jitter_is_not_made_worse(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1800)
+@pytest.mark.timeout(900)
 def test_deciding_is_as_good_as_doing_nothing_and_as_always_replanning(monkeypatch):
-    rows = {kind: [_policies(kind, seed, monkeypatch) for seed in range(50)] for kind in KINDS}
+    rows = {kind: [_policies(kind, seed, monkeypatch) for seed in range(15)] for kind in KINDS}
     worse = []
     for kind, cases in rows.items():
         median = {x: float(np.median([case[x] for case in cases])) for x in cases[0]}
@@ -211,7 +211,7 @@ def test_deciding_is_as_good_as_doing_nothing_and_as_always_replanning(monkeypat
         assert median['decide'] <= min(median['nothing'], median['always']) + 0.5
         worse += [
             (kind, seed) for seed, x in enumerate(cases) if x['decide'] > x['nothing'] + 0.5]
-    assert len(worse) <= 0.01 * sum(map(len, rows.values())), worse
+    assert len(worse) <= 1, worse
 
 
 @pytest.mark.parametrize(('after', 'unsure', 'taken'), [
