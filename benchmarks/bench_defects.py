@@ -17,7 +17,6 @@ import math
 from typing import Any
 
 import numpy as np
-from scipy.stats import binom
 
 from benchmarks.defects import away, measured, motion, PERIOD, plants, Sensor, sequence
 from benchmarks.sheet import Sheet
@@ -113,6 +112,7 @@ def compare(*, quick: bool, runs: int = RUNS) -> Sheet:
         rows.append([words, str(len(answers)), *map(str, counts.values()),
                      str(wrong), f'{100.0 * cover:.1f} %' if inside else '-'])
         if kind == 'exact':
+            from scipy.stats import binom  # others need not wait for it
             passed &= counts['identified'] >= _IDENTIFIED * len(answers) and (
                 binom.ppf(_CHANCE, len(inside), _COVERAGE[0]) <= sum(inside)
                 <= binom.ppf(1.0 - _CHANCE, len(inside), _COVERAGE[1]))

@@ -5,8 +5,6 @@ from functools import partial
 from time import perf_counter, process_time
 
 import numpy as np
-from scipy.signal import lfilter
-from scipy.stats import binom, chi2
 
 from benchmarks.fits import Fitted, with_casadi, with_scipy
 from benchmarks.sheet import Sheet
@@ -46,6 +44,7 @@ def levels_of(shaped: bool, repeats: int) -> tuple[Array, Array]:
 
 def compare(*, quick: bool = False, runs: int = RUNS) -> Sheet:
     """Identify many simulated runs."""
+    from scipy.stats import binom, chi2  # others need not wait for it
     runs = QUICK_RUNS if quick else runs
     # What one in ten thousand rows misses by chance.
     ratio = LARGEST_RATIO * np.sqrt(chi2.ppf(1.0 - _CHANCE, runs) / runs)
@@ -147,6 +146,7 @@ def _spoilt(kind: str, clean: Array, random: np.random.Generator) -> Array:
     n = len(clean)
     white = 1e-3 * random.standard_normal(n)
     if kind == _CORRELATED:
+        from scipy.signal import lfilter  # others need not wait for it
         return clean + np.sqrt(1.0 - 0.9 ** 2) * lfilter([1.0], [1.0, -0.9], white)
     if kind == _PIXELS:
         pixel = 0.8 / 255.0

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from scipy.signal import lfilter
 
 from benchmarks.sheet import Sheet
 from hmsa_ros.judge.judging import judge
@@ -132,6 +131,7 @@ def draw(seed: int, kind: str) -> Trial:
         stamps = time + interval * random.uniform(0.0, 0.2) * random.standard_normal(len(time))
     white, correlation, quantum = random.standard_normal(len(time)), 0.0, 0.0
     if kind == 'coloured':
+        from scipy.signal import lfilter  # others need not wait for it
         correlation = random.uniform(0.3, 0.97)
         white[1:] *= math.sqrt(1.0 - correlation ** 2)
         white = lfilter([1.0], [1.0, -correlation], white)

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.constants import mu_0
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
-from scipy.signal import lfilter
 
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
@@ -183,6 +182,7 @@ def measured(place: int, given: Plants, seen: Callable[[int, Array], Array], swi
     if sensor.kind == 'jittered':
         true = np.clip(at + 0.002 * PERIOD * random.standard_normal(len(at)), 0.02, end - 0.03)
     if sensor.kind == 'coloured':
+        from scipy.signal import lfilter  # others need not wait for it
         noise = lfilter([math.sqrt(1.0 - 0.8 ** 2)], [1.0, -0.8], noise)
     stretch = seen(place, true) + noise
     if sensor.kind == 'quantised':

@@ -9,7 +9,6 @@ import mpmath
 import numpy as np
 import pytest
 from scipy.constants import mu_0
-import sympy
 
 from hmsa_ros.model import equations
 from hmsa_ros.model.parameters import (
@@ -40,6 +39,7 @@ def inside(j_lim: float, share: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope='module')
 def derivation():
     """Derive Eqs. 10 and 11 from the integrals and the energies of the paper."""
+    import sympy
     l, v, a, b = sympy.symbols('l v a B', real=True)  # noqa: E741
     rho, half_l, half_h, shear, j_lim, remanence, c, mu = sympy.symbols(
         'rho L H G J Br c mu', positive=True)

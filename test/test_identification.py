@@ -5,7 +5,6 @@ from dataclasses import replace
 from identification_oracle import BLOCK, Extras, level_of, relative, simulate, steps
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from benchmarks.bench_identification import levels_of
 from hmsa_ros.errors import BadInputError
@@ -246,6 +245,7 @@ def test_one_in_a_hundred_outliers_moves_nothing_by_a_deviation():
 
 @pytest.mark.slow
 def test_correlated_noise_widens_the_intervals_and_is_no_misfit():
+    from scipy.signal import lfilter
     clean = recorded(noise=0.0)
     errors, plain = [], identify(recorded()).parameters['shear_modulus'].std
     for seed in range(6):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
-from scipy.stats import chi2
+from scipy.special import chdtri
 from sensor_msgs.msg import JointState, MagneticField
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
@@ -248,7 +248,7 @@ def test_minimax_takes_the_ellipsoid_of_an_identification_and_refuses_a_file_wit
     # Its outline in G and damping is that of the covariance, where 95 % are.
     axes, values = np.array(errors.axes), [1e4, block.damping_coefficient]
     assert (axes.T @ axes)[:2, :2] == pytest.approx(
-        chi2.ppf(0.95, 2) * covariance / np.outer(values, values), rel=1e-3)
+        chdtri(2, 0.05) * covariance / np.outer(values, values), rel=1e-3)
     planner.core.set_options(replace(planner.core.options, shaper='minimax', errors=errors))
     planner.request(*SEQUENCE)
     planner.run(END)

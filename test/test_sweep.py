@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
 from scipy.integrate import solve_ivp
 import yaml
 
@@ -136,6 +135,7 @@ def test_nondimensional_laws_limits_and_ramps_are_columns(run):
 
 
 def test_samples_of_an_identification_have_its_mean_and_covariance(run, params_file):
+    from scipy import stats
     names = ['shear_modulus', 'damping_coefficient', 'stretch_bias']
     path = params_file(**{
         'identification.names': names,
@@ -156,6 +156,7 @@ def test_samples_of_an_identification_have_its_mean_and_covariance(run, params_f
 
 
 def test_samples_are_those_of_sobol_and_follow_from_number_and_seed_alone(run):
+    from scipy import stats
     spreads = {'zeta': Spread(False, 0.1, 0.3), 'j_lim': Spread(True, 5.0, 0.1)}
     found = draw(spreads, NOTHING, 600, 3)
     points = stats.qmc.Sobol(2, seed=np.random.default_rng(3)).random(1024)[:600]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from hmsa_ros.device.assembly import CoilModel
 from hmsa_ros.device.hardware import Hardware, load
@@ -134,7 +134,7 @@ def calibrate_coil(current: Array, flux_density: Array) -> CoilCalibration:
             f'{deviation:.3g}): expected a field that rises or falls with it; look after the '
             'probe and its direction')
     misses = float(np.max(np.abs(mean - _model(at, *values)))) / span
-    half = float(student.ppf(0.975, len(current) - len(values))) * deviation
+    half = float(stdtrit(len(current) - len(values), 0.975)) * deviation
     # Both branches of a loop miss a curve in their middle by half of the hysteresis.
     allowed = _MISSES + 0.5 * (0.0 if math.isnan(hysteresis) else hysteresis)
     model = 'table' if misses > allowed else 'saturation' if saturates else 'number'

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.identify import identify
@@ -104,7 +104,7 @@ def field_delays(
             f'the readings of the probe miss a lagged field by {noise:.3g} T, and it steps by '
             f'{np.max(np.abs(weight)):.3g} T at most: expected a field that follows the levels; '
             'look after the probe, or raise --limit')
-    half = float(student.ppf(0.975, freedom)) * noise * np.sqrt(
+    half = float(stdtrit(freedom, 0.975)) * noise * np.sqrt(
         np.abs(np.diag(np.linalg.pinv(found.jac.T @ found.jac))))
     transport, lag = (
         Interval(1e-3 * float(x), 1e-3 * float(x - y), 1e-3 * float(x + y))

@@ -16,9 +16,7 @@ from typing import Any
 
 from matplotlib import rcParams, style
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
-from matplotlib.backends.backend_mixed import MixedModeRenderer
-from matplotlib.backends.backend_pgf import RendererPgf
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import AutoMinorLocator, NullLocator
 import numpy as np
@@ -99,7 +97,8 @@ def picture(
         for path, kind in zip(paths, kinds, strict=True):
             with replacing(path) as beside:
                 if kind == 'pgf':
-                    beside.write_text(_pgf(figure, path), encoding='utf-8')
+                    from hmsa_ros.report.latex import pgf  # others need not wait for it
+                    beside.write_text(pgf(figure, path), encoding='utf-8')
                 else:
                     figure.savefig(beside, format=kind, metadata=_METADATA[kind])
         for path in dict.fromkeys(x.with_suffix('.csv') for x in paths if paper.data):
@@ -109,44 +108,6 @@ def picture(
                 size = max((len(x) for x in rows), default=len(_COLUMNS))
                 writer.writerow((*_COLUMNS, 'z')[:size])
                 writer.writerows(rows)
-
-
-class _Words(RendererPgf):
-    """Measures words as the other pictures do, so that no LaTeX is needed to write a file."""
-
-    def __init__(self, figure: Figure, file: Any) -> None:
-        super().__init__(figure, file)  # type: ignore[no-untyped-call]
-        self._ruler = RendererAgg(1, 1, figure.dpi)  # type: ignore[no-untyped-call]
-
-    def get_text_width_height_descent(
-            self, s: str, prop: Any, ismath: Any) -> tuple[float, float, float]:
-        """Return the size of a text in dots."""
-        size: tuple[float, float, float] = self._ruler.get_text_width_height_descent(  # type: ignore[no-untyped-call]
-            s, prop, ismath)
-        return size
-
-
-class _File(io.StringIO):
-    """A text in memory with the name of a file, beside which images of the picture go."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        self.name = str(path)
-
-
-def _pgf(figure: Figure, path: Path) -> str:
-    """Return a picture that LaTeX inputs; images in it are written beside the path."""
-    file = _File(path)
-    width, height = (float(x) for x in figure.get_size_inches())
-    file.write(
-        f'% \\usepackage{{pgf}}, and \\input{{{path.name}}}\n\\begingroup\n\\makeatletter\n'
-        '\\begin{pgfpicture}\n\\pgfpathrectangle{\\pgfpointorigin}'
-        f'{{\\pgfqpoint{{{width:.6f}in}}{{{height:.6f}in}}}}\n'
-        '\\pgfusepath{use as bounding box, clip}\n')
-    renderer: Any = MixedModeRenderer(  # type: ignore[no-untyped-call]
-        figure, width, height, figure.dpi, _Words(figure, file))
-    figure.draw(renderer)
-    return f'{file.getvalue()}\\end{{pgfpicture}}\n\\makeatother\n\\endgroup\n'
 
 
 def axis(quantity: str, symbol: str = '', unit: str = '') -> str:
