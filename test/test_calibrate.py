@@ -30,13 +30,13 @@ def readings(slope, saturation=math.inf, hysteresis=0.0, noise=2e-4, seed=0):
 @pytest.mark.parametrize('saturation', [math.inf, 0.5])
 @pytest.mark.parametrize('hysteresis', [0.0, 0.02])
 def test_the_constant_is_right_to_a_fifth_of_a_percent_in_nearly_all_runs(saturation, hysteresis):
-    drawn = np.random.default_rng(4).uniform(0.0475, 0.0525, 100)
+    drawn = np.random.default_rng(4).uniform(0.0475, 0.0525, 40)
     found = [calibrate_coil(LOOP, readings(x, saturation, hysteresis, seed=i))
              for i, x in enumerate(drawn)]
     off = np.abs([x.tesla_per_ampere for x in found] / drawn - 1.0)
-    assert np.sum(off < 2e-3) >= 97
+    assert np.sum(off < 2e-3) >= 39
     inside = [x.interval[0] < y < x.interval[1] for x, y in zip(found, drawn, strict=True)]
-    assert sum(inside) >= 90
+    assert sum(inside) >= 34
     for x in found:
         assert x.model == ('number' if saturation == math.inf else 'saturation')
         assert x.hysteresis == pytest.approx(hysteresis, abs=2e-3)
