@@ -27,7 +27,6 @@ COMMANDS = (
         'export', 'check_driver', 'calibrate')),
     *(f'hmsa_studies.commands.{x}' for x in ('sweep', 'robustness', 'figures')),
     'hmsa_ros.cli.completion')
-_NODE = ('hmsa_ros.cli.node',)
 
 
 class _Help(argparse.HelpFormatter):
@@ -81,8 +80,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     0 is done, 1 the run failed, 2 bad input, 130 interrupted (SIGINT; 143 SIGTERM, 129 SIGHUP).
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    # A node starts without the modules of all other commands.
-    parser = build_parser(_NODE if words and words[0] in NODES else COMMANDS)
+    # A command starts without the modules of all others.
+    name = 'node' if words and words[0] in NODES else ''.join(words[:1]).replace('-', '_')
+    parser = build_parser([x for x in COMMANDS if x.endswith(f'.{name}')] or COMMANDS)
     arguments, unknown = parser.parse_known_args(split_ros_args(words))
     if unknown:
         arguments.parser.error(f'unrecognized arguments: {" ".join(unknown)}')
