@@ -61,7 +61,7 @@ def pytest_runtest_makereport(
     """Show what the processes of a failed test have printed."""
     report = yield
     starter = getattr(item, 'funcargs', {}).get('start')
-    if report.failed and starter is not None:
+    if report.failed and isinstance(starter, Starter):
         report.sections += [
             (f'{" ".join(map(str, x.popen.args))}: {x.popen.poll()}', x.output)
             for x in starter.processes]
@@ -72,6 +72,20 @@ def pytest_runtest_makereport(
 def pytest_xdist_auto_num_workers() -> int:
     """Return three workers for two cores: a test with nodes mostly waits for them."""
     return max(3 * (os.cpu_count() or 1) // 2, 2)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+        collector: pytest.Collector
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """Let each worker begin with other modules: what one has compiled, the others only read."""
+    report = yield
+    worker = os.environ.get('PYTEST_XDIST_WORKER', 'gw0')
+    if isinstance(collector, pytest.Directory):
+        count = int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1'))
+        first = len(report.result) * int(worker[2:]) // count
+        report.result = report.result[first:] + report.result[:first]
+    return report
 
 
 @pytest.hookimpl(wrapper=True)
@@ -92,6 +106,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     Long tests begin first. The others alternate, so that while nodes are waited for, something is
     computed; and end with those that run nodes, since they are short.
     """
+    items.sort(key=lambda item: item.path)
     for item in items:
         if 'ros_domain_id' in getattr(item, 'fixturenames', ()):
             item.add_marker(pytest.mark.ros)

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 import math
 
+from core_oracle import integrate
 import numpy as np
 from scipy.constants import mu_0
-from scipy.integrate import odeint
 from scipy.optimize import brentq
 
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
@@ -119,14 +119,9 @@ def _simulated(times: bytes, level_times: bytes, levels: bytes, block: ActuatorP
     ends = np.append(level_times[1:], max(times[-1], level_times[-1]) + 1e-9)
     for begin, end, level in zip(level_times, ends, levels, strict=True):
         inside = (times >= begin) & (times < end)
-        moments = np.concatenate(([begin], times[inside], [end]))
-        # It takes no moments that only rounding tells apart.
-        apart = np.diff(moments, prepend=-math.inf) > 1e-11
-        states = odeint(
-            slope, state, moments[apart], args=(level,), tfirst=True, rtol=1e-10, atol=1e-10,
-            mxstep=100_000)
-        stretch[inside] = states[np.cumsum(apart)[1:-1] - 1, 0]
-        state = states[-1]
+        states = integrate(
+            slope, [begin, *times[inside], end], state, level, rtol=1e-10, atol=1e-10)
+        stretch[inside], state = states[1:-1, 0], states[-1]
     return x.gain * stretch + x.bias
 
 

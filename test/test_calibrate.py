@@ -100,7 +100,7 @@ def test_a_guided_run_measures_the_coil_and_leaves_it_off(typed, tmp_path, capsy
     probe = [] if typed else ['--probe', 'bench_under_test:Supply']
     assert main([
         'calibrate', 'coil', 'bench_under_test:coil', *probe, '--limit', '0.1', '--steps', '3',
-        '--settle', '0.1', '--json']) == 0
+        '--settle', '0.01', '--json']) == 0
     found = json.loads(capsys.readouterr().out)
     assert found['tesla_per_ampere'] == pytest.approx(0.052, rel=1e-6)
     assert found['model'] == 'number'
@@ -113,7 +113,7 @@ def test_a_core_whose_hysteresis_is_written_is_demagnetised_at_the_end(monkeypat
     Supply.written.clear()
     assert main([
         'calibrate', 'coil', 'bench_under_test:coil', '--probe', 'bench_under_test:Supply',
-        '--limit', '0.1', '--steps', '2', '--settle', '0.1', '--hysteresis']) == 0
+        '--limit', '0.1', '--steps', '2', '--settle', '0.01', '--hysteresis']) == 0
     core, left = Iron(0.04, 0.6), []
     for current in Supply.written:
         core.turn(current)
@@ -133,7 +133,7 @@ def test_an_interrupt_leaves_the_coil_off(monkeypatch):
         return '0'
 
     monkeypatch.setattr('builtins.input', interrupted)
-    main(['calibrate', 'coil', 'bench_under_test:coil', '--limit', '0.1', '--settle', '0.1'])
+    main(['calibrate', 'coil', 'bench_under_test:coil', '--limit', '0.1', '--settle', '0.01'])
     assert len(asked) == 3
     assert Supply.amperes == 0.0
 

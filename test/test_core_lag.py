@@ -3,6 +3,7 @@
 import itertools
 import math
 
+from core_oracle import integrate
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -30,7 +31,7 @@ HARDWARE = [{}, {'period': 0.11}, {'period': 0.4}, {'slew': 1.5}, {'slew': 0.4},
 
 def rates(_, state, load, slope, lag):
     """Equation 11 and the coil, written out once more; the time is that of a piece."""
-    stretch, rate, field = state
+    stretch, rate, field = map(float, state)
     j, c1 = PAPER.j_lim, PAPER.c1
     chain = 1.0 - (2.0 / stretch + stretch ** 2 - 3.0) / j
     force = (stretch - stretch ** -2) / chain + 0.5 * PAPER.zeta * c1 * rate
@@ -47,11 +48,8 @@ def end_of(move, request):
     for (begin, load, slope), after in itertools.zip_longest(pieces, pieces[1:]):
         span = (after[0] if after else move.duration) - begin
         if span > 0.0:
-            state = solve_ivp(
-                rates, (0.0, span), state, method='DOP853', rtol=1e-12, atol=1e-14,
-                # In longer steps the field, which decays within some lags, is off by 1e-9.
-                max_step=max(delivery.lag, span / 1000.0),
-                args=(load, slope, delivery.lag)).y[:, -1]
+            state = integrate(
+                rates, [0.0, span], state, load, slope, delivery.lag, rtol=1e-12, atol=1e-14)[-1]
     return state
 
 

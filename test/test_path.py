@@ -4,9 +4,9 @@ from dataclasses import replace
 from itertools import pairwise
 import math
 
+from core_oracle import integrate
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
 from hmsa_ros import Actuator
@@ -63,10 +63,10 @@ def moved(levels, times, start=1.0, slew=math.inf, lag=0.0, creep=()):
                 (ramp, until, reached, 0.0)):
             if last > first:
                 here = np.searchsorted(times, last)
-                solution = solve_ivp(
-                    motion, (first, last), y, method='DOP853', rtol=1e-12, atol=1e-12,
-                    t_eval=np.append(times[done:here], last), args=(value, slope, first))
-                found[done:here], y, done = solution.y[0, :here - done], solution.y[:, -1], here
+                seen = integrate(
+                    motion, [first, *times[done:here], last], y, value, slope, first,
+                    rtol=1e-12, atol=1e-12)
+                found[done:here], y, done = seen[1:-1, 0], seen[-1], here
         load = reached
     return found
 
