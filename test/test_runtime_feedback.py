@@ -18,6 +18,7 @@ from hmsa_ros.control.records import (
     Target,
 )
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.estimation import Estimator
 from hmsa_ros.identification.files import read_belief
 from hmsa_ros.identification.known import Known
 from hmsa_ros.model.creep import Creep
@@ -173,6 +174,17 @@ def test_an_actuator_that_was_identified_is_not_moved_with_caution():
     loop.run((1.4, 1000 * MS))
     first = loop.runtime.group.planners['a'].plan.segments[-1]
     assert (first.arrival - first.begin) / MS == pytest.approx(59.4, abs=1)
+
+
+@pytest.mark.parametrize(('mode', 'cautious', 'predicted'), [
+    ('observe', True, False), ('adapt', False, False), ('adapt', True, True)])
+def test_only_a_cautious_first_request_waits_for_what_it_may_leave(
+        monkeypatch, mode, cautious, predicted):
+    predict, calls = Estimator.predict, []
+    monkeypatch.setattr(
+        Estimator, 'predict', lambda *x: calls.append(x) or predict(*x))
+    Loop(1.0, 1e-3, feedback=mode, feedback_cautious=cautious).runtime.request(Target('a', 1.2))
+    assert bool(calls) is predicted
 
 
 @pytest.mark.parametrize(('named', 'bound'), [

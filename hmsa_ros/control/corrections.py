@@ -89,6 +89,8 @@ class Corrections:
         course = _drafted(draft, self._group.planners[name].plan)
         slew = self._group.planners[name].options.slew_limit
         self._feedback.planned(name, model, expect(estimate, course, slew).size)
+        if math.isinf(self._feedback.tolerance):
+            return draft
         # What is only suspected is no reason to take longer.
         size = expect(estimate.sure_of(self._feedback.named), course, slew).size
         if size <= self._feedback.tolerance * step:

@@ -353,9 +353,9 @@ class Feedback:
         return joint.estimator.predict(time)
 
     def foreseen(self, name: str, time: int) -> Estimate | None:
-        """Return what moves may be corrected from at a time in ns, before samples come too."""
+        """Return what moves are corrected from at a time in ns; cautious ones before samples."""
         joint = self._joints.get(name)
-        if joint is None or joint.latest is not None:
+        if joint is None or joint.latest is not None or math.isinf(self.tolerance):
             return self.state(name, time)
         return self._predicted(name, joint, time)
 
