@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 import pytest
 
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.equations import natural_frequency
 from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa_ros.model.simulation import ActuatorSimulation
@@ -200,10 +201,12 @@ def test_joint_in_motion_is_not_held_back():
         x.segments[0].arrival == latest for name, x in drafts.items() if name != 'left')
 
 
-def test_preview_has_every_joint_at_every_change():
-    joints = group()
+@pytest.mark.parametrize('creep', [Creep(), Creep((0.1, 0.05), (0.01, 0.2))])
+def test_preview_has_every_joint_at_every_change(creep):
+    joints = PlannerGroup({
+        name: Planner(replace(block, creep=creep), Options()) for name, block in BLOCKS.items()})
     joints.take(finish(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, START)), START)
-    stamps, samples = joints.preview(START, 100)
+    stamps, samples = joints.preview(START, 10_000)
     assert stamps == sorted({
         x.stamp for p in joints.planners.values() for x in p.plan.levels if x.stamp > 0})
     for name, planner in joints.planners.items():
@@ -215,7 +218,7 @@ def test_preview_has_every_joint_at_every_change():
             assert flux_density == planner.plan.level(stamp).flux_density
     # From when on each joint has the level that is in force.
     begun = stamps[len(stamps) // 2]
-    assert joints.preview(begun, 100)[0] == [x for x in stamps if x >= begun]
+    assert joints.preview(begun, 10_000)[0] == [x for x in stamps if x >= begun]
 
 
 # -- late, lost and foreign commands ------------------------------------------------------------

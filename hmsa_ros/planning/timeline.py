@@ -205,28 +205,28 @@ class PlannedLevel:
             return self.state
         return self.model.follow(
             self.state, self.load,
-            min(max(self.model.time(time - self.stamp), 0.0), self._longest()))
+            min(max(self.model.time(time - self.stamp), 0.0),
+                math.inf if self.model.material.creep else self._settled()))
 
-    def _longest(self) -> float:
-        """Return for how long the motion is worth following."""
-        model = self.model
-        if model.material.creep:
-            return math.inf
-        return model.delivery.settling(self.load - self.state.ramps_from) \
-            + longest_motion(self.load, model.material)
+    def _settled(self) -> float:
+        """Return the time after which nothing moves, but for creep."""
+        return self.model.delivery.settling(self.load - self.state.ramps_from) \
+            + longest_motion(self.load, self.model.material)
 
     def sample(self, times: Sequence[int]) -> list[tuple[float, float]]:
         """Predict stretch and rate (1/s) at times in ns, not decreasing, from the stamp on."""
         if self.stamp == ALWAYS or all(x == self.stamp for x in times):
             return [(self.stretch, self.rate)] * len(times)
-        model = self.model
-        if model.material.creep:
-            return [(x.stretch, x.rate / model.units.time) for x in map(self.at, times)]
-        longest = self._longest()
-        after = np.array([min(model.time(x - self.stamp), longest) for x in times])
+        model, settled = self.model, self._settled()
+        after = np.array([model.time(x - self.stamp) for x in times])
+        # What has settled may still creep.
+        count = int(np.searchsorted(after, settled)) if model.material.creep else len(after)
         stretch, rate, *_ = sampled(
-            (Level(0.0, self.load),), self.state, after, model.material, model.delivery)
-        return list(zip(stretch.tolist(), (rate / model.units.time).tolist(), strict=True))
+            (Level(0.0, self.load),), self.state, np.minimum(after[:count], settled),
+            model.material, model.delivery) if count else np.empty((2, 0))
+        found = [*zip(stretch.tolist(), rate.tolist(), strict=True),
+                 *((x.stretch, x.rate) for x in map(self.at, times[count:]))]
+        return [(x, y / model.units.time) for x, y in found]
 
     def after(self, level: 'PlannedLevel') -> 'PlannedLevel':
         """Return this level with what is predicted at its stamp if another one precedes it."""
