@@ -20,8 +20,9 @@ from hmsa_ros.model.status import Code
 from hmsa_ros.planning.group import PlannerGroup, Progress
 from hmsa_ros.planning.timeline import PlannedSegment
 
-# Changes of level in one preview.
-_PREVIEW = 500
+# Changes of level in one preview, and how soon in ns a correction is in one: it takes some time to
+# make, and those of several joints come together.
+_PREVIEW, _SOON = 500, 50_000_000
 #: How often it is looked whether somebody listens, in ns.
 LOOK = 200_000_000
 
@@ -120,10 +121,12 @@ class Bulletin:
                 Severity.OK if fine else Severity.WARN, worst.verdict, worst.message,
                 self.verdict.request), log=worst.failed and worst is finding)
 
-    def corrected(self, names: Iterable[str]) -> None:
-        """Take in that the plans of joints have been corrected."""
+    def corrected(self, names: Iterable[str], now: int) -> None:
+        """Take in that the plans of joints have been corrected at a time in ns; show them soon."""
         for name in names:
             self._watch.corrected(name)
+        soon = now + _SOON
+        self.preview_again = soon if self.preview_again is None else min(self.preview_again, soon)
 
     def look_for_listeners(self) -> None:
         """Warn where nobody carries out what is sent, or samples cease, and say when that ends."""

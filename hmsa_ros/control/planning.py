@@ -168,8 +168,7 @@ class Planning:
         verdict = self._corrections.take(drafts, now, self._bulletin.verdict.request)
         self._send()
         if verdict is not None:
-            self._bulletin.corrected(drafts)
-            self._bulletin.show()
+            self._bulletin.corrected(drafts, now)
             self._bulletin.give(verdict)
 
 
