@@ -69,8 +69,8 @@ def test_a_file_cut_anywhere_is_read_up_to_the_cut(tmp_path, preset):
     data = write_bag(tmp_path / 'bag', preset=preset).read_bytes()
     cut = tmp_path / 'cut.mcap'
     before = 0
-    # A thousand cuts over the three presets, the ends among them.
-    lengths = sorted({*random.Random(3).sample(range(len(data)), 330), *range(10),
+    # Hundreds of cuts over the three presets, the ends among them.
+    lengths = sorted({*random.Random(3).sample(range(len(data)), 120), *range(10),
                       *range(len(data) - 10, len(data))})
     for length in lengths:
         cut.write_bytes(data[:length])

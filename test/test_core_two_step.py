@@ -459,7 +459,7 @@ def test_passing_the_target_is_not_being_there(zeta, rate):
     assert not plan.tau_p < 0.1
 
 
-@pytest.mark.parametrize('rate', [1e2, 1e3, 1e5, 1e9, 1e15, 1e150, -1e2, -1e5, -1e15, -1e150])
+@pytest.mark.parametrize('rate', [1e2, 1e5, 1e150, -1e3, -1e15])
 def test_huge_rates_end_in_a_plan_or_a_code_within_bounded_work(rate):
     for zeta in (0.0, 0.2, 50.0):
         for target in (0.9, 1.2, 2.6):

@@ -57,14 +57,14 @@ def test_constants_of_a_law_are_found_blind_within_their_intervals(law):
     true = dict(zip(names, constants, strict=True)) | {
         'damping_coefficient': BLOCK.damping_coefficient, 'remanence': BLOCK.remanence}
     inside = []
-    for seed in range(6):
+    for seed in range(3):
         found = identify(
             recorded(Extras(law=(law, *constants)), seed=seed), free=[*start, *REST],
             actuator=block)
         assert found.verdict == 'identified', found.reason
         inside += covered(found, true)
-    # Of 24 to 30 intervals of 95 % more than four miss in one of some thousand runs.
-    assert inside.count(False) <= 4
+    # Of 12 to 15 intervals of 95 % more than three miss in one of some hundred runs.
+    assert inside.count(False) <= 3
     for name, value in true.items():
         assert abs(found.parameters[name].value - value) < 4.5 * found.parameters[name].std
         # A hundredth of the modulus, or of the value.
@@ -89,14 +89,14 @@ def test_two_branches_of_creep_are_found_blind():
             'viscoelastic_ratio_2': 0.25, 'viscoelastic_time_2': 0.2,
             'shear_modulus': BLOCK.shear_modulus, 'remanence': BLOCK.remanence}
     inside = []
-    for seed in range(4):
+    for seed in range(2):
         found = identify(
             recorded(creep, seed=seed, noise=3e-4, span=0.25, repeats=2),
             free=['shear_modulus', 'chain_limit', *REST, *list(true)[:4]],
             actuator=replace(BLOCK, shear_modulus=1.2e4, remanence=0.08))
         assert found.verdict == 'identified', found.reason
         inside += covered(found, true)
-    assert inside.count(False) <= 4
+    assert inside.count(False) <= 3
 
 
 def test_a_second_branch_that_is_not_there_is_not_identifiable():

@@ -46,7 +46,7 @@ def left(truth, begin, end, target, step):
     return np.ptp(seen) / step, (np.mean(seen) - target) / step
 
 
-@pytest.mark.parametrize('factor', [0.8, 1.2])
+@pytest.mark.parametrize('factor', [0.8, pytest.param(1.2, marks=pytest.mark.slow)])
 def test_observing_says_what_is_wrong_and_changes_nothing(factor):
     loop, plain = (
         Loop(factor, 1e-3, heartbeat_period=0, feedback=x) for x in ('observe', 'off'))
