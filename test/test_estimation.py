@@ -263,6 +263,19 @@ def test_a_bias_and_a_constant_force_are_said_to_be_confounded_until_two_targets
         0.03, abs=4.0 * found.deviations['constant_force'])
 
 
+@pytest.mark.parametrize('factor', [0.8, 1.2])
+@pytest.mark.parametrize('force', [0.03, -0.03])
+def test_a_force_is_told_from_a_bias_where_another_modulus_was_given(factor, force):
+    # It shifts the rest that the first move begins from by another share than was thought.
+    block = replace(
+        oracle.BLOCK, shear_modulus=factor * oracle.BLOCK.shear_modulus,
+        damping_coefficient=2.0 * oracle.BLOCK.damping_coefficient)
+    samples = measured(block, oracle.Extras(bias=1e-3, force=force), noise=1e-4)
+    _, found = run(samples, prior=Prior.nominal(oracle.BLOCK, suspects=True))
+    assert abs(found.values['stretch_bias'] - 1e-3) < 3.0 * found.deviations['stretch_bias']
+    assert found.values['constant_force'] == pytest.approx(force, rel=0.1)
+
+
 @pytest.mark.parametrize('gain', [0.98, 1.02])
 def test_a_bias_is_known_no_better_than_the_gain_of_the_sensor_lets_tell_it_from_a_force(gain):
     # The gain is about rest: what it shows of a stretch of 1 is right.

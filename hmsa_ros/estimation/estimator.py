@@ -14,7 +14,7 @@ from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
 from hmsa_ros.estimation.prior import Prior
 from hmsa_ros.estimation.screening import Screening
 from hmsa_ros.estimation.suspects import Suspects
-from hmsa_ros.estimation.window import coordinates, Solution, Trial, values_at, Window
+from hmsa_ros.estimation.window import coordinates, Rest, Solution, Trial, values_at, Window
 from hmsa_ros.identification.fit import robust_scale
 from hmsa_ros.identification.quantities import actuator_of, BRANCHES, derivative, QUANTITIES
 from hmsa_ros.model.creep import Creep
@@ -214,8 +214,9 @@ class Estimator:
         levels = self._as_levels()
         until = max([self._seconds(x) for x, _ in self._pending[-1:]] + window.time[-1:].tolist()
                     + [self._seconds(time), window.begin])
-        here = self._take(window, levels, until)
         z = window.mean if self._solution is None else self._solution.z
+        window.settle(z, _AT_REST)
+        here = self._take(window, levels, until)
         found = window.solve(z, levels, self.noise, until, here)
         if found is None:
             self.screening.trouble = 'no motion leads through the samples'
@@ -291,23 +292,24 @@ class Estimator:
         mean = coordinates(prior.values, prior.free)
         self._fixed = None if self.learning else prior.covariance
         known = prior.covariance * (1.0 if self.learning else _FIXED)
-        at = rest(prior.values, prior.free, self._in_force(stamp))
-        stretch, frequency, by = at or (
-            shown, 1.0 / prior.values['time_unit'], np.zeros(len(mean)))
-        off = _AT_REST if at is not None and self._unchanged(
-            stamp, stamp, _SETTLED) else _ANYWHERE
+        level = self._in_force(stamp)
+        at = rest(prior.values, prior.free, level)
+        stretch, frequency = at[:2] if at else (shown, 1.0 / prior.values['time_unit'])
+        rests = at is not None and self._unchanged(stamp, stamp, _SETTLED)
+        off = _AT_REST if rests else _ANYWHERE
         covariance = np.zeros((len(mean) + 2, len(mean) + 2))
         covariance[:-2, :-2] = known
-        covariance[:-2, -2] = covariance[-2, :-2] = known @ by
-        covariance[-2, -2] = by @ known @ by + off ** 2
-        covariance[-1, -1] = (off * frequency) ** 2
-        return Window(
+        covariance[-2:, -2:] = np.diag(np.square([off, off * frequency]))
+        window = Window(
             dict(prior.values), prior.free, np.append(mean, [stretch, 0.0]), covariance,
             _bounds(self.prior), 0.0, np.zeros(0), np.zeros(0), Suspects(
                 prior.free, prior.suspects, prior.named,
                 coordinates(self.prior.values, self.prior.free),
                 1.0 / np.diag(self.prior.covariance)),
-            self._window.suspected if self._window else ())
+            self._window.suspected if self._window else (),
+            rest=Rest(level, mean, known) if rests else None)
+        window.settle(window.mean, _AT_REST)
+        return window
 
     def _take(self, window: Window, levels: Levels, until: float) -> Trial | None:
         """
@@ -400,7 +402,11 @@ class Estimator:
             drift[:-2] = _DRIFT ** 2 * (time - window.begin) * self.prior.spread ** 2
         shift = round(time * NANOSECONDS)
         seconds = shift / NANOSECONDS
-        moved = window.move_on(place, time, found, self.noise, drift)
+        # How a rest depends on parameters shows in the motion after it.
+        at = window.rest if self.learning is (self._fixed is None) and self._unchanged(
+            self._origin, self._origin + shift, 0.0) else None
+        moved = window.move_on(place, time, found, self.noise, drift) if at is None else (
+            window.rest_on(at, place, time, found, self.noise, drift))
         self._fix(moved, found)
         if found.motion.behind:
             until_then = self._follow(found, window, time)
@@ -413,7 +419,8 @@ class Estimator:
         self._window = moved
         self._solution = replace(found, z=np.append(
             found.z[:-2], [found.motion.stretch[place], found.motion.rate[place]]),
-            covariance=moved.covariance, off=np.zeros_like(found.off))
+            covariance=moved.covariance if at is None else found.covariance,
+            off=np.zeros_like(found.off))
         first = bisect_right(self._levels, self._origin, key=lambda x: x[0]) - 1
         # The field of a coil that lags remembers some levels more.
         del self._levels[:max(first - 8, 0)]

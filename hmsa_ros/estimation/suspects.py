@@ -49,16 +49,6 @@ class Suspects:
         there[:len(self.names)] = self.known
         return np.where(self.sought(len(z), suspected), z, there)
 
-    def forced(self, follows: Array) -> Array:
-        """
-        Return what a force that is not sought adds to variances, by how coordinates follow it.
-
-        It may be anything, whatever samples say (S. F. Schmidt, Advances in Control Systems 3
-        (1966) 293).
-        """
-        force = [i for i in self.places if self.names[i] == 'constant_force']
-        return np.square(follows[:, force]) @ (1.0 / self.priors[force])
-
     @cached_property
     def sets(self) -> list[tuple[int, ...]]:
         """All sets of suspects; ratio and time of a branch are sought together."""

@@ -16,12 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa_ros.estimation.motion import follow, Levels, Motion
+from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
 from hmsa_ros.estimation.prior import DEVIATIONS
 from hmsa_ros.estimation.suspects import Gain, inverse, Look, optimum, Others, Suspects
 from hmsa_ros.identification.fit import loss, weights_of
 from hmsa_ros.identification.quantities import from_coordinate, QUANTITIES, to_coordinate
-from hmsa_ros.identification.response import clip, complete
+from hmsa_ros.identification.response import clip, complete, sensed
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import coordinate_of
 
@@ -77,7 +77,7 @@ class Solution:
     covariance: Array  # of z, about itself
     off: Array  # how far what is expected is from z, shape (q,)
     sure: float  # how probable it is that no other suspects are wrong than those sought
-    variances: Array  # of z, where a constant force and the gain of the sensor may be anything
+    variances: Array  # of z, where a force and the gain of the sensor may be wrong besides
 
     def at_end(self) -> tuple[Array, Array, Array]:
         """Return coordinates and state at the time asked for, their covariance, how far off."""
@@ -93,6 +93,16 @@ def transport(motion: Motion, place: int) -> Array:
     change = np.eye(size)
     change[-2], change[-1] = motion.by[place], motion.rate_by[place]
     return change
+
+
+class Rest(NamedTuple):
+    """A rest, which depends on parameters, and what was seen of it."""
+
+    level: float  # in T
+    mean: Array  # of the parameters, before it was seen, shape (p,)
+    covariance: Array
+    shown: float = 0.0  # what the sensor shows
+    weight: float = 0.0  # information in that
 
 
 @dataclass(eq=False)
@@ -112,10 +122,53 @@ class Window:
     weighed: int = 0  # samples there were when these were chosen
     others: Others = Others(1.0, np.zeros(()), np.zeros(()))  # than these
     leans: Array = field(default_factory=lambda: np.zeros(()))  # of the mean, by a gain
+    rest: Rest | None = None  # that it begins at
 
     def values_at(self, z: Array) -> dict[str, Any]:
         """Return the values of all quantities for coordinates."""
         return values_at(self.values, self.free, z)
+
+    def settle(self, z: Array, off: float) -> None:
+        """
+        Begin at rest, if it does, to within a deviation, as it is about some coordinates.
+
+        Far from them a force shifts it otherwise, so that one would seem to be shown.
+        """
+        if self.rest is None:
+            return
+        values = self.values_at(z)
+        at = rest(values, self.free, self.rest.level)
+        if at is None:
+            return
+        tie = np.vstack([np.eye(len(z) - 2), at[2], np.zeros(len(z) - 2)])
+        there = np.append(z[:-2], [at[0], 0.0])
+        self.mean = there + tie @ (self.rest.mean - z[:-2])
+        self.covariance = tie @ self.rest.covariance @ tie.T
+        self.covariance[[-2, -1], [-2, -1]] += np.square([off, off * at[1]])
+        if self.rest.weight > 0.0:
+            state = np.zeros((1, len(z)))
+            state[0, -2] = values['stretch_gain']
+            shown, (by,) = sensed(values, self.free, np.array([at[0]]), np.zeros(1), state)
+            pull = self.covariance @ by
+            share = pull / (by @ pull + 1.0 / self.rest.weight)
+            self.mean += share * (
+                self.rest.shown - float(shown[0]) - by @ (self.mean - there))
+            self.covariance -= np.outer(share, pull)
+            self.leans = -share * self._gained(np.array(at[0]))
+
+    def rest_on(
+            self, at: Rest, count: int, begin: float, solution: Solution, noise: float,
+            drift: Array) -> 'Window':
+        """Return the window, all at rest, without the first samples; as `move_on`."""
+        before, weights = at.weight, solution.weights[:count]
+        before /= 1.0 + before * float(np.sum(np.square(solution.by[:count][-1:]) @ drift))
+        weight = before + float(np.sum(weights)) / noise ** 2
+        shown = before * at.shown + float(weights @ self.stretch[:count]) / noise ** 2
+        return replace(
+            self, begin=begin, time=self.time[count:], stretch=self.stretch[count:], weighed=0,
+            rest=at._replace(
+                covariance=at.covariance + np.diag(drift[:-2]),
+                shown=shown / weight if weight else 0.0, weight=weight))
 
     def solve(
             self, z: Array, levels: Levels, noise: float, until: float, here: Trial | None = None
@@ -156,15 +209,16 @@ class Window:
         return Solution(
             found.z, found.here.values, motion, by, residual, weights,
             sure * covariance + square, np.broadcast_to(off, z.shape), sure,
-            np.diag(covariance) + self.suspects.forced(covariance @ found.matrix)
-            + self._by_gain(found, prior, noise))
+            self._open(found, prior, noise))
 
     def _more(self, here: 'Trial | Solution', count: int) -> Array:
         """Return what a usual error of the gain about rest shows more, shape (n,); 0 if sought."""
-        if 'stretch_gain' in self.free:
-            return np.zeros(count)
-        found: Array = DEVIATIONS['stretch_gain'] * (
-            here.motion.stretch[:count] - coordinate_of(self.values['law']).rest)
+        return self._gained(here.motion.stretch[:count])
+
+    def _gained(self, stretch: Array) -> Array:
+        """Return what a usual error of the gain about rest shows more of a stretch."""
+        found: Array = DEVIATIONS['stretch_gain'] * ('stretch_gain' not in self.free) * (
+            stretch - coordinate_of(self.values['law']).rest)
         return found
 
     def _pull(
@@ -197,14 +251,21 @@ class Window:
             matrix[np.ix_(loose, loose)] / np.outer(size, size), pull[loose] / size) / size
         return found
 
-    def _by_gain(self, found: Found, prior: Array, noise: float) -> Array:
-        """Return what an error of the gain adds to variances, as far as samples allow or show."""
-        here = found.here
-        leans = self._leaning(
-            found.matrix, found.loose, prior, here, noise, len(here.residual))
+    def _open(self, found: Found, prior: Array, noise: float) -> Array:
+        """
+        Return variances where a constant force and the gain of the sensor may be wrong besides.
+
+        What samples say of both counts, and as an error what they would shift.
+        """
+        here, force = found.here, [x == 'constant_force' for x in (*self.free, '', '')]
+        loose = found.loose | np.array(force)
+        covariance = inverse(found.matrix, loose)
+        shift = covariance @ found.gradient
+        leans = self._leaning(found.matrix, loose, prior, here, noise, len(here.residual))
         gain = self._gain(found, prior, noise)
         curvature = max(gain.curvature + float(gain.cross @ leans), 1.0)
-        variances: Array = np.square(leans) * (1.0 + gain.gradient ** 2 / curvature) / curvature
+        more = 1.0 + (gain.gradient - float(gain.cross @ shift)) ** 2 / curvature
+        variances: Array = np.diag(covariance) + shift ** 2 + leans ** 2 * more / curvature
         return variances
 
     def _is_poor(self, found: Found, noise: float) -> bool:
