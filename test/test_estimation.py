@@ -336,3 +336,11 @@ def test_plans_use_what_is_expected_with_or_without_creep(deviation, sure, modul
     block = found.model(PlannerOptions()).actuator
     assert bool(block.creep) is (deviation < 0.01)
     assert block.shear_modulus == pytest.approx(np.exp(modulus) * oracle.BLOCK.shear_modulus)
+
+
+def test_plans_have_no_lag_where_none_was_found():
+    found, random = _unsure(sure=0.1), np.random.default_rng(0)
+    for _ in range(8):
+        root = 1e-3 * random.standard_normal(found.covariance.shape)
+        there = replace(found, covariance=root @ root.T, off=root[0])
+        assert there.model(PlannerOptions()).options.coil_time_constant == 0.0

@@ -128,8 +128,11 @@ class Estimate:
             i = self.free.index(BRANCHES[0][0])
             left[i] -= z[i]
         spread = self.covariance[:-2, :-2] - np.outer(off, off)
+        # A lag that is none is none exactly: else plans are for one.
+        kept = (z + (off + left))[known]
         z += off + spread[:, known] @ np.linalg.pinv(
             spread[np.ix_(known, known)], hermitian=True) @ left[known]
+        z[known] = kept
         found = replace(self, values=values_at(self.values, self.free, z))
         return Model(
             replace(found.block(sure), creep=block.creep),
