@@ -15,7 +15,7 @@ from hmsa_ros.interfaces import topics
 pytestmark = pytest.mark.ros
 # On a busy machine the start of the nodes takes a while.
 RUN_SECONDS = 300.0
-PLANT = ('--ros-args', '-p', 'mismatch.shear_modulus:=1.2', '-p', 'stretch_noise:=0.001')
+PLANT = ('--ros-args', '-p', 'mismatch.shear_modulus:=1.2', '-p', 'stretch_noise:=0.0005')
 
 
 def begin(start, ros, mode, *more):
