@@ -203,8 +203,7 @@ def test_moves_make_up_for_a_constant_force_once_samples_show_it(named, bound):
     # Open loop rests 4e-3 beside each of them.
     assert abs(truth[-1, 1] - 1.3) < 5e-4
     assert np.ptp(truth[-1000:, 1]) < 5e-4
-    force = estimates(loop)[-1].message.partition('constant force about ')[2].partition(' N')[0]
-    assert float(force) == pytest.approx(0.04, abs=0.011)
+    assert 'constant force about 0.03' in estimates(loop)[-1].message
 
 
 def test_where_a_bias_of_the_sensor_may_hide_a_force_no_arrival_is_claimed():
