@@ -13,7 +13,7 @@ from hmsa_ros.control.records import (
     Trajectory,
     Verdict,
 )
-from hmsa_ros.control.slices import Clock
+from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.control.watching import Watch
 from hmsa_ros.judge.records import Finding, VERDICTS
 from hmsa_ros.model.status import Code
@@ -31,10 +31,11 @@ class Bulletin:
     """Verdicts, progress, previews and notes that wait to be passed on."""
 
     def __init__(
-            self, group: PlannerGroup, following: Following, watch: Watch, clock: Clock,
-            steady: Clock, unheard: Callable[[], str], unseen: Callable[[], str]) -> None:
+            self, group: PlannerGroup, following: Following, watch: Watch,
+            surroundings: Surroundings, unheard: Callable[[], str],
+            unseen: Callable[[], str]) -> None:
         self._group, self._following, self._watch = group, following, watch
-        self._clock, self._steady = clock, steady
+        self._around = surroundings
         self._looks = unheard, unseen
         self._look_again = 0
         self.unheard = ''  # why nobody carries out commands; empty where somebody does
@@ -87,7 +88,7 @@ class Bulletin:
             x.plan.segments is known for x, known in zip(planners, self._segments, strict=True))
 
     def _state(self) -> tuple[Progress, Mapping[str, Progress], bool]:
-        now = self._clock()
+        now = self._around.clock()
         self._watch.follow(now)
         self._segments = [x.plan.segments for x in self._group.planners.values()]
         self._until = self._group.next_change(now)
@@ -104,7 +105,7 @@ class Bulletin:
 
     def show(self) -> None:
         """Show what is planned; of a long plan the beginning, and the rest in time."""
-        stamps, samples = self._group.preview(self._clock(), _PREVIEW)
+        stamps, samples = self._group.preview(self._around.clock(), _PREVIEW)
         self.preview_again = stamps[_PREVIEW // 2] if len(stamps) == _PREVIEW else None
         self.outputs.append(PlanChanged(tuple(stamps), samples))
 
@@ -130,7 +131,7 @@ class Bulletin:
 
     def look_for_listeners(self) -> None:
         """Warn where nobody carries out what is sent, or samples cease, and say when that ends."""
-        now = self._steady()
+        now = self._around.steady()
         if now < self._look_again:
             return
         self._look_again = now + LOOK

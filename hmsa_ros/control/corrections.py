@@ -4,14 +4,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 import math
-from typing import TypeVar
 
 import numpy as np
 
 from hmsa_ros.control.feedback import Feedback
 from hmsa_ros.control.learnt import believed, learnt_model
 from hmsa_ros.control.records import Severity, Verdict
-from hmsa_ros.control.slices import Clock, in_time, Work
+from hmsa_ros.control.slices import Clock, Drafting, in_time, Work
 from hmsa_ros.control.trimming import trimmed
 from hmsa_ros.estimation import Estimate
 from hmsa_ros.estimation.correction import (
@@ -35,7 +34,6 @@ from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Planner
 from hmsa_ros.planning.timeline import Draft, Model, Plan, PlannedLevel
 
-T = TypeVar('T')
 # A correction gains at least this share of the step, less while a move has time for corrections:
 # what rests is not to be moved for little.
 _GAIN, _LITTLE = 5e-4, 5e-5
@@ -132,7 +130,7 @@ class Corrections:
         work = in_time(steps, self._group, joints, self._clock)
         return Work(joints, self._timed(name, work), corrects=True)
 
-    def _timed(self, name: str, steps: Steps[T]) -> Steps[T]:
+    def _timed(self, name: str, steps: Drafting) -> Drafting:
         """Do work, and let commands have their share of the time after it."""
         spent = 0
         while True:
@@ -141,8 +139,8 @@ class Corrections:
                 next(steps)
             except StopIteration as end:
                 self._feedback.spent(name, spent + self._clock() - begun)
-                result: T = end.value
-                return result
+                drafts: tuple[Mapping[str, Draft], int] = end.value
+                return drafts
             spent += self._clock() - begun
             yield
 

@@ -63,15 +63,15 @@ class PlannerRuntime:
         self.clock_jumps = 0
         #: By how many ns the clock was set ahead since `tick` has taken that in.
         self._stepped = 0
-        clock, steady = partial(self._read, surroundings.clock), surroundings.steady
+        clock = partial(self._read, surroundings.clock)
         around = self.surroundings = replace(surroundings, clock=clock)
-        self._clock, self._steady = clock, steady
+        self._clock, self._steady = clock, around.steady
         self._takeover = Takeover(group, around)
         self._silence = Silence(around)
         self._watch = Watch(group, around)
         self.hearing = Hearing(group, self.following, self._takeover, around)
         self._bulletin = Bulletin(
-            group, self.following, self._watch, clock, steady,
+            group, self.following, self._watch, around,
             lambda: around.unheard() or self.hearing.receipts.words, self._unseen)
         self.sending = Sending(
             group, self.following, self.hearing, self._bulletin.outputs)
@@ -81,7 +81,7 @@ class PlannerRuntime:
         self._watch.doing = self.feedback.do
         self.planning = Planning(
             group, self.following, Corrections(group, self.feedback, clock), self._bulletin,
-            clock, steady, lambda: self.sending.send(clock()))
+            around, lambda: self.sending.send(clock()))
         self._last_jump: int | None = None
         self._set_back = 0
         self._tell_impossible = Seldom()

@@ -8,7 +8,8 @@ from hmsa_ros.control.bulletin import Bulletin
 from hmsa_ros.control.corrections import Corrections
 from hmsa_ros.control.following import Following
 from hmsa_ros.control.records import Note, Request, Severity, Verdict
-from hmsa_ros.control.slices import Clock, SLICE, Work, work_on
+from hmsa_ros.control.slices import SLICE, Work, work_on
+from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.group import PlannerGroup
@@ -23,10 +24,10 @@ class Planning:
 
     def __init__(
             self, group: PlannerGroup, following: Following, corrections: Corrections,
-            bulletin: Bulletin, clock: Clock, steady: Clock, send: Callable[[], None]) -> None:
+            bulletin: Bulletin, surroundings: Surroundings, send: Callable[[], None]) -> None:
         self._group, self._following, self._bulletin = group, following, bulletin
         self._corrections = corrections
-        self._clock, self._steady, self._send = clock, steady, send
+        self._around, self._send = surroundings, send
         self._queue: deque[Work] = deque()
         # What plans that were replaced consist of: to free it all at once takes tens of ms.
         self._leftovers: list[object] = []
@@ -57,7 +58,7 @@ class Planning:
 
     def add(self, request: Request, *, engaged: bool) -> Work:
         """Take a checked request; one that replaces all that waits comes first once engaged."""
-        work = work_on(request, self._group, self._clock, self._corrections.cautious)
+        work = work_on(request, self._group, self._around.clock, self._corrections.cautious)
         if engaged and work.replaces(self._queue):
             self._queue.appendleft(work)
         else:
@@ -78,12 +79,12 @@ class Planning:
         """Plan what waits, for the length of a slice."""
         for name in self._following.to_resume():
             if not any(x.request is None and name in x.joints for x in self._queue):
-                self._queue.appendleft(self._following.resumption(name, self._clock))
+                self._queue.appendleft(self._following.resumption(name, self._around.clock))
         if not self._queue:
-            self._queue += self._corrections.due(self._clock())
+            self._queue += self._corrections.due(self._around.clock())
         del self._leftovers[-_FREED:]
-        end = self._steady() + SLICE
-        while self._queue and self._steady() < end:
+        end = self._around.steady() + SLICE
+        while self._queue and self._around.steady() < end:
             work = self._queue[0]
             if self.advance(work) and work in self._queue:
                 self._queue.remove(work)

@@ -12,6 +12,8 @@ from hmsa_ros.planning.timeline import Draft
 
 #: Tells the time of the stamps in ns.
 Clock = Callable[[], int]
+#: Pauses after each bounded piece; returns drafts by joint and the time in ns they are for.
+Drafting = Steps[tuple[Mapping[str, Draft], int]]
 # What is done with drafts by joint before they are taken.
 Then = Callable[[Mapping[str, Draft]], Mapping[str, Draft]]
 #: How long work goes on before commands and requests are served again, in ns.
@@ -33,8 +35,7 @@ class Work:
     """A request, or a plan to be made anew, that is being worked out."""
 
     joints: frozenset[str]  # whose plans it changes
-    # Pause after each bounded piece; return drafts by joint and the time in ns they are for.
-    steps: Steps[tuple[Mapping[str, Draft], int]]
+    steps: Drafting
     request: Request | None = None  # None for a plan that is made anew
     number: int = field(default_factory=count().__next__)  # grows from one to the next
     corrects: bool = False  # from samples
@@ -68,7 +69,7 @@ def work_on(
 
 def _trajectory(
         request: Trajectory, group: PlannerGroup, clock: Clock,
-        then: Then) -> Steps[tuple[Mapping[str, Draft], int]]:
+        then: Then) -> Drafting:
     """Read the points, then plan."""
     points: dict[str, list[tuple[Any, int]]] = {name: [] for name in request.joints}
     for number, (stretches, time) in enumerate(
@@ -88,7 +89,7 @@ def _trajectory(
 def in_time(
         make: Callable[[int], Steps[Mapping[str, Draft]]], group: PlannerGroup,
         joints: frozenset[str], clock: Clock, size: int = 1,
-        then: Then = _as_drafted) -> Steps[tuple[Mapping[str, Draft], int]]:
+        then: Then = _as_drafted) -> Drafting:
     """
     Return drafts, and the time in ns they are for, which has not come yet when they are ready.
 
