@@ -106,7 +106,9 @@ def test_an_actuator_is_driven_from_the_page(browser, start, tmp_path):
     enter(page, 'stretch', 'x')
     press(page, '#move button')
     shows('#note', 'expected STRETCH:DURATION')
-    # Recorded, with feedback.
+    # Recorded, with feedback, whose words leave the buttons where they are.
+    place = 'document.querySelector("#record").getBoundingClientRect().y + scrollY'
+    before = page.evaluate(place)
     press(page, '[data-mode=observe]')
     page.wait_for('document.querySelector("[data-mode=observe][aria-pressed=true]") !== null')
     press(page, '#record')
@@ -119,6 +121,7 @@ def test_an_actuator_is_driven_from_the_page(browser, start, tmp_path):
     page.wait_for('document.querySelectorAll("#estimates .bar circle[cx]").length >= 1')
     shows('#estimates', 'shear modulus')
     shows('#state', 'at rest, 2 of 2')
+    assert page.evaluate(place) == before
     # Both charts have been drawn.
     assert page.evaluate(
         '[...document.querySelectorAll("canvas")].map(x => new Set(x.getContext("2d")'
