@@ -52,8 +52,10 @@ def test_every_block_of_the_page_is_run_or_checked(page):
 @pytest.mark.long
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize('page', [
+    # Not beside mypy, which would leave the nodes too little of two cores.
     pytest.param(
-        x, marks=[] if x.name == 'README.md' else pytest.mark.slow, id=name_of(x))
+        x, id=name_of(x),
+        marks=pytest.mark.xdist_group('heavy') if x.name == 'README.md' else pytest.mark.slow)
     for x in RUNNING])
 def test_page_does_what_it_says(page, ros_env, tmp_path):
     # How long each block took: shown if it fails, or by pytest -rP.

@@ -10,6 +10,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.mark.long
+@pytest.mark.xdist_group('heavy')
 @pytest.mark.timeout(600)
 def test_types_of_the_package_are_right():
     checked = subprocess.run(
