@@ -76,7 +76,7 @@ pictures: tools ## draw the pictures of the documentation anew
 	$(BIN)/python scripts/draw_docs.py $(ARGS)
 
 .PHONY: release
-release: env ## build sdist and wheel into dist/, and test both in empty environments
+release: env ## build sdist and wheels into dist/, and test them in empty environments
 	$(EXTRAS) release > $(VENV)/extras.txt
 	$(INSTALL) -r $(VENV)/extras.txt
 	$(BIN)/python scripts/make_release.py $(ARGS)

@@ -1,5 +1,5 @@
 """
-Build sdist and wheel into dist/, and test each in an empty environment.
+Build the sdist and a wheel per Python into dist/, and test each in an empty environment.
 
     python scripts/make_release.py [PYTHON ...]
 
@@ -42,14 +42,21 @@ def try_out(python: str, archive: Path, folder: Path) -> None:
 
 
 def main() -> int:
-    """Build the archives, and test each with every Python given."""
-    shutil.rmtree(ROOT / 'dist', ignore_errors=True)
-    run(sys.executable, '-m', 'build', '--outdir', ROOT / 'dist')
+    """Build the archives, and test them with every Python given."""
+    dist = ROOT / 'dist'
+    shutil.rmtree(dist, ignore_errors=True)
+    run(sys.executable, '-m', 'build', '--sdist', '--outdir', dist)
+    sdist, = dist.iterdir()
     for python in sys.argv[1:] or [sys.executable]:
-        for archive in sorted((ROOT / 'dist').iterdir()):
+        before = set(dist.iterdir())
+        # The motion is compiled, so that a wheel runs on one version of Python only.
+        run(sys.executable, '-m', 'pip', '--python', python, 'wheel', '--quiet', '--no-deps',
+            '--wheel-dir', dist, sdist)
+        wheel, = set(dist.iterdir()) - before
+        for archive in (wheel, sdist):
             with tempfile.TemporaryDirectory() as folder:
                 try_out(python, archive, Path(folder))
-    print('dist:', *sorted(x.name for x in (ROOT / 'dist').iterdir()))
+    print('dist:', *sorted(x.name for x in dist.iterdir()))
     return 0
 
 
