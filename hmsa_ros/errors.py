@@ -54,5 +54,5 @@ def printable(text: str) -> str:
 
 
 def excerpt(value: object) -> str:
-    """Return a value's ``repr``, its middle left out where it is long, for a message."""
-    return _EXCERPT.repr(value)
+    """Return a value's ``repr`` in one line, its middle left out where it is long."""
+    return ' '.join(_EXCERPT.repr(value).split())

@@ -1,8 +1,11 @@
 """The public face: what ``import hmsa_ros`` offers, without ROS, in seconds and tesla."""
 
+import contextlib
 import doctest
 from importlib import import_module
+import inspect
 import json
+import math
 from pathlib import Path
 import subprocess
 import sys
@@ -165,6 +168,9 @@ def test_what_cannot_be_identified_says_why(block, tmp_path):
     (lambda x: hmsa_ros.Actuator(zeta=0.1, damping_coefficient=0.1), 'expected one of them'),
     (lambda x: hmsa_ros.Actuator(law='rubber'), "law is 'rubber': expected one of gent"),
     (lambda x: hmsa_ros.Actuator(law='yeoh', constants={'c50': 1}), "no constant 'c50'"),
+    (lambda x: hmsa_ros.Actuator(law='yeoh', constants=[1e4]), 'expected values by name'),
+    (lambda x: hmsa_ros.Actuator(law='ogden', constants={'mu': 'soft'}), "mu is 'soft'"),
+    (lambda x: hmsa_ros.Actuator(creep=0.1), r'branches of creep have the shape \(\)'),
     (lambda x: hmsa_ros.Actuator(law='yeoh', shear_modulus=1e4), 'whose constants it follows'),
     (lambda x: hmsa_ros.Actuator(flux_density_limits=(1, -1)), 'the least below the largest'),
     (lambda x: hmsa_ros.Actuator(slew_limit=0.0), 'or inf for steps'),
@@ -204,6 +210,40 @@ def test_wrong_types_units_and_ranges_get_a_sentence(block, tmp_path, monkeypatc
     with pytest.raises(hmsa_ros.HmsaError, match=said) as found:
         call(block)
     assert '\n' not in str(found.value)
+
+
+GARBAGE = (
+    None, True, -1, 10 ** 400, math.nan, 'x', b'x', 'a\0b', [], [1], [(1.1, 0.5), (1.0,)],
+    {'a': 1}, np.array(1.1), np.array([1 + 2j]), np.zeros((2, 2)), iter([1]), object())
+WELL = {
+    'setpoints': [(1.1, 0.05)], 'levels': [(0.0, 0.01)], 'frequency': 5.0, 'amplitude': 0.05,
+    'shape': 'sine', 'times': [0.0, 1.0], 'stretches': [1.0, 1.1], 'length': 0.01,
+    'thickness': 1e-3, 'width': 1e-3, 'youngs_modulus': 1e5, 'layer_thickness': 1e-4,
+    'path': 'nothing', 'values': {}}
+
+
+@pytest.mark.parametrize('name', [
+    'Actuator', 'Actuator.beam', 'Actuator.dielectric', 'Actuator.from_parameters',
+    'Actuator.from_yaml', 'block.plan', 'block.follow', 'block.wave', 'block.wave_bands',
+    'block.simulate', 'block.amplifiers', 'block.stretch', 'block.flux_density', 'plan.simulate',
+    'plan.currents', 'plan.save', 'plan.plot', 'motion.report', 'motion.save', 'identify', 'read'])
+def test_every_argument_takes_garbage_or_refuses_it_with_a_sentence(
+        block, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    plan = block.plan([(1.1, 0.02), (1.0, 0.02)])
+    motion = plan.simulate(noise=1e-3)
+    place, _, method = name.partition('.')
+    function = {'block': block, 'plan': plan, 'motion': motion}.get(
+        place, getattr(hmsa_ros, place, None))
+    function = getattr(function, method) if method else function
+    arguments = inspect.signature(function).parameters.values()
+    names = {x.name for x in arguments if x.kind is not x.VAR_KEYWORD}
+    well = {x: WELL[x] for x in WELL if x in names} | (
+        {'samples': motion} if name == 'identify' else {})
+    for argument in names:
+        for value in GARBAGE:
+            with contextlib.suppress(hmsa_ros.HmsaError):
+                function(**{**well, argument: value})
 
 
 def test_a_notebook_shows_tables_and_pictures(block, tmp_path):

@@ -14,8 +14,10 @@ from hmsa_ros.api.arguments import (
     columns_of,
     creep_values,
     DEFAULTS,
+    file_of,
     law_values,
     limits_of,
+    mapping_of,
     number,
     numbers,
     setpoints_of,
@@ -54,6 +56,8 @@ if TYPE_CHECKING:
     from hmsa_ros.api.plan import Plan
     from hmsa_ros.identification.files import Belief
 
+# Period of a grid in s, below which commands have any time.
+_FINEST = 1e-9
 _STRONGEST: Any = FLUX_DENSITY_MAX.default
 # Nobody has to send the levels of such a plan: unless a file says how fine, they are very fine.
 _SPECS = (*PLANNED, *VISCOELASTIC, replace(CREEP_TOLERANCE, default=IDEAL.ripple))
@@ -122,7 +126,7 @@ class Actuator:
             ('density', density, 'kg/m^3'), ('half_length', half_length, 'm'),
             ('half_thickness', half_length if half_thickness is None else half_thickness, 'm'),
             ('remanence', remanence, 'T'), ('chain_limit', chain_limit, ''))}
-        values |= law_values(law, constants or {}, shear_modulus) | creep_values(creep)
+        values |= law_values(law, constants, shear_modulus) | creep_values(creep)
         low, high = limits_of(flux_density_limits)
         slew_limit = number(slew_limit, 'slew_limit', 'T/s')
         values |= {
@@ -157,7 +161,7 @@ class Actuator:
         file with it. A value of another type or out of range is a `BadInputError`.
         """
         made = cls.__new__(cls)
-        made._take(values, belief)
+        made._take(mapping_of(values, 'parameters', "'actuator.remanence': 0.1"), belief)
         return made
 
     @classmethod
@@ -171,11 +175,10 @@ class Actuator:
             If the file cannot be read, or a value in it is out of range.
 
         """
-        if not isinstance(path, (str, Path)):
-            raise BadInputError(f'path is {excerpt(path)}: expected the path of a YAML file')
+        path = file_of(path, 'the path of a YAML file')
         return cls.from_parameters(
             {name.partition('.')[2]: value for name, value in read_parameter_file(path).items()
-             if name.startswith(f'{PLANNER}.')}, Path(path))
+             if name.startswith(f'{PLANNER}.')}, path)
 
     @classmethod
     def beam(
@@ -503,15 +506,19 @@ class Actuator:
         from hmsa_ros.api.plan import Plan
 
         model = self.model
-        if not isinstance(shaper, str):
-            raise BadInputError(f'shaper is {excerpt(shaper)}: expected a name such as two_step')
+        for name, word in (('shaper', shaper), ('short_spell', short_spell)):
+            if not isinstance(word, str):
+                raise BadInputError(f'{name} is {excerpt(word)}: expected a name')
         stretches, durations = setpoints_of(setpoints, model.material.rest)
-        order = whole(order, 'order')
+        order, rate = whole(order, 'order'), number(max_rate, 'max_rate', '1/s')
         if limits is not None:
             low, high = limits_of(limits)
             model = Model(model.actuator, replace(
                 model.options, flux_density_min=low, flux_density_max=high))
         unit = model.units.time
+        if 0.0 < number(period, 'period', 's', least=0.0) < _FINEST:
+            raise BadInputError(
+                f'period is {period:g} s: expected 0 for any time, or at least {_FINEST:g} s')
         segments = plan_sequence(
             [Setpoint(x, y / unit) for x, y in zip(
                 stretches.tolist(), durations.tolist(), strict=True)],
@@ -519,12 +526,10 @@ class Actuator:
                 model.material,
                 State(model.material.rest if start is None else number(start, 'start')),
                 limits=model.limits, units=model.units, order=order,
-                delivery=replace(
-                    model.delivery, period=number(period, 'period', 's', least=0.0) / unit),
+                delivery=replace(model.delivery, period=period / unit),
                 errors=self._errors(shaper) if errors is None else as_errors(errors),
-                pace=Pace(number(periods, 'periods'), unit * (
-                    number(max_rate, 'max_rate', '1/s', above=0.0) if max_rate != math.inf
-                    else math.inf))),
+                pace=Pace(number(periods, 'periods'), unit * (rate if rate == math.inf else number(
+                    rate, 'max_rate', '1/s', above=0.0)))),
             shaper, short_spell)
         return Plan(self, segments, shaper)
 
@@ -711,7 +716,7 @@ class Actuator:
         from hmsa_ros.identification.tables import read_levels
 
         if isinstance(levels, (str, Path)):
-            times, values, _ = read_levels(Path(levels))
+            times, values, _ = read_levels(file_of(levels))
         else:
             times, values = columns_of(levels, ('time', 'flux_density'), 'levels')
         return simulated(
@@ -763,7 +768,7 @@ class Actuator:
             If it cannot be written.
 
         """
-        write_text(Path(path), '\n'.join([
+        write_text(file_of(path), '\n'.join([
             '/**:', '  ros__parameters:',
             *(f'    {x}: {yaml_text(y)}' for x, y in self.parameters.items())]) + '\n')
 

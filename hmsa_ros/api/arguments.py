@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 import math
 from numbers import Real
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -90,10 +92,38 @@ def setpoints_of(value: Any, rest: float) -> tuple[Array, Array]:
     return stretches, durations
 
 
-def whole(value: Any, what: str) -> int:
-    """Return a whole number, or raise `BadInputError`."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise BadInputError(f'{what} is {excerpt(value)}: expected a whole number')
+def file_of(value: Any, what: str = 'the path of a file') -> Path:
+    """Return a path, or raise `BadInputError`."""
+    if not isinstance(value, (str, os.PathLike)) or '\0' in os.fsdecode(value):
+        raise BadInputError(f'path is {excerpt(value)}: expected {what}')
+    return Path(value)
+
+
+def mapping_of(value: Any, what: str, example: str) -> Mapping[str, Any]:
+    """Return values by name, none for None, or raise `BadInputError`."""
+    if value is None:
+        return {}
+    if not isinstance(value, Mapping):
+        raise BadInputError(
+            f'{what} are {excerpt(value)}: expected values by name, as in {{{example}}}')
+    return value
+
+
+def names_of(value: Any, what: str) -> list[str]:
+    """Return names of parameters, or raise `BadInputError`."""
+    if isinstance(value, str) or not np.iterable(value) or not all(
+            isinstance(x, str) for x in value):
+        raise BadInputError(
+            f"{what} is {excerpt(value)}: expected names of parameters, as in ['remanence']")
+    return list(value)
+
+
+def whole(value: Any, what: str, least: float = -math.inf) -> int:
+    """Return a whole number of at least one, or raise `BadInputError`."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise BadInputError(
+            f'{what} is {excerpt(value)}: expected a whole number'
+            + (f' of at least {least:g}' if least > -math.inf else ''))
     return int(value)
 
 
@@ -108,8 +138,10 @@ def _column(value: Any, name: str, what: str) -> Any:
 def numbers(value: Any, what: str, expected: str = 'expected numbers') -> Array:
     """Return numbers of any shape, or raise `BadInputError`."""
     try:
+        if np.iscomplexobj(value):
+            raise TypeError  # NumPy would drop the imaginary parts
         found: Array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise BadInputError(f'{what} are {excerpt(value)}: {expected}') from error
     return found
 
@@ -130,7 +162,10 @@ def number(
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
         raise BadInputError(
             f'{what} is {excerpt(value)}: expected a number' + (f' in {unit}' if unit else ''))
-    found = float(value)
+    try:
+        found = float(value)
+    except OverflowError:
+        found = math.inf
     bounded = least > -math.inf or above > -math.inf
     if bounded and not (least <= found and above < found <= most and found < math.inf):
         raise BadInputError(
@@ -141,9 +176,9 @@ def number(
 
 
 def law_values(
-        name: Any, constants: Mapping[str, Any], modulus: float | None) -> dict[str, Any]:
+        name: Any, constants: Any, modulus: float | None) -> dict[str, Any]:
     """
-    Return the parameters of a law.
+    Return the parameters of a law; a constant of several values may be one number.
 
     Raises
     ------
@@ -154,6 +189,7 @@ def law_values(
     if not isinstance(name, str) or name not in LAWS:
         raise BadInputError(f'law is {excerpt(name)}: expected one of {", ".join(LAWS)}')
     law = LAWS[name]
+    constants = mapping_of(constants, 'constants', "'mu': 5e3")
     names = {x.name.partition('.')[2]: x for x in law.constants}
     unknown = [x for x in constants if x not in names]
     if unknown:
@@ -170,7 +206,9 @@ def law_values(
         kind = names[key].kind
         values[names[key].name] = (
             number(value, key, names[key].unit) if kind is float
-            else [number(x, key) for x in value] if kind is list else str(value))
+            else str(value) if kind is not list else [
+                number(x, key) for x in (
+                    value if np.iterable(value) and not isinstance(value, str) else [value])])
     if not owns:
         values['actuator.shear_modulus'] = number(
             DEFAULTS['shear_modulus'] if modulus is None else modulus, 'shear_modulus', 'Pa')
@@ -181,7 +219,7 @@ def creep_values(creep: Any) -> dict[str, Any]:
     """Return the parameters of branches, pairs of ratio and time unless they are `Creep`."""
     if isinstance(creep, Creep):
         return creep.parameters
-    if not len(creep):
+    if isinstance(creep, (tuple, list)) and not creep:
         return {}
     ratios, times = columns_of(creep, ('ratio', 'time'), 'branches of creep')
     return {'viscoelastic.ratio': ratios.tolist(), 'viscoelastic.time': times.tolist()}
@@ -199,7 +237,7 @@ def limits_of(limits: Any) -> tuple[float, float]:
     """
     if isinstance(limits, Limits):
         raise BadInputError('limits are without a dimension: expected flux densities in T')
-    if isinstance(limits, (tuple, list, np.ndarray)):
+    if isinstance(limits, (tuple, list)) or np.ndim(limits):
         if len(limits) != 2:
             raise BadInputError(
                 f'limits are {excerpt(limits)}: expected the least and the largest flux density '

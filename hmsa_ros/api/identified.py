@@ -4,13 +4,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 import math
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hmsa_ros.api.actuator import Actuator
-from hmsa_ros.api.arguments import columns_of
+from hmsa_ros.api.arguments import columns_of, file_of, mapping_of, names_of, number
 from hmsa_ros.api.motion import Motion
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.files import write_text
@@ -71,7 +72,7 @@ class Identified:
         if path is not None:
             from hmsa_ros.report.identified import page
 
-            write_text(Path(path), page(self.result))
+            write_text(file_of(path), page(self.result))
         return self.result.report()
 
     def to_yaml(self, path: str | Path) -> None:
@@ -87,7 +88,7 @@ class Identified:
         if self.verdict != 'identified':
             raise BadInputError(
                 f'{path} was not written: the verdict is {self.verdict} ({self.reason})')
-        write_text(Path(path), self._text)
+        write_text(file_of(path), self._text)
 
     def _repr_html_(self) -> str:
         return self.report()._repr_html_()
@@ -137,14 +138,20 @@ def identify(
     ('identified', 0.12)
 
     """
+    if not isinstance(actuator, Actuator | None):
+        raise BadInputError(f'actuator is {excerpt(actuator)}: expected an Actuator')
+    known, uncertain = ({x: number(y, x) for x, y in mapping_of(
+        values, what, "'sensor_latency': 2e-3").items()} for what, values in (
+            ('known values', known), ('standard deviations', uncertain)))
     block = None if actuator is None else actuator.block
     given: dict[str, float] = {} if actuator is None else {
         'coil_time_constant': actuator.model.options.coil_time_constant}
     slew = math.inf if actuator is None else actuator.model.options.slew_limit
     coordinate = (actuator or Actuator()).block.coordinate
-    if isinstance(samples, (str, Path)) and (
-            Path(samples).is_dir() or Path(samples).suffix == '.mcap'):
-        samples = Motion(read_run(Path(samples)))
+    if isinstance(samples, (str, os.PathLike)):
+        samples = file_of(samples)
+        if os.path.isdir(samples) or samples.suffix == '.mcap':
+            samples = Motion(read_run(samples))
     if isinstance(samples, Motion):
         if commands is not None:
             raise BadInputError(
@@ -154,12 +161,12 @@ def identify(
         given = {**theirs, **given}
         actuator = actuator or Actuator.from_parameters(samples.actuator.parameters)
         block = found
-    elif isinstance(samples, (str, Path)):
-        if not (commands is None or isinstance(commands, (str, Path))):
+    elif isinstance(samples, Path):
+        if not (commands is None or isinstance(commands, (str, os.PathLike))):
             raise BadInputError(
                 f'commands are {excerpt(commands)} with the file {samples}: expected a file, too')
         recording = read_csv(
-            Path(samples), None if commands is None else Path(commands), slew_limit=slew,
+            samples, None if commands is None else file_of(commands), slew_limit=slew,
             coordinate=coordinate)
     else:
         if commands is None:
@@ -173,10 +180,10 @@ def identify(
         recording = Recording(
             time - time[0], stretch, times - time[0], levels, slew, coordinate=coordinate)
     base = actuator or Actuator()
-    others = {x: y for x, y in {**given, **(known or {})}.items() if y or known and x in known}
+    others = {x: y for x, y in {**given, **known}.items() if y or x in known}
+    names = [] if free is None else names_of(free, 'free')
     result = find(
-        recording, free=free_of('' if free is None else ','.join(free), base.block.law, others),
-        known=others,
+        recording, free=free_of(','.join(names), base.block.law, others), known=others,
         actuator=block or base.block, uncertain=uncertain)
     text = file_text(
         result, Belief(result.actuator, others, base.parameters, Known()),

@@ -8,7 +8,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from hmsa_ros.api.arguments import number
+from hmsa_ros.api.arguments import file_of, number, whole
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.equations import Array, elastic_force, natural_frequency
 from hmsa_ros.model.moves import Level as Load
@@ -101,7 +101,7 @@ class Motion:
             from hmsa_ros.files import write_text
             from hmsa_ros.report.page import page
 
-            write_text(Path(path), page([part]))
+            write_text(file_of(path), page([part]))
         if part.evaluation.findings:
             return setpoints([part])
         from hmsa_ros.report.outcome import level_results, level_table
@@ -131,11 +131,7 @@ class Motion:
             If an argument is out of range, or a file cannot be written.
 
         """
-        return self.draw(_paths(path), _paper(paper))
-
-    def draw(self, paths: Sequence[Path], paper: 'Paper') -> Any:
-        """Draw as `plot` does; raise `BadInputError` for what cannot be written."""
-        return draw_all([self], paths, paper)
+        return draw_all([self], _paths(path), _paper(paper))
 
     def _part(self, colour: str = '') -> 'Part':
         from hmsa_ros.report.arrivals import Part
@@ -148,7 +144,7 @@ class Motion:
 
         A name ends in .csv, .parquet or .mat. What cannot be written is a `BadInputError`.
         """
-        return write_run(Path(path), self.run)
+        return write_run(file_of(path), self.run)
 
     def to_pandas(self) -> Any:
         """Return the samples as a DataFrame: time, stretch, stretch_rate and flux_density."""
@@ -187,9 +183,9 @@ def read(path: str | Path, *, joint: str = '') -> Motion:
     """
     from hmsa_ros.recordings.bags import read_run
 
-    if not isinstance(path, (str, Path)):
-        raise BadInputError(f'path is {excerpt(path)}: expected the folder of a bag')
-    return Motion(read_run(Path(path), joint=joint))
+    if not isinstance(joint, str):
+        raise BadInputError(f'joint is {excerpt(joint)}: expected a name')
+    return Motion(read_run(file_of(path, 'the folder of a bag'), joint=joint))
 
 
 def compare(*motions: Motion, picture: str | Path | None = None, **paper: Any) -> Table:
@@ -252,7 +248,8 @@ def _paths(path: Any) -> list[Path]:
         return []
     from hmsa_ros.report.paper import kind_of
 
-    paths = [Path(x) for x in ([path] if isinstance(path, (str, Path)) else path)]
+    paths = [file_of(x) for x in (
+        path if np.iterable(path) and not isinstance(path, str) else [path])]
     for each in paths:
         kind_of(each)
     return paths
@@ -318,7 +315,7 @@ def simulated(
     stretch, speed, field = response(truth, times, levels, stamps / NANOSECONDS, begin)
     switched = np.round(times * NANOSECONDS).astype(np.int64).tolist()
     stretch = stretch + noise * np.random.default_rng(
-        sampling.seed).standard_normal(len(stretch))
+        whole(sampling.seed, 'seed', least=0)).standard_normal(len(stretch))
     commands = tuple(
         Level(stamp, level, -_AHEAD) for stamp, level in zip(
             switched, levels.tolist(), strict=True))

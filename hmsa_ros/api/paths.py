@@ -6,7 +6,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from hmsa_ros.api.arguments import columns_of, number
+from hmsa_ros.api.arguments import columns_of, number, numbers
 from hmsa_ros.columns import read_table
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.equations import Array
@@ -50,7 +50,7 @@ def path_of(actuator: 'Actuator', columns: tuple[Any, ...]) -> Path:
 
     Columns that are no path are a `BadInputError`.
     """
-    given = [_column(x) for x in columns if x is not None]
+    given = [_column(x) for i, x in enumerate(columns) if i < 2 or x is not None]
     if columns[2] is None and columns[3] is not None:
         raise BadInputError('accelerations are given without rates: expected both')
     if len({len(x) for x in given}) > 1 or len(given[0]) < 2:
@@ -72,11 +72,7 @@ def path_of(actuator: 'Actuator', columns: tuple[Any, ...]) -> Path:
 
 
 def _column(values: Any) -> Array:
-    try:
-        found = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise BadInputError(
-            f'a column of the path is {excerpt(values)}: expected numbers') from error
+    found = numbers(values, 'columns of the path')
     if found.ndim != 1 or not np.all(np.isfinite(found)):
         raise BadInputError(
             f'a column of the path is {excerpt(values)}: expected one dimension of finite numbers')
@@ -183,8 +179,7 @@ def segments_along(
 
     A number out of range is a `BadInputError`, what cannot be followed a `RefusedError`.
     """
-    if not 0.0 < number(tolerance, 'tolerance') <= 1.0:
-        raise BadInputError(f'tolerance is {tolerance:g}: expected above 0 to 1')
+    tolerance = number(tolerance, 'tolerance', above=0.0, most=1.0)
     frame = replace(_frame(actuator), state=State(ends[0]), target=ends[0])
     if number(period, 'period', 's', least=0.0):
         frame = replace(frame, delivery=replace(

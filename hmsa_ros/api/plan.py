@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hmsa_ros.api.actuator import Actuator
-from hmsa_ros.api.arguments import number
+from hmsa_ros.api.arguments import file_of, number
 from hmsa_ros.api.motion import Motion, Sampling, simulated
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.equations import Array
@@ -192,7 +192,7 @@ class Plan:
         ``hmsa simulate`` and ``hmsa run --levels`` take the CSV. What cannot be written is a
         `BadInputError`.
         """
-        write_table(Path(path), {'time': self.times, 'flux_density': self.flux_densities})
+        write_table(file_of(path), {'time': self.times, 'flux_density': self.flux_densities})
 
     def to_pandas(self) -> Any:
         """Return the levels as a DataFrame."""

@@ -105,6 +105,11 @@ def _values(
     actuator = replace(
         actuator, half_length=known.get('half_length', actuator.half_length),
         half_thickness=known.get('half_thickness', actuator.half_thickness))
+    unknown = [x for x in uncertain if x not in (*quantities.QUANTITIES, *quantities.GEOMETRY)]
+    if unknown:
+        raise BadInputError(
+            f'unknown parameter {unknown[0]!r}: expected some of '
+            f'{", ".join(quantities.QUANTITIES)}')
     both = [x for x in {**known, **uncertain} if x in free and x in uncertain]
     bad = [x for x, y in uncertain.items() if not 0.0 <= y < math.inf]
     if both or bad:

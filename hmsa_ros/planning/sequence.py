@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.errors import BadInputError, excerpt, HmsaError
 from hmsa_ros.model.delivery import Delivery, ramps
 from hmsa_ros.model.equations import elastic_force, natural_frequency, stretch_limits
 from hmsa_ros.model.laws.record import ENDLESS
@@ -99,7 +99,7 @@ def plan_sequence(
         raise RefusedError(Code.BAD_INPUT, 'no setpoint given: expected at least one')
     if short_spell not in SHORT_SPELL:
         raise BadInputError(
-            f'short_spell is {short_spell!r}: expected one of {", ".join(SHORT_SPELL)}')
+            f'short_spell is {excerpt(short_spell)}: expected one of {", ".join(SHORT_SPELL)}')
     begin = frame if isinstance(frame, Request) else Request.of(frame)
     shape = get_shaper(shaper) if isinstance(shaper, str) else shaper
     return tuple(segments(begin, setpoints, shape, short_spell))

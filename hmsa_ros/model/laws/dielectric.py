@@ -38,7 +38,7 @@ def _scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
     return modulus, Elastic(
         LAW.name, DIELECTRIC, (1.0 / limit,), given(LAW, values, modulus),
         (largest ** -2 or 1e-6, least ** -2 if least else 1e6),
-        volts=layer * math.sqrt(2.0 / (permittivity * EPSILON_0)))
+        volts=layer * math.sqrt(2.0 / permittivity / EPSILON_0))
 
 
 LAW = Law(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model import law
 from hmsa_ros.model.delivery import Delivery, IDEAL
 from hmsa_ros.model.equations import Array
@@ -37,11 +37,17 @@ def as_errors(values: Sequence[float] | Ellipsoid) -> Uncertainty:
     """
     if isinstance(values, Ellipsoid):
         return values
-    if len(values) != 3 or not all(0.0 <= x <= LARGEST_ERROR for x in values):
+    try:
+        if np.iscomplexobj(values):
+            raise TypeError
+        modulus, damping, limit = (float(x) for x in values)
+    except (TypeError, ValueError, OverflowError):
+        modulus = damping = limit = math.nan
+    if not all(0.0 <= x <= LARGEST_ERROR for x in (modulus, damping, limit)):
         raise BadInputError(
-            f'errors of G, damping coefficient and J_lim are {", ".join(f"{x:g}" for x in values)}'
-            f': expected three shares of 0 to {LARGEST_ERROR:g}')
-    return float(values[0]), float(values[1]), float(values[2])
+            f'errors of G, damping coefficient and J_lim are {excerpt(values)}: expected three '
+            f'shares of 0 to {LARGEST_ERROR:g}')
+    return modulus, damping, limit
 
 
 @dataclass
