@@ -246,6 +246,7 @@ def test_hmsa_plan_takes_errors_from_the_command_line_or_from_an_identification(
     both = {'identification.names': ['shear_modulus', 'remanence'],
             'identification.covariance': [1e4, 0.0999, 0.0999, 1e-6]}
     assert levels(**both) not in (levels(), levels(**known))
-    for text, message in (('0.1', 'three shares'), ('a,b,c', "'a,b,c'"), ('2,0,0', '[2.0, 0.0, 0.0]')):
+    for text, message in (
+            ('0.1', 'three shares'), ('a,b,c', "'a,b,c'"), ('2,0,0', '[2.0, 0.0, 0.0]')):
         assert main(['plan', '1.2:9', '--errors', text]) == 2
         assert message in capsys.readouterr().err
