@@ -246,6 +246,23 @@ def test_every_argument_takes_garbage_or_refuses_it_with_a_sentence(
                 function(**{**well, argument: value})
 
 
+@pytest.mark.parametrize('value', GARBAGE)
+def test_so_does_what_is_passed_on(block, tmp_path, value):
+    motion = block.plan([(1.1, 0.02)]).simulate()
+    for function, well, names in (
+            (block.amplifiers, {'setpoints': [(1.1, 0.05)], 'slew_limits': [], 'bandwidths': []},
+             ('slew_limits', 'bandwidths', 'inductance', 'resistance', 'tesla_per_ampere')),
+            (block.replace, {}, ('constants', 'creep', 'law', 'remanence')),
+            (block.scaled, {}, ('shear_modulus', 'remanence')),
+            (motion.plot, {'path': tmp_path / 'a.svg'}, ('width', 'letters', 'dpi'))):
+        for name in names:
+            with contextlib.suppress(hmsa_ros.HmsaError):
+                function(**{**well, name: value})
+    for name in ('actuator.shear_modulus', 'law.mu', 'viscoelastic.time', 'flux_density_max'):
+        with contextlib.suppress(hmsa_ros.HmsaError):
+            hmsa_ros.Actuator.from_parameters({name: value})
+
+
 def test_a_notebook_shows_tables_and_pictures(block, tmp_path):
     plan = block.plan([(1.1, 0.02)])
     motion = plan.simulate()

@@ -395,12 +395,14 @@ class Actuator:
             'creep': block.creep,
             'flux_density_limits': self.flux_density_limits, 'slew_limit': options.slew_limit,
             'coil_time_constant': options.coil_time_constant}
-        if parameters.get('law', self.law) == self.law:
+        law = parameters.get('law', self.law)
+        if isinstance(law, str) and law == self.law:
             now['constants'] = {
                 name.partition('.')[2]: value for name, value in parameters_of(block).items()
                 if name.startswith('law.') and name != LAW_NAME.name}
         if 'constants' in parameters:
-            now['constants'] = {**now.get('constants', {}), **parameters.pop('constants')}
+            now['constants'] = {**now.get('constants', {}), **mapping_of(
+                parameters.pop('constants'), 'constants', "'mu': 5e3")}
         if LAWS[self.law].scaled is None or not LAWS[self.law].own_modulus:
             now['shear_modulus'] = block.shear_modulus
         if 'damping_coefficient' in parameters:

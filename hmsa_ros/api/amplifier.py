@@ -6,7 +6,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from hmsa_ros.api.arguments import number
+from hmsa_ros.api.arguments import number, numbers
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.status import RefusedError
@@ -37,9 +37,9 @@ def amplifiers(
 
     """
     given = {x: more.pop(x, None) for x in _COIL}
-    numbers = {
+    coil = {
         x: number(y, x, _COIL[x], above=0.0) for x, y in given.items() if y is not None}
-    if numbers and 'tesla_per_ampere' not in numbers:
+    if coil and 'tesla_per_ampere' not in coil:
         raise BadInputError(
             'tesla_per_ampere is missing: expected it with inductance and resistance')
     ideal = actuator.replace(slew_limit=math.inf, coil_time_constant=0.0)
@@ -52,40 +52,41 @@ def amplifiers(
             'such as two_step')
     if slew_limits is None:
         slew_limits = _series(swing / fastest)
-    rows = [_row(best, best, math.inf, math.inf, numbers)]
+    rows = [_row(best, best, math.inf, math.inf, coil)]
     notes = []
     if bandwidths is None:
         bandwidths = _series(1.0 / fastest)
-        if len(numbers) == len(_COIL):
-            own = numbers['resistance'] / (2.0 * math.pi * numbers['inductance'])
+        if len(coil) == len(_COIL):
+            own = coil['resistance'] / (2.0 * math.pi * coil['inductance'])
             bandwidths = sorted({*bandwidths, own}, reverse=True)
             notes.append(
                 f'{own:.4g} Hz is the bandwidth of the coil itself, R/(2 pi L), on an amplifier '
                 'that sets voltages and not currents')
+    slew_limits, bandwidths = (np.atleast_1d(numbers(x, y)).ravel().tolist() for x, y in (
+        (slew_limits, 'slew limits'), (bandwidths, 'bandwidths')))
     for slew, band in [*((x, math.inf) for x in slew_limits), *(
             (math.inf, x) for x in bandwidths)]:
         try:
             plan = ideal.replace(
-                slew_limit=number(slew, 'slew limit', 'T/s'), coil_time_constant=0.0
-                if math.isinf(band) else 0.5 / (math.pi * number(band, 'bandwidth', 'Hz'))
-            ).plan(setpoints, **more)
+                slew_limit=slew, coil_time_constant=0.0 if math.isinf(band) else 0.5 / (
+                    math.pi * number(band, 'bandwidth', 'Hz', above=0.0))).plan(setpoints, **more)
         except RefusedError as error:
             rows.append((slew, band, *(None for _ in rows[0][2:])))
             notes.append(f'{_named(slew, band)}: {error}')
             continue
-        rows.append(_row(plan, best, slew, band, numbers))
+        rows.append(_row(plan, best, slew, band, coil))
     columns = [Column('slew', 'T/s', '.4g'), Column('bandwidth', 'Hz', '.4g'),
                Column('longest move', 'ms', '.4g'), Column('lost', 'ms', '.3g'),
                Column('field', 'mT', '.4g')]
-    if 'tesla_per_ampere' in numbers:
+    if 'tesla_per_ampere' in coil:
         columns += [Column('current', 'A', '.3g'), Column('change', 'A/s', '.3g')]
-    if len(numbers) == len(_COIL):
+    if len(coil) == len(_COIL):
         columns += [Column('voltage', 'V', '.3g'), Column('power', 'W', '.3g')]
     return Table(tuple(columns), tuple(rows), (
         '∞: no limit; slew: of ramps; bandwidth: of a first-order lag; lost: against ideal steps, '
         'in the longest move; field: largest magnitude of a level' + (
             '; voltage: L dI/dt + R I, its largest magnitude; power: that voltage times the '
-            'largest current' if len(numbers) == len(_COIL) else '')), tuple(notes))
+            'largest current' if len(coil) == len(_COIL) else '')), tuple(notes))
 
 
 def _named(slew: float, band: float) -> str:

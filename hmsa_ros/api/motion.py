@@ -258,8 +258,10 @@ def _paths(path: Any) -> list[Path]:
 def _paper(settings: dict[str, Any]) -> 'Paper':
     from hmsa_ros.report.paper import Paper
 
+    checked: dict[str, Any] = {
+        x: y if x == 'data' else number(y, x) for x, y in settings.items()}
     try:
-        return Paper(**settings)
+        return Paper(**checked)
     except TypeError as error:
         raise BadInputError(
             f'pictures have {", ".join(settings)}: expected numbers for width (mm), letters (pt) '

@@ -75,7 +75,11 @@ class ParameterSpec:
             of = 'numbers' if self.items is float else 'strings'
             raise BadInputError(
                 f'parameter {self.name} is {excerpt(value)}: expected a list of {of}')
-        return [self.items(x) for x in values]
+        try:
+            return [self.items(x) for x in values]
+        except OverflowError as error:
+            raise BadInputError(
+                f'parameter {self.name} is {excerpt(value)}: expected finite numbers') from error
 
     def check(self, value: Any) -> None:
         """
