@@ -98,10 +98,10 @@ def wave_of(
     else:
         times, stretches = columns_of(shape, ('time', 'stretch'), 'samples of a wave')
         form = sampled_shape(times, stretches)
-    if mean + size == mean:
-        raise BadInputError(f'amplitude is {size:g}: expected more beside the offset {mean:g}')
     for stretch in (mean - size, mean + size):
         check_stretch(stretch, actuator.model.material, 'an extreme of the wave')
+    if mean + size == mean:
+        raise BadInputError(f'amplitude is {size:g}: expected more beside the offset {mean:g}')
     return Wave(form, mean, size)
 
 
