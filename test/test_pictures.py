@@ -146,6 +146,17 @@ def test_between_six_samples_a_period_the_curve_is_the_motion_and_no_polygon() -
     assert np.count_nonzero(np.isnan(shown)) == 1
 
 
+def test_runs_that_agree_are_all_seen(tmp_path: Path) -> None:
+    run = one(tmp_path / 'one', simulated(), **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    path = tmp_path / 'both.png'
+    draw(path, [run, run], Paper(width=85.0, dpi=200.0))
+    shades = np.rint(255.0 * imread(path)[..., :3])
+    for look in CASES[:2]:
+        colour = [int(look.colour[i:i + 2], 16) for i in (1, 3, 5)]
+        # More than its sample in the legend.
+        assert np.count_nonzero(np.all(np.abs(shades - colour) < 8.0, axis=-1)) > 2000, look
+
+
 def test_time_begins_at_the_first_level_of_the_run_and_its_step_is_drawn(tmp_path: Path) -> None:
     told = parameters(planner=ACTUATOR, plant=ACTUATOR)
     messages = simulated(period=1_000_000)

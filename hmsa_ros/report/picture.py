@@ -1,6 +1,7 @@
 """Runs as pictures: command, response, phase plane, and the arrivals with most residual."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,9 @@ def draw(
         axes: dict[str, Axes] = figure.subplot_mosaic(
             rows, height_ratios=heights)  # type: ignore[arg-type]
         for number, part in enumerate(parts):
-            look = looks.RECORDED if len(parts) == 1 else looks.case(number)
+            # The first is solid: those that agree with it lie above, and are seen in its gaps.
+            look = looks.RECORDED if len(parts) == 1 else replace(
+                looks.case(number), order=looks.RECORDED.order)
             _draw_run(axes, part, unit, look, times, alone=len(parts) == 1)
             for i in shown:
                 if i < len(part.evaluation.results):
