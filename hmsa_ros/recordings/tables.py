@@ -89,8 +89,9 @@ def write_table(path: Path, columns: Mapping[str, Array]) -> None:
     if kind == '.mat':
         from scipy.io import savemat  # not all need it
 
-        with replacing(path) as beside:
-            savemat(beside, dict(columns), appendmat=False, oned_as='column')
+        # Opened here: what savemat raises if it cannot does not say why.
+        with replacing(path) as beside, beside.open('wb') as matrix:
+            savemat(matrix, dict(columns), oned_as='column')
         return
     with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
         writer = csv.writer(file)
