@@ -65,6 +65,9 @@ class Table:
                 f'the table has no column {name!r}: expected one of {", ".join(names)}')
         return [row[names.index(name)] for row in self.rows]
 
+    def __repr__(self) -> str:
+        return str(self)  # what a prompt shows
+
     def __str__(self) -> str:
         cells = [[x.title for x in self.columns], *self._texts()]
         widths = [max(map(len, x)) for x in zip(*cells, strict=True)]

@@ -203,6 +203,7 @@ def test_what_cannot_be_identified_says_why(block, tmp_path):
     (lambda x: hmsa_ros.identify([(0.0, 1.0)]), 'commands are missing'),
     (lambda x: hmsa_ros.compare(1, 2), 'expected two motions or more'),
     (lambda x: hmsa_ros.read(3), 'path is 3: expected the folder of a bag'),
+    (lambda x: x.plan([(1.1, 0.5)]).save('no/levels.mat'), 'cannot write no/levels.mat: No such'),
     (lambda x: hmsa_ros.read('nothing'), 'does not exist'),
 ])
 def test_wrong_types_units_and_ranges_get_a_sentence(block, tmp_path, monkeypatch, call, said):
@@ -279,6 +280,9 @@ def test_a_notebook_shows_tables_and_pictures(block, tmp_path):
     assert '<th>a&lt;b (T)</th>' in table._repr_html_()
     assert str(table).splitlines() == [
         'a<b (T)  what', '───────  ────', '   1.00  x', '      –  y', 'c', 'note: n']
+    # As a prompt without HTML shows them.
+    assert repr(table) == str(table)
+    assert repr(plan) == '<Plan two_step: 1 setpoints, 2 levels in 0.00165067 s>'
 
 
 # -- the commands that use it -------------------------------------------------------------------

@@ -90,6 +90,9 @@ class Identified:
                 f'{path} was not written: the verdict is {self.verdict} ({self.reason})')
         write_text(file_of(path), self._text)
 
+    def __repr__(self) -> str:
+        return f'<Identified {self.verdict}: {self.reason}>'
+
     def _repr_html_(self) -> str:
         return self.report()._repr_html_()
 

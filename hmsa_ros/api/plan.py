@@ -198,5 +198,9 @@ class Plan:
         """Return the levels as a DataFrame."""
         return frame({'time': self.times, 'flux_density': self.flux_densities})
 
+    def __repr__(self) -> str:
+        return (f'<Plan {self.shaper}: {len(self.segments)} setpoints, {len(self.levels)} levels '
+                f'in {self.times[-1]:.6g} s>')
+
     def _repr_html_(self) -> str:
         return self.report()._repr_html_()
