@@ -377,6 +377,13 @@ def test_progress_is_shown_on_a_terminal_and_gone_at_the_end(capsys):
     assert (captured.out, captured.err) == ('', '')
 
 
+def test_a_notebook_which_asks_for_colours_gets_no_progress():
+    shown = subprocess.run(
+        [sys.executable, '-c', PROGRESS], cwd=ROOT, env={**os.environ, 'FORCE_COLOR': '1'},
+        capture_output=True, text=True, check=True)
+    assert (shown.stdout, shown.stderr) == ('done\n', '')
+
+
 @pytest.mark.parametrize('code', [PROGRESS, TABLE])
 @pytest.mark.parametrize('env', [{'NO_COLOR': '1'}, {'TERM': 'dumb'}])
 def test_no_colour_where_none_is_wanted(code, env):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+import sys
 
 
 @contextmanager
@@ -14,7 +15,8 @@ def progress(what: str = 'starting') -> Iterator[Callable[[str, float | None], N
     with Progress(
             TextColumn('{task.description:<28}'), BarColumn(), TextColumn('{task.fields[share]}'),
             TimeElapsedColumn(), console=console, transient=True,
-            disable=not console.is_terminal or console.is_dumb_terminal) as shown:
+            # Asked of the file: notebooks have Rich take any for a terminal (FORCE_COLOR).
+            disable=not sys.stderr.isatty() or console.is_dumb_terminal) as shown:
         # Without a total the bar only says that something goes on.
         task = shown.add_task(what, total=None, share='     ')
 
