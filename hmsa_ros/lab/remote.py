@@ -51,8 +51,8 @@ class RemoteNode(Visitor):
     def _ask(self, kind: Any, service: str, **request: Any) -> Any:
         return self.ask(
             ServiceCall(self.node, kind, f'{self._name}/{service}', kind.Request(**request)),
-            f'no node {self._name} in namespace {self._where or "/"} replies; start it (hmsa '
-            f'{self._name}) with the same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here')
+            f'no node {self._name} in namespace {self._where or "/"} replies: expected '
+            'one that runs, with the same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here')
 
     def _values(self, names: Sequence[str]) -> dict[str, Any]:
         """Return the messages of some parameters, by name."""
