@@ -85,6 +85,8 @@ def amplifiers(
     return Table(tuple(columns), tuple(rows), (
         '∞: no limit; slew: of ramps; bandwidth: of a first-order lag; lost: against ideal steps, '
         'in the longest move; field: largest magnitude of a level' + (
+            '; current: that of this field; change: largest rate of the current'
+            if 'tesla_per_ampere' in coil else '') + (
             '; voltage: L dI/dt + R I, its largest magnitude; power: that voltage times the '
             'largest current' if len(coil) == len(_COIL) else '')), tuple(notes))
 
