@@ -10,10 +10,12 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+from hmsa_ros.control.corrections import course_of
 from hmsa_ros.control.loop import Loop
 from hmsa_ros.control.records import Settings, Target
 from hmsa_ros.estimation import Estimator, Options, Prior
 from hmsa_ros.estimation.correction import Course, expect
+from hmsa_ros.estimation.motion import follow, Levels
 from hmsa_ros.identification.known import Known
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Options as PlannerOptions
@@ -157,6 +159,25 @@ def test_what_a_course_is_expected_to_leave_is_what_errors_drawn_from_the_covari
     assert expect(replace(
         estimate, covariance=np.zeros_like(estimate.covariance)), course).size < 1e-6
     assert expected == pytest.approx(np.sqrt(np.mean(np.square(sizes))), rel=0.1)
+
+
+def test_the_field_of_a_coil_that_lags_remembers_the_levels_before_a_correction():
+    lag = 1e-3
+    prior = Prior.nominal(
+        oracle.BLOCK, ('shear_modulus',), others={'coil_time_constant': lag})
+    planner = Planner(oracle.BLOCK, PlannerOptions(lead_time=0, coil_time_constant=lag))
+    levels = planner.setpoint(TARGET, MS).levels
+    begin = levels[-1].stamp + 1000
+    motion = follow(prior.values, prior.free, (1.0, 0.0), Levels(
+        np.array([0.0, *(1e-9 * x.stamp for x in levels if x.stamp > 0)]),
+        np.array([0.0, *(x.flux_density for x in levels if x.stamp > 0)])), 0.0,
+        np.array([1e-9 * begin]))
+    estimator = Estimator(prior, Options(noise=1e-3))
+    estimator.sample(0, 1.0)
+    estimate = replace(
+        estimator.update(0), time=begin, stretch=motion.stretch[0], rate=motion.rate[0])
+    course, _ = course_of(planner.plan, begin, 0.0)
+    assert np.linalg.norm(expect(estimate, course).misses) < 1e-5
 
 
 def test_a_block_is_linearised_as_it_moves_under_small_changes_of_a_level_that_comes_late():

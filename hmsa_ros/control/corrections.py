@@ -177,7 +177,7 @@ class Corrections:
         """Return whether a plan is expected to leave more than it must."""
         share = _LITTLE if self._arrival(name, now) else (
             _GAIN if self._feedback.shown(name, now) else MUCH)
-        course, gain = _course(planner.plan, estimate.time, share)
+        course, gain = course_of(planner.plan, estimate.time, share)
         return expect(estimate, course, planner.options.slew_limit).size > gain
 
     def _correct(self, name: str, now: int) -> Steps[Mapping[str, Draft]]:
@@ -197,7 +197,7 @@ class Corrections:
             # An amplifier that is saturated follows no larger level.
             return {}
         slew = planner.options.slew_limit
-        course, gain = _course(planner.plan, draft.begin, _LITTLE if arrival else _GAIN)
+        course, gain = course_of(planner.plan, draft.begin, _LITTLE if arrival else _GAIN)
         segment = draft.segments[0]
         step = max(abs(segment.stretch - self._feedback.start(name)), _LEAST_STEP)
         before = expect(estimate, course, slew, segment.arrival or 0)
@@ -282,10 +282,11 @@ class Corrections:
 def _drafted(draft: Draft, plan: Plan) -> Course:
     """Return the course of the first setpoint of a draft that takes the place of a plan."""
     segment, *rest = draft.segments
+    before = _until(plan, plan.place(draft.begin - 1) + 1)
     return Course(
-        tuple((x.stamp, x.flux_density) for x in draft.levels
+        tuple((x.stamp, x.flux_density) for x in (*before, *draft.levels)
               if not rest or x.stamp < rest[0].begin),
-        segment.arrival or draft.begin, segment.stretch, plan.level(draft.begin - 1).flux_density,
+        segment.arrival or draft.begin, segment.stretch, before[0].flux_density,
         _relaxed(draft.levels[0].model, segment.stretch) if rest else math.nan)
 
 
@@ -294,7 +295,12 @@ def _relaxed(model: Model, stretch: float) -> float:
     return model.flux_density(model.holding(stretch)) if model.material.creep else math.nan
 
 
-def _course(plan: Plan, begin: int, gain: float) -> tuple[Course, float]:
+def _until(plan: Plan, place: int) -> Sequence[PlannedLevel]:
+    """Return the last levels before a place, which the field of a coil that lags remembers."""
+    return plan.levels[max(place - _BEFORE, 0):place]
+
+
+def course_of(plan: Plan, begin: int, gain: float) -> tuple[Course, float]:
     """Return what is planned from a time in ns to its setpoint's end, and what counts then."""
     levels, place = plan.levels, max(plan.under_way(begin), 0)
     segment = plan.segments[place]
@@ -302,9 +308,10 @@ def _course(plan: Plan, begin: int, gain: float) -> tuple[Course, float]:
     first = plan.place(begin)
     kept = [x for x in levels[first:] if end is None or x.stamp < end or x is levels[first]]
     start = plan.segments[place - 1].stretch if place else levels[0].stretch
+    course = [*_until(plan, first), *kept]
     return Course(
-        tuple((x.stamp, x.flux_density) for x in kept),
-        segment.arrival or kept[-1].stamp, segment.stretch, levels[max(first - 1, 0)].flux_density,
+        tuple((x.stamp, x.flux_density) for x in course),
+        segment.arrival or kept[-1].stamp, segment.stretch, course[0].flux_density,
         math.nan if end is None else _relaxed(kept[-1].model, segment.stretch)), max(
             gain * abs(segment.stretch - start), gain * _LEAST_STEP, segment.vibration)
 
