@@ -9,7 +9,7 @@ import pytest
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation import Estimator, Options, Prior
 from hmsa_ros.estimation.motion import follow, Levels
-from hmsa_ros.estimation.suspects import Gain, Look, Suspects
+from hmsa_ros.estimation.suspects import Look, Suspects
 from hmsa_ros.estimation.words import confounded, sentence
 from hmsa_ros.identification.files import read_belief
 from hmsa_ros.model.creep import Creep
@@ -299,17 +299,19 @@ def test_a_gain_of_the_sensor_is_no_chain_limit():
     assert found.values['chain_limit'] == pytest.approx(oracle.BLOCK.chain_limit)
 
 
-@pytest.mark.parametrize(('gain', 'sought'), [
-    (Gain(0.0, np.zeros(1), 1.0), (0,)), (Gain(30.0, np.full(1, 100.0), 101.0), ())])
-def test_a_force_is_not_sought_where_a_gain_explains_samples_too(gain, sought):
-    # Thirty hundredths of the prior's deviation, known to a tenth.
+def test_a_gain_that_explains_samples_as_well_as_a_force_is_as_likely_but_not_sought():
+    # Three tenths of the prior's deviation, known to a tenth, of either.
     look = Look(
-        Suspects(('constant_force',), (0,), 0, np.zeros(1), np.ones(1)), np.zeros(1),
-        np.full((1, 1), 101.0), np.full(1, 30.0), np.full(1, -np.inf), np.full(1, np.inf), gain)
-    assert look.choose(())[0] == sought
+        Suspects(('constant_force', 'stretch_gain'), (0, 1), 0, np.zeros(2), np.ones(2)),
+        np.zeros(2), np.array([[101.0, 100.0], [100.0, 101.0]]), np.full(2, 40.0),
+        np.full(2, -np.inf), np.full(2, np.inf))
+    sought, others = look.choose(())
+    assert sought == (0,)
+    assert others.sure < 0.5
+    assert others.off == pytest.approx([-0.2, 0.2], abs=0.01)
 
 
-def _unsure(**changes):
+def _unsure(*, expected=True):
     """Return an estimate of a block as given whose G and ratio of creep lean on each other."""
     prior = Prior.nominal(oracle.BLOCK, suspects=True)
     estimator = Estimator(prior)
@@ -321,17 +323,17 @@ def _unsure(**changes):
     off = np.zeros(len(found.off))
     off[places[0]] = 0.01
     return replace(
-        found, covariance=covariance, off=off,
-        values={**found.values, 'viscoelastic_ratio': 0.02}, **changes)
+        found, covariance=covariance, off=off, instead=expected * off,
+        values={**found.values, 'viscoelastic_ratio': 0.02})
 
 
-@pytest.mark.parametrize(('deviation', 'sure', 'modulus'), [
+@pytest.mark.parametrize(('deviation', 'expected', 'modulus'), [
     # Creep is known: the modulus beside it; what is expected, unless what is sought is likely.
-    (0.005, 0.9, 0.0), (0.005, 0.1, 0.01),
+    (0.005, False, 0.0), (0.005, True, 0.01),
     # It is not: the modulus if there is none.
-    (0.02, 0.9, 0.8 * 0.02), (0.02, 0.1, 0.01 + 0.8 * 0.02)])
-def test_plans_use_what_is_expected_with_or_without_creep(deviation, sure, modulus):
-    found = _unsure(sure=sure)
+    (0.02, False, 0.8 * 0.02), (0.02, True, 0.01 + 0.8 * 0.02)])
+def test_plans_use_what_is_expected_with_or_without_creep(deviation, expected, modulus):
+    found = _unsure(expected=expected)
     found.deviations['viscoelastic_ratio'] = deviation
     block = found.model(PlannerOptions()).actuator
     assert bool(block.creep) is (deviation < 0.01)
@@ -339,8 +341,8 @@ def test_plans_use_what_is_expected_with_or_without_creep(deviation, sure, modul
 
 
 def test_plans_have_no_lag_where_none_was_found():
-    found, random = _unsure(sure=0.1), np.random.default_rng(0)
+    found, random = _unsure(), np.random.default_rng(0)
     for _ in range(8):
         root = 1e-3 * random.standard_normal(found.covariance.shape)
-        there = replace(found, covariance=root @ root.T, off=root[0])
+        there = replace(found, covariance=root @ root.T, off=root[0], instead=root[0])
         assert there.model(PlannerOptions()).options.coil_time_constant == 0.0

@@ -27,6 +27,7 @@ from hmsa_ros.estimation.correction import (
     SHARE,
     worthwhile,
 )
+from hmsa_ros.estimation.words import confounded
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.drafting import Steps
@@ -41,6 +42,9 @@ _GAIN, _LITTLE = 5e-4, 5e-5
 _NOISE = 0.02
 # Units of time before its end from which on a move is not corrected any more.
 _SHORTEST = 0.3
+# Share of the step from which on a bias matters that may be a force: after a move that began this
+# near to rest without field, where they look alike, what rests is then corrected for much alone.
+_HIDDEN, _FIRST = 0.01, 0.02
 # Levels that differ by less, in units of load, are the same.
 _SAME = 1e-5
 # Natural periods after which a path that was joined is looked at again, and at least as many times
@@ -200,12 +204,18 @@ class Corrections:
         course, gain = course_of(planner.plan, draft.begin, _LITTLE if arrival else _GAIN)
         segment = draft.segments[0]
         step = max(abs(segment.stretch - self._feedback.start(name)), _LEAST_STEP)
-        before = expect(estimate, course, slew, segment.arrival or 0)
-        after = expect(estimate, _drafted(draft, planner.plan), slew)
-        if not worthwhile(
-                before, after, max(gain, _NOISE * estimate.noise), little=LITTLE * step,
-                share=SHARE if arrival else AT_REST):
-            return {}
+        # A force that samples do not show either way is not to make it worse.
+        doubted, start = estimate.doubted, self._feedback.start(name)
+        hidden = MUCH * step if not arrival and abs(
+            start - planner.model.actuator.rest) < _FIRST and confounded(
+                doubted, _HIDDEN * step) else 0.0
+        for each, least in ((doubted, hidden), (estimate, 0.0)):
+            before = expect(each, course, slew, segment.arrival or 0)
+            after = expect(each, _drafted(draft, planner.plan), slew)
+            if not worthwhile(
+                    before, after, max(gain, least, _NOISE * estimate.noise),
+                    little=LITTLE * step, share=SHARE if arrival else AT_REST):
+                return {}
         self._after[name] = after.size
         return {name: draft}
 

@@ -73,7 +73,8 @@ def alike(model: Model, other: Model) -> bool:
 def known_of(estimate: Estimate) -> Known:
     """Return how well an estimate knows parameters."""
     # A suspect that is none has no deviation.
-    places = [i for i, x in enumerate(estimate.free) if estimate.deviations[x] > 0.0]
+    places = [i for i, x in enumerate(estimate.free)
+              if estimate.deviations[x] > 0.0 and i != estimate.gain]
     names = tuple(estimate.free[i] for i in places)
     values = tuple(estimate.values[x] for x in names)
     scale = np.array([derivative(x, y) for x, y in zip(names, values, strict=True)])

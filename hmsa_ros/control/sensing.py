@@ -24,7 +24,7 @@ def sensor_of(found: Estimate, prior: Prior) -> Sensor:
     What a force leaves open of a bias counts.
     """
     before, sure = np.diag(prior.covariance), np.diag(found.covariance)
-    known = [x for i, x in enumerate(found.free) if x in _SENSOR and (
+    known = [x for i, x in enumerate(found.free) if x in _SENSOR and i != found.gain and (
         _shows_bias(found) if x == 'stretch_bias' else sure[i] < _FOUND**2 * before[i])]
     figures = {_SENSOR[x]: found.values[x] for x in known} | {
         f'{_SENSOR[x]}_std': found.deviations[x] for x in known}

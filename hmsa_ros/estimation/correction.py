@@ -18,6 +18,7 @@ import numpy as np
 from hmsa_ros.estimation.estimator import Estimate
 from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
 from hmsa_ros.model.equations import Array
+from hmsa_ros.model.laws.coordinate import coordinate_of
 from hmsa_ros.model.units import NANOSECONDS
 
 #: A move that is expected to leave more than this share of its step is given more time.
@@ -124,6 +125,10 @@ def expect(
     rows[0, :-2] -= by
     rows[1] = motion.rate_by[0] / frequency
     rows[2, :-2] = by
+    if estimate.gain >= 0:
+        # The target is where the sensor shows it.
+        rows[2, estimate.gain] = estimate.values['stretch_gain'] * (
+            stretch - coordinate_of(estimate.values['law']).rest)
     return _outcome(estimate, np.array([
         motion.stretch[0] - stretch, motion.rate[0] / frequency, stretch - course.target]), rows)
 

@@ -13,8 +13,8 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
 from hmsa_ros.estimation.prior import Prior
 from hmsa_ros.estimation.screening import Screening
-from hmsa_ros.estimation.suspects import Suspects
-from hmsa_ros.estimation.window import coordinates, Rest, Solution, Trial, values_at, Window
+from hmsa_ros.estimation.suspects import GAIN, Suspects
+from hmsa_ros.estimation.window import coordinates, Doubt, Rest, Solution, Trial, values_at, Window
 from hmsa_ros.identification.fit import robust_scale
 from hmsa_ros.identification.quantities import actuator_of, BRANCHES, derivative, QUANTITIES
 from hmsa_ros.model.creep import Creep
@@ -47,8 +47,6 @@ _CORRECTS = 0.1
 _WAITING = 10
 #: Deviations from which on a suspected branch of creep is one.
 CREEPS = 2.0
-# How probable the most probable suspects are that plans take for certain.
-_MOST_LIKELY = 0.5
 # What plans take into account by other levels, however little of it there is.
 _AS_IS = ('coil_time_constant', *BRANCHES[0])
 # Window, as a share, that is left when it moves on, its longest span in units of time, and the
@@ -86,10 +84,19 @@ class Estimate:
     deviations: dict[str, float]  # standard ones of these, in SI
     covariance: Array  # of the coordinates of these, of stretch and of rate, about the values
     off: Array  # how far what is expected of them is from the values
-    sure: float  # how probable it is that no other suspects are wrong than those sought
+    # As `off` of what plans use, with what shows as much as a gain of the sensor in its place.
+    instead: Array
+    doubt: Doubt
+    named: int  # how many of the first that are tracked are named
     noise: float  # standard deviation of a sample
     trusted: bool  # whether it may be acted upon
     trouble: str  # why not; empty if it may
+
+    @property
+    def gain(self) -> int:
+        """Place of a suspected gain of the sensor about rest; -1 for none."""
+        place = self.free.index(GAIN) if GAIN in self.free else -1
+        return place if place >= self.named else -1
 
     @property
     def actuator(self) -> ActuatorParameters:
@@ -104,6 +111,11 @@ class Estimate:
             return replace(found, creep=Creep((value,), (self.values[time],)))
         return found
 
+    @property
+    def doubted(self) -> 'Estimate':
+        """The estimate, were a constant force and the gain of the sensor wrong besides."""
+        return replace(self, off=self.doubt.off, covariance=self.doubt.covariance)
+
     def sure_of(self, first: int) -> 'Estimate':
         """Return the estimate, were all that is tracked from the place of a first one on known."""
         covariance, known = self.covariance, slice(first, -2)
@@ -111,7 +123,9 @@ class Estimate:
         left = covariance - cross @ np.linalg.pinv(
             covariance[known, known], hermitian=True) @ cross.T
         left[known], left[:, known] = 0.0, 0.0
-        return replace(self, covariance=left, off=np.zeros_like(self.off))
+        return replace(
+            self, covariance=left, off=np.zeros_like(self.off),
+            instead=np.zeros_like(self.off))
 
     def model(self, options: PlannerOptions, sure: float = CREEPS) -> Model:
         """
@@ -122,15 +136,15 @@ class Estimate:
         """
         block, z = self.block(sure), coordinates(self.values, self.free)
         known = [i for i, x in enumerate(self.free) if x in _AS_IS]
-        off = self.off[:-2] * (self.sure < _MOST_LIKELY)
-        left = -off
+        off, instead = self.off[:-2], self.instead[:-2]
+        left = -instead
         if BRANCHES[0][0] in self.free and not block.creep:
             i = self.free.index(BRANCHES[0][0])
             left[i] -= z[i]
         spread = self.covariance[:-2, :-2] - np.outer(off, off)
         # A lag that is none is none exactly: else plans are for one.
-        kept = (z + (off + left))[known]
-        z += off + spread[:, known] @ np.linalg.pinv(
+        kept = (z + (instead + left))[known]
+        z += instead + spread[:, known] @ np.linalg.pinv(
             spread[np.ix_(known, known)], hermitian=True) @ left[known]
         z[known] = kept
         found = replace(self, values=values_at(self.values, self.free, z))
@@ -350,24 +364,25 @@ class Estimator:
             (1.0 - gain) * math.log(self.noise) + gain * math.log(seen))
 
     def _estimate(self, time: int, found: Solution, window: Window) -> Estimate:
-        state, covariance, off = found.at_end()
+        state, covariance, off, doubt = found.at_end()
         values = found.values
         if found.motion.behind:
             values = {**values, 'behind': found.motion.behind}
         # A bias may be a force as well, or told from one by the gain of the sensor alone.
         variances = np.where(
             [x == 'stretch_bias' for x in (*self.prior.free, '', '')],
-            np.maximum(np.diag(covariance), found.variances), np.diag(covariance))
+            np.maximum(np.diag(covariance), np.diag(doubt.covariance)), np.diag(covariance))
         if self._fixed is not None:
             covariance[:-2, :-2], off = self._fixed, np.zeros_like(off)
-            variances = np.diag(covariance)
+            variances, doubt = np.diag(covariance), Doubt(off, covariance)
         deviations = {
             name: abs(derivative(name, found.values[name])) * math.sqrt(variances[i])
             for i, name in enumerate(self.prior.free)}
         trouble = self.screening.trouble or self._strange(found.z)
         return Estimate(
             time, float(state[-2]), float(state[-1]), values, self.prior.free, deviations,
-            covariance, off, found.sure, self.noise, not trouble, trouble)
+            covariance, off, found.instead, doubt, self.prior.named, self.noise,
+            not trouble, trouble)
 
     def _strange(self, z: Array) -> str:
         """Say what would have to be implausibly far off for samples to fit; empty for nothing."""
@@ -423,7 +438,8 @@ class Estimator:
         self._solution = replace(found, z=np.append(
             found.z[:-2], [found.motion.stretch[place], found.motion.rate[place]]),
             covariance=moved.covariance if at is None else found.covariance,
-            off=np.zeros_like(found.off))
+            off=np.zeros_like(found.off), instead=np.zeros_like(found.off),
+            doubt=Doubt(np.zeros_like(found.off), moved.covariance) if at is None else found.doubt)
         first = bisect_right(self._levels, self._origin, key=lambda x: x[0]) - 1
         # The field of a coil that lags remembers some levels more.
         del self._levels[:max(first - 8, 0)]

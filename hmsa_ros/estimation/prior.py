@@ -38,10 +38,11 @@ _NOT_TRACKED = (
 #: Tracked unless others are named.
 TRACKED = ('shear_modulus', 'damping_coefficient', 'stretch_bias')
 #: What may be wrong besides, and is tracked with these that no one takes it for an error of them.
-#: The gain of the sensor is none: it looks like another remanence and chain limit.
+#: The gain of the sensor, here about rest without field, is never sought: it looks like another
+#: remanence and chain limit.
 SUSPECTS = (
     'remanence', 'chain_limit', 'coil_time_constant', 'sensor_latency', 'viscoelastic_ratio',
-    'viscoelastic_time', 'constant_force')
+    'viscoelastic_time', 'constant_force', 'stretch_gain')
 # What is named, and may well be as given.
 _AS_GIVEN = ('shear_modulus', 'damping_coefficient')
 # Relaxation time of a suspected branch in units of time.
@@ -134,6 +135,12 @@ class Prior:
         covariance = self.covariance.copy()
         covariance[np.ix_(into, into)] = (
             known.covariance[np.ix_(places, places)] / np.outer(scale, scale))
+        if 'stretch_gain' in both[self.named:] and 'stretch_bias' in both:
+            # Identified is that about 0, and suspected that about rest.
+            about = np.eye(len(self.free))
+            about[self.free.index('stretch_bias'), self.free.index('stretch_gain')] = (
+                values['stretch_gain'] * self.coordinate.rest)
+            covariance = about @ covariance @ about.T
         return replace(
             self, values=values, covariance=covariance,
             spread=np.maximum(self.spread, np.sqrt(np.diag(covariance))))

@@ -20,8 +20,12 @@ from hmsa_ros.model.equations import Array
 # How improbable a suspect that is not named is before the first sample, as a logarithm, and the
 # gain of that of the evidence from which on others are sought in place of those sought.
 _PRUDENCE, _CLEARLY = 1.0, 1.0
-# What a gain that explains samples in its place counts against a force at most, as a logarithm.
-_BESIDES = 2.0
+#: A suspect that is never sought, and what shows much as it does.
+GAIN, _LIKE_GAIN = 'stretch_gain', ('remanence', 'chain_limit')
+# What shows at rest without field.
+_AT_REST = ('stretch_bias', 'constant_force')
+# How probable those sought are, or those that show alike, that plans take for certain.
+_MOST_LIKELY = 0.5
 # How much less probable than the most probable ones suspects are that do not count.
 _UNLIKELY = 1e-4
 
@@ -64,16 +68,46 @@ class Suspects:
         return np.array([self.sought(len(self.names), x) for x in self.sets])
 
     @cached_property
-    def forceless(self) -> NDArray[np.int64]:
-        """Place of each set's own without a force, shape (n,)."""
-        places = {x: i for i, x in enumerate(self.sets)}
-        return np.array([
-            places[tuple(i for i in x if self.names[i] != 'constant_force')] for x in self.sets])
+    def gain(self) -> int:
+        """Place of the gain of the sensor if that is suspected; -1 else."""
+        return next((i for i in self.places if self.names[i] == GAIN and i >= self.named), -1)
+
+    @property
+    def all_sought(self) -> tuple[int, ...]:
+        """Places of all suspects that may be sought."""
+        return tuple(i for i in self.places if i != self.gain)
 
     @cached_property
-    def with_remanence(self) -> NDArray[np.bool_]:
-        """Which sets have the remanence, shape (n,)."""
-        return np.array([any(self.names[i] == 'remanence' for i in x) for x in self.sets])
+    def with_gain(self) -> NDArray[np.bool_]:
+        """Which sets have the gain of the sensor, shape (n,)."""
+        return np.array([self.gain in x for x in self.sets])
+
+    @cached_property
+    def shown_alike(self) -> NDArray[np.int64]:
+        """Places of each set, with a gain besides the remanence and in its place, shape (3, n)."""
+        places = {x: i for i, x in enumerate(self.sets)}
+        found = []
+        for own in self.sets:
+            others = tuple(i for i in own if self.names[i] != 'remanence')
+            either = self.gain >= 0 and self.gain not in own and others != own
+            found.append([places[x] for x in (
+                own, (*own, self.gain) if either else own,
+                (*others, self.gain) if either else own)])
+        return np.array(found).T
+
+    @cached_property
+    def kinds(self) -> NDArray[np.int64]:
+        """Number of each set, one for all that differ by what shows as a gain, shape (n,)."""
+        numbers: dict[tuple[int, ...], int] = {}
+        return np.array([numbers.setdefault(tuple(
+            i for i in x if self.names[i] not in (GAIN, *_LIKE_GAIN)), len(numbers))
+            for x in self.sets])
+
+    def of(self, names: Iterable[str], count: int) -> NDArray[np.bool_]:
+        """Return which of so many coordinates have one of some names, shape (q,)."""
+        found = np.zeros(count, dtype=np.bool_)
+        found[[i for i, x in enumerate(self.names) if x in names]] = True
+        return found
 
     @cached_property
     def prudence(self) -> Array:
@@ -96,6 +130,8 @@ class Others(NamedTuple):
     sure: float  # how probable those sought are
     off: Array  # how far coordinates are expected from those with these, shape (q,)
     square: Array  # what the others add to the expected square of that, shape (q, q)
+    # As `off` of what plans use, with what shows as much as a gain of the sensor in its place.
+    instead: Array
 
 
 class Explained(NamedTuple):
@@ -104,22 +140,6 @@ class Explained(NamedTuple):
     evidence: Array  # logarithm of how probable samples are, but for a constant, shape (n,)
     step: Array  # to the most probable coordinates, shape (n, q)
     loose: NDArray[np.bool_]  # which of them vary, shape (n, q)
-
-
-class Gain(NamedTuple):
-    """How the cost goes with usual errors of the gain of the sensor."""
-
-    gradient: float  # downwards
-    cross: Array  # second derivatives by such an error and the coordinates, shape (q,)
-    curvature: float  # second derivative, at least that of what is usual, 1
-
-    def explains(self, found: Explained, matrix: Array) -> Array:
-        """Return what an error of the gain besides adds to each evidence, if anything."""
-        rest = self.gradient - found.step @ self.cross
-        leans = _solution(matrix, self.cross, np.zeros_like(found.step), found.loose)
-        curvature = np.maximum(self.curvature - leans @ self.cross, 1.0)
-        more: Array = np.maximum(0.5 * rest ** 2 / curvature - 0.5 * np.log(curvature), 0.0)
-        return more
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,38 +152,48 @@ class Look:
     gradient: Array  # downwards
     low: Array  # least and largest steps
     high: Array
-    gain: Gain
 
     def choose(self, before: tuple[int, ...]) -> tuple[tuple[int, ...], Others]:
         """Return the suspects to be sought in place of those before, and what of others counts."""
-        sets = self.suspects.sets
+        sets, with_gain = self.suspects.sets, self.suspects.with_gain
         found = self._all()
-        evidence = found.evidence + self._by_gain(found)
+        # What looks like another remanence may be a gain, or one in part.
+        evidence = np.where(with_gain, -math.inf, np.max(
+            found.evidence[self.suspects.shown_alike], axis=0))
         here, best = sets.index(before), int(np.argmax(evidence))
         if evidence[best] <= evidence[here] + _CLEARLY:
             best = here
-        weight = np.exp(np.minimum(evidence - evidence[best], _CLEARLY))
-        counts = np.flatnonzero(weight > _UNLIKELY)
-        weight, total = weight[counts], float(np.sum(weight[counts]))
+        weight = np.exp(found.evidence - np.max(found.evidence))
+        counts = np.flatnonzero((weight > _UNLIKELY) | (np.arange(len(sets)) == best))
+        weight = weight[counts] / float(np.sum(weight[counts]))
         apart = found.step[counts] - found.step[best]
         square = np.einsum(
             'k,kij->ij', weight * (counts != best), inverse(self.matrix, found.loose[counts]))
+        # Those that count in plans.
+        likely = weight
+        for some in (counts == best, self.suspects.kinds[counts] == self.suspects.kinds[best]):
+            if (share := float(weight @ some)) > _MOST_LIKELY:
+                likely = weight * some / share
+                break
         return sets[best], Others(
-            1.0 / total, weight @ apart / total,
-            (square + (weight[:, None] * apart).T @ apart) / total)
+            float(weight @ (counts == best)), weight @ apart,
+            square + (weight[:, None] * apart).T @ apart,
+            likely @ (self._without_gain(found, counts) - found.step[best]))
 
-    def _by_gain(self, found: Explained) -> Array:
-        """
-        Return what is added to each evidence where a gain may be wrong besides.
-
-        What looks like another remanence may be a gain in part, and a force is less probable where
-        a gain in its place explains samples too.
-        """
-        explains, forceless = self.gain.explains(found, self.matrix), self.suspects.forceless
-        more: Array = np.where(self.suspects.with_remanence, explains, np.where(
-            forceless != np.arange(len(forceless)), -np.minimum(explains[forceless], _BESIDES),
-            0.0))
-        return more
+    def _without_gain(self, found: Explained, places: NDArray[np.int64]) -> Array:
+        """Return the steps of sets of suspects, with other parameters in place of a gain."""
+        step, instead = found.step[places], self.suspects.with_gain[places]
+        if not instead.any():
+            return step
+        count = len(self.z)
+        # A gain does not show at rest without field: what does stays. The remanence alone, since
+        # what J_lim makes up for at one stretch it spoils at others.
+        loose = found.loose[places] & ~self.suspects.of((*_AT_REST, GAIN), count)
+        loose |= self.suspects.of(('remanence',), count)
+        there = np.where(loose, 0.0, step)
+        there[:, self.suspects.gain] = 0.0
+        return np.where(instead[:, None], _solution(
+            self.matrix, self.gradient, there, loose), step)
 
     def _all(self) -> Explained:
         """

@@ -9,7 +9,7 @@ along with the motion (C. V. Rao, J. B. Rawlings and D. Q. Mayne, IEEE Trans. Au
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 import math
 from typing import Any, NamedTuple
 
@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
-from hmsa_ros.estimation.prior import DEVIATIONS
-from hmsa_ros.estimation.suspects import Gain, inverse, Look, optimum, Others, Suspects
+from hmsa_ros.estimation.suspects import GAIN, inverse, Look, optimum, Others, Suspects
 from hmsa_ros.identification.fit import loss, weights_of
 from hmsa_ros.identification.quantities import from_coordinate, QUANTITIES, to_coordinate
 from hmsa_ros.identification.response import clip, complete, sensed
@@ -64,6 +63,13 @@ class Found(NamedTuple):
     loose: NDArray[np.bool_]  # what varies
 
 
+class Doubt(NamedTuple):
+    """What is expected where a constant force and the gain of the sensor are wrong besides."""
+
+    off: Array  # how far coordinates are expected off the most probable ones, shape (q,)
+    covariance: Array  # of these, about the latter, shape (q, q)
+
+
 @dataclass(frozen=True, eq=False)
 class Solution:
     """The most probable motion."""
@@ -76,15 +82,17 @@ class Solution:
     weights: Array  # how far each counts, 0 to 1
     covariance: Array  # of z, about itself
     off: Array  # how far what is expected is from z, shape (q,)
-    sure: float  # how probable it is that no other suspects are wrong than those sought
-    variances: Array  # of z, where a force and the gain of the sensor may be wrong besides
+    # As `off` of what plans use, with what shows as much as a gain of the sensor in its place.
+    instead: Array
+    doubt: Doubt
 
-    def at_end(self) -> tuple[Array, Array, Array]:
+    def at_end(self) -> tuple[Array, Array, Array, Doubt]:
         """Return coordinates and state at the time asked for, their covariance, how far off."""
         change = transport(self.motion, len(self.residual))
         state = np.append(
             self.z[:-2], [self.motion.stretch[-1], self.motion.rate[-1]])
-        return state, change @ self.covariance @ change.T, change @ self.off
+        return state, change @ self.covariance @ change.T, change @ self.off, Doubt(
+            change @ self.doubt.off, change @ self.doubt.covariance @ change.T)
 
 
 def transport(motion: Motion, place: int) -> Array:
@@ -120,8 +128,7 @@ class Window:
     suspects: Suspects
     suspected: tuple[int, ...] = ()  # places of suspects that are sought
     weighed: int = 0  # samples there were when these were chosen
-    others: Others = Others(1.0, np.zeros(()), np.zeros(()))  # than these
-    leans: Array = field(default_factory=lambda: np.zeros(()))  # of the mean, by a gain
+    others: Others = Others(1.0, *(np.zeros(()),) * 3)  # than these
     rest: Rest | None = None  # that it begins at
 
     def values_at(self, z: Array) -> dict[str, Any]:
@@ -148,13 +155,13 @@ class Window:
         if self.rest.weight > 0.0:
             state = np.zeros((1, len(z)))
             state[0, -2] = values['stretch_gain']
-            shown, (by,) = sensed(values, self.free, np.array([at[0]]), np.zeros(1), state)
+            shown, by_all = sensed(values, self.free, np.array([at[0]]), np.zeros(1), state)
+            by = self._about_rest(values, by_all)[0]
             pull = self.covariance @ by
             share = pull / (by @ pull + 1.0 / self.rest.weight)
             self.mean += share * (
                 self.rest.shown - float(shown[0]) - by @ (self.mean - there))
             self.covariance -= np.outer(share, pull)
-            self.leans = -share * self._gained(np.array(at[0]))
 
     def rest_on(
             self, at: Rest, count: int, begin: float, solution: Solution, noise: float,
@@ -185,7 +192,7 @@ class Window:
             return self._descend(z, here, levels, noise, until, prior)
 
         def look(found: Found) -> Found:
-            return self._look(found, descend, self._gain(found, prior, noise))
+            return self._look(found, descend)
 
         found = descend(z, here) or descend(self._at_ease(self.mean))
         if found is None:
@@ -195,7 +202,7 @@ class Window:
             if self._is_poor(found, noise):
                 # There may be another valley.
                 before = self.suspected, self.others
-                self.suspected = self.suspects.places
+                self.suspected = self.suspects.all_sought
                 other = descend(self._at_ease(self.mean))
                 if other is not None:
                     other = look(other)
@@ -203,82 +210,32 @@ class Window:
                     found = other
                 else:
                     self.suspected, self.others = before
-        sure, off, square = self.others
+        sure, off, square, instead = self.others
         _, motion, residual, by, weights, _ = found.here
         covariance = inverse(found.matrix, found.loose)
         return Solution(
             found.z, found.here.values, motion, by, residual, weights,
-            sure * covariance + square, np.broadcast_to(off, z.shape), sure,
-            self._open(found, prior, noise))
+            sure * covariance + square, np.broadcast_to(off, z.shape),
+            np.broadcast_to(instead, z.shape), self._doubt(found))
 
-    def _more(self, here: 'Trial | Solution', count: int) -> Array:
-        """Return what a usual error of the gain about rest shows more, shape (n,); 0 if sought."""
-        return self._gained(here.motion.stretch[:count])
-
-    def _gained(self, stretch: Array) -> Array:
-        """Return what a usual error of the gain about rest shows more of a stretch."""
-        found: Array = DEVIATIONS['stretch_gain'] * ('stretch_gain' not in self.free) * (
-            stretch - coordinate_of(self.values['law']).rest)
-        return found
-
-    def _pull(
-            self, prior: Array, here: 'Trial | Solution', noise: float, count: int) -> Array:
-        """Return how such an error pulls at coordinates by samples, shape (q,)."""
-        found: Array = prior @ np.broadcast_to(
-            self.leans, self.mean.shape) - here.by[:count].T @ (
-                here.weights[:count] * self._more(here, count)) / noise ** 2
-        return found
-
-    def _gain(self, found: Found, prior: Array, noise: float) -> Gain:
-        """Return how the cost goes with such an error."""
-        here, count = found.here, len(found.here.residual)
-        more, leans = self._more(here, count), np.broadcast_to(self.leans, self.mean.shape)
-        pulled = leans @ prior
-        return Gain(
-            float((here.weights * more) @ here.residual / noise ** 2
-                  + pulled @ (found.z - self.mean)),
-            -self._pull(prior, here, noise, count),
-            1.0 + float(here.weights @ np.square(more) / noise ** 2 + pulled @ leans))
-
-    def _leaning(
-            self, matrix: Array, loose: NDArray[np.bool_], prior: Array,
-            here: 'Trial | Solution', noise: float, count: int) -> Array:
-        """Return how far such an error would shift coordinates by samples, shape (q,)."""
-        pull = self._pull(prior, here, noise, count)
-        # Rounding would be large in units of the coordinates.
-        size, found = np.sqrt(np.diag(matrix)[loose]), np.zeros(len(self.mean))
-        found[loose] = np.linalg.solve(
-            matrix[np.ix_(loose, loose)] / np.outer(size, size), pull[loose] / size) / size
-        return found
-
-    def _open(self, found: Found, prior: Array, noise: float) -> Array:
-        """
-        Return variances where a constant force and the gain of the sensor may be wrong besides.
-
-        What samples say of both counts, and as an error what they would shift.
-        """
-        here, force = found.here, [x == 'constant_force' for x in (*self.free, '', '')]
-        loose = found.loose | np.array(force)
+    def _doubt(self, found: Found) -> Doubt:
+        """Return what is expected where a constant force and a gain are wrong besides."""
+        loose = found.loose | self.suspects.of(('constant_force', GAIN), len(found.loose))
         covariance = inverse(found.matrix, loose)
-        shift = covariance @ found.gradient
-        leans = self._leaning(found.matrix, loose, prior, here, noise, len(here.residual))
-        gain = self._gain(found, prior, noise)
-        curvature = max(gain.curvature + float(gain.cross @ leans), 1.0)
-        more = 1.0 + (gain.gradient - float(gain.cross @ shift)) ** 2 / curvature
-        variances: Array = np.diag(covariance) + shift ** 2 + leans ** 2 * more / curvature
-        return variances
+        off = covariance @ found.gradient
+        return Doubt(off, covariance + np.outer(off, off))
 
     def _is_poor(self, found: Found, noise: float) -> bool:
         """Return whether what is sought explains samples poorly."""
         return loss(found.here.residual, noise, convex=True) > _POOR * len(self.time)
 
     def _look(
-            self, found: Found, descend: Callable[[Array], Found | None], gain: Gain) -> Found:
+            self, found: Found, descend: Callable[[Array], Found | None]) -> Found:
         """Choose the suspects to be sought, and return the most probable coordinates then."""
         self.weighed, before = len(self.time), self.suspected
         self.suspected, self.others = Look(
             self.suspects, found.z, found.matrix, found.gradient,
-            *self._room(found.z), gain).choose(before)
+            *self._room(found.z)).choose(before)
         if self.suspected == before:
             return found
         return descend(self._at_ease(found.z)) or found
@@ -360,7 +317,15 @@ class Window:
         apart = z - self.mean
         cost = loss(residual, noise, convex=True) + 0.5 * float(apart @ prior @ apart)
         return Trial(
-            values, motion, residual, by[:n], weights_of(residual, noise, convex=True), cost)
+            values, motion, residual, self._about_rest(values, by[:n]),
+            weights_of(residual, noise, convex=True), cost)
+
+    def _about_rest(self, values: Mapping[str, Any], by: Array) -> Array:
+        """Return derivatives of what the sensor shows by a suspected gain about rest."""
+        if self.suspects.gain >= 0:
+            by[:, self.suspects.gain] -= (
+                values['stretch_gain'] * coordinate_of(values['law']).rest)
+        return by
 
     def move_on(
             self, count: int, begin: float, solution: Solution, noise: float,
@@ -386,8 +351,7 @@ class Window:
         return Window(
             self.values, self.free, here + change @ step,
             0.5 * (covariance + covariance.T), self.bounds, begin,
-            self.time[count:], self.stretch[count:], self.suspects, self.suspected,
-            leans=change @ self._leaning(matrix, every, prior, solution, noise, count))
+            self.time[count:], self.stretch[count:], self.suspects, self.suspected)
 
 
 def coordinates(values: Mapping[str, float], free: Sequence[str]) -> Array:
