@@ -26,6 +26,9 @@ KINDS = {
 GROUPS = {'none': 'nothing', **KINDS, 'several': 'several of these'}
 # Units of time that are integrated at once, and samples in one.
 _AHEAD, _SAMPLES = 3.0, (4.4, 25.0)
+# Looks at the stretch in one, for whoever judges moves: what samples happen to show of one that
+# ends late depends on when they are.
+_LOOKS = 100.0
 # Every second bench has several things wrong, each with this probability.
 _LIKELY = 0.5
 _TARGETS = (1.08, 1.45)  # range of stretches, and the least step
@@ -259,7 +262,9 @@ class Device:
         self._silent = 0  # samples that will still be lost
         # When a sample arrives, its timestamp and value.
         self._wire: list[tuple[int, int, float]] = []
+        # The stretch, at times that do not depend on samples.
         self.truth: list[tuple[int, float]] = []
+        self._look = round(1e9 * bench.unit / _LOOKS)
 
     @property
     def next_sample(self) -> int:
@@ -278,10 +283,16 @@ class Device:
             self._measure()
         self.time = time
 
+    def _go_on(self, time: int) -> float:
+        """Go on until a time; return the stretch then."""
+        first = self.plant.time // self._look + 1
+        self.truth += [(x, self.plant.advance(x)) for x in range(
+            first * self._look, time + 1, self._look)]
+        return self.plant.advance(time)
+
     def _measure(self) -> None:
         bench, now = self.bench, self._measured
-        stretch = self.plant.advance(now)
-        self.truth.append((now, stretch))
+        stretch = self._go_on(now)
         noise = bench.noise * float(self._random.standard_normal())
         lucky = float(self._random.random())
         if self._silent:
@@ -297,7 +308,7 @@ class Device:
 
     def changes(self) -> Sequence[tuple[int, int, float]]:
         """Return which levels took effect."""
-        self.plant.advance(self.time)
+        self._go_on(self.time)
         found, self.plant.applied = self.plant.applied, []
         return [(0, *x) for x in found]
 
