@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from hmsa_ros.control.feedback import Feedback
-from hmsa_ros.control.learnt import believed, learnt_model
+from hmsa_ros.control.learnt import as_of_path, believed, learnt_model
 from hmsa_ros.control.records import Severity, Verdict
 from hmsa_ros.control.slices import Clock, Drafting, in_time, Work
 from hmsa_ros.control.trimming import trimmed
@@ -262,6 +262,7 @@ class Corrections:
             return {}
         model = learnt_model(
             planner.model, estimate, planner.plan.segments[-1].stretch, _CREEPS)
+        model = as_of_path(model, planner.model, estimate)
         draft = yield from planner.draft_path_anew(
             begin, model, believed(estimate, creeps=bool(model.actuator.creep)))
         spent = self._clock() - begun

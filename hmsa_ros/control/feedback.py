@@ -10,7 +10,7 @@ from hmsa_ros.control.aside import ANSWER, Awaited, Doing, goes_on, here
 from hmsa_ros.control.choice import clearly_better
 from hmsa_ros.control.field import Field
 from hmsa_ros.control.holds import Hold
-from hmsa_ros.control.learnt import alike, believed, differs, learnt_model, save
+from hmsa_ros.control.learnt import alike, as_of_path, believed, differs, learnt_model, save
 from hmsa_ros.control.ledger import Ledger, Moves
 from hmsa_ros.control.records import EstimateChanged, Output, Settings, Severity
 from hmsa_ros.control.sensing import sensor_of
@@ -448,6 +448,8 @@ class Feedback:
         model, waits = used, latest.time < joint.waits
         if differs(used, latest):
             learnt = self._learnt(name, used)
+            if segments[-1].path is not None:
+                learnt = as_of_path(learnt, used, latest)
             better = partial(
                 clearly_better, given=used == self._nominal[name], shown=not waits)
             if (yield from self.doing(

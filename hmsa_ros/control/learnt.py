@@ -1,6 +1,7 @@
 """What was learnt of an actuator: as a model to plan with, and as a parameter file."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import datetime
 import math
 from pathlib import Path
@@ -22,6 +23,8 @@ from hmsa_ros.planning.timeline import Model
 
 # A model is another one from this share of a parameter, and this many of its deviations, on.
 _NEWS, _SURE = 1e-3, 0.5
+# A force is known from so many deviations on.
+_FORCED = 2.0
 # Parameters of planner and plant besides those of the block.
 _OTHERS = ('coil_time_constant', 'stretch_bias', 'stretch_gain')
 
@@ -39,6 +42,19 @@ def learnt_model(
     except BadInputError:
         return model
     return found
+
+
+def as_of_path(model: Model, before: Model, estimate: Estimate) -> Model:
+    """
+    Return a model learnt from a path with the force of the one before, unless it is known.
+
+    About one rest, as of a wave, a force looks like a bias, and would shift the mean.
+    """
+    force = before.options.constant_force
+    if abs(model.options.constant_force - force) >= _FORCED * estimate.deviations.get(
+            'constant_force', 0.0):
+        return model
+    return replace(model, options=replace(model.options, constant_force=force))
 
 
 def believed(estimate: Estimate, *, creeps: bool) -> Believed:
