@@ -51,11 +51,11 @@ def test_every_block_of_the_page_is_run_or_checked(page):
 @pytest.mark.ros
 @pytest.mark.long
 @pytest.mark.timeout(600)
+# One after the other, and not beside mypy, which would leave the nodes too little of two cores.
+@pytest.mark.xdist_group('heavy')
 @pytest.mark.parametrize('page', [
-    # Not beside mypy, which would leave the nodes too little of two cores.
     pytest.param(
-        x, id=name_of(x),
-        marks=pytest.mark.xdist_group('heavy') if x.name == 'README.md' else pytest.mark.slow)
+        x, marks=[] if x.name == 'README.md' else pytest.mark.slow, id=name_of(x))
     for x in RUNNING])
 def test_page_does_what_it_says(page, ros_env, tmp_path):
     # How long each block took: shown if it fails, or by pytest -rP.
