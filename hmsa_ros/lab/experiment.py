@@ -191,6 +191,7 @@ def _conduct(
             times.append(monotonic())
             pace = (watch.now - begin) / (times[-1] - times[-2])
             measured = watch.measured
+            watch.wait_for_parameters()
         except BaseException as error:
             resting = True
             if watch.sent:

@@ -24,6 +24,8 @@ from hmsa_ros.nodes.service_call import RemoteParameters
 
 # How long the end of a sequence may keep us waiting after its time is over.
 _GRACE_SECONDS = 20.0
+# How long a recorder may take at the end to read the parameters of the nodes.
+_STORED_SECONDS = 10.0
 # Between two looks at who is there.
 _LOOK_SECONDS = 0.5
 _SAME = 1e-9
@@ -42,6 +44,8 @@ class Watch:
         self._experiment = experiment
         # Topics of which the recorder has found a publisher, by what it says.
         self._matched = 0
+        # Nodes whose parameters are in the bag.
+        self._stored = 0
         self._time = 0.0
         self._looked = 0.0
         # The time, and when it last went on.
@@ -59,6 +63,7 @@ class Watch:
             # Others may record too.
             if values.get('bag') == str(self._experiment.bag):
                 self._matched = whole(values.get('matched'))
+                self._stored = whole(values.get('parameters_of'))
 
     @property
     def now(self) -> float:
@@ -75,6 +80,17 @@ class Watch:
         """Whether the recorder hears everything that somebody sends."""
         sent = [x for x in self._experiment.topics() if self.client.node.count_publishers(x)]
         return self._matched >= len(sent)
+
+    def wait_for_parameters(self) -> None:
+        """Wait until parameters of planner and plant are in the bag, or note that they are not."""
+        count = sum(self._known(x) for x in (topics.PLANNER, topics.PLANT))
+        try:
+            self.client.spin_until(
+                lambda: self._stored >= count, 'no parameters', self._check, _STORED_SECONDS)
+        except HmsaError:
+            self.notes.append(
+                'the recorder has not read all parameters of planner and plant: they are not in '
+                'the bag')
 
     @property
     def measured(self) -> bool:

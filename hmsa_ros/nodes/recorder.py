@@ -130,7 +130,7 @@ class Recorder(ManagedNode):
         self._setpoints = SetpointLog()
         self._setpoint_topics: set[str] = set()
         # Topics of which a publisher was found at the last look.
-        self._matched = 0
+        self._matched = self._known = 0
         limits = _limits(values)
         writer = _writer(values, self._experiment)
         self.folder: Path = writer.folder
@@ -189,11 +189,6 @@ class Recorder(ManagedNode):
         self._find_nodes()
         found = self.get_topic_names_and_types()
         self._recorded.look(found)
-        before, self._matched = self._matched, sum(
-            isinstance(x, RecordedTopic) for x in self._capture.matched())
-        if self._matched != before:
-            # At once: somebody may wait for it.
-            self._diagnose()
         for name, types in found:
             topic = _SETPOINTS.get(name.rsplit('/', 1)[-1])
             if topic is not None and topic.type in types and any(
@@ -201,6 +196,12 @@ class Recorder(ManagedNode):
                 self._follow_setpoints(topic, name)
         for followed in self._followed.values():
             followed.poll(self._note)
+        before = self._matched, self._known
+        self._matched = sum(isinstance(x, RecordedTopic) for x in self._capture.matched())
+        self._known = sum(x.known for x in self._followed.values())
+        if (self._matched, self._known) != before:
+            # At once: somebody may wait for it.
+            self._diagnose()
 
     def _find_nodes(self) -> None:
         """Look for nodes whose parameters are to be stored."""
@@ -336,6 +337,7 @@ class Recorder(ManagedNode):
             'state': state,
             'subscribed': f'{len(self._recorded.topics)}/{self._recorded.wanted_count}',
             'matched': self._matched,
+            'parameters_of': self._known,
             'received': sum(topic.received for topic in self._recorded.topics.values()),
             **figures(status, lost, self._before()),
             **({} if self._sim_time is None else {

@@ -91,15 +91,16 @@ class RemoteParameters:
         self._server = node.create_client(ListParameters, f'{name}/list_parameters')
         self._names: list[str] = []
         self._call: ServiceCall | None = None
-        self._done = False
+        #: Whether they were given, and the node is still there.
+        self.known = False
 
     def poll(self, note: Callable[[dict[str, str]], None]) -> None:
         """Take the next step towards the node's parameters, for ``note`` as custom data."""
         if not self._server.service_is_ready():
             # Asked again when it comes back, perhaps with other parameters.
             self._ask(None)
-            self._done = False
-        elif self._done:
+            self.known = False
+        elif self.known:
             return
         elif self._call is None:
             self._ask(ListParameters)
@@ -115,7 +116,7 @@ class RemoteParameters:
             self._ask(GetParameters, names=self._names)
         else:
             self._ask(None)
-            self._done = True
+            self.known = True
             note(self.texts(zip(self._names, answer.values, strict=False)))
 
     def _ask(self, kind: Any, **request: Any) -> None:
