@@ -188,6 +188,8 @@ def test_what_cannot_be_identified_says_why(block, tmp_path):
     (lambda x: x.plan([(1.1, 1)], 'robust', order=1.5), 'order is 1.5: expected a whole number'),
     (lambda x: x.plan([(1.1, 1)], 'minimax', order=17), 'order is 17: expected 1 to 16'),
     (lambda x: x.plan([(1.1, 1)], period=-1), 'period is -1 s'),
+    (lambda x: x.plan([(1.1, 1)], period=1e-12), '0 for any time, or at least 1e-09 s'),
+    (lambda x: x.follow([0, 1], [1.0, 1.1], period=1e-320), '0 for any time, or at least'),
     (lambda x: x.plan([(1.1, 1)], 'smooth', max_rate=-1), 'max_rate is -1 1/s'),
     (lambda x: x.flux_density('high'), "stretches are 'high': expected numbers"),
     (lambda x: x.wave([(0, 1), (1, 1.1), (2, np.nan), (3, 1)], 5, 0.1), 'contain nan'),

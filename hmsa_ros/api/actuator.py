@@ -15,6 +15,7 @@ from hmsa_ros.api.arguments import (
     creep_values,
     DEFAULTS,
     file_of,
+    grid_of,
     law_values,
     limits_of,
     mapping_of,
@@ -56,8 +57,6 @@ if TYPE_CHECKING:
     from hmsa_ros.api.plan import Plan
     from hmsa_ros.identification.files import Belief
 
-# Period of a grid in s, below which commands have any time.
-_FINEST = 1e-9
 _STRONGEST: Any = FLUX_DENSITY_MAX.default
 # Nobody has to send the levels of such a plan: unless a file says how fine, they are very fine.
 _SPECS = (*PLANNED, *VISCOELASTIC, replace(CREEP_TOLERANCE, default=IDEAL.ripple))
@@ -518,9 +517,6 @@ class Actuator:
             model = Model(model.actuator, replace(
                 model.options, flux_density_min=low, flux_density_max=high))
         unit = model.units.time
-        if 0.0 < number(period, 'period', 's', least=0.0) < _FINEST:
-            raise BadInputError(
-                f'period is {period:g} s: expected 0 for any time, or at least {_FINEST:g} s')
         segments = plan_sequence(
             [Setpoint(x, y / unit) for x, y in zip(
                 stretches.tolist(), durations.tolist(), strict=True)],
@@ -528,7 +524,7 @@ class Actuator:
                 model.material,
                 State(model.material.rest if start is None else number(start, 'start')),
                 limits=model.limits, units=model.units, order=order,
-                delivery=replace(model.delivery, period=period / unit),
+                delivery=replace(model.delivery, period=grid_of(period) / unit),
                 errors=self._errors(shaper) if errors is None else as_errors(errors),
                 pace=Pace(number(periods, 'periods'), unit * (rate if rate == math.inf else number(
                     rate, 'max_rate', '1/s', above=0.0)))),

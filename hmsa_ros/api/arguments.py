@@ -20,6 +20,8 @@ from hmsa_ros.planning.setpoint import impossible
 #: Parameters of a block by their names without the group, with their defaults.
 DEFAULTS = {x.name.partition('.')[2]: x.default for x in ACTUATOR}
 
+# Period of a grid in s, below which commands have any time.
+_FINEST = 1e-9
 #: Other names of a column.
 _ALIASES = {'duration': ('span', 'seconds'), 'stretch': ('deflection', 'position')}
 
@@ -97,6 +99,14 @@ def file_of(value: Any, what: str = 'the path of a file') -> Path:
     if not isinstance(value, (str, os.PathLike)) or '\0' in os.fsdecode(value):
         raise BadInputError(f'path is {excerpt(value)}: expected {what}')
     return Path(value)
+
+
+def grid_of(period: Any) -> float:
+    """Return the period of a grid in s, 0 for any time, or raise `BadInputError`."""
+    if 0.0 < number(period, 'period', 's', least=0.0) < _FINEST:
+        raise BadInputError(
+            f'period is {period:g} s: expected 0 for any time, or at least {_FINEST:g} s')
+    return float(period)
 
 
 def mapping_of(value: Any, what: str, example: str) -> Mapping[str, Any]:

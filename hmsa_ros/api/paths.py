@@ -6,7 +6,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from hmsa_ros.api.arguments import columns_of, number, numbers
+from hmsa_ros.api.arguments import columns_of, grid_of, number, numbers
 from hmsa_ros.columns import read_table
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.equations import Array
@@ -183,7 +183,7 @@ def segments_along(
     """
     tolerance = number(tolerance, 'tolerance', above=0.0, most=1.0)
     frame = replace(_frame(actuator), state=State(ends[0]), target=ends[0])
-    if number(period, 'period', 's', least=0.0):
+    if period := grid_of(period):
         frame = replace(frame, delivery=replace(
             frame.delivery, period=period / actuator.model.units.time))
     move = finish(along(replace(frame, target=ends[1]), path, tolerance))
