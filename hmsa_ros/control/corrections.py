@@ -203,9 +203,10 @@ class Corrections:
         slew = planner.options.slew_limit
         course, gain = course_of(planner.plan, draft.begin, _LITTLE if arrival else _GAIN)
         segment = draft.segments[0]
-        step = max(abs(segment.stretch - self._feedback.start(name)), _LEAST_STEP)
+        start = self._feedback.start(name)
+        step = max(abs(segment.stretch - start), _LEAST_STEP)
         # A force that samples do not show either way is not to make it worse.
-        doubted, start = estimate.doubted, self._feedback.start(name)
+        doubted = estimate.doubted
         hidden = MUCH * step if not arrival and abs(
             start - planner.model.actuator.rest) < _FIRST and confounded(
                 doubted, _HIDDEN * step) else 0.0

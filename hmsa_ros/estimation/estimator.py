@@ -13,7 +13,7 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
 from hmsa_ros.estimation.prior import Prior
 from hmsa_ros.estimation.screening import Screening
-from hmsa_ros.estimation.suspects import GAIN, Suspects
+from hmsa_ros.estimation.suspects import Suspects
 from hmsa_ros.estimation.window import coordinates, Doubt, Rest, Solution, Trial, values_at, Window
 from hmsa_ros.identification.fit import robust_scale
 from hmsa_ros.identification.quantities import actuator_of, BRANCHES, derivative, QUANTITIES
@@ -87,16 +87,10 @@ class Estimate:
     # As `off` of what plans use, with what shows as much as a gain of the sensor in its place.
     instead: Array
     doubt: Doubt
-    named: int  # how many of the first that are tracked are named
+    gain: int  # place of a suspected gain of the sensor about rest; -1 for none
     noise: float  # standard deviation of a sample
     trusted: bool  # whether it may be acted upon
     trouble: str  # why not; empty if it may
-
-    @property
-    def gain(self) -> int:
-        """Place of a suspected gain of the sensor about rest; -1 for none."""
-        place = self.free.index(GAIN) if GAIN in self.free else -1
-        return place if place >= self.named else -1
 
     @property
     def actuator(self) -> ActuatorParameters:
@@ -381,7 +375,7 @@ class Estimator:
         trouble = self.screening.trouble or self._strange(found.z)
         return Estimate(
             time, float(state[-2]), float(state[-1]), values, self.prior.free, deviations,
-            covariance, off, found.instead, doubt, self.prior.named, self.noise,
+            covariance, off, found.instead, doubt, window.suspects.gain, self.noise,
             not trouble, trouble)
 
     def _strange(self, z: Array) -> str:

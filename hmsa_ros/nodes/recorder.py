@@ -129,7 +129,8 @@ class Recorder(ManagedNode):
         self._experiment: dict[str, str] = {'hmsa_ros.version': __version__}
         self._setpoints = SetpointLog()
         self._setpoint_topics: set[str] = set()
-        # Topics of which a publisher was found at the last look.
+        # Topics of which a publisher was found at the last look, and nodes whose parameters are
+        # stored.
         self._matched = self._known = 0
         limits = _limits(values)
         writer = _writer(values, self._experiment)
