@@ -147,6 +147,15 @@ inline double energy_beyond(double way, double depth, double force, double stiff
     return force * way - stiffness * depth * depth * (log1p(-share) + share);
 }
 
+// Energy at a way into a piece of the force of degree N: its begin, the energy there, its factors.
+template <int N> double energy_within(const double *piece, double way)
+{
+    double total = 0;
+    for (int k = N + 1; k > 0; k--)
+        total = way * (piece[1 + k] / k + total);
+    return piece[1] + total;
+}
+
 template <class R> struct Table {
     // Measured at rest: pieces of the force, of degree 5 in the stretch.
     const double *c;
@@ -179,11 +188,7 @@ template <class R> struct Table {
         if (end)
             return end[1] + energy_beyond(l - *end, end == first() ? c[1] : c[2], end[2], end[3]);
         const double *p = piece(l);
-        const double u = l - *p;
-        double total = 0;
-        for (int k = 6; k > 0; k--)
-            total = u * (p[1 + k] / k + total);
-        return p[1] + total;
+        return energy_within<5>(p, l - *p);
     }
 };
 }  // namespace hmsa

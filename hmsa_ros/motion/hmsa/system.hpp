@@ -92,31 +92,27 @@ struct Beam {
         const double *p = piece(a);
         return horner<7>(p + 2, S(size - *p)) * sign;
     }
-    // Inertia, half its slope, and what multiplies the damping at rest.
-    template <class S> void inertia(const S &l, S &mass, S &half, S &shape) const
+    // 1/m, m'/(2 m), and what multiplies the damping at rest, over m.
+    template <class S> void inertia(const S &l, S &i_mass, S &falls, S &damps) const
     {
         const double x = value(l), a = abs(x), sign = x < 0 ? -1 : 1;
         if (!(a <= c[2])) {
-            mass = 0.0 * l + c[6];
-            half = 0.0 * l;
-            shape = 0.0 * l + c[7];
+            i_mass = inverse(S(0.0 * l + c[6]));
+            falls = 0.0 * l;
+            damps = i_mass * c[7];
             return;
         }
         const double *p = piece(a);
         const S u = l * sign - *p;
-        mass = horner<7>(p + 10, u);
-        half = horner_slope<7>(p + 10, u) * (0.5 * sign);
-        shape = horner<7>(p + 18, u);
+        i_mass = inverse(horner<7>(p + 10, u));
+        falls = horner_slope<7>(p + 10, u) * (0.5 * sign) * i_mass;
+        damps = horner<7>(p + 18, u) * i_mass;
     }
     double energy(double l) const
     {
         const double a = abs(l), way = a - c[2], inside = min(a, c[2]);
-        const double *p = piece(inside);
-        const double u = inside - *p;
-        double total = 0;
-        for (int k = 8; k > 0; k--)
-            total = u * (p[1 + k] / k + total);
-        return p[1] + total + (way > 0 ? energy_beyond(way, c[1] - c[2], c[4], c[5]) : 0);
+        const double *p = piece(inside), within = energy_within<7>(p, inside - *p);
+        return within + (way > 0 ? energy_beyond(way, c[1] - c[2], c[4], c[5]) : 0);
     }
 };
 
@@ -154,28 +150,30 @@ template <class C> struct AnyOf {
         case ogden: return ogden_law.seed(constant, j);
         }
     }
-    template <class L> HMSA_APART L force(const L &l) const
+    template <class F> auto with_law(const F &f) const
     {
         switch (kind) {
         case polynomial:
-        case arruda_boyce: return polynomial_law.force(l);
-        case ogden: return ogden_law.force(l);
-        case table: return table_law.force(l);
-        case dielectric: return dielectric_law.force(l);
-        default: return beam_law.force(l);
+        case arruda_boyce: return f(polynomial_law);
+        case ogden: return f(ogden_law);
+        case table: return f(table_law);
+        case dielectric: return f(dielectric_law);
+        default: return f(beam_law);
         }
+    }
+    template <class L> HMSA_APART L force(const L &l) const
+    {
+        return with_law([&](const auto &law) { return L(law.force(l)); });
+    }
+    double energy(double l) const
+    {
+        return with_law([&](const auto &law) { return law.energy(l); });
     }
     // 1/m, m'/(2 m), and what multiplies the damping at rest, over m.
     template <class L> HMSA_APART void inertia(const L &l, L &i_mass, L &falls, L &damps) const
     {
-        if (kind == beam) {
-            L m, half, shape;
-            beam_law.inertia(l, m, half, shape);
-            i_mass = inverse(m);
-            falls = half * i_mass;
-            damps = shape * i_mass;
-            return;
-        }
+        if (kind == beam)
+            return beam_law.inertia(l, i_mass, falls, damps);
         if (kind == dielectric)
             return dielectric_law.inertia(l, i_mass, falls, damps);
         const L l2 = l * l, l4 = l2 * l2, q = inverse(l + l4 * c1);
@@ -196,17 +194,6 @@ template <class C> struct AnyOf {
                 *squared = pull.d[0] * i_mass.v;
         return net(outer<direct>(pull, l)) * outer<direct>(i_mass, l)
             - (outer<direct>(damps, l) * damping + outer<direct>(falls, l) * v) * v;
-    }
-    double energy(double l) const
-    {
-        switch (kind) {
-        case polynomial:
-        case arruda_boyce: return polynomial_law.energy(l);
-        case ogden: return ogden_law.energy(l);
-        case table: return table_law.energy(l);
-        case dielectric: return dielectric_law.energy(l);
-        default: return beam_law.energy(l);
-        }
     }
     Dual<double, 1> elastic(double l) const { return force(Dual<double, 1>{l, {1}}); }
     double mass(double l) const
