@@ -12,7 +12,20 @@ template <class S> struct Drive {
     double slope;
     S rest;
     double decay;
+
+    S load() const { return line + rest; }
+    void go_on(double duration)
+    {
+        line = line + slope * duration;
+        rest = rest * exp(-decay * duration);
+    }
 };
+// Of a field that follows with a lag an amplifier's output begin + slope t.
+template <class S> Drive<S> following(const S &begin, double slope, double lag, const S &field)
+{
+    const S line = begin - slope * lag;
+    return {line, slope, lag > 0 ? S(field - line) : S(0.0 * line), lag > 0 ? 1 / lag : 0};
+}
 
 template <class S, class System, int NB> struct Motion {
     const System &system;
@@ -130,33 +143,27 @@ template <int NB, class System> bool sample(
     motion.y[0] = course.stretch, motion.y[1] = course.rate;
     for (int b = 0; b < branches.count(); b++)
         motion.y[2 + b] = course.branches[branch_columns * b + follower_at];
-    const double lag = course.lag, decay = lag > 0 ? 1 / lag : 0;
-    double t = course.switches[0], field = course.field, h = 0;
-    int piece = 0;
-    double line = course.loads[0] - course.slopes[0] * lag;
-    double rest = lag > 0 ? field - line : 0;
-    for (int i = 0; i < course.count;) {
+    const auto piece_from = [&](int piece, double field) {
+        return following(course.loads[piece], course.slopes[piece], course.lag, field);
+    };
+    Drive<double> drive = piece_from(0, course.field);
+    double t = course.switches[0], h = 0;
+    for (int i = 0, piece = 0; i < course.count;) {
         const bool ends = piece + 1 < course.pieces && course.switches[piece + 1] <= course.times[i];
-        const double end = ends ? course.switches[piece + 1] : course.times[i], span = end - t;
-        const double slope = course.slopes[piece];
-        if (!motion.advance({line, slope, rest, decay}, span, course.zeta, course.rtol, h))
+        const double end = ends ? course.switches[piece + 1] : course.times[i];
+        if (!motion.advance(drive, end - t, course.zeta, course.rtol, h))
             return false;
-        line += slope * span;
-        if (rest != 0)
-            rest *= exp(-decay * span);
-        field = line + rest;
+        drive.go_on(end - t);
         t = end;
         if (ends) {
-            piece++;
+            drive = piece_from(++piece, drive.load());
             h = 0;
-            line = course.loads[piece] - course.slopes[piece] * lag;
-            rest = lag > 0 ? field - line : 0;
             continue;
         }
         double *column = course.out + i++;
         column[0] = motion.y[0];
         column[course.count] = motion.y[1];
-        column[2 * course.count] = field;
+        column[2 * course.count] = drive.load();
         for (int b = 0; b < branches.count(); b++)
             column[(3 + b) * course.count] = motion.y[2 + b];
     }

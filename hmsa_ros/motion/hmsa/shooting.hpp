@@ -126,25 +126,23 @@ template <class System, int P> struct Shooting {
         for (int b = 0; b < branches.count(); b++)
             motion.y[2 + b] = motion.y[2 + b] + shot.followed[b];
         S field = 0.0 * motion.y[0] + shot.field;
-        const double decay = shot.lag > 0 ? 1 / shot.lag : 0;
         for (int m = 0; m < count; m++) {
-            const S line = with<S>(begin[m] - slope[m] * shot.lag, d_begin[m]);
-            const S rest = shot.lag > 0 ? S(field - line) : S(0.0 * line);
+            auto drive = following(with<S>(begin[m], d_begin[m]), slope[m], shot.lag, field);
             double h = 0;
             constexpr int each = 2 + count_of<S>;
             motion.room = min(most_attempts, (shot.most_work - work) / each);
             const int before = motion.made;
-            const bool there = motion.advance({line, slope[m], rest, decay}, duration[m], zeta, rtol, h);
+            const bool there = motion.advance(drive, duration[m], zeta, rtol, h);
             work += each * (motion.made - before);
             if (!there)
                 return false;
-            const double left = shot.lag > 0 ? exp(-decay * duration[m]) : 0;
-            field = line + slope[m] * duration[m] + rest * left;
+            drive.go_on(duration[m]);
+            field = drive.load();
             if constexpr (count_of<S> > 0) {
                 // By the length of the piece: the equation at its end.
                 S by[2 + NB];
                 change(system, branches, motion.y, field, by);
-                const double change = slope[m] - value(rest) * decay * left;
+                const double change = slope[m] - value(drive.rest) * drive.decay;
                 for (int c = 0; c < shot.unknowns; c++) {
                     for (int w = 0; w < motion.width; w++)
                         motion.y[w].d[c] += by[w].v * d_duration[m][c];
