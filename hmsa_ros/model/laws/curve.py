@@ -8,14 +8,15 @@ Points without scatter, less than 1/5000 of their range, are interpolated.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 import math
 import os
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import BSpline, PPoly
 
 from hmsa_ros.errors import BadInputError
 
@@ -45,22 +46,12 @@ _STOP = 0.1
 _LOOK = 24
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """Level in T against stretch, as a spline of degree 5."""
+class Curve(NamedTuple):
+    """Level in T against stretch."""
 
-    breaks: Array  #: (p + 1,), stretches at which the pieces meet
-    #: (p, 6), factors in T of the powers of the stretch beyond the beginning of each piece.
-    pieces: Array
+    level: PPoly  #: of degree 5, 0 at stretch 1
     slope: float  #: at stretch 1, in T
     scatter: float  #: standard deviation of the points in T, estimated
-
-    def at(self, stretch: float, order: int = 0) -> float:
-        """Return the level at a stretch, or a derivative of it."""
-        i = min(max(int(np.searchsorted(self.breaks, stretch, 'right')) - 1, 0),
-                len(self.pieces) - 1)
-        poly = np.polynomial.Polynomial(self.pieces[i])
-        return float((poly.deriv(order) if order else poly)(stretch - self.breaks[i]))
 
     def packed(self, unit: float) -> tuple[float, ...]:
         """
@@ -69,21 +60,15 @@ class Curve:
         Number of pieces and depths of the stops; of each piece begin, energy there and factors;
         end, energy, force and stiffness there.
         """
-        pieces = self.pieces / unit
-        widths = np.diff(self.breaks)
-        powers = np.arange(1, _DEGREE + 2)
-        work = np.sum(pieces / powers * widths[:, None] ** powers, axis=1)
-        energy = np.append(0.0, np.cumsum(work))
-        first = int(np.searchsorted(self.breaks, 1.0, 'right')) - 1
-        rest = energy[first] + float(np.sum(
-            pieces[first] / powers * (1.0 - self.breaks[first]) ** powers))
-        energy -= rest
-        rows = np.column_stack([self.breaks[:-1], energy[:-1], pieces])
-        end = float(self.breaks[-1])
+        level, breaks = self.level, self.level.x
+        energy = level.antiderivative()
+        rows = np.column_stack([
+            breaks[:-1], (energy(breaks[:-1]) - energy(1.0)) / unit, level.c[::-1].T / unit])
+        end = breaks[-1]
+        at_end = np.array([energy(end) - energy(1.0), level(end), level(end, 1)]) / unit
         return (
-            float(len(pieces)), *(_STOP * (self.breaks[[0, -1]] - 1.0)).tolist(),
-            *rows.ravel().tolist(), end, float(energy[-1]), self.at(end) / unit,
-            self.at(end, 1) / unit)
+            float(len(rows)), *(_STOP * (breaks[[0, -1]] - 1.0)).tolist(), *rows.ravel().tolist(),
+            float(end), *at_end.tolist())
 
 
 def points_in(name: str) -> tuple[list[float], list[float]]:
@@ -152,16 +137,26 @@ def fitted(stretch: tuple[float, ...], flux: tuple[float, ...]) -> Curve:
     span, height = float(x[-1] - x[0]), float(y[-1] - y[0])
     u, v = (x - x[0]) / span, y / height
     knots = _knots(u)
-    breaks = knots[_DEGREE:-_DEGREE]
-    local = _local(knots, breaks)
-    solve = _Smoothing.of(_basis(u, knots), _roughness(local, np.diff(breaks)), v)
-    best, scatter = solve.best()
+    basis = BSpline(knots, np.eye(len(knots) - _DEGREE - 1), _DEGREE)
+    design = basis(u)
+    curves, roughness, parts = _told_apart(design, _roughness(basis), v)
+    shares = 1.0 / (1.0 + _WEIGHTS[:, None] * roughness)
+    coefficients = shares * parts @ curves.T
+    squares = np.sum((v - coefficients @ design.T) ** 2, axis=1)
+    used = np.sum(shares, axis=1)
+    free = len(u) - _PRICE * used
+    best = int(np.argmin(np.divide(
+        squares, free ** 2, out=np.full_like(squares, np.inf), where=free > 0.0)))
+    scatter = math.sqrt(squares[best] / max(len(u) - used[best], 1e-6))
     if scatter > _MOST_SCATTER:
         raise BadInputError(
             f'law table has a scatter of {scatter * height:.3g} T about a smooth curve: expected '
             f'at most {_MOST_SCATTER * height:.3g} T, {_MOST_SCATTER:.0%} of its range')
-    chosen = _rising(solve, best, local, breaks)
-    missed = np.abs(solve.design @ chosen - v)
+    # The roughest that rises everywhere; where not even a parabola does, it misses the points.
+    slopes = basis.derivative()(_points(knots, np.linspace(0.0, 1.0, _LOOK)))
+    chosen = next((x for x in coefficients[best if scatter > _EXACT else 0:]
+                   if np.min(slopes @ x) > _LEAST_SLOPE), np.zeros(len(basis.c)))
+    missed = np.abs(design @ chosen - v)
     if np.max(missed) > max(_DEVIATIONS * scatter, _SHARE):
         # Where the points themselves turn back the most.
         falls = np.maximum.accumulate(v) - v
@@ -170,36 +165,15 @@ def fitted(stretch: tuple[float, ...], flux: tuple[float, ...]) -> Curve:
             f'law table does not rise beyond its scatter of {scatter * height:.2g} T near row '
             f'{i + 1} (stretch {x[i]:g}, {y[i]:g} T): expected flux densities that rise with '
             'stretch; repeat the measurement there')
-    widths = np.diff(breaks) * span
-    pieces = height * (local @ chosen) / widths[:, None] ** np.arange(_DEGREE + 1)
-    curve = Curve(x[0] + span * breaks, pieces, 0.0, scatter * height)
-    return _through_rest(curve, height)
-
-
-def _rising(solve: '_Smoothing', first: int, local: Array, breaks: Array) -> Array:
-    """Return the coefficients of the roughest curve from a weight on that rises everywhere."""
-    shares = np.linspace(0.0, 1.0, _LOOK)[:, None] ** np.arange(_DEGREE)
-    for weight in _WEIGHTS[first:]:
-        coefficients = solve.coefficients(weight)
-        pieces = local @ coefficients
-        slopes = (shares @ (pieces[:, 1:] * np.arange(1, _DEGREE + 1)).T) / np.diff(breaks)
-        if np.min(slopes) > _LEAST_SLOPE:
-            return coefficients
-    # Not even a parabola does: a curve that misses the points.
-    return np.zeros(local.shape[2])
-
-
-def _through_rest(curve: Curve, height: float) -> Curve:
-    """Return a curve that is 0 at stretch 1, where it was nearly so."""
-    offset = curve.at(1.0)
-    allowed = max(_DEVIATIONS * curve.scatter, _ZERO * height)
+    spline = PPoly.from_spline(BSpline(x[0] + span * knots, height * chosen, _DEGREE))
+    level = PPoly(spline.c[:, _DEGREE:-_DEGREE], spline.x[_DEGREE:-_DEGREE])
+    offset, allowed = float(level(1.0)), max(_DEVIATIONS * scatter, _ZERO) * height
     if abs(offset) > allowed:
         raise BadInputError(
             f'law table has a flux density of {offset:.4g} T at stretch 1: expected 0 within '
             f'{allowed:.2g} T; stretch is the length over the length at rest without field')
-    pieces = curve.pieces.copy()
-    pieces[:, 0] -= offset
-    return Curve(curve.breaks, pieces, curve.at(1.0, 1), curve.scatter)
+    level.c[-1] -= offset
+    return Curve(level, float(level(1.0, 1)), scatter * height)
 
 
 def _knots(u: Array) -> Array:
@@ -212,75 +186,33 @@ def _knots(u: Array) -> Array:
     return knots
 
 
-def _basis(u: Array, knots: Array) -> Array:
-    """Return the B-splines at points, a row each, by the recursion of Cox and de Boor."""
-    column = np.minimum(u, np.nextafter(1.0, 0.0))[:, None]
-    made: Array = ((knots[:-1] <= column) & (column < knots[1:])).astype(np.float64)
-    for k in range(1, _DEGREE + 1):
-        spans = knots[k:] - knots[:-k]
-        shares = (column - knots[:-k]) / np.where(spans > 0.0, spans, 1.0)
-        made = np.where(spans[:-1] > 0.0, shares[:, :-1], 0.0) * made[:, :-1] + np.where(
-            spans[1:] > 0.0, 1.0 - shares[:, 1:], 0.0) * made[:, 1:]
+def _points(knots: Array, shares: Array) -> Array:
+    """Return points at shares of each piece between knots."""
+    breaks = knots[_DEGREE:-_DEGREE, None]
+    points: Array = (breaks[:-1] + np.diff(breaks, axis=0) * shares).ravel()
+    return points
+
+
+def _roughness(basis: BSpline) -> Array:
+    """Return what squared and added gives the integral of the squared third derivative."""
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    third = basis.derivative(3)(_points(basis.t, 0.5 + 0.5 * nodes))
+    widths = np.diff(basis.t[_DEGREE:-_DEGREE])
+    made: Array = third * np.sqrt(np.outer(widths, 0.5 * weights)).reshape(-1, 1)
     return made
 
 
-def _local(knots: Array, breaks: Array) -> Array:
-    """Return (p, 6, m): B-splines on each piece by powers of the share of it that is passed."""
-    nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))
-    points = breaks[:-1, None] + np.diff(breaks)[:, None] * nodes
-    values = _basis(points.ravel(), knots).reshape(*points.shape, -1)
-    powers = nodes[:, None] ** np.arange(_DEGREE + 1)
-    local: Array = np.linalg.solve(
-        np.broadcast_to(powers, (len(points), *powers.shape)), values).astype(np.float64)
-    return local
+def _told_apart(design: Array, rough: Array, levels: Array) -> tuple[Array, Array, Array]:
+    """
+    Return coefficients of the curves that the roughness tells apart, by column.
 
-
-def _roughness(local: Array, widths: Array) -> Array:
-    """Return what squared and added gives the integral of the squared third derivative."""
-    nodes, weights = np.polynomial.legendre.leggauss(3)
-    share = 0.5 + 0.5 * nodes
-    third = np.stack([np.full(3, 6.0), 24.0 * share, 60.0 * share ** 2], axis=1)
-    rows: Array = third @ local[:, 3:, :] * np.sqrt(0.5 * weights)[:, None]
-    made: Array = rows / widths[:, None, None] ** 2.5
-    return made.reshape(-1, local.shape[2])
-
-
-@dataclass(frozen=True, eq=False)
-class _Smoothing:
-    """All smooth curves through points: one decomposition serves every weight of the roughness."""
-
-    design: Array
-    levels: Array
-    # Coefficients of the curves that the roughness tells apart, how rough each is, and what the
-    # points say of each.
-    curves: Array
-    roughness: Array
-    parts: Array
-
-    @classmethod
-    def of(cls, design: Array, rough: Array, levels: Array) -> '_Smoothing':
-        q, r = np.linalg.qr(design)
-        inverse = np.linalg.inv(r)
-        # A piece has 3 rows: few pieces have fewer than there are directions.
-        square = np.vstack([rough @ inverse, np.zeros_like(inverse)])
-        _, sizes, directions = np.linalg.svd(square, full_matrices=False)
-        roughness = sizes ** 2
-        roughness[-3:] = 0.0  # parabolas have no third derivative
-        return cls(design, levels, inverse @ directions.T, roughness, directions @ (q.T @ levels))
-
-    def coefficients(self, weight: float) -> Array:
-        """Return the coefficients of a curve."""
-        made: Array = self.curves @ (self.parts / (1.0 + weight * self.roughness))
-        return made
-
-    def best(self) -> tuple[int, float]:
-        """Return which weight cross-validation takes, and the scatter."""
-        scores, scatters = [], []
-        for weight in _WEIGHTS:
-            missed = self.levels - self.design @ self.coefficients(weight)
-            used = float(np.sum(1.0 / (1.0 + weight * self.roughness)))
-            squares, free = float(missed @ missed), len(missed) - _PRICE * used
-            scores.append(squares / free ** 2 if free > 0.0 else math.inf)
-            scatters.append(math.sqrt(squares / max(len(missed) - used, 1e-6)))
-        best = int(np.argmin(scores))
-        return (best, scatters[best]) if scatters[best] > _EXACT else (0, scatters[best])
+    And how rough each is, and what the points say of each: one decomposition serves every weight.
+    """
+    q, r = np.linalg.qr(design)
+    inverse = np.linalg.inv(r)
+    # A piece has 3 rows: few pieces have fewer than there are directions.
+    square = np.vstack([rough @ inverse, np.zeros_like(inverse)])
+    _, sizes, directions = np.linalg.svd(square, full_matrices=False)
+    roughness = sizes ** 2
+    roughness[-3:] = 0.0  # parabolas have no third derivative
+    return inverse @ directions.T, roughness, directions @ (q.T @ levels)
