@@ -8,7 +8,7 @@ from hmsa_ros.report.charts import axis, Figure, label
 from hmsa_ros.report.curves import numbers
 from hmsa_ros.report.looks import BLUE
 from hmsa_ros.report.page import document
-from hmsa_ros.report.tables import cell, table
+from hmsa_ros.table import Column, Table
 
 _BINS = 40
 
@@ -24,9 +24,11 @@ def page(found: Conformance) -> str:
             (len(found.checks) - failed, 'checks passed'), (failed, 'checks failed'),
             (len(found.untried), 'not tried')),
         untried=[f'not tried: {x}' for x in found.untried],
-        checks=table('checks', ('check', 'result', 'figure', 'limit', 'unit', 'finding'), [
-            [x.name, 'passed' if x.passed else 'FAILED', cell(x.figure, '.3g'),
-             cell(x.limit, '.3g'), x.unit, x.sentence] for x in found.checks]))
+        checks=Table(
+            (Column('check'), Column('result'), Column('figure', form='.3g'),
+             Column('limit', form='.3g'), Column('unit'), Column('finding')),
+            tuple((x.name, 'passed' if x.passed else 'FAILED', x.figure, x.limit, x.unit,
+                   x.sentence) for x in found.checks)))
 
 
 def _histogram(name: str, times: Array) -> Figure:

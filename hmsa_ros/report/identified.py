@@ -14,7 +14,7 @@ from hmsa_ros.report.charts import Figure, label
 from hmsa_ros.report.curves import BUCKETS, decimate, numbers
 from hmsa_ros.report.looks import BLACK, BLUE, GREY, VERMILION
 from hmsa_ros.report.page import document
-from hmsa_ros.report.tables import Cell, cell, PageTable, table
+from hmsa_ros.table import Column, Table
 
 _LAGS = 60
 # Points of the fitted curve, in time units, and how many at most.
@@ -123,33 +123,34 @@ def _correlation(found: Identification) -> Figure:
         'xaxis': _axis('lag (samples)'), 'yaxis': _axis('autocorrelation')})
 
 
-def _parameters(found: Identification) -> PageTable:
-    rows: list[list[Cell | str]] = []
+def _parameters(found: Identification) -> Table:
+    rows: list[tuple[Any, ...]] = []
     for key in found.parameters:
         name, x = found.shown(key)
+        share: float | str = 'fixed'
         if x.free:
-            lost = math.isnan(x.value)
-            rows.append([
-                name, x.unit or '1', *(cell(y) for y in (x.value, x.std, x.low, x.high)),
-                'not identifiable' if lost else cell(100.0 * x.std / abs(x.value), '.3g')
-                if abs(x.value) > x.std else ''])
-        else:
-            rows.append([name, x.unit or '1', cell(x.value), '', '', '', 'fixed'])
-    return table(
-        'parameter-table',
-        ['parameter', 'unit', 'value', 'deviation', 'low', 'high', 'deviation [%]'], rows)
+            share = 'not identifiable' if math.isnan(x.value) else (
+                100.0 * x.std / abs(x.value) if abs(x.value) > x.std else '')
+        rows.append((
+            name, x.unit or '1', x.value, *((x.std, x.low, x.high) if x.free else ('',) * 3),
+            share))
+    return Table((
+        *map(Column, ('parameter', 'unit', 'value', 'deviation', 'low', 'high')),
+        Column('deviation [%]', form='.3g')), tuple(rows))
 
 
-def _marks(found: Identification) -> PageTable:
-    return table('signature-table', ['searched for', 'share [%]', 'deviations', 'found'], [
-        [x.name, cell(100.0 * x.share, '.3g'), cell(x.deviations, '.3g'),
-         'yes' if x.found else 'no'] for x in found.signatures])
+def _marks(found: Identification) -> Table:
+    return Table(
+        (Column('searched for'), Column('share [%]', form='.3g'), Column('deviations', form='.3g'),
+         Column('found')),
+        tuple((x.name, 100.0 * x.share, x.deviations, 'yes' if x.found else 'no')
+              for x in found.signatures))
 
 
-def _pairs(found: Identification) -> PageTable | None:
+def _pairs(found: Identification) -> Table | None:
     if len(found.names) < 2:
         return None
-    matrix = found.correlation
     names = [found.shown(x)[0] for x in found.names]
-    return table('correlation-table', ['', *names], [
-        [name, *(cell(float(x), '.3f') for x in matrix[i])] for i, name in enumerate(names)])
+    return Table(
+        (Column(''), *(Column(x, form='.3f') for x in names)), tuple(
+            (name, *row) for name, row in zip(names, found.correlation.tolist(), strict=True)))

@@ -4,7 +4,7 @@ A report as one HTML page that needs nothing else: no network, no other file.
 What the page may load is nailed down in its content security policy, too.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 import json
 import math
@@ -29,7 +29,7 @@ from hmsa_ros.report import charts, curves, looks
 from hmsa_ros.report.arrivals import NOT_MOVED, Part, residual_text
 from hmsa_ros.report.charts import Figure, TimeUnit
 from hmsa_ros.report.evaluation import FEW_SAMPLES, period_of, plan_points
-from hmsa_ros.report.tables import Cell, cell, formatted, PageTable, Row, table, Values
+from hmsa_ros.table import Column, Table
 
 _FOLDER = Path(__file__).parent
 # Plans and requests of long runs are cut here; the figures show all of them.
@@ -65,8 +65,8 @@ def page(parts: Sequence[Part]) -> str:
         known=all(x.run.parameters_known for x in parts), setpoints=_setpoints(parts),
         plan=_plan(parts, unit), times=_timing(parts), requests=_requests(parts, unit),
         losses=_losses(parts), actuator=_parameters(parts),
-        recorded=table('recorded-table', ['run', 'parameter', 'value'], [
-            [part.run.label, key, json.dumps(value)] for part in parts
+        recorded=_table({'run': '', 'parameter': '', 'value': ''}, [
+            (part.run.label, key, json.dumps(value)) for part in parts
             for key, value in part.run.parameters.items()]),
         buckets=curves.BUCKETS)
 
@@ -81,13 +81,19 @@ def document(template: str, title: str, figures: Sequence[Figure], **values: Any
     pages = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_FOLDER), autoescape=True, trim_blocks=True,
         lstrip_blocks=True, undefined=jinja2.StrictUndefined)
-    pages.globals['zip'] = zip
+    pages.globals |= {'zip': zip, 'numeric': _numeric}
     return pages.get_template(template).render(
         title=title, version=__version__, figures=figures, plotly=_plotly(),
         style=(_FOLDER / 'page.css').read_text(encoding='utf-8'),
         script=(_FOLDER / 'page.js').read_text(encoding='utf-8'),
         # Inside a script "</" could end it, and "<!--" keep it from ending.
         data=data.replace('<', '\\u003c'), **values)
+
+
+def _numeric(table: Table) -> list[bool]:
+    """Return of each column whether it has numbers."""
+    return [any(not isinstance(row[i], str) for row in table.rows)
+            for i in range(len(table.columns))]
 
 
 def _plotly() -> str:
@@ -118,7 +124,7 @@ def _source(run: Run) -> tuple[str, ...]:
             _time(int(run.time[0])), f'{(run.time[-1] - run.time[0]) / NANOSECONDS:.6g}')
 
 
-def _summary(parts: Sequence[Part]) -> list[tuple[str, str]] | PageTable:
+def _summary(parts: Sequence[Part]) -> list[tuple[str, str]] | Table:
     """Return the figures that say most: of one run with their names, of several as a table."""
     def largest(values: Iterable[float]) -> float:
         return max((x for x in values if math.isfinite(x)), default=math.nan)
@@ -136,8 +142,8 @@ def _summary(parts: Sequence[Part]) -> list[tuple[str, str]] | PageTable:
         _lost(x.run.summary)] for x in parts]
     if len(parts) == 1:
         return list(zip(rows[0], header, strict=True))
-    return table('run-table', ['run', *header], [
-        [x.run.label, *row] for x, row in zip(parts, rows, strict=True)])
+    return _table(dict.fromkeys(('run', *header), ''), [
+        (x.run.label, *row) for x, row in zip(parts, rows, strict=True)])
 
 
 def _notes(parts: Sequence[Part]) -> list[str]:
@@ -177,86 +183,89 @@ def _notes_of(part: Part) -> Iterable[str]:
 
 # Tables --------------------------------------------------------------------------------------
 
-def _setpoints(parts: Sequence[Part]) -> PageTable:
+def _table(columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]) -> Table:
+    """Return a table by headings with formats; a run on its own needs no name in every row."""
+    names = tuple(Column(name, form=form) for name, form in columns.items())
+    if names[0].name in ('run', 'bag') and len({row[0] for row in rows}) <= 1:
+        names, rows = names[1:], [row[1:] for row in rows]
+    return Table(names, tuple(rows))
+
+
+def _setpoints(parts: Sequence[Part]) -> Table:
     """Return the table of the setpoints and their results."""
-    rows: list[Values] = []
+    rows: list[tuple[Any, ...]] = []
     for part in parts:
         moves = {x.place: (x, y) for x, y in zip(
             part.evaluation.moves, part.evaluation.results, strict=True)}
         for i, found in enumerate(part.evaluation.findings):
             move, x = moves.get(i, (None, None))
             levels = 0 if move is None else len(move.flux_densities)
-            of_move = [math.nan] * 9 if x is None else [
+            of_move = (math.nan,) * 9 if x is None else (
                 x.b_p, x.tau_p, x.b_1, x.begin * 1e3, x.arrival * 1e3, (x.end - x.begin) * 1e3,
                 100.0 * x.error, 100.0 * x.residual if x.moved else NOT_MOVED,
-                100.0 * x.residual_unshaped]
+                100.0 * x.residual_unshaped)
             share = found.setpoint.percent
-            rows.append([
-                part.run.label, Cell(str(i + 1), i + 1), found.setpoint.target,
-                Cell(str(found.verdict).replace('_', ' ')), share(found.offset),
+            rows.append((
+                part.run.label, i + 1, found.setpoint.target,
+                str(found.verdict).replace('_', ' '), share(found.offset),
                 share(found.offset_std), share(found.vibration),
                 share(found.vibration_std), found.frequency, *of_move,
-                'unshaped step' if levels == 1 else f'{levels} levels' if levels else '–'])
-    return formatted('setpoint-table', {
-            'run': '', 'setpoint': '', f'target {parts[0].run.plant.coordinate.symbol} [1]': '.6g',
-            'verdict': '', 'offset [%]': '+%', '± [%]': '%', 'vibration [%]': '%',
-            '± of it [%]': '%', 'frequency [Hz]': '.3g',
+                'unshaped step' if levels == 1 else f'{levels} levels' if levels else '–'))
+    return _table({
+            'run': '', 'setpoint': 'd',
+            f'target {parts[0].run.plant.coordinate.symbol} [1]': '.6g', 'verdict': '',
+            'offset [%]': '+%', '± [%]': '%', 'vibration [%]': '%', '± of it [%]': '%',
+            'frequency [Hz]': '.3g',
             'b_p [1]': '.5f', 'tau_p [1]': '.5f', 'b_1 [1]': '.5f', 'begin [ms]': '.3f',
             'arrival [ms]': '.3f', 'end [ms]': '.3f', 'largest error [%]': '%',
             'residual [%]': '%', 'unshaped steps [%]': '%', 'command': ''}, rows)
 
 
-def _requests(parts: Sequence[Part], unit: TimeUnit) -> PageTable:
+def _requests(parts: Sequence[Part], unit: TimeUnit) -> Table:
     """Return the table of verdicts."""
-    rows: list[Values] = []
+    rows = []
     for part in parts:
         before = None
         for x in part.run.verdicts:
             if (x.code, x.message) != before and x.code != 'none':
                 before = x.code, x.message
-                rows.append([
-                    part.run.label, unit.of(part.evaluation.seconds(x.sent)).item(), x.level,
-                    x.code, x.message])
-    return formatted('request-table', {
+                rows.append((
+                    part.run.label, part.evaluation.seconds(x.sent) / unit.size, x.level, x.code,
+                    x.message))
+    return _table({
         'run': '', f'time [{unit.name}]': '.3f', 'level': '', 'code': '', 'message': ''},
         rows[:_MOST_ROWS])
 
 
-def _plan(parts: Sequence[Part], unit: TimeUnit) -> PageTable:
+def _plan(parts: Sequence[Part], unit: TimeUnit) -> Table:
     """Return the table of planned changes of level."""
     what = parts[0].run.plant.coordinate
     symbol, drive = what.symbol, what.drive
-    rows: list[Values] = [
-        [part.run.label, unit.of(x.time).item(), x.planned * drive.per, x.commanded * drive.per,
-         x.stretch,
-         x.recorded_stretch, x.rate, x.recorded_rate, x.deviation]
+    rows = [
+        (part.run.label, x.time / unit.size, x.planned * drive.per, x.commanded * drive.per,
+         x.stretch, x.recorded_stretch, x.rate, x.recorded_rate, x.deviation)
         for part in parts for x in plan_points(part.run, part.evaluation)]
     shown = f'[{drive.shown}]'
-    return formatted('plan-table', {
+    return _table({
             'run': '', f'time [{unit.name}]': '.4f', f'{drive.symbol} planned {shown}': '.4f',
             f'{drive.symbol} commanded {shown}': '.4f', f'{symbol} planned [1]': '.7f',
             f'{symbol} recorded [1]': '.7f', 'rate planned [1/s]': '.4g',
             'rate recorded [1/s]': '.4g', f'largest |Δ{symbol}| [1]': '.2e'}, rows[:_MOST_ROWS])
 
 
-def _timing(parts: Sequence[Part]) -> PageTable:
+def _timing(parts: Sequence[Part]) -> Table:
     """Return the table of times."""
-    rows: list[Values] = []
-    for part in parts:
-        x = part.timing
-        for name, values in (
-                ('command lead', x.lead),
-                ('lateness of the command', x.lateness[np.isfinite(x.lateness)]),
-                ('sample delay', x.delay),
-                ('interval of the timestamps', x.interval),
-                ('interval of the recorded samples', x.arrival_interval)):
-            if len(values):
-                rows.append([
-                    part.run.label, name, Cell(str(len(values)), len(values)),
-                    *np.quantile(values, [0.0, 0.5, 0.99, 1.0]) * 1e3,
-                    float(np.std(values)) * 1e3])
-    return formatted('timing-table', {
-        'run': '', 'quantity': '', 'count': '', 'least [ms]': '.4f', 'median [ms]': '.4f',
+    rows = [
+        (part.run.label, name, len(values), *np.quantile(values, [0.0, 0.5, 0.99, 1.0]) * 1e3,
+         np.std(values) * 1e3)
+        for part in parts for name, values in (
+            ('command lead', part.timing.lead),
+            ('lateness of the command', part.timing.lateness[np.isfinite(part.timing.lateness)]),
+            ('sample delay', part.timing.delay),
+            ('interval of the timestamps', part.timing.interval),
+            ('interval of the recorded samples', part.timing.arrival_interval)) if len(values)]
+    return _table({
+        'run': '', 'quantity': '', 'count': 'd', 'least [ms]': '.4f', 'median [ms]': '.4f',
         '99 % [ms]': '.4f', 'largest [ms]': '.4f', 'jitter [ms]': '.4f'}, rows)
 
 
@@ -265,65 +274,57 @@ def _lost(summary: BagSummary | None) -> str:
     return 'not counted' if summary is None or summary.lost is None else str(summary.lost)
 
 
-def _losses(parts: Sequence[Part]) -> PageTable:
+def _losses(parts: Sequence[Part]) -> Table:
     """Return the table of topics, those of each bag once."""
     bags = {x.run.path: x.run for x in reversed(parts)}
-    return table('loss-table', ['bag', 'topic', 'type', 'messages', 'a second', 'lost'], [
-        [run.label, topic.name, topic.type, Cell(str(topic.count), topic.count),
-         cell(math.nan if topic.rate is None else topic.rate, '.1f'),
-         Cell('not counted' if topic.lost is None else str(topic.lost),
-              math.nan if topic.lost is None else topic.lost)]
+    return _table({
+        'bag': '', 'topic': '', 'type': '', 'messages': 'd', 'a second': '.1f', 'lost': 'd'}, [
+        (run.label, topic.name, topic.type, topic.count,
+         math.nan if topic.rate is None else topic.rate,
+         'not counted' if topic.lost is None else topic.lost)
         for run in reversed(bags.values()) if run.summary is not None
         for topic in run.summary.topics])
 
 
-def _given(value: object) -> Cell | str:
+def _given(value: object) -> float | str:
     """Return a constant of a law as a cell shows it; Gent has none."""
     if isinstance(value, list) and len(value) > 6:
         return f'{len(value)} values, {min(value):.6g} to {max(value):.6g}'
     if isinstance(value, list):
         return ', '.join(f'{x:.6g}' for x in value)
-    return cell(value) if isinstance(value, float) else str(value or '-')
+    return value if isinstance(value, float) else str(value or '-')
 
 
-def _parameters(parts: Sequence[Part]) -> PageTable:
+def _parameters(parts: Sequence[Part]) -> Table:
     """Return the table of parameters."""
-    header = ['parameter', 'unit']
-    columns: list[ActuatorParameters] = []
+    columns: list[tuple[str, ActuatorParameters]] = []
     for part in parts:
         run = part.run
         source = '' if run.parameters_known else ' (unknown: example block)'
         prefix = f'{run.label}: ' if len(parts) > 1 else ''
-        if run.plant == run.planner:
-            header.append(f'{prefix}actuator{source}')
-            columns.append(run.plant)
-        else:
-            header += [f'{prefix}plant', f'{prefix}as planned']
-            columns += [run.plant, run.planner]
-    gent = any(x.law is None for x in columns)
-    rows: list[Row] = [
-        [name.replace('_', ' '), (spec.unit or '1').replace('^3', '³'),
-         *(cell(getattr(x, name)) for x in columns)]
-        for name, spec in zip(ACTUATOR_FIELDS, ACTUATOR, strict=True)
-        if name != 'chain_limit' or gent]
-    laws = [parameters_of(x) for x in columns]
-    rows += [
-        [spec.name, spec.unit or '1', *(_given(x.get(spec.name)) for x in laws)]
-        for spec in LAW if any(spec.name in x for x in laws)]
-    groups = [x.nondimensional for x in columns]
-    name, rest, drive = columns[0].coordinate.name, columns[0].rest, columns[0].coordinate.drive
-    chains: list[Row] = [['J_lim', '1', *(cell(x.j_lim) for x in groups)]] if gent else []
-    limits = [stretch_limits(x.nondimensional) for x in columns]
-    rows += [
-        ['zeta', '1', *(cell(x.zeta) for x in groups)],
-        [f'critical zeta about {name} {rest:g}', '1', *(
-            cell(float(critical_zeta(x.rest, x))) for x in groups)],
-        *chains,
-        ['c1', '1', *(cell(x.c1) for x in groups)],
-        ['time unit', 'ms', *(cell(x.time_unit * 1e3) for x in columns)],
-        [f'{drive.name} of load 1', drive.shown, *(
-            cell(x.flux_density_unit * drive.per) for x in columns)],
-        [f'least {name}', '1', *(cell(x) for x, _ in limits)],
-        [f'largest {name}', '1', *(cell(x) for _, x in limits)],
-    ]
-    return table('parameter-table', header, rows)
+        columns += [(f'{prefix}actuator{source}', run.plant)] if run.plant == run.planner else [
+            (f'{prefix}plant', run.plant), (f'{prefix}as planned', run.planner)]
+    blocks = [x for _, x in columns]
+    gent = any(x.law is None for x in blocks)
+    groups, laws = [x.nondimensional for x in blocks], [parameters_of(x) for x in blocks]
+    limits = [stretch_limits(x) for x in groups]
+    name, drive = blocks[0].coordinate.name, blocks[0].coordinate.drive
+    rows = [
+        *((field.replace('_', ' '), (spec.unit or '1').replace('^3', '³'),
+           *(getattr(x, field) for x in blocks))
+          for field, spec in zip(ACTUATOR_FIELDS, ACTUATOR, strict=True)
+          if field != 'chain_limit' or gent),
+        *((spec.name, spec.unit or '1', *(_given(x.get(spec.name)) for x in laws))
+          for spec in LAW if any(spec.name in x for x in laws)),
+        ('zeta', '1', *(x.zeta for x in groups)),
+        (f'critical zeta about {name} {blocks[0].rest:g}', '1', *(
+            float(critical_zeta(x.rest, x)) for x in groups)),
+        *([('J_lim', '1', *(x.j_lim for x in groups))] if gent else []),
+        ('c1', '1', *(x.c1 for x in groups)),
+        ('time unit', 'ms', *(x.time_unit * 1e3 for x in blocks)),
+        (f'{drive.name} of load 1', drive.shown, *(
+            x.flux_density_unit * drive.per for x in blocks)),
+        (f'least {name}', '1', *(x for x, _ in limits)),
+        (f'largest {name}', '1', *(x for _, x in limits))]
+    return Table(
+        tuple(map(Column, ('parameter', 'unit', *(x for x, _ in columns)))), tuple(rows))
