@@ -47,7 +47,7 @@ class _Watch:
         self.late = 0
         self.refusal = ''
         # Stamped as they arrive and not decoded: what this process does later does not count.
-        self._capture = Capture(rig.node, self._take)
+        self._capture = Capture(self._take)
         self._capture.add(None, endpoints.listen(rig.node, replace(
             topics.JOINT_STATES, name=f'{space}/{topics.JOINT_STATES.name}')))
         self._capture.start()

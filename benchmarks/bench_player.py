@@ -50,7 +50,7 @@ def receive():
     rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
     node = rclpy.create_node('receiver', enable_rosout=False)
     stamps = []
-    capture = Capture(node, lambda taken: stamps.extend(
+    capture = Capture(lambda taken: stamps.extend(
         (message.source_ns, message.data[4:].hex()) for _, messages in taken
         for message in messages))
     capture.add('load', RawSubscription(node, Float64, '/load', QoSProfile(

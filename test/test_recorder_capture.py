@@ -15,7 +15,7 @@ TALKER = Path(__file__).parent / 'talker.py'
 @pytest.mark.ros
 def test_messages_are_taken_with_stamps_and_numbers(ros, start, wait_until):
     got = []
-    capture = Capture(ros.node, lambda taken: got.extend(
+    capture = Capture(lambda taken: got.extend(
         message for key, messages in taken for message in messages if key == 'a'))
     capture.add('a', RawSubscription(ros.node, Float64, '/a', QoSProfile(depth=1000)))
     capture.start()
@@ -37,7 +37,7 @@ def test_an_error_in_the_thread_is_kept(ros, start, wait_until):
     def fail(taken):
         raise ValueError('no')
 
-    capture = Capture(ros.node, fail)
+    capture = Capture(fail)
     capture.add('a', RawSubscription(ros.node, Float64, '/a', QoSProfile(depth=10)))
     capture.start()
     start.python(TALKER, '/a', '1').wait_for_output('done')

@@ -2,8 +2,8 @@
 Taking raw messages off subscriptions, fast and with all that is known of each.
 
 rclpy's own executors pass one message at a time and do not tell which publisher sent it. Here
-a thread of its own waits for several subscriptions and takes whatever has arrived in one go,
-with the publisher's identifier, so that a gap in its sequence numbers is a lost message.
+a thread of its own looks at several subscriptions and takes whatever has arrived in one go, with
+the publisher's identifier, so that a gap in its sequence numbers is a lost message.
 """
 
 from bisect import bisect_right
@@ -26,10 +26,9 @@ from hmsa_ros.errors import BadInputError
 
 # Taken from one subscription before the next has its turn.
 _BATCH = 2000
-# After messages have arrived the thread rests this long, so that at high rates many are taken
-# for one wait. Stamps come from the middleware, so this does not blur them.
-_REST_SECONDS = 0.001
-_WAIT_NS = 200_000_000
+# The thread rests this long after messages have arrived, and if none have: at high rates many are
+# taken at once. Stamps come from the middleware, so this does not blur them.
+_REST_SECONDS, _IDLE_SECONDS = 0.001, 0.005
 # A publisher of /clock that has been silent for so long gives way to another.
 _SILENCE_NS = 1_000_000_000
 
@@ -165,20 +164,12 @@ class Capture:
     ``deliver`` gets a list of (key, messages) a round, in the order of the subscriptions.
     """
 
-    def __init__(
-            self, node: Node,
-            deliver: Callable[[Sequence[tuple[Any, list[Taken]]]], None]) -> None:
-        self._node = node
+    def __init__(self, deliver: Callable[[Sequence[tuple[Any, list[Taken]]]], None]) -> None:
         self._deliver = deliver
-        self._lock = threading.Lock()
         self._subscriptions: list[tuple[Any, RawSubscription]] = []
         self._leaving: list[tuple[Any, RawSubscription]] = []
-        self._current: list[tuple[Any, RawSubscription]] = []
-        self._changed = True
         self._stopping = False
         self.error: BaseException | None = None
-        with node.context.handle:
-            self._guard = _rclpy.GuardCondition(node.context.handle)
         self._thread = threading.Thread(target=self._run, name='capture', daemon=True)
 
     def start(self) -> None:
@@ -187,115 +178,60 @@ class Capture:
 
     def add(self, key: Any, subscription: RawSubscription) -> None:
         """Take over a subscription: read it, pass its messages on with the key, destroy it."""
-        with self._lock:
-            self._subscriptions.append((key, subscription))
-            self._changed = True
-        self._wake()
+        self._subscriptions.append((key, subscription))
 
     def replace(self, key: Any, subscription: RawSubscription) -> None:
         """Read another subscription under a known key; what the old one holds is passed on."""
-        with self._lock:
-            for i, (known, old) in enumerate(self._subscriptions):
-                if known is key:
-                    self._leaving.append((known, old))
-                    self._subscriptions[i] = (key, subscription)
-                    self._changed = True
-        self._wake()
+        for i, (known, old) in enumerate(self._subscriptions):
+            if known is key:
+                self._subscriptions[i] = key, subscription
+                self._leaving.append((key, old))
 
     def matched(self) -> list[Any]:
         """Return the keys of the subscriptions that have found a publisher."""
-        with self._lock:
-            return [key for key, x in self._subscriptions if x.matched]
+        return [key for key, x in self._subscriptions if x.matched]
 
     def take_again(self) -> list[tuple[Any, list[Taken]]]:
         """Take all that has arrived since this round was taken; for ``deliver`` alone."""
-        return self._round(self._current, sys.maxsize)
+        return self._round(sys.maxsize)
 
     def stop(self) -> None:
         """Pass on what has arrived so far and end the thread."""
         self._stopping = True
-        self._wake()
         if self._thread.is_alive():
             self._thread.join()
 
-    def _wake(self) -> None:
-        """Make the thread look around."""
-        try:
-            self._guard.trigger_guard_condition()
-        except Exception:  # the context may be gone: the wait then ends by its own limit
-            return
-
     def _run(self) -> None:
-        wait_set = None
         try:
             while True:
-                with self._lock:
-                    # Read before the last round, so that this round is complete.
-                    stopping = self._stopping
-                    self._current = subscriptions = [*self._leaving, *self._subscriptions]
-                    leaving = len(self._leaving)
-                    self._leaving = []
-                    changed, self._changed = self._changed, False
-                if changed or wait_set is None:
-                    wait_set = self._make_wait_set(len(subscriptions))
-                if wait_set is not None and not stopping and not leaving:
-                    self._wait(wait_set, subscriptions)
-                taken = self._round(subscriptions)
-                for _, subscription in subscriptions[:leaving]:
-                    subscription.destroy()
-                if leaving:
-                    with self._lock:
-                        self._changed = True
-                if stopping and not taken:
-                    break
+                # Read before the last round, so that this round is complete.
+                stopping = self._stopping
+                taken = self._round()
                 if taken:
                     self._deliver(taken)
-                    if not stopping:
-                        time.sleep(_REST_SECONDS)
+                elif stopping:
+                    break
+                if not stopping:
+                    time.sleep(_REST_SECONDS if taken else _IDLE_SECONDS)
         except BaseException as error:  # reported by the node that owns the thread
             self.error = error
         finally:
             for _, subscription in self._subscriptions:
                 subscription.destroy()
 
-    def _make_wait_set(self, count: int) -> Any:
-        """Return a wait set of the right size, None once the context is shut down."""
-        try:
-            with self._node.context.handle:
-                return _rclpy.WaitSet(count, 1, 0, 0, 0, 0, self._node.context.handle)
-        except (InvalidHandle, _rclpy.RCLError):
-            time.sleep(_REST_SECONDS)
-            return None
-
-    def _wait(self, wait_set: Any, subscriptions: list[tuple[Any, RawSubscription]]) -> None:
-        """Wait until something has arrived or been asked for."""
-        try:
-            wait_set.clear_entities()
-            wait_set.add_guard_condition(self._guard)
-            for _, subscription in subscriptions:
-                wait_set.add_subscription(subscription.handle)
-            wait_set.wait(_WAIT_NS)
-        except (InvalidHandle, _rclpy.RCLError):
-            # The context has been shut down; `stop` is about to come.
-            time.sleep(_REST_SECONDS)
-
-    @staticmethod
-    def _round(
-            subscriptions: list[tuple[Any, RawSubscription]],
-            limit: int = _BATCH) -> list[tuple[Any, list[Taken]]]:
+    def _round(self, limit: int = _BATCH) -> list[tuple[Any, list[Taken]]]:
         """
         Take once from each subscription.
 
         The first is taken last: with /clock added first, every tick that came before a message
         of this round is known when the message is stamped.
         """
-        taken = []
-        for key, subscription in reversed(subscriptions):
-            messages = subscription.take(limit)
-            if messages:
-                taken.append((key, messages))
-        taken.reverse()
-        return taken
+        taken = [(key, x.take(limit)) for key, x in reversed([*self._subscriptions])]
+        while self._leaving:
+            key, old = self._leaving.pop()
+            taken.append((key, old.take(sys.maxsize)))
+            old.destroy()
+        return [x for x in reversed(taken) if x[1]]
 
 
 class SimulatedTime:

@@ -136,7 +136,7 @@ class Recorder(ManagedNode):
         writer = _writer(values, self._experiment)
         self.folder: Path = writer.folder
         self._recording = Recording(writer, limits, self._report)
-        self._capture = Capture(self, self._deliver)
+        self._capture = Capture(self._deliver)
         self._recorded = Subscriptions(
             self, selection, self._recording, self._capture, values['record.queue_depth'])
         self._closed = False
