@@ -18,7 +18,6 @@ from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.model.simulation import ActuatorSimulation
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import from_time, to_clock, to_command, to_time
-from hmsa_ros.nodes.device_node import Allegiance
 from hmsa_ros.nodes.endpoints import interface_class
 from hmsa_ros.nodes.plant import PlantNode
 
@@ -182,14 +181,6 @@ def test_only_the_first_publisher_is_obeyed_until_it_is_gone(stand):
         return plant.samples[-1].effort[0] == 0.03
 
     plant.ros.spin_until(takes_over, 'the second publisher to be obeyed')
-
-
-def test_another_publisher_is_refused_until_the_first_is_gone():
-    ours = Allegiance()
-    assert ours.accepts(b'a', lambda: [b'a', b'b'])
-    assert not ours.accepts(b'b', lambda: [b'a', b'b'])
-    assert ours.accepts(b'b', lambda: [b'b'])
-    assert ours.refused == 1
 
 
 # -- conveniences ------------------------------------------------------------------------------

@@ -24,123 +24,11 @@ from hmsa_ros.nodes.parameters import JointParameters, JOINTS
 from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.samples import SamplePublisher
 
-#: Obey every publisher, or only the one that was seen first, until it is gone.
-COMMAND_SOURCES = ('any', 'first')
-
-
-class Allegiance:
-    """
-    Decides by identifiers which publisher is obeyed.
-
-    ``source`` is whom it obeys, None before the first command; ``refused`` counts others'
-    commands.
-    """
-
-    def __init__(self) -> None:
-        self.source: bytes | None = None
-        self.refused = 0
-
-    def accepts(self, publisher: bytes, present: Callable[[], Iterable[bytes]]) -> bool:
-        """Return whether to obey a publisher, of those that are present."""
-        if self.source in (None, publisher) or self.source not in present():
-            self.source = publisher
-            return True
-        self.refused += 1
-        return False
-
 
 def publishers_of(node: Node, topic: topics.Topic) -> dict[bytes, tuple[str, str]]:
     """Return name and namespace of a topic's publishers by identifier, as in the graph."""
     return {bytes(x.endpoint_gid): (x.node_name, x.node_namespace)
             for x in node.get_publishers_info_by_topic(node.resolve_topic_name(topic.name))}
-
-
-class CommandInput:
-    """
-    Commands for one actuator from ``'any'`` or only the ``'first'`` publisher.
-
-    ``take`` gets each message that is obeyed; ``unreadable`` counts those that cannot be decoded.
-    What a ``companion`` publishes, a node of that name in the same namespace, is passed over:
-    its commands come directly, and first.
-    """
-
-    def __init__(
-            self, node: Node, topic: topics.Topic, take: Callable[[MagneticField], None],
-            source: str, companion: str = '') -> None:
-        self._companion = companion
-        self._companions: dict[bytes, bool] = {}
-        self.unreadable = 0
-        self._node = node
-        self._topic = topic
-        self._take = take
-        self._allegiance: Allegiance | None = None
-        self._raw: RawSubscription | None = None
-        if source == 'first':
-            self._allegiance = Allegiance()
-        if source == 'first' or companion:
-            self._raw = endpoints.listen(node, topic)
-        self._subscription = None if self._raw is not None else endpoints.subscribe(
-            node, topic, take)
-
-    @property
-    def refused(self) -> int:
-        """Number of commands of publishers that are not obeyed."""
-        return self._allegiance.refused if self._allegiance is not None else 0
-
-    def count(self) -> int:
-        """Return how many publishers the topic has."""
-        return int(self._node.count_publishers(self._topic.name))
-
-    def _publishers(self) -> dict[bytes, tuple[str, str]]:
-        """Return name and namespace of the topic's publishers by identifier, as in the graph."""
-        return publishers_of(self._node, self._topic)
-
-    def poll(self) -> None:
-        """Take what has arrived, where the node's executor does not."""
-        if self._raw is None:
-            return
-        for taken in self._raw.take():
-            if self._companion and self._is_companion(taken.publisher):
-                continue
-            if self._allegiance is None or self._allegiance.accepts(
-                    taken.publisher, self._publishers):
-                self._obey(taken.data)
-            else:
-                self._node.get_logger().warning(
-                    f'command on {self._topic.name} refused: it comes from a publisher other '
-                    'than the one obeyed; stop one of them, or set command_source to any',
-                    throttle_duration_sec=60.0)
-
-    def _is_companion(self, publisher: bytes) -> bool:
-        """Return whether a publisher is the companion; looked up in the graph once."""
-        if publisher not in self._companions:
-            own = self._companion, self._node.get_namespace()
-            found = {x: node == own for x, node in self._publishers().items()}
-            if self._allegiance is not None:
-                self._allegiance.source = next((x for x in found if found[x]), None)
-            self._companions = found
-        return self._companions.get(publisher, False)
-
-    def _obey(self, data: bytes) -> None:
-        try:
-            message = decode(data, MagneticField)
-        except BadInputError as error:
-            self.unreadable += 1
-            self._node.get_logger().error(
-                f'message on {self._topic.name} ignored: {error}',
-                throttle_duration_sec=60.0)
-            return
-        self._take(message)
-
-    def close(self) -> None:
-        """Receive no more."""
-        if self._raw is not None:
-            self._raw.destroy()
-            self._raw = None
-        if self._subscription is not None:
-            silence(self._subscription)
-            self._node.destroy_subscription(self._subscription)
-            self._subscription = None
 
 
 #: What a joint does when nobody commands it; each may have values of its own.
@@ -163,7 +51,7 @@ FALLBACK = (
 COMMAND_SOURCE = ParameterSpec(
     'command_source', 'any',
     'Publishers whose commands are obeyed: any, or only the first until it disappears.',
-    choices=COMMAND_SOURCES)
+    choices=('any', 'first'))
 PUBLISH_SCALARS = ParameterSpec(
     'publish_scalars', 'auto',
     'Whether to publish stretch and stretch_rate besides joint_states; auto: only for a '
@@ -186,10 +74,13 @@ def fallback_from(values: Mapping[str, Any]) -> Fallback:
 
 class DeviceJoint:
     """
-    An actuator on the wire; it obeys ``commands`` while its node is active.
+    An actuator on the wire; it obeys commands while its node is active.
 
-    ``received``, ``refused``, ``late`` and ``failed`` count commands that came, were refused or
-    late, and how often the device failed; ``latest`` is the largest lateness in ns.
+    They come from any publisher or only from the first that was seen, and from a companion of the
+    node directly: what that publishes is passed over. ``received``, ``refused``,
+    ``refused_source``, ``late`` and ``failed`` count commands that came, were refused, for their
+    publisher too, or late, and how often the device failed; ``latest`` is the largest lateness in
+    ns.
     """
 
     def __init__(self, node: 'DeviceNode', number: int) -> None:
@@ -199,16 +90,22 @@ class DeviceJoint:
         self._of_me = '' if len(names) == 1 else f'joint {self.name}: '
         self._crowded = False
         self._tell_refused, self._tell_late = Seldom(), Seldom()
-        self.received = self.refused = self.late = self.latest = self.failed = 0
+        self.received = self.refused = self.refused_source = 0
+        self.late = self.latest = self.failed = 0
         self._applied, self._received = (
             Outlet(endpoints.publisher(node, topics.of_joint(x, self.name, names)))
             for x in (topics.FLUX_DENSITY_APPLIED, topics.FLUX_DENSITY_RECEIVED))
         # Stamp of the newest command, when it came if that was not told yet, both in ns; and when
         # something was told by a clock that is never set.
         self._newest, self._came, self._told = 0, 0, 0
-        self.commands = CommandInput(
-            node, topics.of_joint(topics.FLUX_DENSITY_COMMAND, self.name, names),
-            self._on_command, node.values['command_source'], node.companion)
+        self._topic = topics.of_joint(topics.FLUX_DENSITY_COMMAND, self.name, names)
+        # Names of publishers at the last look, and the one that is obeyed if only one is.
+        self._publishers: dict[bytes, tuple[str, str]] = {}
+        self._first: bytes | None = None
+        self._only_first = node.values[COMMAND_SOURCE.name] == 'first'
+        self._commands: Any = (
+            endpoints.listen(node, self._topic) if self._only_first or node.companion
+            else endpoints.subscribe(node, self._topic, self._on_command))
 
     # -- out -----------------------------------------------------------------------------------
 
@@ -257,6 +154,46 @@ class DeviceJoint:
     def _on_command(self, message: MagneticField) -> None:
         self._obey(lambda: conversions.from_command(message))
 
+    def poll(self) -> None:
+        """Take the commands that have come, where the node's executor does not."""
+        if not isinstance(self._commands, RawSubscription):
+            return
+        for taken in self._commands.take():
+            if self._obeys(taken.publisher):
+                self._obey(lambda data=taken.data: conversions.from_command(  # type: ignore[misc]
+                    decode(data, MagneticField)))
+
+    def _obeys(self, publisher: bytes) -> bool:
+        """Return whether commands that a publisher sends on the topic are obeyed."""
+        if self._node.companion:
+            own = self._node.companion, self._node.get_namespace()
+            if publisher not in self._publishers:
+                self._publishers = publishers_of(self._node, self._topic)
+                self._first = next((x for x, y in self._publishers.items() if y == own), None)
+            if self._publishers.get(publisher) == own:
+                return False
+        if not self._only_first:
+            return True
+        if self._first in (None, publisher) or self._first not in publishers_of(
+                self._node, self._topic):
+            self._first = publisher
+            return True
+        self.refused_source += 1
+        self._node.get_logger().warning(
+            f'command on {self._topic.name} refused: it comes from a publisher other than the one '
+            'obeyed; stop one of them, or set command_source to any',
+            throttle_duration_sec=60.0)
+        return False
+
+    def close(self) -> None:
+        """Take no more commands."""
+        if isinstance(self._commands, RawSubscription):
+            self._commands.destroy()
+        elif self._commands is not None:
+            silence(self._commands)
+            self._node.destroy_subscription(self._commands)
+        self._commands = None
+
     def command(self, stamp: int, level: float) -> None:
         """Obey a level in T from a stamp in ns on, from a planner in the same process."""
         self._obey(lambda: (stamp, level))
@@ -280,7 +217,7 @@ class DeviceJoint:
 
     def crowded(self) -> bool:
         """Return whether several publishers command this joint, and log it once."""
-        count = self.commands.count()
+        count = self._node.count_publishers(self._topic.name)
         if count > 1 and not self._crowded:
             self._node.get_logger().warning(
                 f'{self._of_me}{count} publishers command this joint: expected one; with '
@@ -313,7 +250,7 @@ class DeviceNode(ManagedNode):
 
     def _hear(self) -> None:
         for joint in self._joints:
-            joint.commands.poll()
+            joint.poll()
 
     @abstractmethod
     def _go_on(self) -> None:
@@ -347,7 +284,7 @@ class DeviceNode(ManagedNode):
     def cleanup(self) -> None:
         """Close the inputs that no executor serves."""
         for joint in self._joints:
-            joint.commands.close()
+            joint.close()
         if self._joints:
             self._presence.close()
         self._joints = ()
@@ -390,8 +327,8 @@ class DeviceNode(ManagedNode):
         joints = self._joints
         counts = {
             'late': sum(x.late for x in joints),
-            'refused': sum(x.refused + x.commands.unreadable for x in joints),
-            'refused_source': sum(x.commands.refused for x in joints),
+            'refused': sum(x.refused for x in joints),
+            'refused_source': sum(x.refused_source for x in joints),
             'failed': sum(x.failed for x in joints)}
         silent = [joints[i].name for i in self.device.silent]
         level, message = judge_commands(

@@ -213,7 +213,7 @@ class DriverNode(DeviceNode):
                 self.trouble = trouble
                 for joint in self._joints:
                     # Nobody takes commands any more, and planners can see that.
-                    joint.commands.close()
+                    joint.close()
             self._diagnose()
         if self.device.failure is not None:
             self.failure, self.finished = self.device.failure, True
