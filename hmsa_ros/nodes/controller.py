@@ -93,8 +93,7 @@ class LinkedPlanner(PlannerNode):
 
     def now(self) -> int:
         """Return the time in ns, which a plant that leads it knows best."""
-        time = None if self.plant is None or not self._clock_reader.simulated else \
-            self.plant.leading_time
+        time = None if self.plant is None or not self.simulated else self.plant.leading_time
         if time is None:
             return super().now()
         last, self._last = self._last, time

@@ -143,7 +143,7 @@ class DriverNode(DeviceNode):
             If parameters are out of range, there is no such hardware, or it does not obey.
 
         """
-        if self.get_parameter('use_sim_time').value:
+        if self.simulated:
             raise BadInputError(
                 'use_sim_time is true: expected false, hardware follows the clock of the machine')
         name = self.values[HARDWARE.name]

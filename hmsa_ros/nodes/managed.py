@@ -23,13 +23,13 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 from rclpy.timer import Timer
-from rosgraph_msgs.msg import Clock
 
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.parameters import ParameterSpec
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import to_diagnostics
+from hmsa_ros.nodes.newest_clock import NewestClock
 from hmsa_ros.nodes.outlet import Outlet
 from hmsa_ros.nodes.parameters import check_former_names, check_names, declare
 
@@ -52,7 +52,7 @@ class ManagedNode(LifecycleNode):
     def __init__(self, name: str) -> None:
         super().__init__(name, start_parameter_services=False)
         self._parameter_service = _CarefulParameterService(self)
-        self._guard_clock()
+        self._time = NewestClock(self)
         self.active = False
         self.finished = False
         check_former_names(self._parameter_overrides)
@@ -74,24 +74,6 @@ class ManagedNode(LifecycleNode):
                 return response
 
         self._service_change_state.callback = change_state
-
-    def _guard_clock(self) -> None:
-        """Pass over time before zero, which rclpy raises on: anybody could end the node so."""
-        source = self._time_source
-        take = source.clock_callback
-
-        def take_carefully(message: Clock) -> None:
-            if message.clock.sec >= 0:
-                take(message)
-            else:
-                self.get_logger().error(
-                    f'time {message.clock.sec} s on /clock skipped: expected at least 0',
-                    throttle_duration_sec=1.0)
-
-        # For a subscription that is made later, when use_sim_time is set, and the one there is.
-        source.clock_callback = take_carefully
-        if source._clock_sub is not None:
-            source._clock_sub.callback = take_carefully
 
     @property
     def state(self) -> str:
@@ -143,7 +125,12 @@ class ManagedNode(LifecycleNode):
 
     def now(self) -> int:
         """Return the node's time in ns."""
-        return int(self.get_clock().now().nanoseconds)
+        return self._time.read()
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the node follows simulated time."""
+        return self._time.simulated
 
     def keep(self, *entities: object) -> None:
         """Keep what was created when the node is cleaned up."""

@@ -16,7 +16,8 @@ class NewestClock:
     Sets a node's clock from /clock when it is read, instead of its own subscription.
 
     The executor would keep an event for each message, without limit where the node cannot keep
-    up with them. A subscription that is read here keeps the newest message alone.
+    up with them. A subscription that is read here keeps the newest message alone. Time before
+    zero, which anybody may publish and rclpy raises on, is passed over.
     """
 
     def __init__(self, node: Node) -> None:
@@ -47,14 +48,11 @@ class NewestClock:
         if self._subscription is not None:
             for taken in self._subscription.take()[-1:]:
                 try:
-                    self._source.clock_callback(decode(taken.data, Clock))
+                    message = decode(taken.data, Clock)
+                    if message.clock.sec < 0:
+                        raise BadInputError(f'time {message.clock.sec} s: expected at least 0')
+                    self._source.clock_callback(message)
                 except BadInputError as error:
                     self._node.get_logger().error(
                         f'message on /clock skipped: {error}', throttle_duration_sec=1.0)
         return int(self._node.get_clock().now().nanoseconds)
-
-    def destroy(self) -> None:
-        """Read no more."""
-        if self._subscription is not None:
-            self._subscription.destroy()
-            self._subscription = None

@@ -28,7 +28,6 @@ from hmsa_ros.nodes.cdr import read_trajectory, stamp_of
 from hmsa_ros.nodes.channel import JointChannel
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.markers import TargetMarkers
-from hmsa_ros.nodes.newest_clock import NewestClock
 from hmsa_ros.nodes.parameters import check_names, declare_joints
 from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from, SPECS
 from hmsa_ros.nodes.presence import Presence
@@ -65,7 +64,6 @@ class PlannerNode(ManagedNode):
         super().__init__(topics.PLANNER)
         self._settings = declare_joints(self, PARAMETERS, OWN)
         self._aside = Aside(self.get_logger().warning)
-        self._clock_reader = NewestClock(self)
         self._steps = StepWatch()
         self._runtime = self._new_runtime()
         self._channels: dict[str, JointChannel] = {}
@@ -238,7 +236,7 @@ class PlannerNode(ManagedNode):
 
     def _one_clock(self) -> bool:
         """Return whether one clock tells the times of all nodes."""
-        return self._clock_reader.simulated
+        return self.simulated
 
     def _observable(self) -> bool:
         """Return whether somebody may give samples."""
@@ -253,8 +251,8 @@ class PlannerNode(ManagedNode):
     def now(self) -> int:
         """Return the node's time in ns; that the clock was set is noted."""
         before = monotonic_ns()
-        now = self._clock_reader.read()
-        if not self._clock_reader.simulated and (
+        now = super().now()
+        if not self.simulated and (
                 by := self._steps.step(before, now, monotonic_ns())):
             self._runtime.clock_set(by)
         return now
@@ -275,7 +273,7 @@ class PlannerNode(ManagedNode):
 
     def _serve_soon(self) -> None:
         """Serve within a period: news that may come in crowds are not served one by one."""
-        if self._clock_reader.simulated:
+        if self.simulated:
             self._serve()
         elif self._channels:
             self._pace()
@@ -285,11 +283,11 @@ class PlannerNode(ManagedNode):
         wake, longest = self._runtime.wake, _LONGEST_POLL_NS
         if self._samples is not None:
             longest = _POLL_NS if soon else _READ_NS
-        elif wake is None and not self._clock_reader.simulated:
+        elif wake is None and not self.simulated:
             self._poll.cancel()
             return
         period = _POLL_NS
-        if not self._clock_reader.simulated:
+        if not self.simulated:
             period = longest if wake is None else min(
                 max(wake - self.now(), _POLL_NS), longest)
         if period != self._poll.timer_period_ns or self._poll.is_canceled():
@@ -356,7 +354,7 @@ class PlannerNode(ManagedNode):
         crowd = rivals or self._presence.devices(self._settings.names)
         self._runtime.crowded = RefusedError(
             Code.SEVERAL_PLANNERS if rivals else Code.SEVERAL_PLANTS, crowd) if crowd else None
-        clocks = self.count_publishers('/clock') if self._clock_reader.simulated else 1
+        clocks = self.count_publishers('/clock') if self.simulated else 1
         return crowd or (
             f'{clocks} publishers on /clock, and time may go back and forth: expected one'
             if clocks > 1 else '')

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 import math
-from time import monotonic_ns, time_ns
+from time import monotonic_ns
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -11,7 +11,6 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.parameter import Parameter
 
-from hmsa_ros.control.seldom import Seldom
 from hmsa_ros.device.health import too_few_samples
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
@@ -67,7 +66,6 @@ class PlantJoint(DeviceJoint):
 
     def __init__(self, node: DeviceNode, number: int) -> None:
         super().__init__(node, number)
-        self._tell_force = Seldom()
         endpoints.subscribe(node, topics.of_joint(
             topics.DISTURBANCE_FORCE, self.name, node.values.names), self._on_force)
 
@@ -77,8 +75,8 @@ class PlantJoint(DeviceJoint):
         try:
             self._device.push(self._number, *_from_wrench(message))
         except BadInputError as error:
-            if self._tell_force():
-                self._node.get_logger().error(f'{self._of_me}disturbance refused: {error}')
+            self._node.get_logger().error(
+                f'{self._of_me}disturbance refused: {error}', throttle_duration_sec=1.0)
 
 
 def joint_from(values: Mapping[str, Any]) -> SimulatedJoint:
@@ -178,7 +176,7 @@ class PlantNode(DeviceNode):
         """
         values = self.values
         self._authority: bool = values['publish_clock']
-        if self._authority and self.get_parameter('use_sim_time').value:
+        if self._authority and self.simulated:
             raise BadInputError(
                 'publish_clock and use_sim_time are both true: expected a plant that either '
                 'leads simulated time or follows it')
@@ -238,8 +236,7 @@ class PlantNode(DeviceNode):
 
     def _follow(self) -> None:
         """Advance to the node's clock: the wall clock, or somebody else's /clock."""
-        # The wall clock is what rclpy's reads then, without its objects.
-        now = self.now() if self._time_source.ros_time_is_active else time_ns()
+        now = self.now()
         if now == 0:
             return
         behind = now - self._clock_seen < 1_000_000_000
@@ -343,7 +340,7 @@ class PlantNode(DeviceNode):
                        'publish_rate')
         self._fell = 0
         clocks = self.count_publishers(topics.CLOCK_TOPIC.name)
-        if clocks > 1 and (self._authority or self.get_parameter('use_sim_time').value):
+        if clocks > 1 and (self._authority or self.simulated):
             level = 1
             message = f'{clocks} publishers of /clock: expected one'
             if self._authority:

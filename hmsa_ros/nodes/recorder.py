@@ -125,7 +125,7 @@ class Recorder(ManagedNode):
         # While inactive it is paused.
         self._paused = True
         self._resumes = not values['record.start_paused']
-        self._sim_time = SimulatedTime() if self.get_parameter('use_sim_time').value else None
+        self._sim_time = SimulatedTime() if self.simulated else None
         self._experiment: dict[str, str] = {'hmsa_ros.version': __version__}
         self._setpoints = SetpointLog()
         self._setpoint_topics: set[str] = set()
