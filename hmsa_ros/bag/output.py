@@ -5,8 +5,8 @@ A chunk is in the file whole or not at all, and room for the chunk and for the s
 on the disk before, so that a full disk leaves a file that can still be closed.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 import itertools
 import os
 from pathlib import Path
@@ -38,132 +38,126 @@ from hmsa_ros.bag import metadata, qos
 from hmsa_ros.bag.records import MAGIC, MESSAGE, MESSAGE_FIXED, MESSAGE_HEAD
 from hmsa_ros.bag.topics import Topic
 
+LIBRARY = f'hmsa_ros {__version__}'
+#: Name of the metadata record with the experiment.
+EXPERIMENT = 'hmsa_ros'
+#: Room is taken in steps of so many bytes.
+RESERVE_STEP = 256 * 1024
 _INDEX_HEAD = struct.Struct('<BQHI')
 _COMPRESS: Mapping[str, Any] = {
     '': lambda data: data, 'lz4': lz4.frame.compress, 'zstd': zstandard.compress}
+#: Compression of each preset, and whether it has checksums. Names as rosbag2 has them, and lz4.
+#: With fastwrite rosbag2 leaves out chunks too; here they stay, since the recovery of a cut file
+#: goes by them.
+PRESETS: Mapping[str, tuple[str, bool]] = {
+    'none': ('', True), 'fastwrite': ('', False), 'lz4': ('lz4', True),
+    'zstd_fast': ('zstd', True), 'zstd_small': ('zstd', True)}
 
 #: A message: topic number, log and publish time in ns, sequence and payload.
 Entry = tuple[int, int, int, int, bytes]
 
 
-class Stream:
-    """Keeps what is written until `commit`, which stores all of it or nothing."""
-
-    def __init__(self, descriptor: int) -> None:
-        self.descriptor = descriptor
-        self.stored = self.position = self.crc = 0
-        self._pending: list[bytes] = []
-
-    def write(self, data: bytes) -> None:
-        """Keep data."""
-        self._pending.append(data)
-        self.position += len(data)
-
-    def commit(self) -> None:
-        """Store what is kept, or undo a part of it that was stored, and raise `OSError`."""
-        data = b''.join(self._pending)
-        self._pending.clear()
-        view = memoryview(data)
-        try:
-            while view:
-                view = view[os.write(self.descriptor, view):]
-        except OSError:
-            self.position = self.stored
-            os.ftruncate(self.descriptor, self.stored)
-            os.lseek(self.descriptor, self.stored, os.SEEK_SET)
-            raise
-        self.stored = self.position
-        self.crc = zlib.crc32(data, self.crc)
-
-
-class Framing:
+class OutputFile:
     """
-    Writes records to a stream; `OSError` leaves the file as it was before the call.
+    One file of a bag; what writes raises `OSError` if the disk does not take all of it.
 
-    ``compression`` is ``''``, ``'lz4'`` or ``'zstd'``. ``counts`` has the messages stored by
-    channel less one; ``start`` and ``end`` are the lowest and highest log time stored.
+    ``topics`` is the list of the bag's topics, which may grow. ``counts`` has the messages stored
+    by topic, ``start`` and ``end`` are the lowest and highest log time stored, ``size`` is what
+    is stored in bytes, ``message_size`` the part of it that is messages, and ``notes_size`` that
+    which says something of the experiment.
     """
 
-    def __init__(self, stream: Stream, library: str, compression: str, *, crc: bool) -> None:
-        self._stream = stream
-        self._compression = compression
-        self._crc = crc
-        self._schemas: list[Schema] = []
+    def __init__(self, path: Path, preset: str, topics: Sequence[Topic]) -> None:
+        self._descriptor = os.open(
+            path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        self.path = path
+        self.counts = Counter[int]()
+        self.start, self.end = 2**64 - 1, 0
+        self.size = self.message_size = self.notes_size = 0
+        self._compression, self._has_crc = PRESETS[preset]
+        self._topics = topics
+        self._schemas: dict[str, Schema] = {}  # by message type
         self._channels: list[Channel] = []
-        self._declared: list[McapRecord] = []
+        self._declared: list[McapRecord] = []  # what the next chunk begins with
         self._chunks: list[ChunkIndex] = []
         self._metadata: list[MetadataIndex] = []
-        self.counts: dict[int, int] = {}
-        self.start, self.end = 2**64 - 1, 0
-        stream.write(MAGIC + _packed([Header('ros2', library)]))
+        self._noted: dict[str, str] = {}
+        self._crc = 0
+        # Bytes of the file that are taken on the disk, and what of them is for its end.
+        self._room = self._end_size = self._notes_room = 0
+        self._ending = False
 
-    def add_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Announce a message type with the next chunk; return its number."""
-        self._schemas.append(Schema(
-            id=len(self._schemas) + 1, name=name, encoding=encoding, data=data))
-        self._declared.append(self._schemas[-1])
-        return len(self._schemas)
-
-    def add_channel(self, topic: str, schema: int, metadata: dict[str, str]) -> None:
-        """Announce a topic with the next chunk."""
-        self._channels.append(Channel(
-            id=len(self._channels) + 1, topic=topic, schema_id=schema, message_encoding='cdr',
-            metadata=metadata))
-        self._declared.append(self._channels[-1])
-
-    def add_chunk(self, entries: Sequence[Entry]) -> None:
-        """Store messages, the topic of each being its channel less one."""
+    def write(self, entries: Sequence[Entry]) -> None:
+        """Store messages as one chunk, after what of their topics is not yet in the file."""
+        self._declare()
         declared = _packed(self._declared)
         content, places = _messages(entries, len(declared))
         data = declared + content
         times = [entry[1] for entry in entries]
-        stored = _COMPRESS[self._compression](data)
         chunk = Chunk(
-            compression=self._compression, data=stored, message_start_time=min(times),
-            message_end_time=max(times), uncompressed_size=len(data),
-            uncompressed_crc=zlib.crc32(data) if self._crc else 0)
-        offset = self._stream.position
-        record = _packed([chunk])
-        self._stream.write(record)
-        after = offsets_at = self._stream.position
+            compression=self._compression, data=_COMPRESS[self._compression](data),
+            message_start_time=min(times), message_end_time=max(times),
+            uncompressed_size=len(data), uncompressed_crc=zlib.crc32(data) if self._has_crc else 0)
+        parts = [_packed([chunk])]
+        after = indexes_at = self.size + len(parts[0])
         offsets = {}
         for topic, pairs in places.items():
             offsets[topic + 1] = after
             index = struct.pack(f'<{len(pairs)}Q', *pairs)
-            self._stream.write(_INDEX_HEAD.pack(
-                Opcode.MESSAGE_INDEX, len(index) + 6, topic + 1, len(index)) + index)
-            after = self._stream.position
-        self._stream.commit()
-        self._declared.clear()
-        self._chunks.append(ChunkIndex(
+            parts += _INDEX_HEAD.pack(
+                Opcode.MESSAGE_INDEX, len(index) + 6, topic + 1, len(index)), index
+            after += _INDEX_HEAD.size + len(index)
+        chunk_index = ChunkIndex(
             message_start_time=chunk.message_start_time,
-            message_end_time=chunk.message_end_time, chunk_start_offset=offset,
-            chunk_length=len(record), message_index_offsets=offsets,
-            message_index_length=after - offsets_at, compression=self._compression,
-            compressed_size=len(stored), uncompressed_size=len(data)))
-        for topic, pairs in places.items():
-            self.counts[topic] = self.counts.get(topic, 0) + len(pairs) // 2
+            message_end_time=chunk.message_end_time, chunk_start_offset=self.size,
+            chunk_length=len(parts[0]), message_index_offsets=offsets,
+            message_index_length=after - indexes_at, compression=self._compression,
+            compressed_size=len(chunk.data), uncompressed_size=len(data))
+        self._add(b''.join(parts), len(_packed([chunk_index])))
+        self._declared.clear()
+        self._chunks.append(chunk_index)
+        self.message_size += after - chunk_index.chunk_start_offset - len(declared)
+        self.counts.update({topic: len(pairs) // 2 for topic, pairs in places.items()})
         self.start = min(self.start, chunk.message_start_time)
         self.end = max(self.end, chunk.message_end_time)
 
-    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Store a metadata record."""
-        data = _packed([Metadata(name=name, metadata=dict(values))])
-        offset = self._stream.position
-        self._stream.write(data)
-        self._stream.commit()
-        self._metadata.append(MetadataIndex(offset=offset, length=len(data), name=name))
+    def describe(self, serialized_metadata: str, notes: Mapping[str, str]) -> None:
+        """Store the record that rosbag2 has at both ends of a file, and the experiment."""
+        if not self.size:
+            self._add(MAGIC + _packed([Header('ros2', LIBRARY)]))
+        self._add_metadata('rosbag2', {'serialized_metadata': serialized_metadata})
+        self.note(notes)
 
-    def add_summary(self) -> None:
-        """Store the summary and the end of the file."""
-        stream = self._stream
-        stream.write(_packed([DataEnd(stream.crc if self._crc else 0)]))
-        begin = stream.position
-        groups = [
-            (Opcode.SCHEMA, _packed(self._schemas)), (Opcode.CHANNEL, _packed(self._channels)),
-            (Opcode.STATISTICS, _packed([self._statistics()])),
-            (Opcode.CHUNK_INDEX, _packed(self._chunks)),
-            (Opcode.METADATA_INDEX, _packed(self._metadata))]
+    def note(self, values: Mapping[str, str]) -> None:
+        """Store what of the experiment the file does not say yet: viewers show each record."""
+        new = {key: value for key, value in values.items() if self._noted.get(key) != value}
+        if new:
+            # All of it comes once more at the end, and twice in the metadata file.
+            self._notes_room = 4 * sum(len(key) + len(value) for key, value in values.items())
+            before = self.size
+            self._add_metadata(EXPERIMENT, new)
+            self.notes_size += self.size - before
+            self._noted.update(new)
+
+    def finish(
+            self, serialized_metadata: str, notes: Mapping[str, str], *, fsync: bool) -> None:
+        """Store the metadata and the summary in the room taken, and close the file."""
+        self._declare()
+        self._ending = True
+        self.describe(serialized_metadata, notes)
+        count = self.counts.total()
+        statistics = Statistics(
+            attachment_count=0, channel_count=len(self._channels),
+            channel_message_counts={topic + 1: x for topic, x in self.counts.items()},
+            chunk_count=len(self._chunks), message_count=count,
+            message_start_time=self.start if count else 0, message_end_time=self.end,
+            metadata_count=len(self._metadata), schema_count=len(self._schemas))
+        groups = [(code, _packed(records)) for code, records in (
+            (Opcode.SCHEMA, self._schemas.values()), (Opcode.CHANNEL, self._channels),
+            (Opcode.STATISTICS, [statistics]), (Opcode.CHUNK_INDEX, self._chunks),
+            (Opcode.METADATA_INDEX, self._metadata))]
+        data_end = _packed([DataEnd(self._crc if self._has_crc else 0)])
+        begin = self.size + len(data_end)
         starts = itertools.accumulate((len(data) for _, data in groups), initial=begin)
         offsets = _packed(
             SummaryOffset(group_opcode=code, group_start=start, group_length=len(data))
@@ -172,20 +166,82 @@ class Framing:
         footer = Footer(
             summary_start=begin, summary_offset_start=begin + len(summary) - len(offsets),
             summary_crc=0)
-        if self._crc:
+        if self._has_crc:
             # Of the summary and the footer's fields before it.
             footer.summary_crc = zlib.crc32(summary + _packed([footer])[:-4])
-        stream.write(summary + _packed([footer]) + MAGIC)
-        stream.commit()
+        self._add(data_end + summary + _packed([footer]) + MAGIC)
+        os.ftruncate(self._descriptor, self.size)
+        if fsync:
+            self.sync()
+        self.close()
 
-    def _statistics(self) -> Statistics:
-        count = sum(self.counts.values())
-        return Statistics(
-            attachment_count=0, channel_count=len(self._channels),
-            channel_message_counts={topic + 1: x for topic, x in self.counts.items()},
-            chunk_count=len(self._chunks), message_count=count,
-            message_start_time=self.start if count else 0, message_end_time=self.end,
-            metadata_count=len(self._metadata), schema_count=len(self._schemas))
+    def sync(self) -> None:
+        """Wait until what is stored is on the disk."""
+        os.fsync(self._descriptor)
+
+    def close(self) -> None:
+        """Close the file as it is."""
+        os.close(self._descriptor)
+
+    def check_still_there(self) -> None:
+        """Raise `FileNotFoundError` if the file was removed: what is written is lost."""
+        try:
+            there = os.stat(self.path)
+        except OSError as error:
+            raise FileNotFoundError(
+                error.errno, f'{self.path} is gone', str(self.path)) from error
+        if not os.path.samestat(there, os.fstat(self._descriptor)):
+            raise FileNotFoundError(2, f'{self.path} has been replaced', str(self.path))
+
+    def summary(self) -> metadata.FileMetadata:
+        """Return what the bag's metadata say of the file."""
+        if not self.counts:
+            return metadata.FileMetadata(self.path.name)
+        return metadata.FileMetadata(
+            self.path.name, self.start, self.end - self.start, self.counts.total())
+
+    def _declare(self) -> None:
+        """Announce topics that are new; they are stored with the next chunk and in the summary."""
+        for topic in self._topics[len(self._channels):]:
+            if topic.type not in self._schemas:
+                self._schemas[topic.type] = Schema(
+                    id=len(self._schemas) + 1, name=topic.type,
+                    encoding=topic.definition_encoding, data=topic.definition.encode())
+                self._declared.append(self._schemas[topic.type])
+            self._channels.append(Channel(
+                id=len(self._channels) + 1, topic=topic.name,
+                schema_id=self._schemas[topic.type].id, message_encoding='cdr', metadata={
+                    'offered_qos_profiles': qos.to_yaml(topic.profiles),
+                    'topic_type_hash': topic.type_hash}))
+            self._declared.append(self._channels[-1])
+        # In the summary, and in the metadata.
+        self._end_size += 3 * len(_packed(self._declared))
+
+    def _add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Store a metadata record."""
+        data = _packed([Metadata(name=name, metadata=dict(values))])
+        index = MetadataIndex(offset=self.size, length=len(data), name=name)
+        self._add(data, len(_packed([index])))
+        self._metadata.append(index)
+
+    def _add(self, data: bytes, end_size: int = 0) -> None:
+        """Store data whole, with room for so many bytes more at the end, or undo all of it."""
+        self._end_size += end_size
+        needed = self.size + len(data) + self._end_size + self._notes_room + RESERVE_STEP // 2
+        if needed > self._room and not self._ending:
+            room = -(-needed // RESERVE_STEP) * RESERVE_STEP
+            os.posix_fallocate(self._descriptor, 0, room)
+            self._room = room
+        view = memoryview(data)
+        try:
+            while view:
+                view = view[os.write(self._descriptor, view):]
+        except OSError:
+            os.ftruncate(self._descriptor, self.size)
+            os.lseek(self._descriptor, self.size, os.SEEK_SET)
+            raise
+        self.size += len(data)
+        self._crc = zlib.crc32(data, self._crc)
 
 
 def _packed(records: Iterable[McapRecord]) -> bytes:
@@ -211,154 +267,3 @@ def _messages(entries: Sequence[Entry], place: int) -> tuple[bytes, dict[int, li
             places[topic] = [log_time, place]
         place += head + length
     return b''.join(parts), places
-
-
-LIBRARY = f'hmsa_ros {__version__}'
-#: Name of the metadata record with the experiment.
-EXPERIMENT = 'hmsa_ros'
-#: Room is taken in steps of so many bytes.
-RESERVE_STEP = 256 * 1024
-# A message with its index entry; a channel in the indexes of a chunk; a chunk.
-_MESSAGE_BYTES = MESSAGE_HEAD.size + 16
-_CHANNEL_BYTES = 25
-_CHUNK_BYTES = 256
-
-
-@dataclass(frozen=True)
-class Preset:
-    """How chunks are stored: compression, and whether with checksums."""
-
-    compression: str = ''
-    crc: bool = True
-
-
-# Names as rosbag2 has them, and lz4. With fastwrite rosbag2 leaves out chunks too; here they
-# stay, since the recovery of a cut file goes by them.
-PRESETS: Mapping[str, Preset] = {
-    'none': Preset(),
-    'fastwrite': Preset(crc=False),
-    'lz4': Preset('lz4'),
-    'zstd_fast': Preset('zstd'),
-    'zstd_small': Preset('zstd'),
-}
-
-
-class OutputFile(Framing):
-    """
-    One file of a bag; its methods raise `OSError` if the disk does not take what they write.
-
-    ``counts`` has the messages stored by topic, ``overhead`` the bytes of all else, ``noted`` what
-    the metadata records say of the experiment, and ``notes_size`` their length.
-    """
-
-    def __init__(self, path: Path, number: int, preset: Preset) -> None:
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
-        super().__init__(Stream(descriptor), LIBRARY, preset.compression, crc=preset.crc)
-        self.path = path
-        self.number = number
-        self.overhead = self.notes_size = 0
-        self.noted: dict[str, str] = {}
-        self._types: dict[str, int] = {}
-        self._ending = False
-        self._end_size = self._notes_room = self._room = 0
-
-    @property
-    def size(self) -> int:
-        """Return how many bytes are stored."""
-        return self._stream.stored
-
-    def reserve(self, size: int) -> None:
-        """Take room for some bytes more and for the end of the file."""
-        needed = self.size + size + self._end_size + self._notes_room + RESERVE_STEP // 2
-        if needed > self._room:
-            room = -(-needed // RESERVE_STEP) * RESERVE_STEP
-            os.posix_fallocate(self._stream.descriptor, 0, room)
-            self._room = room
-
-    def declare(self, topic: Topic) -> None:
-        """Announce the next topic; it is stored with the next chunk and in the summary."""
-        data = topic.definition.encode()
-        values = {
-            'offered_qos_profiles': qos.to_yaml(topic.profiles),
-            'topic_type_hash': topic.type_hash}
-        size = len(topic.name) * 4 + sum(map(len, values.values())) + 100
-        if topic.type not in self._types:
-            size += len(data) + len(topic.type) * 4
-        # In a chunk, in the summary, and in the metadata.
-        self._end_size += 4 * size
-        self.reserve(0)
-        self.overhead += size
-        if topic.type not in self._types:
-            self._types[topic.type] = self.add_schema(
-                topic.type, topic.definition_encoding, data)
-        self.add_channel(topic.name, self._types[topic.type], values)
-
-    def write(self, entries: Sequence[Entry], size: int) -> None:
-        """Store messages with ``size`` bytes of payload as one chunk."""
-        index = _CHUNK_BYTES + _CHANNEL_BYTES * len({entry[0] for entry in entries})
-        content = size + _MESSAGE_BYTES * len(entries) + self.overhead
-        # What cannot be compressed becomes a little longer.
-        self.reserve(content + content // 128 + 2 * index)
-        self._end_size += index
-        self.add_chunk(entries)
-
-    def describe(self, serialized_metadata: str, notes: Mapping[str, str]) -> None:
-        """Store the record that rosbag2 has at both ends of a file, and the experiment."""
-        self._store('rosbag2', {'serialized_metadata': serialized_metadata})
-        self.note(notes)
-
-    def note(self, values: Mapping[str, str]) -> None:
-        """Store what of the experiment the file does not say yet: viewers show each record."""
-        new = {key: value for key, value in values.items() if self.noted.get(key) != value}
-        if new:
-            # All of it comes once more at the end, and twice in the metadata file.
-            self._notes_room = 4 * sum(len(key) + len(value) for key, value in values.items())
-            self.notes_size += self._store(EXPERIMENT, new)
-            self.noted.update(new)
-
-    def _store(self, name: str, values: Mapping[str, str]) -> int:
-        """Store a metadata record and return its length."""
-        if not self._ending:
-            self.reserve(100 + sum(
-                4 * (len(key) + len(value)) + 8 for key, value in values.items()))
-        self._end_size += len(name) + 50
-        before = self.size
-        self.add_metadata(name, values)
-        self.overhead += self.size - before
-        return self.size - before
-
-    def finish(
-            self, serialized_metadata: str, notes: Mapping[str, str], *, fsync: bool) -> None:
-        """Store the metadata and the summary in the room taken, and close the file."""
-        self._ending = True
-        self.describe(serialized_metadata, notes)
-        self.add_summary()
-        os.ftruncate(self._stream.descriptor, self.size)
-        if fsync:
-            self.sync()
-        self.close()
-
-    def sync(self) -> None:
-        """Wait until what is stored is on the disk."""
-        os.fsync(self._stream.descriptor)
-
-    def close(self) -> None:
-        """Close the file as it is."""
-        os.close(self._stream.descriptor)
-
-    def check_still_there(self) -> None:
-        """Raise `FileNotFoundError` if the file was removed: what is written is lost."""
-        try:
-            there = os.stat(self.path)
-        except OSError as error:
-            raise FileNotFoundError(
-                error.errno, f'{self.path} is gone', str(self.path)) from error
-        if not os.path.samestat(there, os.fstat(self._stream.descriptor)):
-            raise FileNotFoundError(2, f'{self.path} has been replaced', str(self.path))
-
-    def summary(self) -> metadata.FileMetadata:
-        """Return what the bag's metadata say of the file."""
-        if not self.counts:
-            return metadata.FileMetadata(self.path.name)
-        return metadata.FileMetadata(
-            self.path.name, self.start, self.end - self.start, sum(self.counts.values()))

@@ -6,19 +6,18 @@ happen in the thread. What cannot be kept is counted by topic, never dropped in 
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
+from dataclasses import dataclass
+from functools import partial
 import threading
 import time
 from typing import NamedTuple
 
 from hmsa_ros.bag.output import Entry
-from hmsa_ros.bag.sink import Limits, Sink
 from hmsa_ros.bag.topics import number_of, Topic
-from hmsa_ros.bag.writer import BagWriter
-from hmsa_ros.errors import BagError
-
-__all__ = ['Limits', 'lost_by_topic', 'Recording', 'Status']
+from hmsa_ros.bag.writer import BagWriter, MIN_FILE_SIZE
+from hmsa_ros.errors import BadInputError, BagError
 
 # What a queued message takes in memory besides its payload.
 MESSAGE_OVERHEAD = 250
@@ -27,6 +26,34 @@ RETRY_SECONDS = 1.0
 END_SECONDS = 10.0
 # On top of it, for a disk that does not answer.
 _GRACE_SECONDS = 5.0
+#: New files that may follow each other at once, and then one in so many seconds: each costs
+#: declarations, an index, and waiting for the disk.
+FILE_BURST = 10
+FILE_SECONDS = 1.0
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When to flush, when to split and how much to keep in memory."""
+
+    flush_period: float = 0.5  #: s after which the operating system has a message at the latest
+    max_size: int = 0  #: bytes at which a file is split; 0 for never, else at least 1024
+    max_duration_ns: int = 0  #: time span at which a file is split; 0 for never
+    #: bytes of queued messages at which new ones are counted as lost
+    cache_size: int = 100 * 2**20
+    snapshot_ns: int = 0  #: above 0, messages are kept for so long, written for a snapshot
+
+    def __post_init__(self) -> None:
+        if not self.flush_period > 0.0:
+            raise BadInputError(f'flush period is {self.flush_period} s: expected above 0')
+        if self.max_size and self.max_size < MIN_FILE_SIZE:
+            raise BadInputError(
+                f'largest file size is {self.max_size} bytes: expected 0 for no limit, or at '
+                f'least {MIN_FILE_SIZE}')
+        if self.max_duration_ns < 0 or self.snapshot_ns < 0:
+            raise BadInputError('a duration is negative: expected at least 0')
+        if self.cache_size < 1:
+            raise BadInputError(f'cache size is {self.cache_size}: expected at least 1 byte')
 
 
 class Status(NamedTuple):
@@ -50,19 +77,17 @@ class Status(NamedTuple):
 class _Task(NamedTuple):
     """Something the thread is asked to do, and where its answer goes."""
 
-    action: Callable[[], str]
-    answer: Future[str]
+    action: Callable[[], object]
+    answer: Future[object]
 
 
-class _Batch(NamedTuple):
+@dataclass
+class _Batch:
     """Messages, what they take in memory, and since when they wait."""
 
     messages: list[Entry]
     size: int
     since: float
-
-
-_Item = Topic | Mapping[str, str] | _Task | _Batch
 
 
 class Recording:
@@ -80,17 +105,18 @@ class Recording:
         self._limits = limits
         self._report = report
         self._condition = threading.Condition()
-        self._items: deque[_Item] = deque()
+        self._items: deque[_Task | _Batch] = deque()
+        self._kept: deque[_Batch] = deque()  # for a snapshot
         self._queued = 0
         self._topics: list[Topic] = []
         self._overflowed = Counter[int]()
         self._closing = False
         self._error = ''
         self._next_retry = 0.0
-        self._rest: Iterator[Entry] | None = None
-        self._batch = _Batch([], 0, 0.0)
         self._deadline = float('inf')
-        self._sink = Sink(writer, limits, self._release)
+        # New files that may be begun now, as of a time, and those that were due nevertheless.
+        self._files_left, self._files_since = float(FILE_BURST), time.monotonic()
+        self._crowded = 0
         self._thread = threading.Thread(target=self._run, name='writer', daemon=True)
         self._thread.start()
 
@@ -103,32 +129,31 @@ class Recording:
             number = number_of(topic, self._topics)
             if number == len(self._topics):
                 self._topics.append(topic)
-            self._items.append(topic)
-            self._condition.notify()
+            self._ask(partial(self._writer.add_topic, topic))
         return number
 
     def put(self, messages: list[Entry], payload_bytes: int) -> None:
         """Record messages, whose payloads have so many bytes in all; returns at once."""
         size = payload_bytes + MESSAGE_OVERHEAD * len(messages)
+        batch = _Batch(messages, size, time.monotonic())
         with self._condition:
-            if self._queued + size > self._limits.cache_size:
+            if self._limits.snapshot_ns:
+                self._keep(batch)
+            elif self._queued + size > self._limits.cache_size:
                 self._lose(messages)
-                return
-            self._queued += size
-            wake = not self._items
-            self._items.append(_Batch(messages, size, time.monotonic()))
-            if wake:
-                self._condition.notify()
+            else:
+                self._queued += size
+                self._items.append(batch)
+                if len(self._items) == 1:
+                    self._condition.notify()
 
     def note(self, values: Mapping[str, str]) -> None:
         """Add to the custom data of the bag; a key that exists gets the new value."""
-        with self._condition:
-            self._items.append(dict(values))
-            self._condition.notify()
+        self._ask(partial(self._writer.note, dict(values)))
 
     def split(self) -> str:
         """Go on in a new file, after all that has been put so far."""
-        return self._ask(self._writer.split)
+        return self._answer_to(self._writer.split)
 
     def begin_anew(self) -> None:
         """
@@ -137,25 +162,36 @@ class Recording:
         For when time has jumped back: a snapshot does not reach back beyond it either.
         """
         with self._condition:
-            self._items.append(_Task(self._sink.begin_anew, Future()))
-            self._condition.notify()
+            while self._kept:
+                self._queued -= self._kept.popleft().size
+            self._ask(self._begin_anew)
 
     def snapshot(self) -> str:
-        """Write what is kept in memory."""
-        return self._ask(self._sink.snapshot)
+        """Write what is kept in memory; raise `BagError` where every message is recorded."""
+        if not self._limits.snapshot_ns:
+            raise BagError('there is no snapshot to take: every message is recorded; expected '
+                           'snapshot mode')
+        with self._condition:
+            oldest = self._kept[-1].messages[-1][1] - self._limits.snapshot_ns if self._kept else 0
+            count = 0
+            for batch in self._kept:
+                wanted = [x for x in batch.messages if x[1] >= oldest]
+                self._items.append(_Batch(wanted, batch.size, time.monotonic()))
+                count += len(wanted)
+            self._kept.clear()
+        self._answer_to(self._writer.flush)
+        return f'{count} messages written'
 
     def status(self) -> Status:
         """Return the state."""
         with self._condition:
-            batch = self._batch if self._rest is not None else next(
-                (item for item in self._items if isinstance(item, _Batch)), None)
+            since = next((x.since for x in self._items if isinstance(x, _Batch)), None)
             return Status(
                 self._writer.file_name, self._error, self._writer.topic_counts(),
                 {self._topics[number].name: count
                  for number, count in self._overflowed.items()},
                 dict(self._writer.dropped), self._queued,
-                0.0 if batch is None else time.monotonic() - batch.since,
-                self._sink.pace.refused)
+                0.0 if since is None else time.monotonic() - since, self._crowded)
 
     def close(self, last_words: Callable[[Status], Mapping[str, str]] | None = None) -> Status:
         """Write what has been put, add the custom data of ``last_words``, and close the bag."""
@@ -183,18 +219,37 @@ class Recording:
             self._error = self._error or _not_closed(error)
         return self.status()
 
-    def _ask(self, action: Callable[[], str]) -> str:
+    def _ask(self, action: Callable[[], object]) -> Future[object]:
+        """Have the thread do something; return its answer to come."""
+        task = _Task(action, Future())
+        with self._condition:
+            self._items.append(task)
+            self._condition.notify()
+        return task.answer
+
+    def _answer_to(self, action: Callable[[], object]) -> str:
         """Have the thread do something and return its answer."""
-        answer = Future[str]()
         with self._condition:
             if self._closing:
                 raise BagError('the recording has ended')
-            self._items.append(_Task(action, answer))
-            self._condition.notify()
+            answer = self._ask(action)
         try:
-            return answer.result()
+            return str(answer.result())
         except Exception as error:
             raise BagError(str(error)) from error
+
+    def _keep(self, batch: _Batch) -> None:
+        """Keep messages in memory for a snapshot, the oldest giving way."""
+        self._queued += batch.size
+        self._kept.append(batch)
+        oldest = batch.messages[-1][1] - self._limits.snapshot_ns
+        while self._kept and (self._kept[0].messages[-1][1] < oldest
+                              or self._queued > self._limits.cache_size):
+            self._queued -= self._kept.popleft().size
+
+    def _lose(self, messages: Iterable[Entry]) -> None:
+        """Count messages that will not be written."""
+        self._overflowed.update(message[0] for message in messages)
 
     # In the thread ---------------------------------------------------------------------------
 
@@ -223,58 +278,67 @@ class Recording:
             if closing and self._error:
                 # One last try; it may be the file alone that cannot grow any more.
                 self._retry(now=True)
-            if closing and (self._error or self._is_late()
-                            or not self._items and self._rest is None):
+            if closing and (self._error or self._is_late() or not self._items):
                 self._give_up()
                 return
 
     def _take_items(self) -> None:
-        """Write everything that is queued."""
-        if self._rest is not None:
-            self._write(self._rest, self._batch)
+        """Do and write everything that is queued; on failure the rest waits for the next try."""
         while self._items and not self._is_late():
             item = self._items[0]
-            if isinstance(item, _Batch):
+            if isinstance(item, _Task):
                 self._items.popleft()
-                self._write(iter(item.messages), item)
-            elif isinstance(item, _Task):
+                try:
+                    item.answer.set_result(item.action())
+                except BaseException as error:
+                    item.answer.set_exception(error)
+                    if not isinstance(error, BagError):
+                        raise
+                continue
+            rest = iter(item.messages)
+            try:
+                if self._limits.max_size or self._limits.max_duration_ns:
+                    self._write_splitting(rest)
+                else:
+                    self._writer.write(rest)
+            finally:
+                item.messages = list(rest)
+            with self._condition:
                 self._items.popleft()
-                self._answer(item)
-            elif isinstance(item, Topic):
-                self._writer.add_topic(item)
-                self._items.popleft()
-            else:
-                self._items.popleft()
-                self._writer.note(item)
+                self._queued -= item.size
 
-    def _write(self, messages: Iterator[Entry], batch: _Batch) -> None:
-        """Write messages; on failure what is left waits for the next try."""
-        self._rest, self._batch = messages, batch
-        self._sink.put(messages, batch.size, self._queued)
-        self._rest = None
+    def _write_splitting(self, messages: Iterable[Entry]) -> None:
+        """Write one message after the other, with a new file where a limit is reached."""
+        writer, limits = self._writer, self._limits
+        for message in messages:
+            full = (limits.max_size and writer.file_size >= limits.max_size) or (
+                limits.max_duration_ns and writer.file_duration_ns >= limits.max_duration_ns)
+            try:
+                if full and self._may_split():
+                    writer.split()
+            finally:
+                # Where that fails, too: it waits then.
+                writer.write((message,))
+
+    def _begin_anew(self) -> None:
+        if not self._writer.is_file_empty and self._may_split():
+            self._writer.split()
+
+    def _may_split(self) -> bool:
+        """Return whether a new file may be begun so soon, and take note."""
+        now = time.monotonic()
+        self._files_left = min(
+            float(FILE_BURST), self._files_left + (now - self._files_since) / FILE_SECONDS)
+        self._files_since = now
+        if self._files_left < 1.0:
+            self._crowded += 1
+            return False
+        self._files_left -= 1.0
+        return True
 
     def _is_late(self) -> bool:
         """Return whether the end has taken too long."""
         return time.monotonic() > self._deadline
-
-    def _lose(self, messages: Iterable[Entry]) -> None:
-        """Count messages that will not be written."""
-        self._overflowed.update(message[0] for message in messages)
-
-    def _release(self, size: int) -> None:
-        """Give memory back to the queue."""
-        with self._condition:
-            self._queued -= size
-
-    @staticmethod
-    def _answer(request: _Task) -> None:
-        """Do what was asked for."""
-        try:
-            request.answer.set_result(request.action())
-        except BaseException as error:
-            request.answer.set_exception(error)
-            if not isinstance(error, BagError):
-                raise
 
     def _fail(self, error: OSError) -> None:
         """Take note that writing is not possible."""
@@ -292,7 +356,6 @@ class Recording:
         self._next_retry = time.monotonic() + RETRY_SECONDS
         try:
             name = self._writer.reopen()
-            self._writer.flush()
         except OSError as error:
             self._error = f'cannot write to {self._writer.folder}: {_reason(error)}'
             self._writer.abandon()
@@ -303,7 +366,6 @@ class Recording:
     def _give_up(self) -> None:
         """Count what is left in the queue as lost, and answer who waits."""
         with self._condition:
-            self._lose(self._rest or ())
             for item in self._items:
                 if isinstance(item, _Batch):
                     self._lose(item.messages)

@@ -9,7 +9,6 @@ half way is undone. Message payloads are stored as given.
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 import contextlib
-import errno
 import itertools
 import operator
 import os
@@ -18,7 +17,7 @@ import re
 
 from hmsa_ros import __version__
 from hmsa_ros.bag import metadata, qos
-from hmsa_ros.bag.output import Entry, OutputFile, PRESETS, RESERVE_STEP
+from hmsa_ros.bag.output import Entry, OutputFile, PRESETS
 from hmsa_ros.bag.records import MESSAGE_HEAD
 from hmsa_ros.bag.topics import number_of, Topic
 from hmsa_ros.errors import BadInputError, BagError
@@ -91,21 +90,27 @@ class BagWriter:
         self.custom_data: dict[str, str] = {}
         self.dropped: Counter[str] = Counter()
         self._add(custom_data or {})
-        self._preset = PRESETS[preset]
+        self._preset = preset
         self._chunk_size = chunk_size
         self._fsync = fsync
-        self._waiting: list[Entry] = []
-        self._waiting_size = 0
+        self._waiting: list[Entry]
+        self._start: int  # of the log times that wait
+        self._end: int
+        self._forget_waiting()
         self._file: OutputFile | None = None
         self._next_number = 0
         self._closed = False
-        _make(self.folder)
         try:
+            self.folder.mkdir(parents=True)
             self._open()
+        except FileExistsError:
+            raise BadInputError(
+                f'{self.folder} exists: expected the name of a new bag; choose another name or '
+                'remove it') from None
         except OSError as error:
             raise BadInputError(
-                f'{self.folder} cannot be written to ({error.strerror}): expected a folder '
-                'with space that can be written to') from error
+                f'{self.folder} cannot be made ({error.strerror}): expected a folder with space '
+                'that can be written to') from error
 
     def __enter__(self) -> 'BagWriter':
         return self
@@ -124,17 +129,15 @@ class BagWriter:
     @property
     def file_size(self) -> int:
         """Return the size of the file's messages with what is not yet flushed, in bytes."""
-        if self._file is None:
-            return 0
-        waiting = self._waiting_size + MESSAGE_HEAD.size * len(self._waiting)
-        return max(0, self._file.size - self._file.overhead) + waiting
+        return self._waiting_size + (self._file.message_size if self._file else 0)
 
     @property
     def file_duration_ns(self) -> int:
         """Return the time between the first and the last message of the file, in ns."""
-        if self.is_file_empty or self._file is None:
-            return 0
-        return max(self._file.end, self._end) - min(self._file.start, self._start)
+        start, end = self._start, self._end
+        if self._file is not None:
+            start, end = min(start, self._file.start), max(end, self._file.end)
+        return max(0, end - start)
 
     @property
     def is_file_empty(self) -> bool:
@@ -151,40 +154,31 @@ class BagWriter:
         number = number_of(topic, self._topics)
         if number < len(self._topics):
             # Its first profiles hold for every file.
-            known = self._topics[number]
-            if set(topic.profiles) - set(known.profiles):
+            if set(topic.profiles) - set(self._topics[number].profiles):
                 self.note({qos.LATER + topic.name: qos.to_yaml(topic.profiles)})
             return number
         if number >= MAX_CHANNELS:
             raise BagError(f'a bag cannot have more than {MAX_CHANNELS} topics')
-        if self._file is not None:
-            self._file.declare(topic)
         self._topics.append(topic)
         return number
 
     def write(self, entries: Iterable[Entry]) -> None:
         """Add messages in any order of log times (ns); full chunks go to the file."""
         for entry in entries:
-            log_time = entry[1]
-            if not self._waiting:
-                self._start = self._end = log_time
-            elif log_time < self._start:
-                self._start = log_time
-            elif log_time > self._end:
-                self._end = log_time
+            self._start = min(self._start, entry[1])
+            self._end = max(self._end, entry[1])
             self._waiting.append(entry)
-            self._waiting_size += len(entry[4])
-            if self._waiting_size + MESSAGE_HEAD.size * len(self._waiting) >= self._chunk_size:
+            self._waiting_size += MESSAGE_HEAD.size + len(entry[4])
+            if self._waiting_size >= self._chunk_size:
                 self._write_chunk()
 
     def note(self, values: Mapping[str, str]) -> None:
         """Add to the custom data: in ``metadata.yaml``, and in the file at once or at its end."""
         self._add(values)
-        file = self._file
-        if file is not None:
+        if self._file is not None:
             # What changes all the time would be more than the messages are.
-            if file.notes_size <= max(_NOTES_SIZE, file.size // 16):
-                file.note(self._notes())
+            if self._file.notes_size <= max(_NOTES_SIZE, self._file.size // 16):
+                self._file.note(self._notes())
             self._write_metadata()
 
     def flush(self) -> None:
@@ -205,13 +199,14 @@ class BagWriter:
         """Give up the file after an `OSError`, as `abandon` does, and go on in a new one."""
         self.abandon()
         self.folder.mkdir(parents=True, exist_ok=True)
-        _check_room(self.folder, self._waiting_size + 2 * MESSAGE_HEAD.size * len(self._waiting))
-        return self._open()
+        name = self._open()
+        self.flush()
+        return name
 
     def drop_pending(self) -> None:
         """Forget the messages that wait for the next flush, counting them in `dropped`."""
         self.dropped.update(self._topics[entry[0]].name for entry in self._waiting)
-        self._waiting, self._waiting_size = [], 0
+        self._forget_waiting()
 
     def abandon(self) -> None:
         """Give up the file after an `OSError`, closing it as well as can be done."""
@@ -222,22 +217,20 @@ class BagWriter:
             self._discard(file)
             return
         try:
-            file.check_still_there()
-        except OSError:
-            for number, count in file.counts.items():
-                self.dropped[self._topics[number].name] += count
-                self._counts[number] -= count
-            file.close()
-            self._file = None
-            return
-        try:
             self._finish_file()
-        except OSError:
-            # There is no summary then: the messages are there, a reader that needs the summary
-            # gets it from `hmsa bag recover`.
-            if self._file is not None:
-                file.close()
-                self._forget_file(file)
+        except OSError as error:
+            if self._file is None:
+                return  # it is closed, and only the metadata could not be written
+            file.close()
+            if not isinstance(error, FileNotFoundError):
+                # There is no summary then: the messages are there, a reader that needs the
+                # summary gets it from `hmsa bag recover`.
+                self._closed_files.append(file.summary())
+            else:
+                self._counts.subtract(file.counts)
+                for number, count in file.counts.items():
+                    self.dropped[self._topics[number].name] += count
+            self._file = None
 
     def abort(self) -> None:
         """End as a killed process would: what is in the file stays, nothing says it is all."""
@@ -262,27 +255,24 @@ class BagWriter:
     def _open(self) -> str:
         """Open the next file and write what every file begins with."""
         while True:
-            number = self._next_number
-            name = f'{self._stem}_{number}.mcap'
+            path = self.folder / f'{self._stem}_{self._next_number}.mcap'
             self._next_number += 1
             with contextlib.suppress(FileExistsError):
-                file = self._file = OutputFile(self.folder / name, number, self._preset)
+                file = self._file = OutputFile(path, self._preset, self._topics)
                 break
         try:
             file.describe(self._serialized(file), self._notes())
-            for topic in self._topics:
-                file.declare(topic)
             self._write_metadata()
         except OSError:
             self._discard(file)
             raise
-        return name
+        return path.name
 
     def _discard(self, file: OutputFile) -> None:
         """Remove a file without messages."""
         file.close()
         self._file = None
-        self._next_number = file.number
+        self._next_number -= 1
         with contextlib.suppress(OSError):
             file.path.unlink()
 
@@ -292,9 +282,14 @@ class BagWriter:
             return
         if self._file is None:
             raise OSError('no file is open')
-        self._file.write(self._waiting, self._waiting_size)
+        self._file.write(self._waiting)
         self._counts.update(map(_TOPIC_OF, self._waiting))
+        self._forget_waiting()
+
+    def _forget_waiting(self) -> None:
+        """Begin the next chunk."""
         self._waiting, self._waiting_size = [], 0
+        self._start, self._end = 2**64, 0
 
     def _finish_file(self) -> None:
         """Write metadata and summary, close the file and bring ``metadata.yaml`` up to date."""
@@ -303,13 +298,9 @@ class BagWriter:
             return
         file.check_still_there()
         file.finish(self._serialized(file), self._notes(), fsync=self._fsync)
-        self._forget_file(file)
-        self._write_metadata()
-
-    def _forget_file(self, file: OutputFile) -> None:
-        """Note a closed file among the files written."""
         self._closed_files.append(file.summary())
         self._file = None
+        self._write_metadata()
 
     def _write_metadata(self) -> None:
         """Bring ``metadata.yaml`` up to date."""
@@ -348,27 +339,6 @@ class BagWriter:
 def _storable(text: str) -> str:
     """Return a text with what UTF-8 cannot hold written as its codes."""
     return text.encode('utf-8', 'backslashreplace').decode()
-
-
-def _make(folder: Path) -> None:
-    """Make the folder of a new bag."""
-    try:
-        folder.mkdir(parents=True)
-    except FileExistsError:
-        raise BadInputError(
-            f'{folder} exists: expected the name of a new bag; choose another name '
-            'or remove it') from None
-    except OSError as error:
-        raise BadInputError(
-            f'{folder} cannot be made ({error.strerror}): expected a folder that can '
-            'be written to') from error
-
-
-def _check_room(folder: Path, size: int) -> None:
-    """Refuse to begin a file for which there is no room: every try would leave one behind."""
-    disk = os.statvfs(folder)
-    if disk.f_bavail * disk.f_frsize < size * 5 // 4 + 2 * RESERVE_STEP:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def parse_custom_data(pairs: Iterable[str]) -> dict[str, str]:
