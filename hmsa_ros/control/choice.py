@@ -46,27 +46,15 @@ def clearly_better(
     unless samples have shown an arrival.
     """
     step = math.copysign(max(abs(target - start), _STEP), target - start)
-    pairs: list[list[Outcome]] = []
-    for to in (target - step, target + 0.7 * step):
-        pair = []
-        for each in (used, model):
-            left = _left(estimate, _planned(each, target, to), each.options.slew_limit)
-            if left is None:
-                break
-            pair.append(_shared(left, abs(to - target)))
-        else:
-            pairs.append(pair)
+    tried = [[_left(estimate, each, target, to) for each in (used, model)]
+             for to in (target - step, target + 0.7 * step)]
+    pairs = [(one, other) for one, other in tried if one is not None and other is not None]
     if not pairs:
         return False
-    before, after = (_together([x[i] for x in pairs]) for i in (0, 1))
+    before, after = map(_together, zip(*pairs, strict=True))
     return worthwhile(
         before, after, MUCH if given and not shown else _LEAST,
         little=0.0 if given else _LITTLE, share=CLEARLY if given else AT_REST)
-
-
-def _shared(left: Outcome, step: float) -> Outcome:
-    """Return what a move leaves as shares of its step."""
-    return Outcome(left.misses / step, left.covariance / step ** 2)
 
 
 def _together(outcomes: Sequence[Outcome]) -> Outcome:
@@ -81,29 +69,28 @@ def _together(outcomes: Sequence[Outcome]) -> Outcome:
         covariance.reshape(count * size, -1))
 
 
-def _planned(model: Model, start: float, target: float) -> Course | None:
-    """Return a move from rest as planned with a model; None where it cannot be."""
+def _left(estimate: Estimate, model: Model, start: float, target: float) -> Outcome | None:
+    """
+    Return what a move from rest that is planned with a model is expected to leave.
+
+    Figures are shares of its step. None where it cannot be planned, or followed.
+    """
     try:
-        planner = Planner(
-            model.actuator, replace(model.options, lead_time=0, period=0), stretch=start)
-        plan = planner.setpoint(target, 0)
+        plan = Planner(
+            model.actuator, replace(model.options, lead_time=0, period=0),
+            stretch=start).setpoint(target, 0)
     except HmsaError:
         return None
-    arrival = plan.segments[-1].arrival
-    if arrival is None:
+    arrival, holding = plan.segments[-1].arrival, model.flux_density(model.holding(start))
+    resting = _at_rest(estimate, holding)
+    if arrival is None or resting is None:
         return None
-    return Course(
+    left = expect(resting, Course(
         tuple((x.stamp, x.flux_density) for x in plan.levels if x.stamp >= 0), arrival, target,
-        model.flux_density(model.holding(start)))
-
-
-def _left(estimate: Estimate, course: Course | None, slew_limit: float) -> Outcome | None:
-    """Return what a move from rest is expected to leave; None without."""
-    if course is None:
-        return None
-    resting = _at_rest(estimate, course.before)
-    left = None if resting is None else expect(resting, course, slew_limit)
-    return left if left is not None and math.isfinite(left.size) else None
+        holding), model.options.slew_limit)
+    step = abs(target - start)
+    return Outcome(left.misses / step, left.covariance / step ** 2) if math.isfinite(
+        left.size) else None
 
 
 def _at_rest(estimate: Estimate, level: float) -> Estimate | None:
