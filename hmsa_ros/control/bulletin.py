@@ -1,10 +1,10 @@
 """What a runtime tells: verdicts, progress and previews, in the order in which they happen."""
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 
 from hmsa_ros.control.following import Following
 from hmsa_ros.control.records import (
-    Note,
     Output,
     PlanChanged,
     Request,
@@ -32,16 +32,16 @@ class Bulletin:
 
     def __init__(
             self, group: PlannerGroup, following: Following, watch: Watch,
-            surroundings: Surroundings, unheard: Callable[[], str],
-            unseen: Callable[[], str]) -> None:
+            surroundings: Surroundings, outputs: list[Output], note: Callable[[str], None],
+            *looks: Callable[[], str]) -> None:
+        """Begin with no verdict; looks return what `unheard` and `unseen` are to be."""
         self._group, self._following, self._watch = group, following, watch
-        self._around = surroundings
-        self._looks = unheard, unseen
+        self._around, self._looks = surroundings, looks
+        self.outputs, self.note = outputs, note
         self._look_again = 0
         self.unheard = ''  # why nobody carries out commands; empty where somebody does
         self.unseen = ''  # of which joint samples have ceased; empty for none
         self.verdict = Verdict(Severity.OK, Code.NONE, 'no request yet')
-        self.outputs: list[Output] = []
         self.preview_again: int | None = None  # time in ns of the next part of a long plan
         self._told: tuple[Progress, Mapping[str, Progress], bool] | None = None
         # What progress follows from, and until when it stays as it is.
@@ -57,14 +57,14 @@ class Bulletin:
             self.note(verdict.message)
         self.tell()
 
+    def go_on(self, verdict: Verdict, *, log: bool = False) -> None:
+        """Give a verdict on the request that the one before was on."""
+        self.give(replace(verdict, request=self.verdict.request), log=log)
+
     @property
     def _warned(self) -> bool:
         """Whether the verdict warns of something else than what was measured."""
         return self.verdict.severity > Severity.OK and self.verdict.code not in VERDICTS
-
-    def note(self, message: str) -> None:
-        """Have a sentence logged."""
-        self.outputs.append(Note(Severity.WARN, message))
 
     def tell(self) -> None:
         """Tell verdict and progress."""
@@ -117,10 +117,9 @@ class Bulletin:
             self.tell()
             return
         fine = worst.arrived or worst.verdict is Code.UNOBSERVED and not self._watch.measuring
-        self.give(
-            Verdict(
-                Severity.OK if fine else Severity.WARN, worst.verdict, worst.message,
-                self.verdict.request), log=worst.failed and worst is finding)
+        self.go_on(
+            Verdict(Severity.OK if fine else Severity.WARN, worst.verdict, worst.message),
+            log=worst.failed and worst is finding)
 
     def corrected(self, names: Iterable[str], now: int) -> None:
         """Take in that the plans of joints have been corrected at a time in ns; show them soon."""

@@ -8,10 +8,11 @@ import math
 import numpy as np
 
 from hmsa_ros.control.feedback import Feedback
-from hmsa_ros.control.learnt import as_of_path, believed, learnt_model
+from hmsa_ros.control.learnt import alike, as_of_path, believed, learnt_model
+from hmsa_ros.control.ledger import Moves
 from hmsa_ros.control.records import Severity, Verdict
 from hmsa_ros.control.slices import Clock, Drafting, in_time, Work
-from hmsa_ros.control.trimming import trimmed
+from hmsa_ros.control.tracked import Joint
 from hmsa_ros.estimation import Estimate
 from hmsa_ros.estimation.correction import (
     Ahead,
@@ -27,6 +28,7 @@ from hmsa_ros.estimation.correction import (
     SHARE,
     worthwhile,
 )
+from hmsa_ros.estimation.motion import rest
 from hmsa_ros.estimation.words import confounded
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
@@ -55,6 +57,11 @@ _JOINED, _IDLE, _PERIODS, _SAMPLES, _BEFORE = 2, 4, 3, 61, 8
 _CREEPS = 1.0
 # A step that is smaller counts as this one.
 _LEAST_STEP = 0.1
+# Units of time after the last change from which on a level is trimmed, so that it is slow beside
+# any vibration, and what share of the bound one change may be.
+_PAUSE, _PART = 60.0, 0.25
+# Deviations by which the rest must be beside the target for that, and the least offset.
+_SURE, _OFF = 3.0, 1e-4
 
 
 class Corrections:
@@ -62,13 +69,6 @@ class Corrections:
 
     def __init__(self, group: PlannerGroup, feedback: Feedback, clock: Clock) -> None:
         self._group, self._feedback, self._clock = group, feedback, clock
-        # Times in ns at which moves that take longer are at rest.
-        self._arrivals: dict[str, int] = {}
-        # Times in ns from which on paths are looked at again, and that planning one took.
-        self._looks: dict[str, int] = {}
-        self._spent: dict[str, int] = {}
-        # What corrections that have been worked out are expected to leave.
-        self._after: dict[str, float] = {}
 
     def cautious(self, drafts: Mapping[str, Draft]) -> Mapping[str, Draft]:
         """
@@ -76,65 +76,65 @@ class Corrections:
 
         Their levels stay: the early effect of these shows what the actuator is.
         """
-        self._arrivals = {x: y for x, y in self._arrivals.items() if x not in drafts}
-        return {name: self._slowly(name, draft) for name, draft in drafts.items()}
+        joints = self._feedback.joints
+        return {name: self._slowly(joints[name], draft) if name in joints else draft
+                for name, draft in drafts.items()}
 
-    def _slowly(self, name: str, draft: Draft) -> Draft:
+    def _slowly(self, joint: Joint, draft: Draft) -> Draft:
         segment, *rest = draft.segments
-        estimate = self._feedback.foreseen(name, draft.begin)
-        model = draft.levels[-1].model
-        self._feedback.planned(name, model, 0.0)
+        estimate = joint.foreseen(draft.begin)
+        joint.moves = Moves(not alike(draft.levels[-1].model, joint.given))
+        joint.next_update = joint.next_sample = joint.waits = 0
         if estimate is None or segment.arrival is None or segment.code in (
                 Code.LEVELS, Code.PATH):
             return draft
         step = max(abs(segment.stretch - draft.levels[0].stretch), _LEAST_STEP)
-        course = _drafted(draft, self._group.planners[name].plan)
-        slew = self._group.planners[name].options.slew_limit
-        self._feedback.planned(name, model, expect(estimate, course, slew).size)
-        if math.isinf(self._feedback.tolerance):
+        course = _drafted(draft, joint.planner.plan)
+        slew = joint.planner.options.slew_limit
+        joint.moves.expected = expect(estimate, course, slew).size
+        if math.isinf(joint.tolerance):
             return draft
         # What is only suspected is no reason to take longer.
-        size = expect(estimate.sure_of(self._feedback.named), course, slew).size
-        if size <= self._feedback.tolerance * step:
+        named = len(joint.settings.feedback_parameters)
+        if expect(estimate.sure_of(named), course, slew).size <= joint.tolerance * step:
             return draft
-        longer = caution(self._feedback.named, estimate.noise / step)
+        longer = caution(named, estimate.noise / step)
         arrival = segment.begin + round(longer * (segment.arrival - segment.begin))
         if rest:
             arrival = max(min(arrival, rest[0].begin), segment.arrival)
-        self._arrivals[name] = arrival
-        self._feedback.takes_longer(name, arrival)
+        joint.waits = arrival
         return replace(draft, segments=(replace(segment, arrival=arrival), *rest))
 
     def due(self, now: int) -> Iterator[Work]:
         """Yield what may be worth correcting by a time in ns; the results are for `take`."""
-        for name in self._feedback.taken_back():
-            yield self._work(name, partial(self._take_back, name))
-        for name, planner in self._feedback.news():
+        for joint in self._feedback.taken_back():
+            yield self._work(joint, _take_back)
+        for joint in self._feedback.news():
+            planner = joint.planner
             if not planner.plan.segments:
                 continue
             if planner.as_sent(planner.soonest(now)):
-                if self._leaves_path(name, now):
-                    yield self._work(name, partial(self._rejoin, name))
+                if _leaves_path(joint, now):
+                    yield self._work(joint, self._rejoin)
                 continue
-            estimate = self._feedback.state(name, planner.soonest(now))
+            estimate = joint.state(planner.soonest(now))
             if estimate is None:
                 continue
-            level = trimmed(planner, estimate, self._feedback.trim)
+            level = _trimmed(joint, estimate)
             if level is not None:
-                steps = partial(self._trim, name, level)
-            elif self._feedback.adapted(name) and self._worthwhile(
-                    name, estimate, planner, now):
-                steps = partial(self._correct, name)
-            else:
-                continue
-            yield self._work(name, steps)
+                yield self._work(joint, partial(_trim, level=level))
+            elif joint.adapted() and _may_gain(joint, estimate, now):
+                yield self._work(joint, _correct)
 
-    def _work(self, name: str, steps: Callable[[int], Steps[Mapping[str, Draft]]]) -> Work:
-        joints = frozenset([name])
-        work = in_time(steps, self._group, joints, self._clock)
-        return Work(joints, self._timed(name, work), corrects=True)
+    def _work(self, joint: Joint, make: Callable[[Joint, int], Steps[Draft | None]]) -> Work:
+        def steps(now: int) -> Steps[Mapping[str, Draft]]:
+            draft = yield from make(joint, now)
+            return {} if draft is None else {joint.name: draft}
+        joints = frozenset([joint.name])
+        return Work(joints, self._timed(joint, in_time(
+            steps, self._group, joints, self._clock)), corrects=True)
 
-    def _timed(self, name: str, steps: Drafting) -> Drafting:
+    def _timed(self, joint: Joint, steps: Drafting) -> Drafting:
         """Do work, and let commands have their share of the time after it."""
         spent = 0
         while True:
@@ -142,153 +142,165 @@ class Corrections:
             try:
                 next(steps)
             except StopIteration as end:
-                self._feedback.spent(name, spent + self._clock() - begun)
+                self._feedback.spent(joint, spent + self._clock() - begun)
                 drafts: tuple[Mapping[str, Draft], int] = end.value
                 return drafts
             spent += self._clock() - begun
             yield
 
-    def _take_back(self, name: str, now: int) -> Steps[Mapping[str, Draft]]:
-        """Go on by the model in force, whatever was corrected before."""
-        planner = self._group.planners[name]
-        plan, soonest = planner.plan, planner.soonest(now)
-        place = plan.under_way(soonest)
-        if place < 0:
-            return {}
-        segment = plan.segments[place]
-        if planner.as_sent(soonest):
-            return {} if _ahead(planner, soonest) is None else {
-                name: (yield from planner.draft_path_anew(soonest, planner.model, None))}
-        if place + 1 < len(plan.segments) or segment.arrival is None or segment.arrival > soonest:
-            draft = yield from planner.draft_resumption(now)
-            return {} if draft is None or draft.missed else {name: draft}
-        model, level = planner.model, plan.levels[-1].flux_density
-        holding = model.flux_density(model.holding(segment.stretch))
-        return {} if abs(holding - level) < _SAME * model.units.load else {
-            name: (yield from planner.draft_trim(now, holding))}
-
-    def _trim(self, name: str, level: float, now: int) -> Steps[Mapping[str, Draft]]:
-        """Hold by another level in T."""
-        return {name: (yield from self._group.planners[name].draft_trim(now, level))}
-
-    def _arrival(self, name: str, now: int) -> int:
-        """Return the time in ns of rest of a move that has time for corrections; 0 without one."""
-        planner, arrival = self._group.planners[name], self._arrivals.get(name, 0)
-        left = arrival - planner.soonest(now)
-        return arrival if left >= _SHORTEST * planner.model.units.time * NANOSECONDS else 0
-
-    def _worthwhile(self, name: str, estimate: Estimate, planner: Planner, now: int) -> bool:
-        """Return whether a plan is expected to leave more than it must."""
-        share = _LITTLE if self._arrival(name, now) else (
-            _GAIN if self._feedback.shown(name, now) else MUCH)
-        course, gain = course_of(planner.plan, estimate.time, share)
-        return expect(estimate, course, planner.options.slew_limit).size > gain
-
-    def _correct(self, name: str, now: int) -> Steps[Mapping[str, Draft]]:
-        """Plan the rest anew, if that is expected to leave less."""
-        planner, arrival = self._group.planners[name], self._arrival(name, now)
-        try:
-            draft = yield from planner.draft_resumption(now, arrival or None)
-        except RefusedError:
-            if not arrival:
-                raise
-            return {}
-        estimate = None if draft is None else self._feedback.state(name, draft.begin)
-        if draft is None or estimate is None or draft.missed:
-            # A correction leaves no setpoint out.
-            return {}
-        if max(abs(x.flux_density) for x in draft.levels) > self._feedback.possible(name):
-            # An amplifier that is saturated follows no larger level.
-            return {}
-        slew = planner.options.slew_limit
-        course, gain = course_of(planner.plan, draft.begin, _LITTLE if arrival else _GAIN)
-        segment = draft.segments[0]
-        start = self._feedback.start(name)
-        step = max(abs(segment.stretch - start), _LEAST_STEP)
-        # A force that samples do not show either way is not to make it worse.
-        doubted = estimate.doubted
-        hidden = MUCH * step if not arrival and abs(
-            start - planner.model.actuator.rest) < _FIRST and confounded(
-                doubted, _HIDDEN * step) else 0.0
-        for each, least in ((doubted, hidden), (estimate, 0.0)):
-            before = expect(each, course, slew, segment.arrival or 0)
-            after = expect(each, _drafted(draft, planner.plan), slew)
-            if not worthwhile(
-                    before, after, max(gain, least, _NOISE * estimate.noise),
-                    little=LITTLE * step, share=SHARE if arrival else AT_REST):
-                return {}
-        self._after[name] = after.size
-        return {name: draft}
-
-    def _leaves_path(self, name: str, now: int) -> bool:
-        """Return whether a path under way may be expected to be left, every natural period."""
-        planner = self._group.planners[name]
-        begin = planner.soonest(now + self._spent.get(name, 0))
-        ahead = _ahead(planner, begin) if begin >= self._looks.get(name, 0) else None
-        estimate = None if ahead is None else self._feedback.state(name, begin)
-        if ahead is None or estimate is None:
-            return False
-        self._looks[name] = begin + _period(planner)
-        left = self._leaves(estimate, planner, planner.plan.levels, ahead)
-        # At best nothing but what is not known.
-        return self._nearer(name, left, replace(left, misses=0.0 * left.misses), estimate)
-
-    def _leaves(
-            self, estimate: Estimate, planner: Planner, levels: Sequence[PlannedLevel],
-            ahead: Ahead) -> Outcome:
-        """Return how far levels from the time of an estimate on lead off a path."""
-        first, begin = planner.plan.place(estimate.time - 1), estimate.time
-        end = begin + round(ahead.times[-1] * NANOSECONDS)
-        course = (*planner.plan.levels[max(first - _BEFORE, 0):first + 1],
-                  *(x for x in levels if begin <= x.stamp <= end))
-        return expect_along(
-            estimate, [(x.stamp, x.flux_density) for x in course], ahead,
-            planner.options.slew_limit)
-
-    def _nearer(self, name: str, before: Outcome, after: Outcome, estimate: Estimate) -> bool:
-        """Return whether another course of a path is to take the place of that in force."""
-        planner = self._group.planners[name]
-        model = planner.plan.level(estimate.time).model
-        return worthwhile(
-            before, after, max(_GAIN * _range(planner, estimate.time), _NOISE * estimate.noise),
-            little=0.0, share=SHARE if self._feedback.adapted(name, model) else CLEARLY)
-
-    def _rejoin(self, name: str, now: int) -> Steps[Mapping[str, Draft]]:
+    def _rejoin(self, joint: Joint, now: int) -> Steps[Draft | None]:
         """Plan the rest of a path anew by what is known now, if that stays nearer to it."""
-        planner, begun = self._group.planners[name], self._clock()
-        begin = planner.soonest(now + self._spent.get(name, 0))
-        estimate = self._feedback.state(name, begin)
-        ahead = _ahead(planner, begin)
+        planner, begun = joint.planner, self._clock()
+        begin = planner.soonest(now + joint.planning)
+        estimate, ahead = joint.state(begin), _ahead(planner, begin)
         if estimate is None or ahead is None:
-            return {}
+            return None
         model = learnt_model(
             planner.model, estimate, planner.plan.segments[-1].stretch, _CREEPS)
         model = as_of_path(model, planner.model, estimate)
         draft = yield from planner.draft_path_anew(
             begin, model, believed(estimate, creeps=bool(model.actuator.creep)))
         spent = self._clock() - begun
-        self._spent[name] = spent + spent // 2
-        self._looks[name] = begin + max(_JOINED * _period(planner), _IDLE * spent)
-        before, after = (self._leaves(estimate, planner, x, ahead)
+        joint.planning = spent + spent // 2
+        joint.next_path = begin + max(_JOINED * _period(planner), _IDLE * spent)
+        before, after = (_leaves(estimate, planner, x, ahead)
                          for x in (planner.plan.levels, draft.levels))
-        if max(abs(x.flux_density) for x in draft.levels) > self._feedback.possible(
-                name) or not self._nearer(name, before, after, estimate):
-            return {}
-        self._after[name] = after.size
-        return {name: draft}
+        if _saturates(joint, draft) or not _nearer(joint, before, after, estimate):
+            return None
+        joint.after = after.size
+        return draft
 
-    def take(self, drafts: Mapping[str, Draft], now: int, request: str) -> Verdict | None:
+    def take(self, work: Work, drafts: Mapping[str, Draft], now: int) -> Verdict | None:
         """Take a correction worked out for a time in ns; None where nothing changes."""
         for name, draft in drafts.items():
-            words = self._feedback.words(name, self._clock())
-            self._group.planners[name].take(draft, now)
-            self._feedback.corrected(name, draft.begin, self._after.pop(name, 0.0))
+            joint = self._feedback.joints.get(name)
+            if joint is None:
+                continue
+            words = joint.words(self._clock())
+            joint.planner.take(draft, now)
+            self._feedback.corrections += 1
+            joint.next_sample = 0
+            joint.moves.corrected.append(draft.begin)
+            joint.moves.expected, joint.after = joint.after, 0.0
             if draft.segments[0].path is not None:
                 # What the path was corrected by also takes it to rest, should it be stopped.
-                self._feedback.use(name, draft.levels[0].model)
-            return Verdict(
-                Severity.OK, Code.CORRECTED, f'corrected from samples: {words}', request)
+                joint.used = draft.levels[0].model
+                joint.planner.take_model(joint.used)
+            return Verdict(Severity.OK, Code.CORRECTED, f'corrected from samples: {words}')
         return None
+
+
+def _take_back(joint: Joint, now: int) -> Steps[Draft | None]:
+    """Go on by the model in force, whatever was corrected before."""
+    planner = joint.planner
+    plan, model, soonest = planner.plan, planner.model, planner.soonest(now)
+    place = plan.under_way(soonest)
+    if place < 0:
+        return None
+    segment = plan.segments[place]
+    if planner.as_sent(soonest):
+        return None if _ahead(planner, soonest) is None else (
+            yield from planner.draft_path_anew(soonest, model, None))
+    if place + 1 < len(plan.segments) or segment.arrival is None or segment.arrival > soonest:
+        draft = yield from planner.draft_resumption(now)
+        return None if draft is None or draft.missed else draft
+    holding = model.flux_density(model.holding(segment.stretch))
+    level = plan.levels[-1].flux_density
+    return None if abs(holding - level) < _SAME * model.units.load else (
+        yield from planner.draft_trim(now, holding))
+
+
+def _trim(joint: Joint, now: int, *, level: float) -> Steps[Draft | None]:
+    """Hold by another level in T."""
+    return (yield from joint.planner.draft_trim(now, level))
+
+
+def _arrival(joint: Joint, now: int) -> int:
+    """Return the time in ns of rest of a move that has time for corrections; 0 without one."""
+    planner = joint.planner
+    left = joint.waits - planner.soonest(now)
+    return joint.waits if left >= _SHORTEST * planner.model.units.time * NANOSECONDS else 0
+
+
+def _may_gain(joint: Joint, estimate: Estimate, now: int) -> bool:
+    """Return whether a plan is expected to leave more than it must."""
+    share = _LITTLE if _arrival(joint, now) else _GAIN if joint.shown(now) else MUCH
+    course, gain = course_of(joint.planner.plan, estimate.time, share)
+    return expect(estimate, course, joint.planner.options.slew_limit).size > gain
+
+
+def _saturates(joint: Joint, draft: Draft) -> bool:
+    """Return whether a draft has a level that an amplifier which is saturated does not follow."""
+    return max(abs(x.flux_density) for x in draft.levels) > joint.largest
+
+
+def _correct(joint: Joint, now: int) -> Steps[Draft | None]:
+    """Plan the rest anew, if that is expected to leave less."""
+    planner, arrival = joint.planner, _arrival(joint, now)
+    try:
+        draft = yield from planner.draft_resumption(now, arrival or None)
+    except RefusedError:
+        if not arrival:
+            raise
+        return None
+    estimate = None if draft is None else joint.state(draft.begin)
+    if draft is None or estimate is None or draft.missed or _saturates(joint, draft):
+        # A correction leaves no setpoint out.
+        return None
+    slew = planner.options.slew_limit
+    course, gain = course_of(planner.plan, draft.begin, _LITTLE if arrival else _GAIN)
+    segment = draft.segments[0]
+    step = max(abs(segment.stretch - joint.start), _LEAST_STEP)
+    # A force that samples do not show either way is not to make it worse.
+    doubted = estimate.doubted
+    hidden = MUCH * step if not arrival and abs(
+        joint.start - planner.model.actuator.rest) < _FIRST and confounded(
+            doubted, _HIDDEN * step) else 0.0
+    for each, least in ((doubted, hidden), (estimate, 0.0)):
+        before = expect(each, course, slew, segment.arrival or 0)
+        after = expect(each, _drafted(draft, planner.plan), slew)
+        if not worthwhile(
+                before, after, max(gain, least, _NOISE * estimate.noise),
+                little=LITTLE * step, share=SHARE if arrival else AT_REST):
+            return None
+    joint.after = after.size
+    return draft
+
+
+def _leaves_path(joint: Joint, now: int) -> bool:
+    """Return whether a path under way may be expected to be left, every natural period."""
+    planner = joint.planner
+    begin = planner.soonest(now + joint.planning)
+    ahead = _ahead(planner, begin) if begin >= joint.next_path else None
+    estimate = None if ahead is None else joint.state(begin)
+    if ahead is None or estimate is None:
+        return False
+    joint.next_path = begin + _period(planner)
+    left = _leaves(estimate, planner, planner.plan.levels, ahead)
+    # At best nothing but what is not known.
+    return _nearer(joint, left, replace(left, misses=0.0 * left.misses), estimate)
+
+
+def _leaves(
+        estimate: Estimate, planner: Planner, levels: Sequence[PlannedLevel],
+        ahead: Ahead) -> Outcome:
+    """Return how far levels from the time of an estimate on lead off a path."""
+    first, begin = planner.plan.place(estimate.time - 1), estimate.time
+    end = begin + round(ahead.times[-1] * NANOSECONDS)
+    course = (*planner.plan.levels[max(first - _BEFORE, 0):first + 1],
+              *(x for x in levels if begin <= x.stamp <= end))
+    return expect_along(
+        estimate, [(x.stamp, x.flux_density) for x in course], ahead, planner.options.slew_limit)
+
+
+def _nearer(joint: Joint, before: Outcome, after: Outcome, estimate: Estimate) -> bool:
+    """Return whether another course of a path is to take the place of that in force."""
+    plan = joint.planner.plan
+    path = plan.segments[plan.under_way(estimate.time)].path
+    span = 0.0 if path is None else float(np.ptp(path.course(path.breaks)[0]))
+    return worthwhile(
+        before, after, max(_GAIN * span, _NOISE * estimate.noise), little=0.0,
+        share=SHARE if joint.adapted(plan.level(estimate.time).model) else CLEARLY)
 
 
 def _drafted(draft: Draft, plan: Plan) -> Course:
@@ -349,7 +361,36 @@ def _ahead(planner: Planner, begin: int) -> Ahead | None:
     return Ahead(times, segment.path.course(times + since)[0])
 
 
-def _range(planner: Planner, time: int) -> float:
-    """Return the range of the path under way at a time in ns."""
-    path = planner.plan.segments[planner.plan.under_way(time)].path
-    return 0.0 if path is None else float(np.ptp(path.course(path.breaks)[0]))
+def _trimmed(joint: Joint, estimate: Estimate) -> float | None:
+    """
+    Return the level in T to hold a setpoint by, which makes up for a constant force.
+
+    It is at most ``feedback_trim`` off that of the model. The estimate is of the time from which
+    on levels may be changed. None where the level in force is to be kept: on the way, within what
+    is not known of the rest, at the bound, or where no constant force is tracked.
+    """
+    plan, model, bound = joint.planner.plan, joint.planner.model, joint.settings.feedback_trim
+    place = plan.under_way(estimate.time)
+    if bound <= 0.0 or 'constant_force' not in estimate.free or place + 1 < len(plan.segments):
+        return None
+    segment, last = plan.segments[place], plan.levels[-1]
+    pause = round(_PAUSE * model.units.time * NANOSECONDS)
+    if segment.arrival is None or estimate.time < max(segment.arrival, last.stamp) + pause:
+        return None
+    level, small = last.flux_density, 1e-4 * model.units.load
+    at = rest(estimate.values, estimate.free, level)
+    above = rest(estimate.values, estimate.free, level + small)
+    if at is None or above is None:
+        return None
+    count = len(estimate.free)
+    spread = math.sqrt(max(float(at[2] @ estimate.covariance[:count, :count] @ at[2]), 0.0))
+    off = at[0] - segment.stretch
+    if abs(off) <= max(_SURE * spread, _OFF):
+        return None
+    share = _PART * bound
+    wanted = level - min(max(off * small / (above[0] - at[0]), -share), share)
+    holding = model.flux_density(model.holding(segment.stretch))
+    options = model.options
+    wanted = min(max(wanted, holding - bound, options.flux_density_min),
+                 holding + bound, options.flux_density_max)
+    return wanted if abs(wanted - level) > 0.1 * small else None

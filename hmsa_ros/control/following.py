@@ -1,13 +1,14 @@
 """Late, lost and foreign commands, and the new plans that they call for."""
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 import math
 
 import numpy as np
 
 from hmsa_ros.control.lateness import Lateness
-from hmsa_ros.control.records import Note, Settings, Severity, Verdict
+from hmsa_ros.control.receipts import Receipts
+from hmsa_ros.control.records import Settings, Severity, Verdict
 from hmsa_ros.control.seldom import Seldom
 from hmsa_ros.control.slices import Clock, in_time, Work
 from hmsa_ros.control.weighing import (
@@ -36,8 +37,9 @@ _PAUSE = 20_000_000
 class Following:
     """Holds what takes effect against the plans."""
 
-    def __init__(self, group: PlannerGroup) -> None:
-        self._group = group
+    def __init__(
+            self, group: PlannerGroup, receipts: Receipts, note: Callable[[str], None]) -> None:
+        self._group, self._receipts, self._note = group, receipts, note
         self.lateness = Lateness()
         # Stamp in ns and level in T of the newest change that took effect.
         self.newest: dict[str, tuple[int, float]] = {}
@@ -58,8 +60,6 @@ class Following:
         self._looked = 0, 0
         self._ages: dict[str, int] = {}
         self._found: dict[str, Resumption] = {}
-        #: Returns how the clocks of plant or driver and planner differ; empty where they do not.
-        self.clocks: Callable[[], str] = str
         self._tell_late, self._tell_foreign, self.tell_replanned = Seldom(), Seldom(), Seldom()
 
     def restart(self) -> None:
@@ -92,24 +92,23 @@ class Following:
 
     # -- commands and their effects -------------------------------------------------------------
 
-    def sent(self, joint: str, stamp: int, now: int) -> list[Note]:
+    def sent(self, joint: str, stamp: int, now: int) -> None:
         """Take in that a command was handed out."""
         self.lateness.sent(joint, stamp, now)
-        if stamp >= now:
-            return []
-        self.lateness.missed(now - stamp)
-        return self._late()
+        if stamp < now:
+            self.lateness.missed(now - stamp)
+            self._tell_advice()
 
     def applied(
             self, joint: str, stamp: int, flux_density: float, settings: Settings,
-            now: int) -> list[Note]:
+            now: int) -> None:
         """Hold a change of level that has taken effect against the plan; times in ns."""
         self.newest[joint] = stamp, flux_density
         self._ages[joint] = max(now - stamp, 0)
         tolerance, planner = settings.lateness_tolerance, self._group.planners[joint]
         found = self._group.applied(joint, stamp, flux_density, tolerance)
         if found is None:
-            return []
+            return
         step = step_of(planner.plan, planner.plan.under_way(stamp))
         cost = 2.0 * found.effect / step
         if not found.foreign:
@@ -124,13 +123,13 @@ class Following:
                 and (stamp >= self._again.get(joint, 0) or not planner.awaiting)):
             self.astray.add(joint)
         if found.asked is not None:
-            return self._saturates(joint, found.asked, flux_density)
-        if found.foreign and self._tell_foreign():
-            return [Note(Severity.WARN, (
-                f'joint {joint}: {flux_density:g} T took effect but was not commanded'))]
-        return self._late() if found.late > tolerance else []
+            self._saturates(joint, found.asked, flux_density)
+        elif found.foreign and self._tell_foreign():
+            self._note(f'joint {joint}: {flux_density:g} T took effect but was not commanded')
+        elif found.late > tolerance:
+            self._tell_advice()
 
-    def _saturates(self, joint: str, asked: float, reached: float) -> list[Note]:
+    def _saturates(self, joint: str, asked: float, reached: float) -> None:
         """Plan with what an amplifier gives until somebody asks for something."""
         options = self._group.planners[joint].options
         name = 'flux_density_max' if asked > 0.0 else 'flux_density_min'
@@ -145,15 +144,13 @@ class Following:
             min(options.flux_density_max, reached if asked > 0.0 else math.inf))
         self.verdicts.append(Verdict(Severity.WARN, Code.SATURATED, words, figures={
             'commanded': asked, 'reached': reached}))
-        return [Note(Severity.WARN, words)]
+        self._note(words)
 
-    def drop_missed(
-            self, now: int, tolerance: int, but: Collection[str] = ()) -> list[Note]:
+    def drop_missed(self, now: int, tolerance: int) -> None:
         """Take out of the plans what is too late to be sent, as after a jump of the clock."""
-        notes = []
         for name, planner in self._group.planners.items():
             stamp = planner.next_stamp
-            if name in but or stamp is None or stamp >= now - tolerance or (
+            if name in self._receipts.silent or stamp is None or stamp >= now - tolerance or (
                     planner.as_sent(stamp)):
                 continue
             model = planner.model
@@ -163,10 +160,9 @@ class Following:
                 continue
             for _ in range(planner.drop_missed(now, tolerance)):
                 self.lateness.missed(now - stamp)
-            notes += self._late()
+            self._tell_advice()
             self._leaves(name)
             self._unsent.add(name)
-        return notes
 
     def _leaves(self, name: str) -> None:
         """Note that a joint has left its plan, whatever is expected of commands."""
@@ -202,15 +198,27 @@ class Following:
         sampled = self._newest_seen and now - self._looked[1] < _SILENT
         return min(now, self._newest_seen) if sampled else now - self._ages.get(name, 0)
 
-    def _late(self) -> list[Note]:
-        return [Note(Severity.WARN, self.advice)] if self._tell_late() else []
+    def _tell_advice(self) -> None:
+        if self._tell_late():
+            self._note(self.advice)
+
+    @property
+    def clocks(self) -> str:
+        """How the clocks differ, where that alone makes commands late; empty where it does not."""
+        offset = self._receipts.offset
+        return '' if offset is None or offset.ahead - offset.error <= 0.5 * self._lead_time else (
+            offset.words)
+
+    @property
+    def _lead_time(self) -> int:
+        """How far ahead of their stamps commands are sent in ns, those of all joints."""
+        return next(iter(self._group.planners.values())).options.lead_time
 
     @property
     def advice(self) -> str:
-        """What happens to commands, and what helps; all joints have the same lead time."""
-        planner = next(iter(self._group.planners.values()))
+        """What happens to commands, and what helps."""
         return f'{self.lateness.words()}; ' + (
-            self.clocks() or self.lateness.advice(planner.options.lead_time))
+            self.clocks or self.lateness.advice(self._lead_time))
 
     # -- plans made anew -----------------------------------------------------------------------
 
@@ -256,9 +264,7 @@ class Following:
         joints = frozenset([name])
         return Work(joints, in_time(make, self._group, joints, clock))
 
-    def resume(
-            self, work: Work, drafts: Mapping[str, Draft], now: int,
-            request: str) -> Verdict | None:
+    def take(self, work: Work, drafts: Mapping[str, Draft], now: int) -> Verdict | None:
         """Take a plan made anew for a time in ns; None if nothing was left to do."""
         name, = work.joints
         found = self._found.pop(name, None)
@@ -278,21 +284,20 @@ class Following:
             return Verdict(
                 Severity.ERROR, Code.SATURATED if why else Code.STOPPED, f'{why}; ' * bool(why) +
                 f'joint {name} comes to rest, since its sequence cannot be resumed: '
-                f'{found.refusal}', request)
+                f'{found.refusal}')
         self.replanned += 1
         missed = drafts[name].missed
         return Verdict(
             Severity.WARN, Code.SATURATED if why else Code.REPLANNED,
             (why or 'commands did not take effect as planned') + ': the rest is replanned' + (
-                f', without {missed} setpoints whose time has passed' if missed else ''), request)
+                f', without {missed} setpoints whose time has passed' if missed else ''))
 
-    def abandon(self, work: Work, error: HmsaError, request: str) -> Verdict:
+    def abandon(self, work: Work, error: HmsaError) -> Verdict:
         """Leave a plan as it is that cannot even be stopped."""
         name, = work.joints
         self.dropped([name])
         return Verdict(
-            Severity.ERROR, Code.NOT_CONVERGED, f'joint {name} cannot be replanned: {error}',
-            request)
+            Severity.ERROR, Code.NOT_CONVERGED, f'joint {name} cannot be replanned: {error}')
 
     def _tell_kept(self) -> None:
         """Give the verdict where a new plan does not help."""

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 import math
 
 from hmsa_ros.control.following import Following
-from hmsa_ros.control.receipts import Offset, Receipts
+from hmsa_ros.control.receipts import Receipts
 from hmsa_ros.control.records import Settings, Severity, Verdict
 from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.control.takeover import Takeover
@@ -32,11 +32,10 @@ class Hearing:
     """
 
     def __init__(
-            self, group: PlannerGroup, following: Following, takeover: Takeover,
-            surroundings: Surroundings) -> None:
+            self, group: PlannerGroup, receipts: Receipts, following: Following,
+            takeover: Takeover, surroundings: Surroundings) -> None:
         self._group, self._following, self._takeover = group, following, takeover
-        self._around = surroundings
-        self.receipts = Receipts(surroundings.steady)
+        self.receipts, self._around = receipts, surroundings
         self._absent: set[str] = set()
         self._reporters: dict[str, frozenset[bytes]] = {}
         self.fresh: set[str] = set()
@@ -45,9 +44,6 @@ class Hearing:
         self.open: set[str] = set()
         self.since: int | None = None
         self._acknowledged: dict[str, int] = {}
-        self._warned = False
-        following.clocks = self._clocks
-        takeover.lag = self.receipts.lag
 
     # -- silence -------------------------------------------------------------------------------
 
@@ -58,9 +54,8 @@ class Hearing:
 
     def look(self) -> None:
         """Doubt where joints are whose device has fallen silent, or is heard again."""
-        for names in self.receipts.look():
-            for name in names:
-                self._takeover.doubt(name)
+        for name in self.receipts.look():
+            self._takeover.doubt(name)
 
     def is_led(self, joint: str) -> bool:
         """Return whether a device has been led to the last level, which may be repeated to it."""
@@ -71,22 +66,21 @@ class Hearing:
 
     def look_for_newcomers(self) -> Verdict | None:
         """Find devices that were not found at the last look; return the verdict on a plan."""
-        here = {x for x in self._group.planners if self._around.found(x)}
-        # One that is known, and there again after an outage, is not new.
-        come = {x for x in here & self._absent if not self._reporters.get(x)}
-        self._absent = self._group.planners.keys() - here
-        relieved = {x for x in here if self._relieved(x)}
-        for joint in relieved:
-            self._following.newest.pop(joint, None)
-        verdicts = [self._appeared(x) for x in sorted(come | relieved)]
-        return next((x for x in verdicts if x is not None), None)
-
-    def _relieved(self, joint: str) -> bool:
-        """Return whether another device took over: before its first receipt, or without any."""
-        before, now = self._reporters.get(joint, frozenset()), self._around.reporters(joint)
-        self._reporters[joint] = now or before
-        # Where there was none before, it is only found one topic after the other.
-        return bool(before and now - before)
+        verdict, absent = None, self._absent
+        self._absent = {x for x in self._group.planners if not self._around.found(x)}
+        for joint in sorted(self._group.planners.keys() - self._absent):
+            before, now = self._reporters.get(joint, frozenset()), self._around.reporters(joint)
+            self._reporters[joint] = now or before
+            if before and now - before:
+                # Another device took over: before its first receipt, or without any.
+                self._following.newest.pop(joint, None)
+            elif before or joint not in absent:
+                # One that is known, and there again after an outage, is not new. Where there was
+                # none before, it is only found one topic after the other.
+                continue
+            found = self._appeared(joint)
+            verdict = verdict or found
+        return verdict
 
     def received(self, joint: str, time: int, command: int) -> Verdict | None:
         """Take in a receipt as `Receipts.received` does; return the verdict on a plan."""
@@ -103,10 +97,10 @@ class Hearing:
         planner = self._group.planners[joint]
         planned = bool(planner.plan.segments)
         planner.restart()
-        verdict = self._dropped(
+        dropped = self._dropped(
             joint, Code.MISSED, f'plant or driver of joint {joint} came after the commands were '
             'sent: what it has not heard is dropped')
-        return verdict if planned else None
+        return dropped if planned else None
 
     def cut_off(
             self, joint: str, settings: Settings, *, in_force: bool,
@@ -165,11 +159,9 @@ class Hearing:
     def may_acknowledge(self, joint: str) -> bool:
         """Return whether to tell a device that its cut-off is known: seldom, if it is off."""
         steady = self._around.steady()
-        level = self._following.newest.get(joint)
         off = joint not in self.open if joint in self.locked else (
-            level is not None and level[1] == 0.0)
-        if not off or (
-                steady - self._acknowledged.get(joint, -_AGAIN) < _AGAIN):
+            self._following.newest.get(joint, (0, math.nan))[1] == 0.0)
+        if not off or steady - self._acknowledged.get(joint, -_AGAIN) < _AGAIN:
             return False
         self._acknowledged[joint] = steady
         return True
@@ -208,11 +200,6 @@ class Hearing:
 
     # -- clocks --------------------------------------------------------------------------------
 
-    @property
-    def offset(self) -> Offset | None:
-        """How far the clock of a device is ahead; None where that is not measured."""
-        return self.receipts.worst(self._group.planners)
-
     def check_clocks(self) -> None:
         """
         Look at the clocks before a move.
@@ -223,34 +210,21 @@ class Hearing:
             If they are so far apart that every command would come too late.
 
         """
-        offset = self.offset
+        offset = self.receipts.offset
         if offset is not None and offset.ahead - offset.error > max(
                 x.options.lead_time for x in self._group.planners.values()):
             raise RefusedError(
                 Code.CLOCKS_DIFFER,
                 f'every command would come too late, since {offset.words}')
 
-    def limit(self) -> float:
-        """Return from which offset of clocks on to warn, in ns: it shifts and spoils moves."""
-        limits = [math.inf]
+    @property
+    def clocks(self) -> str:
+        """How far the clocks differ, where that shifts or spoils moves; else empty."""
+        offset, limits = self.receipts.offset, []
         for planner in self._group.planners.values():
             model, plan = planner.model, planner.plan
             stretch = plan.segments[-1].stretch if plan.segments else plan.levels[-1].stretch
-            limits.append(
-                math.pi / model.frequency(stretch) * model.units.time * NANOSECONDS)
-            limits += [planner.options.lead_time] if planner.options.lead_time else []
-        return _SHARE * min(limits)
-
-    def clocks_changed(self, limit: float) -> str:
-        """Return what to log of the clocks: once when they begin to differ."""
-        offset = self.offset
-        warned, self._warned = self._warned, offset is not None and offset.beyond(limit)
-        return offset.words if self._warned and not warned and offset is not None else ''
-
-    def _clocks(self) -> str:
-        """Return how the clocks differ, where that alone makes commands late."""
-        offset = self.offset
-        if offset is None or offset.ahead - offset.error <= 0.5 * next(
-                iter(self._group.planners.values())).options.lead_time:
-            return ''
-        return offset.words
+            limits += [math.pi / model.frequency(stretch) * model.units.time * NANOSECONDS,
+                       planner.options.lead_time or math.inf]
+        return '' if offset is None or (
+            abs(offset.ahead) - offset.error <= _SHARE * min(limits)) else offset.words

@@ -1,4 +1,4 @@
-"""What was learnt of an actuator: as a model to plan with, and as a parameter file."""
+"""What was learnt of an actuator: as a model to plan with, as its sensor, and as a file."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -9,14 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.estimation import Estimate
+from hmsa_ros.estimation import Estimate, Prior
 from hmsa_ros.estimation.estimator import CREEPS
-from hmsa_ros.estimation.motion import followed
+from hmsa_ros.estimation.motion import followed, rest
 from hmsa_ros.files import write_text, yaml_text
 from hmsa_ros.identification.files import known_lines
 from hmsa_ros.identification.known import Known
 from hmsa_ros.identification.quantities import BRANCHES, derivative, QUANTITIES, values_of
 from hmsa_ros.interfaces.actuator import parameters_of
+from hmsa_ros.judge.records import Sensor
+from hmsa_ros.model.laws.coordinate import coordinate_of
 from hmsa_ros.model.simulation import check_stretch
 from hmsa_ros.planning.planner import Believed
 from hmsa_ros.planning.timeline import Model
@@ -27,6 +29,12 @@ _NEWS, _SURE = 1e-3, 0.5
 _FORCED = 2.0
 # Parameters of planner and plant besides those of the block.
 _OTHERS = ('coil_time_constant', 'stretch_bias', 'stretch_gain')
+# What the judge calls figures of a sensor, and the share of what was not known of one before
+# below which it has been found.
+_SENSOR = {'stretch_bias': 'bias', 'stretch_gain': 'gain', 'sensor_latency': 'latency'}
+_FOUND = 0.3
+# A bias of fewer deviations does not show.
+_SHOWS = 3.0
 
 
 def learnt_model(
@@ -84,6 +92,42 @@ def alike(model: Model, other: Model) -> bool:
     return model.actuator.creep == other.actuator.creep and all(
         math.isclose(one[x], two[x], rel_tol=_NEWS) if isinstance(one[x], float)
         else one[x] == two[x] for x in one)
+
+
+def sensor_of(found: Estimate, prior: Prior) -> Sensor:
+    """
+    Return what an estimate has found of a sensor; what it has not is as given.
+
+    What a force leaves open of a bias counts.
+    """
+    before, sure = np.diag(prior.covariance), np.diag(found.covariance)
+    known = [x for i, x in enumerate(found.free) if x in _SENSOR and i != found.gain and (
+        _shows_bias(found) if x == 'stretch_bias' else sure[i] < _FOUND**2 * before[i])]
+    figures = {_SENSOR[x]: found.values[x] for x in known} | {
+        f'{_SENSOR[x]}_std': found.deviations[x] for x in known}
+    together = 0.0
+    if 'stretch_bias' in known and 'stretch_gain' in known:
+        pair = [found.free.index(x) for x in ('stretch_bias', 'stretch_gain')]
+        (one, both), (_, two) = found.covariance[np.ix_(pair, pair)]
+        together = float(both / math.sqrt(one * two))
+    return Sensor(**figures, together=together)
+
+
+def _shows_bias(found: Estimate) -> bool:
+    """
+    Return whether samples show that a sensor may have a bias.
+
+    Either it is known not to be 0, or the block is seen beside its rest without field, where a
+    force may hide the larger part of a bias.
+    """
+    at = rest(found.values, found.free, 0.0)
+    if at is None:
+        return False
+    value, covariance = found.values['stretch_bias'], found.covariance[:-2, :-2]
+    itself = np.array([float(x == 'stretch_bias') for x in found.free])
+    shown = at[0] + value - coordinate_of(found.values['law']).rest
+    return any(abs(off) > _SHOWS * math.sqrt(max(float(by @ covariance @ by), 0.0))
+               for off, by in ((value, itself), (shown, itself + at[2])))
 
 
 def known_of(estimate: Estimate) -> Known:

@@ -55,20 +55,16 @@ class Loop:
         Of the controller.
     device : SimulatedDevice
         What it commands; its time is that of the loop.
-    unheard : callable, optional
-        Returns why nobody carries out commands; default that somebody does.
 
     """
 
     def __init__(
-            self, group: PlannerGroup, settings: Settings, device: SimulatedDevice, *,
-            unheard: Callable[[], str] = str) -> None:
+            self, group: PlannerGroup, settings: Settings, device: SimulatedDevice) -> None:
         self.now = device.time  #: in ns
         self.device = device
         self.runtime = PlannerRuntime(
             group, settings, Surroundings(
-                clock=lambda: self.now, steady=lambda: self.now, one_clock=lambda: True,
-                unheard=unheard))
+                clock=lambda: self.now, steady=lambda: self.now, one_clock=lambda: True))
         self.runtime.active = True
         #: Called with all that the controller says.
         self.tell: Callable[[Output], None] = lambda output: None

@@ -8,7 +8,6 @@ to topics, a loop that has the coil at hand to the coil.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from functools import partial
 import math
 
 from hmsa_ros.control.bulletin import Bulletin, LOOK
@@ -18,20 +17,21 @@ from hmsa_ros.control.feedback import Feedback
 from hmsa_ros.control.following import Following
 from hmsa_ros.control.hearing import Hearing
 from hmsa_ros.control.planning import Planning
+from hmsa_ros.control.receipts import Receipts
 from hmsa_ros.control.records import (
+    Note,
     Output,
     Request,
     Settings,
     Severity,
     Stop,
-    Target,
     Trajectory,
     Verdict,
 )
 from hmsa_ros.control.seldom import Seldom
 from hmsa_ros.control.sending import Sending
 from hmsa_ros.control.silence import Silence
-from hmsa_ros.control.slices import Clock, SLICE, work_on
+from hmsa_ros.control.slices import SLICE, work_on
 from hmsa_ros.control.surroundings import Seen, Surroundings
 from hmsa_ros.control.takeover import Takeover
 from hmsa_ros.control.watching import Watch
@@ -59,37 +59,37 @@ class PlannerRuntime:
         self.active = False
         #: Refuses requests, except to stop, while several planners or devices run.
         self.crowded: RefusedError | None = None
-        self.following = Following(group)
         self.clock_jumps = 0
         #: By how many ns the clock was set ahead since `tick` has taken that in.
         self._stepped = 0
-        clock = partial(self._read, surroundings.clock)
+
+        def clock() -> int:
+            # One that is set meanwhile goes on until that is taken in.
+            return surroundings.clock() - self._stepped
         around = self.surroundings = replace(surroundings, clock=clock)
         self._clock, self._steady = clock, around.steady
-        self._takeover = Takeover(group, around)
+        self._outputs: list[Output] = []
+        receipts = Receipts(around.steady)
+        self.following = Following(group, receipts, self._note)
+        self._takeover = Takeover(group, around, receipts, self._note)
         self._silence = Silence(around)
-        self._watch = Watch(group, around)
-        self.hearing = Hearing(group, self.following, self._takeover, around)
+        self.feedback = Feedback(group, settings, self._outputs, clock, self._tell_ended)
+        self._watch = Watch(group, around, self.feedback)
+        self.hearing = Hearing(group, receipts, self.following, self._takeover, around)
         self._bulletin = Bulletin(
-            group, self.following, self._watch, around,
-            lambda: around.unheard() or self.hearing.receipts.words, self._unseen)
-        self.sending = Sending(
-            group, self.following, self.hearing, self._bulletin.outputs)
-        self.feedback = Feedback(group, settings, self._bulletin.outputs, clock)
-        self.feedback.tell_ended = self._tell_ended
-        self._watch.sensor, self._watch.audit = self.feedback.sensor, self.feedback.audit
-        self._watch.doing = self.feedback.do
+            group, self.following, self._watch, around, self._outputs, self._note,
+            lambda: around.unheard() or receipts.words, self._unseen)
+        self.sending = Sending(group, self.following, self.hearing, self._outputs)
         self.planning = Planning(
             group, self.following, Corrections(group, self.feedback, clock), self._bulletin,
             around, lambda: self.sending.send(clock()))
         self._last_jump: int | None = None
         self._set_back = 0
+        self._differ = False  # whether it has been noted that clocks do
         self._tell_impossible = Seldom()
 
-    def _read(self, clock: Clock) -> int:
-        """Return the time in ns; one that is set meanwhile goes on until that is taken in."""
-        now = clock()
-        return now - self._stepped
+    def _note(self, words: str) -> None:
+        self._outputs.append(Note(Severity.WARN, words))
 
     # -- in ------------------------------------------------------------------------------------
 
@@ -107,7 +107,7 @@ class PlannerRuntime:
             if not isinstance(request, Stop):
                 if self.crowded is not None:
                     raise self.crowded
-                self.hearing.check_interlock(_joints_of(request))
+                self.hearing.check_interlock(request.joints)
                 self.hearing.check_clocks()
         except RefusedError as error:
             return self.planning.refuse(error, request)
@@ -117,7 +117,7 @@ class PlannerRuntime:
         self._begin_anew()
         self._check(request)
         if not isinstance(request, Stop):
-            self.following.asked(_joints_of(request))
+            self.following.asked(request.joints)
         work = self.planning.add(request, engaged=self._takeover.engaged)
         self._engage(begin=True)
         sure = self._work_on()
@@ -134,12 +134,11 @@ class PlannerRuntime:
         self.hearing.since = None
         if isinstance(request, Stop) or not self._takeover.engaged:
             return
-        names = _joints_of(request)
         later = isinstance(request, Trajectory) and request.stamp is not None
         now = self._clock()
         self._look_at_samples()
         self._takeover.check(
-            x for x in names if not (later and self.group.planners[x].moves(now)))
+            x for x in request.joints if not (later and self.group.planners[x].moves(now)))
 
     def _look_at_samples(self) -> None:
         for joint, seen in self.surroundings.glance():
@@ -177,7 +176,7 @@ class PlannerRuntime:
         """Show and say that a plan was dropped, if a verdict says so."""
         if verdict is not None:
             self._bulletin.show()
-            self._bulletin.give(replace(verdict, request=self._bulletin.verdict.request), log=True)
+            self._bulletin.go_on(verdict, log=True)
 
     def applied(self, joint: str, stamp: int, flux_density: float) -> None:
         """Take in that a joint's level in T has really been in force from a stamp in ns on."""
@@ -186,7 +185,7 @@ class PlannerRuntime:
             return
         if not self.group.planners[joint].follows(flux_density):
             if self._tell_impossible():
-                self._bulletin.note(
+                self._note(
                     f'joint {joint}: a report that {flux_density:g} T took effect is ignored, '
                     'since no motion can be predicted from there; see what publishes it')
             return
@@ -195,10 +194,10 @@ class PlannerRuntime:
             # The stamp is of the clock as it was set.
             self._begin_anew()
             now = self._clock()
-        self.feedback.applied(joint, stamp, flux_density)
+        if joint in self.feedback.joints:
+            self.feedback.joints[joint].applied(stamp, flux_density)
         if self._takeover.engaged:
-            self._bulletin.outputs += self.following.applied(
-                joint, stamp, flux_density, self.settings, now)
+            self.following.applied(joint, stamp, flux_density, self.settings, now)
         else:
             self.following.newest[joint] = stamp, flux_density
 
@@ -216,7 +215,8 @@ class PlannerRuntime:
                 stamp, stretch, rate, flux_density,
                 None if self.surroundings.one_clock() else came - stamp))
         self._watch.add(joint, stamp, stretch)
-        self.feedback.add(joint, stamp, stretch, flux_density, came)
+        if joint in self.feedback.joints:
+            self.feedback.joints[joint].add(stamp, stretch, flux_density, came)
 
     def clock_set(self, by: int) -> None:
         """Take in that the clock was set ahead by some ns, and that what is planned goes on."""
@@ -255,13 +255,12 @@ class PlannerRuntime:
         last, self._last_jump = self._last_jump, self._steady()
         if last is not None and self._last_jump - last < _STORM:
             return
-        self._bulletin.give(Verdict(
+        self._bulletin.go_on(Verdict(
             Severity.WARN, Code.CLOCK_JUMPED,
             f'the clock jumped back by {back / NANOSECONDS:.3f} s: the plan is dropped, and the '
             'actuator is assumed where it began, at initial_stretch, unless joint_states shows '
             'otherwise' if back else
-            clock_set_words(by, 'what is planned goes on,'), self._bulletin.verdict.request),
-            log=True)
+            clock_set_words(by, 'what is planned goes on,')), log=True)
 
     def _go_on(self, by: int, requests: Iterable[Request]) -> None:
         """Have all that is planned happen when it would have, though the clock was set."""
@@ -326,7 +325,7 @@ class PlannerRuntime:
     def wake(self) -> int | None:
         """Time in ns at which there is something to do next; None for never, 0 for now."""
         if (self._set_back or self._stepped or self.planning or self._takeover.waiting
-                or self._bulletin.outputs):
+                or self._outputs):
             return 0
         if not self._takeover.engaged:
             return None
@@ -374,8 +373,7 @@ class PlannerRuntime:
             return False
         self.hearing.look()
         if self.settings.replan_late:
-            self._bulletin.outputs += self.following.drop_missed(
-                now, self.settings.lateness_tolerance, self.hearing.receipts.silent)
+            self.following.drop_missed(now, self.settings.lateness_tolerance)
         if self.following.astray:
             # Before more of a plan is sent that does not hold.
             self._work_on()
@@ -396,8 +394,8 @@ class PlannerRuntime:
         self.sending.beat(now)
 
     def _taken(self) -> list[Output]:
-        outputs = self._bulletin.outputs.copy()
-        self._bulletin.outputs.clear()
+        outputs = self._outputs.copy()
+        self._outputs.clear()
         return outputs
 
     def _engage(self, *, begin: bool = False) -> None:
@@ -408,13 +406,11 @@ class PlannerRuntime:
         if self._takeover.waiting:
             self._look_at_samples()
         try:
-            notes = self._takeover.go_on(self.settings, self.following.newest)
+            self._takeover.go_on(self.settings, self.following.newest)
         except RefusedError as error:
             self._takeover.drop()
             self.planning.refuse_all(error)
             return
-        for note in notes:
-            self._bulletin.note(note)
         if self._takeover.engaged and not engaged:
             self.sending.next_beat = self._clock() + self.settings.heartbeat_period
 
@@ -430,22 +426,17 @@ class PlannerRuntime:
         requests = self.planning.requests
         if not requests and not self.following.astray:
             return True
-        if any(not isinstance(x, Stop) for x in requests) or not requests:
-            try:
-                if self.hearing.holds(self.settings):
-                    return False
-                self._look_at_samples()
-                notes = self._takeover.look(
-                    self.settings, self.following.newest, self.feedback.follows,
-                    keep=not requests)
-            except RefusedError as error:
-                self.planning.refuse_all(error)
-                return not requests
-            if notes is None:
+        if requests and all(isinstance(x, Stop) for x in requests):
+            return True
+        try:
+            if self.hearing.holds(self.settings):
                 return False
-            for note in notes:
-                self._bulletin.note(note)
-        return True
+            self._look_at_samples()
+            return self._takeover.look(
+                self.settings, self.following.newest, self.feedback.follows, keep=not requests)
+        except RefusedError as error:
+            self.planning.refuse_all(error)
+            return not requests
 
     def _judge(self, now: int) -> None:
         """Judge arrivals by what was measured."""
@@ -462,27 +453,27 @@ class PlannerRuntime:
 
     def _tell_ended(self, words: str) -> None:
         """Say why feedback of a joint has ended."""
-        self._bulletin.give(Verdict(
-            Severity.WARN, Code.FEEDBACK_ENDED, words, self._bulletin.verdict.request), log=True)
+        self._bulletin.go_on(Verdict(Severity.WARN, Code.FEEDBACK_ENDED, words), log=True)
 
     def report(self) -> tuple[Severity, str, dict[str, object]]:
         """Return how commands fare: severity, a sentence and counters."""
         late, severity, message = self.following.lateness, Severity.OK, 'commands sent in time'
-        offset, limit = self.hearing.offset, self.hearing.limit()
+        receipts, clocks = self.hearing.receipts, self.hearing.clocks
         if late.count:
-            severity = Severity.WARN if late.harms or self.following.clocks() else Severity.OK
+            severity = Severity.WARN if late.harms or self.following.clocks else Severity.OK
             message = f'{late.count} commands late: {self.following.advice}'
-        elif offset is not None and offset.beyond(limit):
-            severity, message = Severity.WARN, offset.words
+        elif clocks:
+            severity, message = Severity.WARN, clocks
         if self.active:
             self._bulletin.look_for_listeners()
         if self._bulletin.unseen:
             severity, message = Severity.WARN, self._bulletin.unseen
-        if self.hearing.receipts.words:
-            severity, message = Severity.ERROR, self.hearing.receipts.words
-        note = self.hearing.clocks_changed(limit)
-        if note:
-            self._bulletin.note(note)
+        if receipts.words:
+            severity, message = Severity.ERROR, receipts.words
+        if clocks and not self._differ:
+            self._note(clocks)
+        self._differ = bool(clocks)
+        offset = receipts.offset
         values: dict[str, object] = {} if offset is None else {
             'clock_offset_ms': f'{offset.ahead / 1e6:.3f}',
             'clock_offset_error_ms': f'{offset.error / 1e6:.3f}'}
@@ -491,8 +482,3 @@ class PlannerRuntime:
             'heartbeats': self.sending.heartbeats,
             'largest_lateness_ms': f'{late.largest / 1e6:.3f}',
             'refused': self.planning.refused, 'clock_jumps': self.clock_jumps, **values}
-
-
-def _joints_of(request: Target | Trajectory) -> tuple[str, ...]:
-    """Return which joints a request is for."""
-    return request.joints if isinstance(request, Trajectory) else (request.joint,)

@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 
 from hmsa_ros.control.bulletin import Bulletin
 from hmsa_ros.control.corrections import Corrections
@@ -89,8 +88,7 @@ class Planning:
             if self.advance(work) and work in self._queue:
                 self._queue.remove(work)
         while self._following.verdicts:
-            self._bulletin.give(replace(
-                self._following.verdicts.pop(0), request=self._bulletin.verdict.request))
+            self._bulletin.go_on(self._following.verdicts.pop(0))
 
     def advance(self, work: Work) -> bool:
         """Go on with one piece of work; say whether it is done."""
@@ -100,10 +98,8 @@ class Planning:
             next(work.steps)
         except StopIteration as end:
             drafts, now = end.value
-            if work.corrects:
-                self._correct(drafts, now)
-            elif work.request is None:
-                self._resume(work, drafts, now)
+            if work.request is None:
+                self._go_on(work, drafts, now)
             else:
                 self._supersede(work)
                 self._answer(work.request, drafts, now)
@@ -111,9 +107,7 @@ class Planning:
             if work.corrects:
                 self._bulletin.note(f'plan not corrected: {error}')
             elif work.request is None:
-                self._bulletin.give(
-                    self._following.abandon(work, error, self._bulletin.verdict.request),
-                    log=True)
+                self._bulletin.go_on(self._following.abandon(work, error), log=True)
             else:
                 self.refuse(error, work.request)
         else:
@@ -156,21 +150,19 @@ class Planning:
         self._bulletin.outputs.append(Note(Severity.ERROR, f'request refused ({code}): {error}'))
         return self._bulletin.verdict
 
-    def _resume(self, work: Work, drafts: Mapping[str, Draft], now: int) -> None:
-        """Go on with a plan that was made anew."""
-        verdict = self._following.resume(work, drafts, now, self._bulletin.verdict.request)
+    def _go_on(self, work: Work, drafts: Mapping[str, Draft], now: int) -> None:
+        """Go on with a plan that was made anew, or corrected from samples."""
+        by = self._corrections if work.corrects else self._following
+        verdict = by.take(work, drafts, now)
         self._send()
-        if verdict is not None:
-            self._bulletin.show()
-            self._bulletin.give(verdict, log=self._following.tell_replanned())
-
-    def _correct(self, drafts: Mapping[str, Draft], now: int) -> None:
-        """Go on with a plan that was corrected from samples."""
-        verdict = self._corrections.take(drafts, now, self._bulletin.verdict.request)
-        self._send()
-        if verdict is not None:
+        if verdict is None:
+            return
+        if work.corrects:
             self._bulletin.corrected(drafts, now)
-            self._bulletin.give(verdict)
+        else:
+            self._bulletin.show()
+        self._bulletin.go_on(
+            verdict, log=not work.corrects and self._following.tell_replanned())
 
 
 def _accepted(drafts: Mapping[str, Draft]) -> str:

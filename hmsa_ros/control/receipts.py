@@ -1,7 +1,7 @@
 """What plant or driver acknowledge: that commands arrive, and what time it is there."""
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -24,10 +24,6 @@ class Offset(NamedTuple):
 
     ahead: int
     error: int
-
-    def beyond(self, limit: float) -> bool:
-        """Return whether it is more than a limit in ns, however wrong it may be."""
-        return abs(self.ahead) - self.error > limit
 
     @property
     def words(self) -> str:
@@ -71,9 +67,6 @@ class Receipts:
 
     def __bool__(self) -> bool:
         return bool(self._joints)
-
-    def __contains__(self, joint: str) -> bool:
-        return joint in self._joints
 
     def sent(self, joint: str, stamp: int, now: int) -> None:
         """Take in that a command of a stamp in ns was sent at a time in ns of our clock."""
@@ -143,22 +136,21 @@ class Receipts:
             known.exchanges.clear()
             known.lags.clear()
 
-    def look(self) -> tuple[list[str], list[str]]:
-        """Return joints whose device has fallen silent, and those that it is heard of again."""
+    def look(self) -> list[str]:
+        """Return joints whose device has fallen silent, or is heard of again."""
         steady = self._steady()
         absent, self._looked = steady - self._looked, steady
-        fallen: list[str] = []
-        back: list[str] = []
+        changed: list[str] = []
         for name, known in self._joints.items():
             if absent > _PAUSE:
                 known.heard += absent
                 known.unanswered = None
             silent = steady - known.heard > _PATIENCE
             if silent is not known.silent:
-                (fallen if silent else back).append(name)
+                changed.append(name)
                 known.silent = silent
         self.silent = {x for x, known in self._joints.items() if known.silent}
-        return fallen, back
+        return changed
 
     def lost(self, joint: str, patience: int = _PATIENCE) -> bool:
         """Return whether what was sent to a joint has not arrived for longer than that, in ns."""
@@ -181,19 +173,15 @@ class Receipts:
                     f'has received none for more than {_PATIENCE / NANOSECONDS:g} s')
         return ''
 
-    def offset(self, joint: str) -> Offset | None:
-        """Return how far the clock of a joint's device is ahead, as the quickest exchange says."""
-        known = self._joints.get(joint)
-        if known is None:
-            return None
-        return min(known.exchanges, key=lambda x: x.error, default=None)
-
     def lag(self, joint: str) -> int | None:
         """Return in ns how old the quickest receipt of a joint was by our clock; None for none."""
         known = self._joints.get(joint)
         return None if known is None else min(known.lags, key=abs, default=None)
 
-    def worst(self, joints: Iterable[str]) -> Offset | None:
-        """Return the largest offset of the clocks of several joints."""
-        found = [x for x in map(self.offset, joints) if x is not None]
+    @property
+    def offset(self) -> Offset | None:
+        """How far the clock of a device is ahead, the one that is farthest off; None for none."""
+        # The quickest exchange says most.
+        found = [min(x.exchanges, key=lambda y: y.error)
+                 for x in self._joints.values() if x.exchanges]
         return max(found, key=lambda x: abs(x.ahead), default=None)

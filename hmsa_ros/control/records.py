@@ -87,6 +87,11 @@ class Target:
     stretch: float
     name: str = ''
 
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Whom it is for."""
+        return (self.joint,)
+
 
 @dataclass(frozen=True)
 class Stop:

@@ -17,10 +17,9 @@ class Sending:
     def __init__(
             self, group: PlannerGroup, following: Following, hearing: Hearing,
             outputs: list[Output]) -> None:
-        self._group, self._following, self._outputs = group, following, outputs
+        self._group, self._following, self._hearing = group, following, hearing
         #: Takes a command at once: whatever else there is to do comes after it.
         self.deliver: Callable[[Send], None] = outputs.append
-        self._hearing = hearing
         self.sent = self.heartbeats = 0
         self.next_beat = 0  # time in ns of the next sign of life
 
@@ -34,7 +33,7 @@ class Sending:
                 self._hearing.fresh.discard(name)
                 self._hand_out(name, level.stamp, level.flux_density, now)
                 self.sent += 1
-                self._outputs += self._following.sent(name, level.stamp, now)
+                self._following.sent(name, level.stamp, now)
 
     def _hand_out(self, name: str, stamp: int, flux_density: float, now: int) -> None:
         self.deliver(Send(name, stamp, flux_density))

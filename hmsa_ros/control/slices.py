@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from itertools import count
 from typing import Any
 
-from hmsa_ros.control.records import Request, Target, Trajectory
+from hmsa_ros.control.records import Request, Stop, Trajectory
 from hmsa_ros.planning.drafting import Steps
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.timeline import Draft
@@ -57,14 +57,13 @@ def work_on(
     if isinstance(request, Trajectory):
         return Work(
             frozenset(request.joints), _trajectory(request, group, clock, then), request)
-    if isinstance(request, Target):
-        joints = frozenset([request.joint])
-        steps = in_time(
-            lambda now: group.draft_setpoint(request.joint, request.stretch, now),
-            group, joints, clock, then=then)
-        return Work(joints, steps, request)
-    joints = frozenset(group.planners)
-    return Work(joints, in_time(group.draft_stop, group, joints, clock), request)
+    if isinstance(request, Stop):
+        joints = frozenset(group.planners)
+        return Work(joints, in_time(group.draft_stop, group, joints, clock), request)
+    joints = frozenset(request.joints)
+    return Work(joints, in_time(
+        lambda now: group.draft_setpoint(request.joint, request.stretch, now), group, joints,
+        clock, then=then), request)
 
 
 def _trajectory(

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 import math
 
+from hmsa_ros.control.receipts import Receipts
 from hmsa_ros.control.records import Settings
 from hmsa_ros.control.surroundings import Seen, Surroundings
 from hmsa_ros.errors import BadInputError
@@ -27,10 +28,11 @@ _QUIET = 20.0
 class Takeover:
     """Waits for samples of the joints before the first request, and goes on from them."""
 
-    def __init__(self, group: PlannerGroup, surroundings: Surroundings) -> None:
+    def __init__(
+            self, group: PlannerGroup, surroundings: Surroundings, receipts: Receipts,
+            note: Callable[[str], None]) -> None:
         self._group, self._around = group, surroundings
-        #: Returns how old in ns what a device says of itself is when it comes; None if unknown.
-        self.lag: Callable[[str], int | None] = lambda joint: None
+        self._receipts, self._note = receipts, note
         self._until: int | None = None
         # Whether it is known where the joints are, or they are taken to rest.
         self.engaged = False
@@ -76,16 +78,15 @@ class Takeover:
         self._samples = {
             name: x._replace(stamp=x.stamp + by) for name, x in self._samples.items()}
 
-    def go_on(
-            self, settings: Settings, newest: Mapping[str, tuple[int, float]]) -> list[str]:
+    def go_on(self, settings: Settings, newest: Mapping[str, tuple[int, float]]) -> None:
         """
         Go on from the samples there are, once there is nothing more to wait for.
 
-        The newest change of each joint has its stamp in ns and its level in T. Returned is in a
-        sentence each why samples do not count. Samples of another clock are a `RefusedError`.
+        The newest change of each joint has its stamp in ns and its level in T. Samples of another
+        clock are a `RefusedError`.
         """
         if self._until is None:
-            return []
+            return
         now = self._around.clock()
         samples = {
             name: x for name, x in self._samples.items()
@@ -100,31 +101,30 @@ class Takeover:
                 # Old indeed, and still the newest there is.
                 samples[name] = seen
         if not over and (len(samples) < len(self._group.planners) or self._around.unheard()):
-            return []
+            return
         self._until, self.engaged = None, True
         observable = self._around.observable()
-        notes = []
         for name in self._group.planners:
             if name in samples:
-                notes += self._take(name, samples[name], newest)
+                self._take(name, samples[name], newest)
             elif observable:
-                notes.append(
+                self._note(
                     f'no sample of joint {name} on joint_states: it is assumed at rest where '
                     'it began (initial_stretch)')
-        return notes
 
     def _take(
             self, name: str, seen: Seen, newest: Mapping[str, tuple[int, float]], *,
-            keep: bool = False) -> list[str]:
-        """Have a joint go on from a sample, with its setpoints if they are kept."""
+            keep: bool = False) -> bool:
+        """Have a joint go on from a sample, with its setpoints if they are kept; say if it can."""
         level = newest.get(name)
         try:
             self._group.planners[name].take_over(
                 seen.stamp, seen.stretch, seen.rate, seen.flux_density,
                 level[1] if level is not None and level[0] <= seen.stamp else None, keep=keep)
         except BadInputError as error:
-            return [f'sample of joint {name} ignored: {error}']
-        return []
+            self._note(f'sample of joint {name} ignored: {error}')
+            return False
+        return True
 
     # -- clocks --------------------------------------------------------------------------------
 
@@ -133,7 +133,7 @@ class Takeover:
         if seen.lag is None and abs(self._around.clock() - seen.stamp) <= _ANOTHER_CLOCK:
             return
         lag = self._around.clock() - seen.stamp if seen.lag is None else seen.lag
-        known, most = self.lag(name), settings.takeover_max_age
+        known, most = self._receipts.lag(name), settings.takeover_max_age
         agrees = known is not None and abs(known) <= most
         if abs(lag) <= most or 0 < lag <= _OLDEST and agrees:
             # In time, or the clocks agree and it is the sample that is late.
@@ -172,15 +172,14 @@ class Takeover:
 
     def look(
             self, settings: Settings, newest: Mapping[str, tuple[int, float]],
-            followed: Callable[[str], bool], *, keep: bool) -> list[str] | None:
+            followed: Callable[[str], bool], *, keep: bool) -> bool:
         """
-        Return in sentences what samples show of joints that are checked; None to wait for some.
+        Hold joints that are checked against what samples show; return False to wait for some.
 
         A joint that feedback has ``followed`` is left to it. One that is not where it is predicted
         goes on from its sample, with the setpoints ahead if they are kept. Where samples came and
         do not any more, or are of another clock, it is a `RefusedError`.
         """
-        notes: list[str] = []
         for name in sorted(self._unsure):
             if name not in self._doubted and followed(name):
                 continue
@@ -188,19 +187,17 @@ class Takeover:
             if seen is None or not self._around.observable():
                 # Nobody shows where it is: as predicted.
                 continue
+            new = self._look_until is not None and (
+                seen.came > self._look_until - settings.takeover_timeout)
             if self._around.steady() - seen.came > _RECENT or (
-                    name in self._doubted and not self._is_new(seen, settings)):
+                    name in self._doubted and not new):
                 if not settings.takeover_timeout:
                     continue
                 if not self._is_over(name, seen, settings):
-                    return None
-            notes += self._compare(name, seen, settings, newest, keep=keep)
+                    return False
+            self._compare(name, seen, settings, newest, keep=keep)
         self._settle()
-        return notes
-
-    def _is_new(self, seen: Seen, settings: Settings) -> bool:
-        return self._look_until is not None and (
-            seen.came > self._look_until - settings.takeover_timeout)
+        return True
 
     def _is_over(self, name: str, seen: Seen, settings: Settings) -> bool:
         """Wait for another sample; say when that has been vain, or refuse to go on without."""
@@ -227,7 +224,7 @@ class Takeover:
 
     def _compare(
             self, name: str, seen: Seen, settings: Settings,
-            newest: Mapping[str, tuple[int, float]], *, keep: bool) -> list[str]:
+            newest: Mapping[str, tuple[int, float]], *, keep: bool) -> None:
         """Go on from a sample where the prediction of its time cannot be."""
         self._check_age(name, seen, settings)
         self._check_ahead(name, seen)
@@ -235,13 +232,11 @@ class Takeover:
         predicted = planner.state(seen.stamp).stretch
         contradicts = abs(seen.stretch - predicted) > _tolerance(planner, seen.stamp, predicted)
         if not contradicts and name not in self._doubted:
-            return []
-        notes = self._take(name, seen, newest, keep=keep)
-        if contradicts and not notes:
-            notes.append(
+            return
+        if self._take(name, seen, newest, keep=keep) and contradicts:
+            self._note(
                 f'joint {name} is at {seen.stretch:.4g} on joint_states, where {predicted:.4g} '
                 'was predicted: what comes next is planned from the sample')
-        return notes
 
 
 def _tolerance(planner: Planner, time: int, predicted: float) -> float:

@@ -1,41 +1,70 @@
-"""One joint that feedback looks at: its estimator, and what the estimate says of the plan."""
+"""One joint that feedback looks at: what samples say of it, and what plans make of that."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, InitVar, replace
+from functools import partial
 import math
 
 from hmsa_ros.control.aside import Awaited, Doing
-from hmsa_ros.control.field import Field
+from hmsa_ros.control.choice import clearly_better
 from hmsa_ros.control.holds import Hold
+from hmsa_ros.control.learnt import as_of_path, believed, differs, learnt_model, sensor_of
 from hmsa_ros.control.ledger import Ledger, Moves
+from hmsa_ros.control.records import Settings
 from hmsa_ros.control.trust import Trust
-from hmsa_ros.estimation import Estimate, Estimator
-from hmsa_ros.estimation.motion import held
+from hmsa_ros.errors import HmsaError
+from hmsa_ros.estimation import Estimate, Estimator, Options, Prior
+from hmsa_ros.estimation.motion import held, rest
 from hmsa_ros.estimation.words import sentence
+from hmsa_ros.identification.known import Known
 from hmsa_ros.judge.records import Sensor
+from hmsa_ros.model.equations import equilibrium_stretch
 from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.planner import Believed, Planner
 from hmsa_ros.planning.timeline import Model, Plan
 
 # Levels before those of the samples that count: the field of a coil that lags remembers them.
 _BEFORE = 8
 # A sample may lie ahead of the clock by this share of the unit of time, since clocks differ.
 _AHEAD = 0.1
+# States further ahead than so many units of time are those of rest.
+_FAR = 100.0
+# How often samples are taken into account while a joint moves, at least and in units of its time,
+# and while it rests, in ns.
+_UPDATE, _OFTEN, RESTING = 20_000_000, 0.45, 200_000_000
+# How many times as seldom where a joint rings, and units of time after its last change of level
+# from which on it does, and from which on it rests.
+_SELDOM, _RINGING, _QUIET = 4, 3.0, 24.0
+# Samples of a natural period that are looked at, and how many fewer at rest.
+_DENSE, _SPARSE = 40, 10
+# Units of time from one choice of the parameters to plan with to the next.
+_CHOICE = 3.0
+# Units of time after an arrival that show it.
+_LOOK = 3.0
+# A field is another one than commanded from this share on, or this share of the unit of load, and
+# so many units of time and time constants of the coil after a change.
+_OFF, _LEAST, _FOLLOWED = 0.05, 0.01, 3.0
+# Share by which a level that took effect may be rounded.
+_ROUNDED = 0.01
 
 
 @dataclass(eq=False)
 class Joint:
     """What is known of one joint; times in ns."""
 
-    estimator: Estimator
-    trust: Trust
-    coil: Field
-    ledger: Ledger
-    start: float  # stretch before the setpoint under way
+    name: str
+    planner: Planner
+    given: Model
+    settings: Settings
+    begun: InitVar[int]
+    estimator: Estimator = field(init=False)
+    trust: Trust = field(init=False)
+    start: float = field(init=False)  # stretch before the setpoint under way
+    ledger: Ledger = field(default_factory=Ledger)
+    moves: Moves = field(default_factory=Moves)  # those of the plan in force
     latest: Estimate | None = None
     newest: int = 0  # time of the newest sample
     next_sample: int = 0  # time from which on another one is of use
-    # What was found of its sensor, and by which estimate.
-    sensor: tuple[Estimate, Sensor] | None = None
     next_update: int = 0  # when to look at samples
     not_before: int = 0  # so that looks take a share of the time only
     next_tell: int = 0  # when to tell the estimate
@@ -44,19 +73,34 @@ class Joint:
     choosing: Iterator[None] | None = None  # the choice under way
     chosen: bool = False  # whether that was made since the latest estimate
     waits: int = 0  # arrival of a move that takes longer, so that it can be corrected
+    next_path: int = 0  # from when on a path is looked at again
+    planning: int = 0  # how long planning one took
+    after: float = 0.0  # what a correction that has been worked out is expected to leave
     amplitude: float = 0.0  # largest of the vibration since the last arrival
-    setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place of the setpoint under way
     fresh: bool = False  # whether there are samples that have not been looked at
     looking: Iterator[None] | None = None  # the look at them under way
-    # Samples that came meanwhile: stamp, stretch, and when.
-    waiting: list[tuple[int, float, int]] = field(default_factory=list)
     spent: int = 0  # on that
     audits: list[Hold] = field(default_factory=list)  # setpoints to be looked at after one
     ready: int = 0  # how many of these follow it now
     auditing: Iterator[None] | None = None  # the look at the first of them
     lost: str = ''  # why the field is not as commanded; empty where it is
-    moves: Moves = field(default_factory=Moves)  # those of the plan in force
+    largest: float = math.inf  # level in T that took effect where a larger one was commanded
     news: bool = False  # whether the latest estimate has not been held against the plan yet
+    # Samples that came during a look: stamp, stretch, and when.
+    _waiting: list[tuple[int, float, int]] = field(default_factory=list)
+    _setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place of what is under way
+    _sensor: tuple[Estimate, Sensor] | None = None  # what was found of it, by which estimate
+    _measured: bool = False  # whether the field is
+
+    def __post_init__(self, begun: int) -> None:
+        given, settings = self.given, self.settings
+        prior = Prior.nominal(
+            given.actuator, settings.feedback_parameters, suspects=True, others=given.others)
+        self.estimator = Estimator(
+            prior.informed(settings.known.get(self.name, Known())),
+            Options(slew_limit=given.options.slew_limit, learn=not settings.feedback_frozen))
+        self.trust = Trust(begun, at_once=settings.feedback_cautious)
+        self.start = given.actuator.rest
 
     @property
     def unit(self) -> float:
@@ -64,24 +108,71 @@ class Joint:
         return float(self.estimator.prior.values['time_unit'])
 
     @property
+    def adapts(self) -> bool:
+        """Whether plans use what is learnt."""
+        return self.settings.feedback == 'adapt'
+
+    @property
+    def tolerance(self) -> float:
+        """Share of its step that a move may be expected to leave without taking longer."""
+        cautious = self.adapts and self.settings.feedback_cautious
+        return self.settings.feedback_tolerance if cautious else math.inf
+
+    @property
+    def acting(self) -> Estimate | None:
+        """The latest estimate if it is to be acted upon: a whole move has shown that it fits."""
+        latest = self.latest
+        return latest if latest is not None and latest.trusted and self.trust.acts else None
+
+    # -- samples -------------------------------------------------------------------------------
+
+    @property
     def next_look(self) -> int:
         """When to look at samples, a time in ns; one that an audit follows is due at once."""
         return max(self.not_before, 0 if self.audits else self.next_update)
 
     @property
-    def acts(self) -> bool:
-        """Whether there is an estimate to act upon."""
-        return self.latest is not None and self.latest.trusted and self.trust.acts
+    def interval(self) -> int:
+        """How long after a look the next one is due."""
+        if self._still(_QUIET * self.given.units.time):
+            return RESTING
+        return min(_UPDATE, round(_OFTEN * self.unit * NANOSECONDS)) * (
+            _SELDOM if self._still(_RINGING * self.unit) else 1)
 
-    def add(self, stamp: int, stretch: float, now: int) -> None:
-        """Take in a stretch measured at a stamp, which is not ahead of the clock."""
+    def _still(self, span: float) -> bool:
+        """Return whether no level has changed for a span in s."""
+        last = self.planner.plan.levels[-1].stamp
+        return self.newest > last + round(span * NANOSECONDS)
+
+    def wants(self, stamp: int) -> bool:
+        """Return whether a sample with a stamp is not too near to the one before."""
+        return not self.newest <= stamp < self.next_sample
+
+    def add(self, stamp: int, stretch: float, flux_density: float, now: int) -> None:
+        """
+        Take in stretch and field in T measured at a stamp, which come at a time.
+
+        Samples come in any order.
+        """
+        if not self.wants(stamp):
+            return
+        lost = self.lost = self._off(stamp, flux_density)
+        if lost and self.trust.why != lost and self.trust.doubt(lost, now, at_once=True):
+            # What was learnt is forgotten, and the look under way ends.
+            self.estimator.restart()
+            self.latest, self.news = None, True
+            self.looked()
+        sample = stamp, math.nan if lost else stretch, now
         self.fresh = True
         if not self._is_ahead(stamp, now):
             self.newest = max(self.newest, min(stamp, now))
         if self.looking is None:
-            self._take(stamp, stretch, now)
+            self._take(*sample)
         else:
-            self.waiting.append((stamp, stretch, now))
+            self._waiting.append(sample)
+        cell = round(self.given.units.time * NANOSECONDS) * 2 // _DENSE
+        rests = self.latest and self._still(_QUIET * self.given.units.time)
+        self.next_sample = self.newest + (cell * _SPARSE if rests else cell)
 
     def _is_ahead(self, stamp: int, now: int) -> bool:
         return stamp > now + _AHEAD * self.unit * NANOSECONDS
@@ -92,56 +183,79 @@ class Joint:
         else:
             self.estimator.sample(stamp, stretch)
 
-    def take_levels(self, plan: Plan, until: int) -> None:
-        """Have the estimator know the levels of a plan that count until a time."""
+    def applied(self, stamp: int, flux_density: float) -> None:
+        """Take in that a level in T has taken effect at a stamp, before the plan does."""
+        wanted = self.planner.plan.level(stamp).flux_density
+        if abs(flux_density) > self.largest:
+            self.largest = math.inf
+        if wanted and 0.0 < flux_density / wanted < 1.0 - _ROUNDED:
+            self.largest = abs(flux_density)
+
+    def _off(self, stamp: int, field: float) -> str:
+        """Return why the field at a time is not known to be the commanded one; else empty."""
+        if math.isnan(field):
+            return (
+                'the field is not reported any more, and may not be the one commanded'
+                if self._measured else '')
+        self._measured = True
+        plan = self.planner.plan
+        level = plan.level(stamp)
+        wanted, options, units = level.flux_density, level.model.options, level.model.units
+        follows = _FOLLOWED * (units.time + options.coil_time_constant) + (
+            abs(wanted - level.in_force) / options.slew_limit)
+        if not plan.segments or stamp < level.stamp + follows * NANOSECONDS or (
+                abs(field - wanted) <= max(
+                    _OFF * max(abs(field), abs(wanted)), _LEAST * units.load)):
+            return ''
+        return (f'the coil has {units.drive.text(field)} where {units.drive.text(wanted)} were '
+                'commanded')
+
+    # -- looks at them -------------------------------------------------------------------------
+
+    def _take_levels(self, until: int) -> None:
+        """Have the estimator know the levels of the plan that count until a time."""
+        plan = self.planner.plan
         first = max(plan.place(self.estimator.since) - _BEFORE, 0)
         self.estimator.set_levels([
             (x.stamp, x.flux_density) for x in plan.levels[first:plan.place(until) + 1]])
 
-    def update(self, plan: Plan, now: int, doing: Doing) -> Awaited[None]:
+    def update(self, now: int, doing: Doing) -> Awaited[None]:
         """Take samples into account that have come, and find what is believed of a time."""
+        plan = self.planner.plan
         self.fresh = False
-        self.take_levels(plan, max(now, self.newest))
+        self._take_levels(max(now, self.newest))
         before = self.estimator.screening.lost
         estimator, found = yield from doing(_updated, self.estimator, now)
         estimator.learning, self.estimator = self.estimator.learning, estimator
-        screening = estimator.screening
-        self.note_start(plan, now)
+        screening, trust = estimator.screening, self.trust
+        self._note_start(plan, now)
         trouble = screening.trouble if found is None else found.trouble
-        if screening.lost > before and not self.trust.acts:
+        if screening.lost > before and not trust.acts:
             # Others that came with them have fitted again.
             trouble = trouble or screening.last_trouble
-        trust = self.trust
         if trust.doubt(trouble, now) if trouble else found is not None and trust.fits(
                 plan, self.unit, self.estimator, now):
             self.estimator.restart()
         if found is not None and not trust.why:
             self._look_at_vibration(plan, found)
-        if found is not None and self.trust.why:
-            found = replace(found, trusted=False, trouble=self.trust.why)
+        if found is not None and trust.why:
+            found = replace(found, trusted=False, trouble=trust.why)
         self.latest, self.news = found, True
-
-    def begin_anew(self) -> None:
-        """Forget what has been learnt, and the look under way."""
-        self.estimator.restart()
-        self.latest, self.news = None, True
-        self.looked()
 
     def looked(self) -> None:
         """End the look under way, and take in the samples that came meanwhile."""
         self.looking = None
-        for sample in self.waiting:
+        for sample in self._waiting:
             self._take(*sample)
-        self.waiting.clear()
+        self._waiting.clear()
 
-    def note_start(self, plan: Plan, now: int) -> None:
+    def _note_start(self, plan: Plan, now: int) -> None:
         """Remember where the joint was before the setpoint under way at a time."""
-        place = plan.under_way(now)
-        if (plan.number, place) == self.setpoint:
+        place, before = plan.under_way(now), self._setpoint
+        self._setpoint = plan.number, place
+        if self._setpoint == before:
             return
-        again = plan.number == self.setpoint[0] and place > self.setpoint[1] >= 0
-        self.setpoint = plan.number, place
-        if again:
+        if plan.number == before[0] and place > before[1] >= 0:
             self.start = plan.segments[place - 1].stretch
         else:
             self.start = plan.levels[0].stretch if self.latest is None else self.latest.stretch
@@ -155,12 +269,108 @@ class Joint:
             return
         level = plan.level(found.time)
         at = held(found.values, found.stretch, level.flux_density)
-        if at is None:
-            return
-        self.amplitude = max(self.amplitude, math.hypot(
-            found.stretch - at[0], found.rate / at[1]))
+        if at is not None:
+            self.amplitude = max(self.amplitude, math.hypot(
+                found.stretch - at[0], found.rate / at[1]))
 
-    def words(self, plan: Plan, now: int, *, adapting: bool) -> str:
+    # -- what plans begin from -----------------------------------------------------------------
+
+    def predicted(self, time: int) -> Estimate | None:
+        """Return what is believed of a time under the plan in force by now."""
+        self._take_levels(time)
+        return self.estimator.predict(time)
+
+    def state(self, time: int) -> Estimate | None:
+        """Return what plans may begin from at a time; None where predictions count."""
+        latest = self.acting
+        if latest is None or not self.adapts or (
+                time - latest.time > _FAR * latest.values['time_unit'] * NANOSECONDS):
+            return None
+        return self.predicted(time)
+
+    def foreseen(self, time: int) -> Estimate | None:
+        """Return what moves are corrected from at a time; cautious ones before samples."""
+        if self.latest is not None or math.isinf(self.tolerance):
+            return self.state(time)
+        return self.predicted(time)
+
+    def adapted(self, model: Model | None = None) -> bool:
+        """Return whether plans, or one by a model, use parameters that were learnt."""
+        return (model or self.planner.model) != self.given
+
+    def believed(self, time: int) -> Believed | None:
+        """Return what `hmsa_ros.planning.planner.Planner` is to believe of a time."""
+        try:
+            found = self.state(time) if self.adapted() else None
+        except HmsaError:
+            return None
+        if found is None:
+            return None
+        # What the model in use does not know shifts its rest: a plan keeps to its own stretches.
+        level, model = self.planner.plan.levels[-1].flux_density, self.planner.model
+        at = rest(found.values, (), level)
+        if at is None:
+            return None
+        shift = float(equilibrium_stretch(model.load(level), model.material)) - at[0]
+        stretch, rate, behind = believed(found, creeps=bool(model.material.creep))
+        return stretch + shift, rate, behind
+
+    @property
+    def sensor(self) -> Sensor:
+        """What was found of the sensor; one as given where nothing was."""
+        found = self.acting
+        if found is None:
+            return Sensor()
+        if self._sensor is None or self._sensor[0] is not found:
+            self._sensor = found, sensor_of(found, self.estimator.prior)
+        return self._sensor[1]
+
+    # -- what plans are made with --------------------------------------------------------------
+
+    def learnt(self, model: Model) -> Model:
+        """Return a model with what is known better by now, or was when samples fitted last."""
+        if self.acting is not None:
+            return learnt_model(model, self.acting, self.planner.plan.levels[-1].stretch)
+        confirmed = self.trust.confirmed
+        return model if confirmed is None else Model(
+            confirmed.actuator, replace(model.options, **confirmed.others))
+
+    def may_choose(self, latest: Estimate) -> bool:
+        """Return whether the parameters to plan with are to be chosen by an estimate."""
+        # A plan that other parameters take over on the way begins from what it does not know.
+        return not self.chosen and bool(self.planner.plan.segments) and (
+            latest.time < self.waits
+            or latest.time >= self.next_choice and self.shown(latest.time))
+
+    def shown(self, time: int) -> bool:
+        """Return whether samples until a time show how the joint has arrived."""
+        plan = self.planner.plan
+        place = plan.under_way(self.planner.soonest(time))
+        look = round(_LOOK * self.unit * NANOSECONDS)
+        return place >= 0 and time >= (plan.segments[place].arrival or 0) + look
+
+    def choose(self, latest: Estimate, doing: Doing) -> Awaited[None]:
+        """Plan with what is learnt, once that is clearly better, or while a move waits for it."""
+        used, segments = self.used or self.planner.model, self.planner.plan.segments
+        model, waits = used, latest.time < self.waits
+        if differs(used, latest):
+            learnt = self.learnt(used)
+            if segments[-1].path is not None:
+                learnt = as_of_path(learnt, used, latest)
+            better = partial(clearly_better, given=used == self.given, shown=not waits)
+            if (yield from doing(
+                    better, latest, learnt, used, self.start, segments[-1].stretch)):
+                model = learnt
+        if self.acting is None:
+            return
+        if not waits:
+            self.next_choice = latest.time + round(_CHOICE * self.unit * NANOSECONDS)
+            self.used = model
+        self.planner.take_model(model)
+
+    # -- words ---------------------------------------------------------------------------------
+
+    def words(self, now: int) -> str:
         """Say in a sentence without its stop what is wrong at a time."""
         trust = self.trust
         why = trust.why or self.estimator.screening.trouble
@@ -168,18 +378,19 @@ class Joint:
             return (f'{why}: feedback has ended, open loop with {trust.parameters}; '
                     '~/reset_estimate begins it anew')
         if why:
-            more = f', with {trust.parameters}' if adapting else ''
+            more = f', with {trust.parameters}' if self.adapts else ''
             anew = ('; the estimate has begun anew and counts after a move that samples fit; '
                     '~/reset_estimate forgets all') if trust.beginnings else ''
             return f'{why}: open loop until samples fit again{more}{anew}'
         if self.latest is None:
             return 'no estimate yet'
+        plan = self.planner.plan
         place = plan.under_way(now)
         target = plan.segments[place].stretch if place >= 0 else self.start
         use = 'plans use it' if trust.acts else 'plans use it after a move that samples fit'
         return sentence(
             self.latest, self.estimator.prior.values, plan.level(now).flux_density, target,
-            self.start, self.amplitude, use if adapting else '')
+            self.start, self.amplitude, use if self.adapts else '')
 
     def figures(self) -> dict[str, object]:
         """Return parameters in SI, with deviations and given values, and counters."""
@@ -199,7 +410,8 @@ class Joint:
             'rejected': screening.rejected, 'frozen': screening.frozen,
             'unreadable': screening.unreadable, 'repeated': screening.repeated,
             'too_late': screening.late, 'ahead_of_clock': screening.ahead,
-            'new_beginnings': self.trust.beginnings, 'ended': self.trust.ended}
+            'new_beginnings': self.trust.beginnings, 'ended': self.trust.ended,
+            **self.sensor.to_dict()}
 
 
 def _updated(estimator: Estimator, now: int) -> tuple[Estimator, Estimate | None]:

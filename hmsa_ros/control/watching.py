@@ -1,17 +1,17 @@
 """The setpoints of a request as they were requested, and what samples show of each."""
 
 from bisect import bisect_left, insort
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
-from hmsa_ros.control.aside import Doing, here
+from hmsa_ros.control.aside import Doing
+from hmsa_ros.control.feedback import Feedback
 from hmsa_ros.control.holds import AHEAD, Hold
 from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.judge.records import (
     Finding,
     GoalTolerances,
     missed,
-    Sensor,
     Setpoint,
     Tolerances,
     worst,
@@ -32,6 +32,8 @@ _STOPPED = 'the joint came to rest instead'
 class _Joint:
     """The setpoints of a joint as they were requested, and what was found of them."""
 
+    name: str  # empty where there is one
+    doing: Doing  # does the judging
     asked: Plan  # as it was accepted
     plan: Plan  # as it is now
     request: int  # its number in the group
@@ -103,18 +105,92 @@ class _Joint:
         return {x for x in range(self.following)
                 if (one := self.segment(x)) is not None and not one.carried_out}
 
+    def stop(self, plan: Plan) -> None:
+        """Take in that a joint came to rest in place of the rest of a request."""
+        self.plan = plan
+        for hold in self.holds:
+            hold.miss(_STOPPED)
+        self._miss(
+            (x for x in range(self.following, self.count) if x not in self.left_out), _STOPPED)
+        self.following = self.count
+
+    def change(self, plan: Plan, now: int) -> None:
+        """Go over to a plan that was made anew; what it leaves out is missed."""
+        self.needed |= not self.corrected
+        self.corrected = False
+        begun = {x.setpoint.number - 1: x for x in self.holds}
+        undone = self.undone()
+        gone = self.leave_out(plan, now)
+        for number in begun.keys() & gone:
+            begun[number].miss(_LEFT_OUT)
+        self._miss((x for x in gone if x not in begun and x >= self.following), _LEFT_OUT)
+        for hold in self.holds:
+            self._keep_up(hold)
+        self._miss(sorted(self.undone() - undone - begun.keys()), _UNDONE)
+
+    def _miss(self, numbers: Iterable[int], reason: str) -> None:
+        """Take in that setpoints are missed, none of which samples were gathered of."""
+        self.news += [missed(self._setpoint(x), reason) for x in numbers]
+
+    def open_next(self) -> None:
+        """Watch the next setpoint."""
+        number, self.following = self.following, self.following + 1
+        if number in self.left_out:
+            return
+        for hold in self.holds:
+            if hold.over:
+                self.close(hold.found)
+        self.holds = [x for x in self.holds if not x.over or x.untold]
+        self.holds.append(self._hold(number))
+
+    def begin_anew(self) -> None:
+        """Gather samples anew of setpoints that are not over, since all times are others."""
+        self.holds = [
+            x if x.over else self._hold(x.setpoint.number - 1) for x in self.holds]
+
+    def _hold(self, number: int) -> Hold:
+        """Return what gathers samples of a setpoint."""
+        last = number + 1 == self.count
+        hold = Hold(
+            self._setpoint(number), last=last, goal=self.goal if last else None,
+            doing=self.doing)
+        self._keep_up(hold)
+        return hold
+
+    def _keep_up(self, hold: Hold) -> None:
+        """Have a setpoint judged from when it is reached by the plan in force."""
+        segment = self.segment(hold.setpoint.number - 1)
+        if segment is None:
+            hold.miss(_LEFT_OUT)
+        elif not segment.carried_out:
+            hold.miss(_UNDONE)
+        elif segment.arrival is not None:
+            hold.move(segment.arrival, corrected=not self.needed)
+        elif hold.setpoint.arrival is not None:
+            hold.miss('its time ended before the move to it')
+
+    def _setpoint(self, number: int) -> Setpoint:
+        """Return a setpoint as it was requested."""
+        asked, place = self.asked, self.asked.kept + number
+        segment = asked.segments[place]
+        level = asked.level(segment.begin if segment.arrival is None else segment.arrival)
+        model = level.model
+        omega = model.frequency(segment.stretch) / model.units.time
+        ratio = model.material.zeta / critical_zeta(segment.stretch, model.material.packed)
+        return Setpoint(
+            segment.stretch, asked.segments[place - 1].stretch if number
+            else asked.level(segment.begin).stretch,
+            segment.since, segment.arrival, segment.until if number + 1 == self.count
+            else asked.segments[place + 1].since, omega, ratio * omega, self.name, number + 1,
+            self.count, possible=stretch_limits(model.material))
+
 
 class Watch:
     """Looks at samples of each setpoint as it was requested, and judges them."""
 
-    def __init__(self, group: PlannerGroup, surroundings: Surroundings) -> None:
-        self._group, self._around = group, surroundings
-        #: Returns what is known of the sensor of a joint.
-        self.sensor: Callable[[str], Sensor] = lambda name: Sensor()
-        #: Looks at the samples of a setpoint of a joint, as soon as they have been judged.
-        self.audit: Callable[[str, Hold], None] = lambda name, hold: None
-        #: Does the judging.
-        self.doing: Doing = here
+    def __init__(
+            self, group: PlannerGroup, surroundings: Surroundings, feedback: Feedback) -> None:
+        self._group, self._around, self._feedback = group, surroundings, feedback
         #: By joint, what counts as having arrived at the end of the newest request.
         self.goals: Mapping[str, GoalTolerances] = {}
         self._joints: dict[str, _Joint] = {}
@@ -127,20 +203,23 @@ class Watch:
 
     def restart(self) -> None:
         """Forget everything; what is planned by now is not judged."""
-        self._joints, self._opens = {}, None
+        self._opens = None
         for name, planner in self._group.planners.items():
             plan = planner.plan
-            self._joints[name] = _Joint(
-                replace(plan, kept=len(plan.segments)), plan, self._group.number)
+            self._begin(name, replace(plan, kept=len(plan.segments)), plan)
+
+    def _begin(self, name: str, asked: Plan, plan: Plan) -> None:
+        """Watch the setpoints of a joint that were asked for."""
+        self._joints[name] = _Joint(
+            name if len(self._group.planners) > 1 else '', self._feedback.do, asked, plan,
+            self._group.number, self.goals.get(name))
 
     def clock_set(self, by: int) -> None:
         """Take in that the clock was set ahead by some ns, and all plans with it."""
         for name, joint in self._joints.items():
             joint.asked = joint.asked.shifted(by)
             joint.plan = self._group.planners[name].plan
-            # What samples have shown so far is of times that were others.
-            joint.holds = [x if x.over else self._hold(name, joint, x.setpoint.number - 1)
-                           for x in joint.holds]
+            joint.begin_anew()
         if self._opens is not None:
             self._opens += by
 
@@ -193,87 +272,22 @@ class Watch:
         """Watch the setpoints that have begun by a time in ns, as they were requested."""
         for name, planner in self._group.planners.items():
             joint, plan = self._joints[name], planner.plan
-            if plan.number != joint.plan.number:
-                joint = self._begin(name, joint, plan)
-            elif plan.segments is not joint.plan.segments:
-                self._change(name, joint, plan, now)
+            if plan.number == joint.plan.number:
+                if plan.segments is not joint.plan.segments:
+                    joint.change(plan, now)
+            elif self._group.number == joint.request:
+                joint.stop(plan)
+            else:
+                self._begin(name, plan, plan)
         self._open_until(now)
 
     def _open_until(self, time: int) -> None:
         """Watch the setpoints that begin by a time in ns."""
-        for name, joint in self._joints.items():
+        for joint in self._joints.values():
             while joint.begins is not None and joint.begins <= time:
-                self._open(name, joint)
+                joint.open_next()
         self._opens = min(
             (x.begins for x in self._joints.values() if x.begins is not None), default=None)
-
-    def _begin(self, name: str, joint: _Joint, plan: Plan) -> _Joint:
-        """Take in a request, or that a joint came to rest in place of the rest of one."""
-        if self._group.number != joint.request:
-            self._joints[name] = begun = _Joint(
-                plan, plan, self._group.number, self.goals.get(name))
-            return begun
-        joint.plan = plan
-        for hold in joint.holds:
-            hold.miss(_STOPPED)
-        joint.news += [
-            missed(self._setpoint(name, joint, x), _STOPPED)
-            for x in range(joint.following, joint.count) if x not in joint.left_out]
-        joint.following = joint.count
-        return joint
-
-    def _change(self, name: str, joint: _Joint, plan: Plan, now: int) -> None:
-        """Go over to a plan that was made anew; what it leaves out is missed."""
-        joint.needed |= not joint.corrected
-        joint.corrected = False
-        begun = {x.setpoint.number: x for x in joint.holds}
-        undone = joint.undone()
-        for number in joint.leave_out(plan, now):
-            if number + 1 in begun:
-                begun[number + 1].miss(_LEFT_OUT)
-            elif number >= joint.following:
-                joint.news.append(missed(self._setpoint(name, joint, number), _LEFT_OUT))
-        for hold in joint.holds:
-            _keep_up(hold, joint)
-        joint.news += [
-            missed(self._setpoint(name, joint, x), _UNDONE)
-            for x in sorted(joint.undone() - undone) if x + 1 not in begun]
-
-    def _open(self, name: str, joint: _Joint) -> None:
-        """Watch the next setpoint."""
-        number, joint.following = joint.following, joint.following + 1
-        if number in joint.left_out:
-            return
-        for hold in joint.holds:
-            if hold.over:
-                joint.close(hold.found)
-        joint.holds = [x for x in joint.holds if not x.over or x.untold]
-        joint.holds.append(self._hold(name, joint, number))
-
-    def _hold(self, name: str, joint: _Joint, number: int) -> Hold:
-        """Return what gathers samples of a setpoint."""
-        last = number + 1 == joint.count
-        hold = Hold(
-            self._setpoint(name, joint, number), last=last, goal=joint.goal if last else None,
-            doing=self.doing)
-        _keep_up(hold, joint)
-        return hold
-
-    def _setpoint(self, name: str, joint: _Joint, number: int) -> Setpoint:
-        """Return a setpoint as it was requested."""
-        asked, place = joint.asked, joint.asked.kept + number
-        segment = asked.segments[place]
-        level = asked.level(segment.begin if segment.arrival is None else segment.arrival)
-        model = level.model
-        omega = model.frequency(segment.stretch) / model.units.time
-        ratio = model.material.zeta / critical_zeta(segment.stretch, model.material.packed)
-        return Setpoint(
-            segment.stretch, asked.segments[place - 1].stretch if number
-            else asked.level(segment.begin).stretch,
-            segment.since, segment.arrival, segment.until if number + 1 == joint.count
-            else asked.segments[place + 1].since, omega, ratio * omega,
-            name if len(self._joints) > 1 else '', number + 1, joint.count,
-            possible=stretch_limits(model.material))
 
     # -- samples -------------------------------------------------------------------------------
 
@@ -315,24 +329,11 @@ class Watch:
                 if (steady := self._around.steady()) >= until:
                     return None
                 found = hold.judge(
-                    now, steady, tolerances, self.sensor(name), observable=observable)
+                    now, steady, tolerances, self._feedback.sensor(name), observable=observable)
                 if hold.news:
                     hold.news = False
-                    self.audit(name, hold)
+                    self._feedback.audit(name, hold)
                 if found is not None:
                     joint.newest = found
                     return found
         return None
-
-
-def _keep_up(hold: Hold, joint: _Joint) -> None:
-    """Have a setpoint judged from when it is reached by the plan in force."""
-    segment = joint.segment(hold.setpoint.number - 1)
-    if segment is None:
-        hold.miss(_LEFT_OUT)
-    elif not segment.carried_out:
-        hold.miss(_UNDONE)
-    elif segment.arrival is not None:
-        hold.move(segment.arrival, corrected=not joint.needed)
-    elif hold.setpoint.arrival is not None:
-        hold.miss('its time ended before the move to it')
