@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from hmsa_ros.control.aside import ANSWER, Awaited, Doing, here
-from hmsa_ros.judge.judging import ENOUGH, judge, look_length, rests_from
+from hmsa_ros.judge.judging import ENOUGH, judge
 from hmsa_ros.judge.records import (
     Finding,
     GoalTolerances,
@@ -58,13 +58,13 @@ class Hold:
         # Largest that a stamp was ahead of the clock.
         self._ahead = 0
         # Arrival as it was requested, and by the newest plan.
-        self.asked = rests_from(setpoint)
+        self.asked = setpoint.rests_from
         self._begin_at(self.asked)
 
     def _begin_at(self, begin: int) -> None:
         setpoint = self.setpoint
         self._judging = None
-        self._begin, self._length = begin, look_length(setpoint)
+        self._begin, self._length = begin, setpoint.look
         # The last one is held on, so that there is always time for a look, at rare samples too.
         least = begin + 2 * self._length if self._last else begin
         self._enough = least if setpoint.end is None else max(setpoint.end, least)

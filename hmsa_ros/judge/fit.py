@@ -50,8 +50,7 @@ _NORMAL = 1.4826
 _MOST_ALIKE = 0.98
 
 
-@dataclass(frozen=True)
-class Figure:
+class Figure(NamedTuple):
     """A figure, its standard deviation and its bounds."""
 
     value: float
@@ -265,7 +264,12 @@ def _bounds(problems: _Problems, number: int, tried: _Solved, searched: float) -
     # One that was only found by searching is not shown, but it may be.
     reach = np.sqrt(np.maximum(slack[possible], 0.0) * scale)
     near = np.sqrt(np.maximum(slack[possible] - searched, 0.0) * scale)
-    swing, factor = _swing(within)
+    fading = np.exp(-np.outer(within.decay / within.omega, _PHASES))
+    waves = fading * (np.outer(within.pair[0], np.cos(_PHASES))
+                      + np.outer(within.pair[1], np.sin(_PHASES)))
+    swing = np.ptp(waves, axis=1)
+    # The largest that any phase has.
+    factor = 1.0 + np.exp(-math.pi * within.decay / within.omega)
     deviation = np.sqrt(within.pair_variance) * factor
     shift = np.sqrt(within.offset_variance)
     mine = int(np.flatnonzero(possible == place)[0])
@@ -302,16 +306,6 @@ def student_quantile(freedom: float, probability: float) -> float:
         (3.0 * z**7 + 19.0 * z**5 + 17.0 * z**3 - 15.0 * z) / 384.0,
         (79.0 * z**9 + 776.0 * z**7 + 1482.0 * z**5 - 1920.0 * z**3 - 945.0 * z) / 92160.0)
     return z + sum(x / freedom**i for i, x in enumerate(terms, 1))
-
-
-def _swing(fits: _Solved) -> tuple[Array, Array]:
-    """Return the vibration, peak to peak in a period from time 0 on, and that of one of size 1."""
-    fading = np.exp(-np.outer(fits.decay / fits.omega, _PHASES))
-    waves = fading * (np.outer(fits.pair[0], np.cos(_PHASES))
-                      + np.outer(fits.pair[1], np.sin(_PHASES)))
-    # The largest that any phase has.
-    factor = 1.0 + np.exp(-math.pi * fits.decay / fits.omega)
-    return np.ptp(waves, axis=1), factor
 
 
 def _together(left: Array) -> float:

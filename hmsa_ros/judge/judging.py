@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hmsa_ros.judge.fit import FEWEST, Figure, Fit, fit
 from hmsa_ros.judge.records import (
     Finding,
-    judged_late,
+    PERIODS,
     Sensor,
     Setpoint,
     Tolerances,
@@ -29,8 +29,8 @@ from hmsa_ros.model.units import NANOSECONDS
 
 Stamps = NDArray[np.int64]
 
-#: Periods of the vibration in one look, and samples where they are rare.
-PERIODS, ENOUGH = 6, 24
+#: Samples of a look where they are rare.
+ENOUGH = 24
 # Parts of a period of which the samples count as one.
 _KEPT = 32
 # Whatever stays nearer to the target than this share of a tolerance, as a root mean square, is
@@ -83,7 +83,7 @@ def judge(
     stamps, values, complaint = _usable(time, stretch, setpoint, sensor)
     if complaint:
         return unobserved(setpoint, complaint, len(stamps))
-    begin, moved = rests_from(setpoint), setpoint.moved
+    begin, moved = setpoint.rests_from, setpoint.moved
     found = _judged(stamps, values, setpoint, tolerances, sensor, begin)
     if found.arrived or moved is None:
         return found
@@ -92,7 +92,9 @@ def judge(
     if again.open and not found.open:
         return found
     after = moved - (setpoint.end or moved + 1)
-    return judged_late(again, after) if again.arrived and after >= 0 else again
+    return again if not again.arrived or after < 0 else replace(
+        again, verdict=Code.LATE,
+        message=f'{again.message}, but {after / 1e6:.3g} ms after its time')
 
 
 def _judged(
@@ -122,7 +124,7 @@ def _judged(
         origin = int(stamps[part][0]) if number else begin
         seconds = ((stamps[part] - origin) / NANOSECONDS).astype(np.float64)
         decided = partial(
-            _decided, count=len(rest), setpoint=setpoint, tolerances=tolerances, sensor=sensor,
+            _decided, count=len(rest), setpoint=setpoint, limits=(allowed, swing), sensor=sensor,
             moves=moves if number else None)
         shown = fit(
             seconds, rest, setpoint.frequency, setpoint.decay,
@@ -138,7 +140,7 @@ def _judged(
         findings, key=lambda x: (VERDICTS.index(x.verdict), x is findings[0], x.rank[1]))
     most = _largest(*every, setpoint)
     if found.verdict is Code.VIBRATING and most <= swing and (
-            len(every[0]) > _SEEN * (every[0][-1] - every[0][0]) / _period_ns(setpoint)):
+            len(every[0]) > _SEEN * (every[0][-1] - every[0][0]) / setpoint.period):
         # Nothing moved as far as what was fitted to it.
         return replace(found, verdict=Code.UNDECIDED, message=(
             f'{found.message}, but nothing moves by more than {setpoint.words(most)}: it does not '
@@ -162,7 +164,7 @@ def _judged(
 
 def _largest(stamps: Stamps, rest: Array, setpoint: Setpoint) -> float:
     """Return the largest motion from peak to peak in a period of a look."""
-    period = _period_ns(setpoint)
+    period = setpoint.period
     most = 0.0
     # What half a period shows is in one period or in one that begins half of it later.
     for begin in (stamps[0], stamps[0] - period // 2):
@@ -170,30 +172,6 @@ def _largest(stamps: Stamps, rest: Array, setpoint: Setpoint) -> float:
         swings = np.maximum.reduceat(rest, first) - np.minimum.reduceat(rest, first)
         most = max(most, float(np.max(swings)))
     return most
-
-
-def rests_from(setpoint: Setpoint) -> int:
-    """Return the time in ns from which on a setpoint is to rest, as it was requested."""
-    if setpoint.arrival is not None:
-        return setpoint.arrival
-    # Approached: until a vibration of the step has faded to a thousandth.
-    settled = setpoint.begins + round(7.0 / max(setpoint.decay, 1e-9) * NANOSECONDS)
-    last = settled if setpoint.end is None else setpoint.end - look_length(setpoint)
-    return max(min(settled, last), setpoint.begins)
-
-
-def look_length(setpoint: Setpoint) -> int:
-    """Return the length in ns of one look at a setpoint."""
-    return round(PERIODS * period_of(setpoint) * NANOSECONDS)
-
-
-def period_of(setpoint: Setpoint) -> float:
-    """Return the period in s of vibration about a setpoint by the model."""
-    return 2.0 * math.pi / setpoint.frequency
-
-
-def _period_ns(setpoint: Setpoint) -> int:
-    return round(period_of(setpoint) * NANOSECONDS)
 
 
 # -- samples ------------------------------------------------------------------------------------
@@ -246,7 +224,7 @@ def _frozen(values: Array, setpoint: Setpoint) -> str:
 def _thinned(
         stamps: Stamps, values: Array, begin: int, setpoint: Setpoint) -> tuple[Stamps, Array]:
     """Return the mean sample of each part of a period, in which the vibration hardly changes."""
-    part = max(round(period_of(setpoint) * NANOSECONDS) // _KEPT, 1)
+    part = max(setpoint.period // _KEPT, 1)
     _, first, counts = np.unique(
         (stamps - begin) // part, return_index=True, return_counts=True)
     after = np.add.reduceat(stamps - begin, first) // counts
@@ -255,7 +233,7 @@ def _thinned(
 
 def _looks(stamps: Stamps, begin: int, setpoint: Setpoint) -> Iterator[slice]:
     """Yield the samples of each look: of whole periods at once, then ever more seldom."""
-    length = look_length(setpoint)
+    length = setpoint.look
     if len(stamps) > 1:
         length = max(length, ENOUGH * round(float(np.median(np.diff(stamps)))))
     last = int(stamps[-1])
@@ -279,9 +257,10 @@ def _looks(stamps: Stamps, begin: int, setpoint: Setpoint) -> Iterator[slice]:
 def _too_few(setpoint: Setpoint, stamps: Stamps) -> Finding:
     """Return the finding where there are samples, and what more there should be."""
     span = float(stamps[-1] - stamps[0]) / NANOSECONDS if len(stamps) else 0.0
-    least = 2.0 * period_of(setpoint)
+    period = 2.0 * math.pi / setpoint.frequency
+    least = 2.0 * period
     if len(stamps) < 2:
-        span = PERIODS * period_of(setpoint)
+        span = PERIODS * period
     wanted = (f'a hold of {least:.2g} s' if span < least
               else f'{FEWEST / span:.3g} samples a second')
     return Finding(
@@ -299,11 +278,11 @@ def _settles(found: Fit, *, decided: Callable[[Fit], Finding], nothing: float) -
 
 
 def _decided(
-        found: Fit, count: int, setpoint: Setpoint, tolerances: Tolerances,
+        found: Fit, count: int, setpoint: Setpoint, limits: tuple[float, float],
         sensor: Sensor, moves: bool | None) -> Finding:
     """Decide on a look by what it shows and, of a later one, whether it is seen to move."""
     offset, vibration = _widened(found.offset, sensor.std(setpoint.target)), found.vibration
-    allowed, swing = tolerances.of(setpoint)
+    allowed, swing = limits
     # One of several looks is enough for a miss, so that each has to be surer.
     off = offset.value - _SURER * (offset.value - offset.low) > allowed or (
         offset.value + _SURER * (offset.high - offset.value) < -allowed)
@@ -316,7 +295,7 @@ def _decided(
     frequency = found.frequency / (2.0 * math.pi) if vibration.low > 0.0 else math.nan
     if vibration.low == 0.0 and vibration.std > swing:
         # It may be anything.
-        vibration = replace(vibration, value=math.nan, std=math.nan)
+        vibration = vibration._replace(value=math.nan, std=math.nan)
     message = f'{setpoint.where}: rests {_distance(offset.value, setpoint)}'
     if vibrates:
         message += (f' and rings at {frequency:.3g} Hz, {setpoint.words(vibration.value)} '
@@ -324,7 +303,7 @@ def _decided(
     elif off and math.isnan(vibration.value):
         message += f'; {count} samples at this rate do not show whether it vibrates'
     if code is Code.UNDECIDED:
-        message += _open(offset, vibration, (allowed, swing), setpoint, sensor)
+        message += _open(offset, vibration, limits, setpoint, sensor)
     return Finding(
         code, message, setpoint, count, offset.value, offset.std, vibration.value, vibration.std,
         frequency, found.noise)
@@ -334,10 +313,10 @@ def _widened(figure: Figure, std: float) -> Figure:
     """Return a figure with what is not known of the sensor."""
     if not std:
         return figure
+    value, own, low, high = figure
     return Figure(
-        figure.value, math.hypot(figure.std, std), figure.value - math.hypot(
-            figure.value - figure.low, 3.0 * std), figure.value + math.hypot(
-                figure.high - figure.value, 3.0 * std))
+        value, math.hypot(own, std), value - math.hypot(value - low, 3.0 * std),
+        value + math.hypot(high - value, 3.0 * std))
 
 
 def _open(

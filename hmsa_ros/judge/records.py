@@ -1,16 +1,19 @@
 """What is judged, by what, and what is found."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 import math
 
 from hmsa_ros.model.residual import percent, RESOLVED
 from hmsa_ros.model.status import Code
+from hmsa_ros.model.units import NANOSECONDS
 
 #: Verdicts on a setpoint, the better ones first.
 VERDICTS = (
     Code.ARRIVED, Code.UNOBSERVED, Code.UNDECIDED, Code.LATE, Code.VIBRATING, Code.OFF_TARGET,
     Code.MISSED)
+#: Periods of the vibration in one look.
+PERIODS = 6
 # What its figures are called in an estimate.
 _SENSOR = 'sensor.'
 # Smaller steps have no percentage.
@@ -40,6 +43,26 @@ class Setpoint:
     #: What a position of the actuator can be.
     possible: tuple[float, float] = (-math.inf, math.inf)
     held: bool = False  #: whether it is held on after its end, as the last one is
+
+    @property
+    def period(self) -> int:
+        """Period of vibration about it by the model in ns."""
+        return round(2.0 * math.pi / self.frequency * NANOSECONDS)
+
+    @property
+    def look(self) -> int:
+        """Length of one look at it in ns."""
+        return round(PERIODS * (2.0 * math.pi / self.frequency) * NANOSECONDS)
+
+    @property
+    def rests_from(self) -> int:
+        """Time in ns from which on it is to rest, as it was requested."""
+        if self.arrival is not None:
+            return self.arrival
+        # Approached: until a vibration of the step has faded to a thousandth.
+        settled = self.begins + round(7.0 / max(self.decay, 1e-9) * NANOSECONDS)
+        last = settled if self.end is None else self.end - self.look
+        return max(min(settled, last), self.begins)
 
     @property
     def step(self) -> float:
@@ -111,7 +134,6 @@ class Sensor:
     latency: float = 0.0  #: in s
     latency_std: float = 0.0
     together: float = 0.0
-    resolution: float = 0.0  #: step between values that it can show; 0 where not known
 
     def to_dict(self) -> dict[str, str]:
         """Return it as the estimate of a planner carries it."""
@@ -217,10 +239,3 @@ def missed(setpoint: Setpoint, reason: str) -> Finding:
     """Return the finding of a setpoint that was not carried out, which a reason says."""
     return Finding(
         Code.MISSED, f'{setpoint.where}: {setpoint.target:.6g} was missed: {reason}', setpoint)
-
-
-def judged_late(found: Finding, after: int) -> Finding:
-    """Return a finding of an arrival so many ns after the setpoint's end."""
-    return replace(
-        found, verdict=Code.LATE,
-        message=f'{found.message}, but {after / 1e6:.3g} ms after its time')

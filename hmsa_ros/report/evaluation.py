@@ -12,7 +12,6 @@ import numpy as np
 
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces.topics import PLANNER
-from hmsa_ros.judge.judging import rests_from
 from hmsa_ros.judge.records import Finding, Tolerances
 from hmsa_ros.model.delivery import Delivery
 from hmsa_ros.model.equations import (
@@ -128,7 +127,7 @@ class Evaluation:
 
 def judged_from(finding: Finding) -> float:
     """Return from when on samples were judged, in s from the start of the move."""
-    return (rests_from(finding.setpoint) - finding.setpoint.begins) / NANOSECONDS
+    return (finding.setpoint.rests_from - finding.setpoint.begins) / NANOSECONDS
 
 
 def verdicts(evaluations: Sequence[Evaluation], number: int) -> str:
