@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from hmsa_ros.control.goals import ErrorCode, Goals, Wish
+from hmsa_ros.control.goals import ErrorCode, Goals
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import Send, Settings, StatusChanged, Stop, Target, Trajectory
 from hmsa_ros.control.surroundings import Surroundings
@@ -48,8 +48,8 @@ class Bench:
         if np.size(points[0][0]) > 1:
             path = [([(*x, NAN)] * len(joints), t * MS) for x, t in points]
         rows = [([np.ravel(x)[0]] * len(joints), t * MS) for x, t in points]
-        return self.goals.add(Wish(Trajectory(
-            joints, rows, len(rows), stamp, name, path=path), **tolerances))
+        return self.goals.add(Trajectory(
+            joints, rows, len(rows), stamp, name, path=path), **tolerances)
 
     def tick(self):
         for x in self.runtime.tick(self.now):
@@ -152,7 +152,7 @@ def test_what_cannot_be_planned_is_refused_with_a_code_of_the_action():
             [(1.2, 100), (1.3, 100)], [(1.2, -1)], [(1.2, 0)], [(NAN, 100)], [(-1.0, 100)],
             [(9.0, 100)], [((1.2, NAN), 100)], [((1.2, 0.5), 100)], [((1.2, 0.0), 0)]):
         assert refused(Bench(), points, ErrorCode.INVALID_GOAL), points
-    assert Bench().goals.add(Wish(Trajectory(('a',), [], 0))).code == 'bad_input'
+    assert Bench().goals.add(Trajectory(('a',), [], 0)).code == 'bad_input'
 
 
 def test_without_samples_it_does_not_succeed_and_says_that_nothing_was_measured():

@@ -59,16 +59,6 @@ class Outcome:
     message: str
 
 
-@dataclass(frozen=True)
-class Wish:
-    """A goal as a client sends it."""
-
-    request: Trajectory
-    path_tolerance: Sequence[Tolerance] = ()
-    goal_tolerance: Sequence[Tolerance] = ()
-    goal_time_tolerance: int = 0  #: in ns
-
-
 @dataclass
 class _Goal:
     request: Trajectory
@@ -94,35 +84,38 @@ class Goals:
         self._goals: dict[str, _Goal] = {}
         self._seen: dict[str, tuple[int, Point]] = {}
 
-    def add(self, wish: Wish) -> Verdict:
-        """Take a goal, named by its request; one that is refused changes nothing else."""
-        try:
-            request, path = self._checked(wish)
-        except RefusedError as error:
-            return self._runtime.planning.refuse(error, wish.request)
-        verdict = self._runtime.request(request)
-        if verdict.severity is not Severity.ERROR:
-            self._goals[request.name] = _Goal(request, path)
-        return verdict
+    def add(
+            self, request: Trajectory, path_tolerance: Sequence[Tolerance] = (),
+            goal_tolerance: Sequence[Tolerance] = (), goal_time_tolerance: int = 0) -> Verdict:
+        """
+        Take a goal, named by its request; one that is refused changes nothing else.
 
-    def _checked(self, wish: Wish) -> tuple[Trajectory, Mapping[str, Point]]:
-        request = wish.request
-        if request.raw:
-            raise RefusedError(
-                Code.BAD_INPUT, 'the points of the goal have effort alone: expected positions')
-        time = wish.goal_time_tolerance
-        if time < 0:
-            raise RefusedError(
-                Code.BAD_INPUT, f'goal_time_tolerance is {time / NANOSECONDS:g} s: expected at '
-                'least 0 s')
-        path, end = (_tolerances(x, getattr(wish, x), request.joints) for x in (
-            'path_tolerance', 'goal_tolerance'))
+        The time tolerance is in ns.
+        """
+        try:
+            if request.raw:
+                raise RefusedError(
+                    Code.BAD_INPUT,
+                    'the points of the goal have effort alone: expected positions')
+            if goal_time_tolerance < 0:
+                raise RefusedError(
+                    Code.BAD_INPUT, f'goal_time_tolerance is '
+                    f'{goal_time_tolerance / NANOSECONDS:g} s: expected at least 0 s')
+            path = _tolerances('path_tolerance', path_tolerance, request.joints)
+            end = _tolerances('goal_tolerance', goal_tolerance, request.joints)
+        except RefusedError as error:
+            return self._runtime.planning.refuse(error, request)
         goals = {}
         for joint in request.joints:
             position, rate = end.get(joint, (0.0, 0.0))
             goals[joint] = GoalTolerances(
-                **vars(self._runtime.settings.tolerances), position=position, rate=rate, time=time)
-        return replace(request, follows=True, goals=goals), path
+                **vars(self._runtime.settings.tolerances), position=position, rate=rate,
+                time=goal_time_tolerance)
+        request = replace(request, follows=True, goals=goals)
+        verdict = self._runtime.request(request)
+        if verdict.severity is not Severity.ERROR:
+            self._goals[request.name] = _Goal(request, path)
+        return verdict
 
     def cancel(self, name: str) -> None:
         """Come to rest instead of going on with a goal."""

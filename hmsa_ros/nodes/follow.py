@@ -19,7 +19,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectoryPoint
 
-from hmsa_ros.control.goals import ErrorCode, Goals, Outcome, Wish
+from hmsa_ros.control.goals import ErrorCode, Goals, Outcome
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import Severity, StatusChanged, Trajectory
 from hmsa_ros.errors import BadInputError
@@ -85,9 +85,9 @@ class FollowJointTrajectory:
             path_tolerance, goal_tolerance = (
                 [(x.name, x.position, x.velocity) for x in tolerances]
                 for tolerances in (goal.path_tolerance, goal.goal_tolerance))
-            verdict = self._goals.add(Wish(
+            verdict = self._goals.add(
                 request, path_tolerance, goal_tolerance,
-                conversions.from_time(goal.goal_time_tolerance)))
+                conversions.from_time(goal.goal_time_tolerance))
         self._serve()
         return GoalResponse.REJECT if verdict.severity is Severity.ERROR else GoalResponse.ACCEPT
 
