@@ -181,7 +181,7 @@ class Rig:
                     x.next_stamp is None or x.next_stamp - x.options.lead_time > self.now
                     for x in self.runtime.group.planners.values()),
                 'what is due')
-            sent = self.runtime.sending.sent + self.runtime.sending.heartbeats
+            sent = self.runtime.devices.sent + self.runtime.devices.heartbeats
             self.spin(
                 lambda sent=sent: sum(
                     x.received for x in self.drivers.values()) >= sent,
@@ -407,9 +407,9 @@ def test_long_trajectory_leaves_room_for_signs_of_life_and_for_a_stop(rig, ros):
         [(1.1 + 0.1 * (k % 2), (k + 1) * SPELL) for k in range(20_000)], 'actuator',
         frame='long'))
     planner.spin(lambda: planner.runtime.wake == 0, 'the planning')
-    before = planner.runtime.sending.heartbeats
+    before = planner.runtime.devices.heartbeats
     planner.run(planner.now + 60 * MS)
-    assert planner.runtime.sending.heartbeats > before
+    assert planner.runtime.devices.heartbeats > before
     assert ros.call(Trigger, 'planner/stop').message == 'accepted'
     planner.verdict(code='accepted', request='', plan=2)
     assert planner.runtime.wake != 0
@@ -442,7 +442,7 @@ def test_deactivated_it_comes_to_rest_and_activated_again_it_takes_over(rig, ros
     change(Transition.TRANSITION_DEACTIVATE)
     planner.verdict(code='stopped')
     assert planner.send(to_trajectory(SEQUENCE, 'actuator'), 'inactive').level == ERROR
-    sent = planner.runtime.sending.sent + planner.runtime.sending.heartbeats
+    sent = planner.runtime.devices.sent + planner.runtime.devices.heartbeats
     planner.spin(lambda: len(driver.arrived) == sent, 'the last commands')
     driver.advance(START + 500 * MS)
     rest = driver.plant.stretch
@@ -452,7 +452,7 @@ def test_deactivated_it_comes_to_rest_and_activated_again_it_takes_over(rig, ros
     samples = ros.publisher(JointState, 'joint_states', 10, subscribers=0)
     ros.spin_until(lambda: planner.planner.count_publishers('joint_states'), 'the publisher')
     change(Transition.TRANSITION_ACTIVATE)
-    assert planner.runtime.sending.sent + planner.runtime.sending.heartbeats == sent
+    assert planner.runtime.devices.sent + planner.runtime.devices.heartbeats == sent
     planner.trajectories.publish(to_trajectory([(1.3, SPELL)], 'actuator', frame='again'))
 
     def answered() -> bool:

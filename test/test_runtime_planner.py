@@ -393,7 +393,7 @@ def test_heartbeat_repeats_the_last_level_and_changes_nothing():
     changes = [x for k, x in enumerate(sent) if k == 0 or x[1] != sent[k - 1][1]]
     assert changes == [
         (x.stamp, x.flux_density) for x in rig.planner.plan.levels if x.stamp > 0]
-    assert 12 <= rig.runtime.sending.heartbeats == len(sent) - len(changes)
+    assert 12 <= rig.runtime.devices.heartbeats == len(sent) - len(changes)
     assert rig.residual(1.1) < 0.1 * RESIDUAL
     rig.runtime.change(QUIET, {}, simultaneous=False)
     rig.run(START + 500 * MS)

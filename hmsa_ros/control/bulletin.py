@@ -44,9 +44,9 @@ class Bulletin:
         self.verdict = Verdict(Severity.OK, Code.NONE, 'no request yet')
         self.preview_again: int | None = None  # time in ns of the next part of a long plan
         self._told: tuple[Progress, Mapping[str, Progress], bool] | None = None
-        # What progress follows from, and until when it stays as it is.
+        # What progress follows from until then.
         self._segments: list[tuple[PlannedSegment, ...]] = []
-        self._until: int | None = None
+        self.next_change: int | None = None  # time in ns at which progress changes next
         self.tell()
 
     def give(self, verdict: Verdict, *, log: bool = False) -> None:
@@ -78,26 +78,19 @@ class Bulletin:
 
     def tell_progress(self, now: int) -> None:
         """Tell progress, if there is any by a time in ns."""
-        if not self._unchanged(now) and self._state() != self._told:
-            self.tell()
-
-    def _unchanged(self, now: int) -> bool:
-        """Return whether all plans are as they were and nothing in them has begun or ended."""
         planners = self._group.planners.values()
-        return (self._until is None or now < self._until) and all(
+        # Where plans are as they were and nothing in them has begun or ended there is none.
+        same = (self.next_change is None or now < self.next_change) and all(
             x.plan.segments is known for x, known in zip(planners, self._segments, strict=True))
+        if not same and self._state() != self._told:
+            self.tell()
 
     def _state(self) -> tuple[Progress, Mapping[str, Progress], bool]:
         now = self._around.clock()
         self._watch.follow(now)
         self._segments = [x.plan.segments for x in self._group.planners.values()]
-        self._until = self._group.next_change(now)
+        self.next_change = self._group.next_change(now)
         return *self._group.progress(now), self._watch.open
-
-    @property
-    def next_change(self) -> int | None:
-        """Time in ns at which progress changes next; None for never."""
-        return self._until
 
     def take_goals(self, request: Request) -> None:
         """Have a request, whose plan was taken just now, judged by what it counts as arrived."""

@@ -11,8 +11,9 @@ from hmsa_ros.control.feedback import Feedback
 from hmsa_ros.control.learnt import alike, as_of_path, believed, learnt_model
 from hmsa_ros.control.ledger import Moves
 from hmsa_ros.control.records import Severity, Verdict
-from hmsa_ros.control.slices import Clock, Drafting, in_time, Work
+from hmsa_ros.control.slices import anew, Clock, Work
 from hmsa_ros.control.tracked import Joint
+from hmsa_ros.control.weighing import LEAST_STEP, step_of
 from hmsa_ros.estimation import Estimate
 from hmsa_ros.estimation.correction import (
     Ahead,
@@ -55,8 +56,6 @@ _JOINED, _IDLE, _PERIODS, _SAMPLES, _BEFORE = 2, 4, 3, 61, 8
 # Deviations by which creep is known that a path takes into account: of what samples cannot tell
 # apart the sum counts.
 _CREEPS = 1.0
-# A step that is smaller counts as this one.
-_LEAST_STEP = 0.1
 # Units of time after the last change from which on a level is trimmed, so that it is slow beside
 # any vibration, and what share of the bound one change may be.
 _PAUSE, _PART = 60.0, 0.25
@@ -88,7 +87,7 @@ class Corrections:
         if estimate is None or segment.arrival is None or segment.code in (
                 Code.LEVELS, Code.PATH):
             return draft
-        step = max(abs(segment.stretch - draft.levels[0].stretch), _LEAST_STEP)
+        step = max(abs(segment.stretch - draft.levels[0].stretch), LEAST_STEP)
         course = _drafted(draft, joint.planner.plan)
         slew = joint.planner.options.slew_limit
         joint.moves.expected = expect(estimate, course, slew).size
@@ -127,26 +126,7 @@ class Corrections:
                 yield self._work(joint, _correct)
 
     def _work(self, joint: Joint, make: Callable[[Joint, int], Steps[Draft | None]]) -> Work:
-        def steps(now: int) -> Steps[Mapping[str, Draft]]:
-            draft = yield from make(joint, now)
-            return {} if draft is None else {joint.name: draft}
-        joints = frozenset([joint.name])
-        return Work(joints, self._timed(joint, in_time(
-            steps, self._group, joints, self._clock)), corrects=True)
-
-    def _timed(self, joint: Joint, steps: Drafting) -> Drafting:
-        """Do work, and let commands have their share of the time after it."""
-        spent = 0
-        while True:
-            begun = self._clock()
-            try:
-                next(steps)
-            except StopIteration as end:
-                self._feedback.spent(joint, spent + self._clock() - begun)
-                drafts: tuple[Mapping[str, Draft], int] = end.value
-                return drafts
-            spent += self._clock() - begun
-            yield
+        return anew(joint.name, partial(make, joint), self._group, self._clock, corrects=True)
 
     def _rejoin(self, joint: Joint, now: int) -> Steps[Draft | None]:
         """Plan the rest of a path anew by what is known now, if that stays nearer to it."""
@@ -172,22 +152,24 @@ class Corrections:
 
     def take(self, work: Work, drafts: Mapping[str, Draft], now: int) -> Verdict | None:
         """Take a correction worked out for a time in ns; None where nothing changes."""
-        for name, draft in drafts.items():
-            joint = self._feedback.joints.get(name)
-            if joint is None:
-                continue
-            words = joint.words(self._clock())
-            joint.planner.take(draft, now)
-            self._feedback.corrections += 1
-            joint.next_sample = 0
-            joint.moves.corrected.append(draft.begin)
-            joint.moves.expected, joint.after = joint.after, 0.0
-            if draft.segments[0].path is not None:
-                # What the path was corrected by also takes it to rest, should it be stopped.
-                joint.used = draft.levels[0].model
-                joint.planner.take_model(joint.used)
-            return Verdict(Severity.OK, Code.CORRECTED, f'corrected from samples: {words}')
-        return None
+        name, = work.joints
+        joint, draft = self._feedback.joints.get(name), drafts.get(name)
+        if joint is not None:
+            # Commands have their share of the time after it.
+            self._feedback.spent(joint, work.spent)
+        if joint is None or draft is None:
+            return None
+        words = joint.words(self._clock())
+        joint.planner.take(draft, now)
+        self._feedback.corrections += 1
+        joint.next_sample = 0
+        joint.moves.corrected.append(draft.begin)
+        joint.moves.expected, joint.after = joint.after, 0.0
+        if draft.segments[0].path is not None:
+            # What the path was corrected by also takes it to rest, should it be stopped.
+            joint.used = draft.levels[0].model
+            joint.planner.take_model(joint.used)
+        return Verdict(Severity.OK, Code.CORRECTED, f'corrected from samples: {words}')
 
 
 def _take_back(joint: Joint, now: int) -> Steps[Draft | None]:
@@ -250,7 +232,7 @@ def _correct(joint: Joint, now: int) -> Steps[Draft | None]:
     slew = planner.options.slew_limit
     course, gain = course_of(planner.plan, draft.begin, _LITTLE if arrival else _GAIN)
     segment = draft.segments[0]
-    step = max(abs(segment.stretch - joint.start), _LEAST_STEP)
+    step = max(abs(segment.stretch - joint.start), LEAST_STEP)
     # A force that samples do not show either way is not to make it worse.
     doubted = estimate.doubted
     hidden = MUCH * step if not arrival and abs(
@@ -331,13 +313,12 @@ def course_of(plan: Plan, begin: int, gain: float) -> tuple[Course, float]:
     end = plan.segments[place + 1].begin if place + 1 < len(plan.segments) else None
     first = plan.place(begin)
     kept = [x for x in levels[first:] if end is None or x.stamp < end or x is levels[first]]
-    start = plan.segments[place - 1].stretch if place else levels[0].stretch
     course = [*_until(plan, first), *kept]
     return Course(
         tuple((x.stamp, x.flux_density) for x in course),
         segment.arrival or kept[-1].stamp, segment.stretch, course[0].flux_density,
         math.nan if end is None else _relaxed(kept[-1].model, segment.stretch)), max(
-            gain * abs(segment.stretch - start), gain * _LEAST_STEP, segment.vibration)
+            gain * step_of(plan, place), segment.vibration)
 
 
 def _period(planner: Planner) -> int:
@@ -374,8 +355,8 @@ def _trimmed(joint: Joint, estimate: Estimate) -> float | None:
     if bound <= 0.0 or 'constant_force' not in estimate.free or place + 1 < len(plan.segments):
         return None
     segment, last = plan.segments[place], plan.levels[-1]
-    pause = round(_PAUSE * model.units.time * NANOSECONDS)
-    if segment.arrival is None or estimate.time < max(segment.arrival, last.stamp) + pause:
+    if segment.arrival is None or (
+            estimate.time < max(segment.arrival, last.stamp) + model.ns(_PAUSE)):
         return None
     level, small = last.flux_density, 1e-4 * model.units.load
     at = rest(estimate.values, estimate.free, level)

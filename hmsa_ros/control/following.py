@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 import math
 
 import numpy as np
@@ -10,7 +11,7 @@ from hmsa_ros.control.lateness import Lateness
 from hmsa_ros.control.receipts import Receipts
 from hmsa_ros.control.records import Settings, Severity, Verdict
 from hmsa_ros.control.seldom import Seldom
-from hmsa_ros.control.slices import Clock, in_time, Work
+from hmsa_ros.control.slices import anew, Clock, Work
 from hmsa_ros.control.weighing import (
     aims,
     compared,
@@ -232,37 +233,36 @@ class Following:
 
     def resumption(self, name: str, clock: Clock) -> Work:
         """Return the work of planning a joint's rest anew, where that leaves less."""
-        def make(now: int) -> Steps[Mapping[str, Draft]]:
-            planner = self._group.planners[name]
-            self._found.pop(name, None)
-            plan, (start, levels) = planner.plan, planner.unknown(now)
-            soonest = planner.soonest(now)
-            # What was to be reached before now is looked at now: it may not have been held.
-            wanted = [replace(x, arrival=max(x.arrival, soonest)) for x in aims(plan, soonest)]
-            left = expected(start, levels, wanted, self.lateness) if wanted else np.zeros(1)
-            if left.mean() <= SHARE:
-                return {}
-            # Whether there will be news before the move under way ends.
-            news = bool(levels) and levels[0].due <= aims(plan, now)[0].arrival
-            unsure = self.lateness.unsure
-            if news and unsure and left.min() <= SHARE:
-                self._found[name] = Resumption(None)
-                return {}
-            yield
-            found = yield from self._group.draft_resumption(name, now)
-            if found.draft is None:
-                return {}
-            before, after = compared(plan, start, levels, found.draft, self.lateness)
-            # Without its levels the plan is no alternative: kept, it left 1.3 of the step after
-            # a stall of 1 s (row planner_stopped of the fault table).
-            if name not in self._unsent and not worthwhile(
-                    before, after, news=news, unsure=unsure):
-                found = Resumption(None, left=float(before.mean()))
-                self._again[name] = 0 if unsure else now + max(_PAUSE, planner.model.ns(1.0))
-            self._found[name] = found
-            return {} if found.draft is None else {name: found.draft}
-        joints = frozenset([name])
-        return Work(joints, in_time(make, self._group, joints, clock))
+        return anew(name, partial(self._resumed, name), self._group, clock)
+
+    def _resumed(self, name: str, now: int) -> Steps[Draft | None]:
+        planner = self._group.planners[name]
+        self._found.pop(name, None)
+        plan, (start, levels) = planner.plan, planner.unknown(now)
+        soonest = planner.soonest(now)
+        # What was to be reached before now is looked at now: it may not have been held.
+        wanted = [replace(x, arrival=max(x.arrival, soonest)) for x in aims(plan, soonest)]
+        left = expected(start, levels, wanted, self.lateness) if wanted else np.zeros(1)
+        if left.mean() <= SHARE:
+            return None
+        # Whether there will be news before the move under way ends.
+        news = bool(levels) and levels[0].due <= aims(plan, now)[0].arrival
+        unsure = self.lateness.unsure
+        if news and unsure and left.min() <= SHARE:
+            self._found[name] = Resumption(None)
+            return None
+        yield
+        found = yield from self._group.draft_resumption(name, now)
+        if found.draft is None:
+            return None
+        before, after = compared(plan, start, levels, found.draft, self.lateness)
+        # Without its levels the plan is no alternative: kept, it left 1.3 of the step after
+        # a stall of 1 s (row planner_stopped of the fault table).
+        if name not in self._unsent and not worthwhile(before, after, news=news, unsure=unsure):
+            found = Resumption(None, left=float(before.mean()))
+            self._again[name] = 0 if unsure else now + max(_PAUSE, planner.model.ns(1.0))
+        self._found[name] = found
+        return found.draft
 
     def take(self, work: Work, drafts: Mapping[str, Draft], now: int) -> Verdict | None:
         """Take a plan made anew for a time in ns; None if nothing was left to do."""

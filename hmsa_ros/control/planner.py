@@ -6,16 +6,16 @@ enough, at the latest when `PlannerRuntime.wake` says so, and passes on what tha
 to topics, a loop that has the coil at hand to the coil.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 import math
 
 from hmsa_ros.control.bulletin import Bulletin, LOOK
 from hmsa_ros.control.checks import check_joints, check_ready
 from hmsa_ros.control.corrections import Corrections
+from hmsa_ros.control.devices import Devices
 from hmsa_ros.control.feedback import Feedback
 from hmsa_ros.control.following import Following
-from hmsa_ros.control.hearing import Hearing
 from hmsa_ros.control.planning import Planning
 from hmsa_ros.control.receipts import Receipts
 from hmsa_ros.control.records import (
@@ -29,9 +29,8 @@ from hmsa_ros.control.records import (
     Verdict,
 )
 from hmsa_ros.control.seldom import Seldom
-from hmsa_ros.control.sending import Sending
 from hmsa_ros.control.silence import Silence
-from hmsa_ros.control.slices import SLICE, work_on
+from hmsa_ros.control.slices import SLICE
 from hmsa_ros.control.surroundings import Seen, Surroundings
 from hmsa_ros.control.takeover import Takeover
 from hmsa_ros.control.watching import Watch
@@ -71,18 +70,21 @@ class PlannerRuntime:
         self._outputs: list[Output] = []
         receipts = Receipts(around.steady)
         self.following = Following(group, receipts, self._note)
-        self._takeover = Takeover(group, around, receipts, self._note)
-        self._silence = Silence(around)
         self.feedback = Feedback(group, settings, self._outputs, clock, self._tell_ended)
+        self._takeover = Takeover(
+            group.planners, around, receipts, self.following.newest, self.feedback.follows,
+            self._note)
+        self._silence = Silence(around)
         self._watch = Watch(group, around, self.feedback)
-        self.hearing = Hearing(group, receipts, self.following, self._takeover, around)
+        self.devices = Devices(
+            group.planners, receipts, self.following, self._takeover, around, self._outputs)
         self._bulletin = Bulletin(
             group, self.following, self._watch, around, self._outputs, self._note,
             lambda: around.unheard() or receipts.words, self._unseen)
-        self.sending = Sending(group, self.following, self.hearing, self._outputs)
         self.planning = Planning(
             group, self.following, Corrections(group, self.feedback, clock), self._bulletin,
-            around, lambda: self.sending.send(clock()))
+            around, lambda: self.devices.send(clock()))
+        self._next_beat = 0  # time in ns of the next sign of life
         self._last_jump: int | None = None
         self._set_back = 0
         self._differ = False  # whether it has been noted that clocks do
@@ -107,8 +109,8 @@ class PlannerRuntime:
             if not isinstance(request, Stop):
                 if self.crowded is not None:
                     raise self.crowded
-                self.hearing.check_interlock(request.joints)
-                self.hearing.check_clocks()
+                self.devices.check_interlock(request.joints)
+                self.devices.check_clocks()
         except RefusedError as error:
             return self.planning.refuse(error, request)
         if (isinstance(request, Trajectory) and self.settings.trajectory_mode == 'rest'
@@ -131,7 +133,7 @@ class PlannerRuntime:
 
     def _check(self, request: Request) -> None:
         """Have joints looked at that are to move now; to stop nothing is waited for."""
-        self.hearing.since = None
+        self.devices.since = None
         if isinstance(request, Stop) or not self._takeover.engaged:
             return
         later = isinstance(request, Trajectory) and request.stamp is not None
@@ -159,18 +161,18 @@ class PlannerRuntime:
         interlock all.
         """
         self.following.seen(time)
-        self._drop(self.hearing.received(joint, time, command))
+        self._drop(self.devices.received(joint, time, command))
         self.cut_off(joint, in_force=cut_off or locked, locked=locked)
 
     def cut_off(self, joint: str, *, in_force: bool, locked: bool = False) -> None:
         """Take in whether a joint's device was cut off, or is locked, and refuses commands."""
-        if locked and joint not in self.hearing.open:
-            self.planning.refuse_all(self.hearing.interlock(joint))
+        if locked and joint not in self.devices.open:
+            self.planning.refuse_all(self.devices.interlock(joint))
             self.planning.clear()
-        self._drop(self.hearing.cut_off(
+        self._drop(self.devices.cut_off(
             joint, self.settings, in_force=in_force, locked=locked))
-        if in_force and self.active and self.hearing.may_acknowledge(joint):
-            self.sending.acknowledge(joint, self._clock())
+        if in_force and self.active:
+            self.devices.acknowledge(joint)
 
     def _drop(self, verdict: Verdict | None) -> None:
         """Show and say that a plan was dropped, if a verdict says so."""
@@ -243,7 +245,7 @@ class PlannerRuntime:
         self.planning.clear()
         self.following.restart()
         self.feedback.restart()
-        self.hearing.receipts.clock_set_back()
+        self.devices.receipts.clock_set_back()
         self._silence.restart()
         if back:
             self.group.restart()
@@ -251,7 +253,15 @@ class PlannerRuntime:
             self._takeover.drop()
             self._takeover.engaged = False
         else:
-            self._go_on(by, requests)
+            # All that is planned happens when it would have.
+            self.group.clock_set(by)
+            self._watch.clock_set(by)
+            self._takeover.clock_set(by)
+            self._next_beat += by
+            for request in requests:
+                # It was being planned for times that are others now.
+                self.planning.add(request, engaged=self._takeover.engaged)
+            self._bulletin.show()
         last, self._last_jump = self._last_jump, self._steady()
         if last is not None and self._last_jump - last < _STORM:
             return
@@ -262,17 +272,6 @@ class PlannerRuntime:
             'otherwise' if back else
             clock_set_words(by, 'what is planned goes on,')), log=True)
 
-    def _go_on(self, by: int, requests: Iterable[Request]) -> None:
-        """Have all that is planned happen when it would have, though the clock was set."""
-        self.group.clock_set(by)
-        self._watch.clock_set(by)
-        self._takeover.clock_set(by)
-        self.sending.next_beat += by
-        for request in requests:
-            # It was being planned for times that are others now.
-            self.planning.add(request, engaged=self._takeover.engaged)
-        self._bulletin.show()
-
     def deactivate(self) -> None:
         """Come to rest, for which all commands are sent now, and take no more requests."""
         self._begin_anew()
@@ -282,11 +281,11 @@ class PlannerRuntime:
         self.planning.clear()
         now = self._clock()
         if self._takeover.engaged and now:
-            work = work_on(Stop(), self.group, self._clock)
+            work = self.planning.add(Stop(), engaged=True)
             while not self.planning.advance(work):
                 pass
             self.planning.clear()
-            self.sending.send(now, everything=True)
+            self.devices.send(now, everything=True)
             self._watch.restart()
             self._bulletin.give(Verdict(Severity.OK, Code.STOPPED, 'deactivated: coming to rest'))
         self._takeover.engaged = False
@@ -296,7 +295,7 @@ class PlannerRuntime:
             simultaneous: bool) -> None:
         """Take other settings now, and other models by joint from the next request on."""
         if settings.heartbeat_period != self.settings.heartbeat_period:
-            self.sending.next_beat = self._clock() + settings.heartbeat_period
+            self._next_beat = self._clock() + settings.heartbeat_period
         self.settings = settings
         self._prepare()
         for name, model in self.feedback.change(settings, models).items():
@@ -331,14 +330,14 @@ class PlannerRuntime:
             return None
         now = self._clock()
         times = [
-            None if self.hearing.deaf else self.group.next_command(),
+            None if self.devices.deaf else self.group.next_command(),
             self._bulletin.next_change, self._bulletin.preview_again, self._watch.wake(now),
             self.feedback.wake]
         if self.settings.heartbeat_period:
-            times.append(self.sending.next_beat)
+            times.append(self._next_beat)
         if self.following.astray or self.following.verdicts:
             times.append(0)
-        if self.hearing.receipts:
+        if self.devices.receipts:
             times.append(now + LOOK)
         return min((x for x in times if x is not None), default=None)
 
@@ -360,7 +359,7 @@ class PlannerRuntime:
         self._bulletin.tell_progress(now)
         if self.active and (
                 self._watch.open or self._bulletin.unheard or self._bulletin.unseen
-                or self.hearing.receipts or self._bulletin.next_change is not None):
+                or self.devices.receipts or self._bulletin.next_change is not None):
             self._bulletin.look_for_listeners()
             if not estimated:
                 self._judge(now)
@@ -371,27 +370,24 @@ class PlannerRuntime:
         """Send what is due, if commands are sent at all."""
         if not (self._takeover.engaged and self.active):
             return False
-        self.hearing.look()
+        self.devices.look()
         if self.settings.replan_late:
             self.following.drop_missed(now, self.settings.lateness_tolerance)
         if self.following.astray:
             # Before more of a plan is sent that does not hold.
             self._work_on()
         late = self.following.lateness.count
-        self.sending.send(now)
+        self.devices.send(now)
         if self.following.lateness.count > late:
             self.feedback.give_way(now)
-        if self.settings.heartbeat_period and now >= self.sending.next_beat:
-            self._beat(now)
+        if self.settings.heartbeat_period and now >= self._next_beat:
+            # Signs of life; and a look which devices give some.
+            self._next_beat = now + self.settings.heartbeat_period
+            if self.settings.replan_late:
+                self.following.look_for_unheard(now)
+            self._drop(self.devices.look_for_newcomers())
+            self.devices.beat(now)
         return True
-
-    def _beat(self, now: int) -> None:
-        """Give signs of life, and look which devices do."""
-        self.sending.next_beat = now + self.settings.heartbeat_period
-        if self.settings.replan_late:
-            self.following.look_for_unheard(now)
-        self._drop(self.hearing.look_for_newcomers())
-        self.sending.beat(now)
 
     def _taken(self) -> list[Output]:
         outputs = self._outputs.copy()
@@ -406,13 +402,13 @@ class PlannerRuntime:
         if self._takeover.waiting:
             self._look_at_samples()
         try:
-            self._takeover.go_on(self.settings, self.following.newest)
+            self._takeover.go_on(self.settings)
         except RefusedError as error:
             self._takeover.drop()
             self.planning.refuse_all(error)
             return
         if self._takeover.engaged and not engaged:
-            self.sending.next_beat = self._clock() + self.settings.heartbeat_period
+            self._next_beat = self._clock() + self.settings.heartbeat_period
 
     def _work_on(self) -> bool:
         """Plan what waits, if it is known where the joints are; return whether it is."""
@@ -429,11 +425,10 @@ class PlannerRuntime:
         if requests and all(isinstance(x, Stop) for x in requests):
             return True
         try:
-            if self.hearing.holds(self.settings):
+            if self.devices.holds(self.settings):
                 return False
             self._look_at_samples()
-            return self._takeover.look(
-                self.settings, self.following.newest, self.feedback.follows, keep=not requests)
+            return self._takeover.look(self.settings, keep=not requests)
         except RefusedError as error:
             self.planning.refuse_all(error)
             return not requests
@@ -458,7 +453,7 @@ class PlannerRuntime:
     def report(self) -> tuple[Severity, str, dict[str, object]]:
         """Return how commands fare: severity, a sentence and counters."""
         late, severity, message = self.following.lateness, Severity.OK, 'commands sent in time'
-        receipts, clocks = self.hearing.receipts, self.hearing.clocks
+        receipts, clocks = self.devices.receipts, self.devices.clocks
         if late.count:
             severity = Severity.WARN if late.harms or self.following.clocks else Severity.OK
             message = f'{late.count} commands late: {self.following.advice}'
@@ -478,7 +473,7 @@ class PlannerRuntime:
             'clock_offset_ms': f'{offset.ahead / 1e6:.3f}',
             'clock_offset_error_ms': f'{offset.error / 1e6:.3f}'}
         return severity, message, {
-            'sent': self.sending.sent, 'late': late.count, 'replanned': self.following.replanned,
-            'heartbeats': self.sending.heartbeats,
+            'sent': self.devices.sent, 'late': late.count, 'replanned': self.following.replanned,
+            'heartbeats': self.devices.heartbeats,
             'largest_lateness_ms': f'{late.largest / 1e6:.3f}',
             'refused': self.planning.refused, 'clock_jumps': self.clock_jumps, **values}

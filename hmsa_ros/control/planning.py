@@ -92,17 +92,12 @@ class Planning:
 
     def advance(self, work: Work) -> bool:
         """Go on with one piece of work; say whether it is done."""
-        planners = [self._group.planners[x] for x in work.joints]
-        plans = [x.plan for x in planners]
+        begun = self._around.clock() if work.corrects else 0
+        found: tuple[Mapping[str, Draft], int] | None = None
         try:
             next(work.steps)
         except StopIteration as end:
-            drafts, now = end.value
-            if work.request is None:
-                self._go_on(work, drafts, now)
-            else:
-                self._supersede(work)
-                self._answer(work.request, drafts, now)
+            found = end.value
         except HmsaError as error:
             if work.corrects:
                 self._bulletin.note(f'plan not corrected: {error}')
@@ -110,12 +105,21 @@ class Planning:
                 self._bulletin.go_on(self._following.abandon(work, error), log=True)
             else:
                 self.refuse(error, work.request)
-        else:
+            return True
+        if work.corrects:
+            work.spent += self._around.clock() - begun
+        if found is None:
             return False
+        planners = [self._group.planners[x] for x in work.joints]
+        plans = [x.plan for x in planners]
+        if work.request is None:
+            self._go_on(work, *found)
+        else:
+            self._supersede(work)
+            self._answer(work.request, *found)
         for planner, plan in zip(planners, plans, strict=True):
             if planner.plan is not plan:
-                self._leftovers += plan.levels
-                self._leftovers += plan.segments
+                self._leftovers += (*plan.levels, *plan.segments)
         return True
 
     def _answer(self, request: Request, drafts: Mapping[str, Draft], now: int) -> None:
@@ -129,16 +133,12 @@ class Planning:
         if changed:
             self._bulletin.show()
         self._bulletin.look_for_listeners()
+        severity, code, words = Severity.OK, Code.ACCEPTED, _accepted(drafts)
         if warnings:
-            self._bulletin.give(Verdict(
-                Severity.WARN, warnings[0].code, warnings[0].reason, request.name), log=True)
-        elif changed:
-            self._bulletin.give(Verdict(
-                Severity.OK, Code.ACCEPTED, _accepted(drafts), request.name))
-        else:
-            self._bulletin.give(Verdict(
-                Severity.OK, Code.UNCHANGED, 'already on the way there: the plan is unchanged',
-                request.name))
+            severity, code, words = Severity.WARN, warnings[0].code, warnings[0].reason
+        elif not changed:
+            code, words = Code.UNCHANGED, 'already on the way there: the plan is unchanged'
+        self._bulletin.give(Verdict(severity, code, words, request.name), log=bool(warnings))
 
     def refuse(self, error: HmsaError, request: Request) -> Verdict:
         """Answer a request that cannot be read or carried out."""

@@ -26,10 +26,6 @@ _MARGIN = 3
 _READY = 1.5
 
 
-def _as_drafted(drafts: Mapping[str, Draft]) -> Mapping[str, Draft]:
-    return drafts
-
-
 @dataclass(eq=False)
 class Work:
     """A request, or a plan to be made anew, that is being worked out."""
@@ -39,6 +35,7 @@ class Work:
     request: Request | None = None  # None for a plan that is made anew
     number: int = field(default_factory=count().__next__)  # grows from one to the next
     corrects: bool = False  # from samples
+    spent: int = 0  # time in ns
 
     @property
     def postponed(self) -> bool:
@@ -51,8 +48,7 @@ class Work:
             x.joints <= self.joints or x.joints.isdisjoint(self.joints) for x in others)
 
 
-def work_on(
-        request: Request, group: PlannerGroup, clock: Clock, then: Then = _as_drafted) -> Work:
+def work_on(request: Request, group: PlannerGroup, clock: Clock, then: Then) -> Work:
     """Return the work that a request of joints of a group makes; see `in_time`."""
     if isinstance(request, Trajectory):
         return Work(
@@ -64,6 +60,17 @@ def work_on(
     return Work(joints, in_time(
         lambda now: group.draft_setpoint(request.joint, request.stretch, now), group, joints,
         clock, then=then), request)
+
+
+def anew(
+        name: str, make: Callable[[int], Steps[Draft | None]], group: PlannerGroup, clock: Clock,
+        *, corrects: bool = False) -> Work:
+    """Return the work of making a joint's plan anew; without a draft it stays."""
+    def steps(now: int) -> Steps[Mapping[str, Draft]]:
+        draft = yield from make(now)
+        return {} if draft is None else {name: draft}
+    joints = frozenset([name])
+    return Work(joints, in_time(steps, group, joints, clock), corrects=corrects)
 
 
 def _trajectory(
@@ -88,7 +95,7 @@ def _trajectory(
 def in_time(
         make: Callable[[int], Steps[Mapping[str, Draft]]], group: PlannerGroup,
         joints: frozenset[str], clock: Clock, size: int = 1,
-        then: Then = _as_drafted) -> Drafting:
+        then: Then = dict) -> Drafting:
     """
     Return drafts, and the time in ns they are for, which has not come yet when they are ready.
 

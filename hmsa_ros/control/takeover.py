@@ -9,7 +9,6 @@ from hmsa_ros.control.surroundings import Seen, Surroundings
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Planner
 
 # How long ago, in ns by the steady clock, a sample may have come to show where a joint is.
@@ -29,10 +28,17 @@ class Takeover:
     """Waits for samples of the joints before the first request, and goes on from them."""
 
     def __init__(
-            self, group: PlannerGroup, surroundings: Surroundings, receipts: Receipts,
+            self, planners: Mapping[str, Planner], surroundings: Surroundings, receipts: Receipts,
+            newest: Mapping[str, tuple[int, float]], followed: Callable[[str], bool],
             note: Callable[[str], None]) -> None:
-        self._group, self._around = group, surroundings
-        self._receipts, self._note = receipts, note
+        """
+        Begin without knowing where joints are.
+
+        The newest change of each joint has its stamp in ns and its level in T; a joint that
+        feedback has ``followed`` is left to it.
+        """
+        self._planners, self._around, self._receipts = planners, surroundings, receipts
+        self._newest, self._followed, self._note = newest, followed, note
         self._until: int | None = None
         # Whether it is known where the joints are, or they are taken to rest.
         self.engaged = False
@@ -59,7 +65,7 @@ class Takeover:
 
     def observe(self, joint: str, seen: Seen) -> None:
         """Take in a sample; one of another joint, with a gap or out of order does not count."""
-        if joint not in self._group.planners or not math.isfinite(
+        if joint not in self._planners or not math.isfinite(
                 seen.stretch + seen.rate + seen.flux_density):
             return
         last, steady = self._samples.get(joint), self._around.steady()
@@ -78,12 +84,11 @@ class Takeover:
         self._samples = {
             name: x._replace(stamp=x.stamp + by) for name, x in self._samples.items()}
 
-    def go_on(self, settings: Settings, newest: Mapping[str, tuple[int, float]]) -> None:
+    def go_on(self, settings: Settings) -> None:
         """
         Go on from the samples there are, once there is nothing more to wait for.
 
-        The newest change of each joint has its stamp in ns and its level in T. Samples of another
-        clock are a `RefusedError`.
+        Samples of another clock are a `RefusedError`.
         """
         if self._until is None:
             return
@@ -100,25 +105,23 @@ class Takeover:
                 self._check_age(name, seen, settings)
                 # Old indeed, and still the newest there is.
                 samples[name] = seen
-        if not over and (len(samples) < len(self._group.planners) or self._around.unheard()):
+        if not over and (len(samples) < len(self._planners) or self._around.unheard()):
             return
         self._until, self.engaged = None, True
         observable = self._around.observable()
-        for name in self._group.planners:
+        for name in self._planners:
             if name in samples:
-                self._take(name, samples[name], newest)
+                self._take(name, samples[name])
             elif observable:
                 self._note(
                     f'no sample of joint {name} on joint_states: it is assumed at rest where '
                     'it began (initial_stretch)')
 
-    def _take(
-            self, name: str, seen: Seen, newest: Mapping[str, tuple[int, float]], *,
-            keep: bool = False) -> bool:
+    def _take(self, name: str, seen: Seen, *, keep: bool = False) -> bool:
         """Have a joint go on from a sample, with its setpoints if they are kept; say if it can."""
-        level = newest.get(name)
+        level = self._newest.get(name)
         try:
-            self._group.planners[name].take_over(
+            self._planners[name].take_over(
                 seen.stamp, seen.stretch, seen.rate, seen.flux_density,
                 level[1] if level is not None and level[0] <= seen.stamp else None, keep=keep)
         except BadInputError as error:
@@ -150,7 +153,7 @@ class Takeover:
 
     def _check_ahead(self, name: str, seen: Seen) -> None:
         """Refuse to command a device whose clock is so far ahead that all commands are late."""
-        lead = self._group.planners[name].options.lead_time
+        lead = self._planners[name].options.lead_time
         if seen.lag is None or -seen.lag <= lead:
             return
         raise RefusedError(
@@ -163,25 +166,23 @@ class Takeover:
 
     def check(self, joints: Iterable[str]) -> None:
         """Hold joints against their samples before they are planned for again."""
-        self._unsure |= {*joints} & self._group.planners.keys()
+        self._unsure |= {*joints} & self._planners.keys()
 
     def doubt(self, joint: str) -> None:
         """Plan for a joint from a sample next: it may not be where it is predicted."""
         self._doubted.add(joint)
         self._unsure.add(joint)
 
-    def look(
-            self, settings: Settings, newest: Mapping[str, tuple[int, float]],
-            followed: Callable[[str], bool], *, keep: bool) -> bool:
+    def look(self, settings: Settings, *, keep: bool) -> bool:
         """
         Hold joints that are checked against what samples show; return False to wait for some.
 
-        A joint that feedback has ``followed`` is left to it. One that is not where it is predicted
-        goes on from its sample, with the setpoints ahead if they are kept. Where samples came and
-        do not any more, or are of another clock, it is a `RefusedError`.
+        One that is not where it is predicted goes on from its sample, with the setpoints ahead if
+        they are kept. Where samples came and do not any more, or are of another clock, it is a
+        `RefusedError`.
         """
         for name in sorted(self._unsure):
-            if name not in self._doubted and followed(name):
+            if name not in self._doubted and self._followed(name):
                 continue
             seen = self._samples.get(name)
             if seen is None or not self._around.observable():
@@ -195,7 +196,7 @@ class Takeover:
                     continue
                 if not self._is_over(name, seen, settings):
                     return False
-            self._compare(name, seen, settings, newest, keep=keep)
+            self._compare(name, seen, settings, keep=keep)
         self._settle()
         return True
 
@@ -222,18 +223,16 @@ class Takeover:
         self._unsure.clear()
         self._doubted &= {keep}
 
-    def _compare(
-            self, name: str, seen: Seen, settings: Settings,
-            newest: Mapping[str, tuple[int, float]], *, keep: bool) -> None:
+    def _compare(self, name: str, seen: Seen, settings: Settings, *, keep: bool) -> None:
         """Go on from a sample where the prediction of its time cannot be."""
         self._check_age(name, seen, settings)
         self._check_ahead(name, seen)
-        planner = self._group.planners[name]
+        planner = self._planners[name]
         predicted = planner.state(seen.stamp).stretch
         contradicts = abs(seen.stretch - predicted) > _tolerance(planner, seen.stamp, predicted)
         if not contradicts and name not in self._doubted:
             return
-        if self._take(name, seen, newest, keep=keep) and contradicts:
+        if self._take(name, seen, keep=keep) and contradicts:
             self._note(
                 f'joint {name} is at {seen.stretch:.4g} on joint_states, where {predicted:.4g} '
                 'was predicted: what comes next is planned from the sample')
@@ -246,8 +245,7 @@ def _tolerance(planner: Planner, time: int, predicted: float) -> float:
     if found is None:
         return max(_LEAST, _WAY * abs(predicted - rest))
     place, segment = found
-    before = plan.segments[place - 1].stretch if place else plan.levels[0].stretch
-    quiet = round(_QUIET * planner.model.units.time * NANOSECONDS)
-    arrived = segment.arrival is not None and time > segment.arrival + quiet
-    step = abs(segment.stretch - before)
-    return max(_LEAST, _WAY * abs(predicted - rest), (_ARRIVED if arrived else _MOVING) * step)
+    arrived = segment.arrival is not None and (
+        time > segment.arrival + planner.model.ns(_QUIET))
+    share = _ARRIVED if arrived else _MOVING
+    return max(_LEAST, _WAY * abs(predicted - rest), share * plan.step(place))

@@ -48,10 +48,7 @@ class Aim:
 
 def step_of(plan: Plan, place: int) -> float:
     """Return the step of a setpoint of a plan by its place; small ones count as larger."""
-    if place < 0:
-        return LEAST_STEP
-    begin = plan.segments[place - 1].stretch if place else plan.levels[0].stretch
-    return max(abs(plan.segments[place].stretch - begin), LEAST_STEP)
+    return LEAST_STEP if place < 0 else max(plan.step(place), LEAST_STEP)
 
 
 def aims(plan: Plan, now: int) -> list[Aim]:

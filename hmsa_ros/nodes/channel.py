@@ -65,7 +65,7 @@ class JointChannel:
             return f'no node subscribes to {self._command.topic_name}: start a plant or a driver'
         if not self._node.count_publishers(self._received):
             # Who listens now gives no receipts.
-            self._runtime.hearing.receipts.forget(self._joint)
+            self._runtime.devices.receipts.forget(self._joint)
         if not self._node.count_publishers(self._applied) and not self._node.count_publishers(
                 topics.JOINT_STATES.name):
             return (

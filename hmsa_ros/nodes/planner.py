@@ -82,7 +82,7 @@ class PlannerNode(ManagedNode):
                 self.now, one_clock=self._one_clock, observable=self._observable,
                 unheard=self._unheard, found=lambda joint: self._channels[joint].found,
                 reporters=lambda joint: self._channels[joint].reporters, glance=self._glance))
-        runtime.sending.deliver = lambda command: self._take((command,))
+        runtime.devices.deliver = lambda command: self._take((command,))
         runtime.feedback.doing = self._aside
         if runtime.feedback.on:
             self._aside.start()

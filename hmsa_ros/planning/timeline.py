@@ -291,6 +291,11 @@ class Plan:
         """Return the place of the setpoint that holds at a time, -1 before the first."""
         return bisect_right(self.segments, time, key=lambda x: x.since) - 1
 
+    def step(self, place: int) -> float:
+        """Return how far the setpoint of a place is from the one before, in stretch."""
+        before = self.segments[place - 1] if place else self.levels[0]
+        return abs(self.segments[place].stretch - before.stretch)
+
 
 @dataclass(frozen=True)
 class Draft:

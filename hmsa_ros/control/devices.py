@@ -1,16 +1,16 @@
-"""Whether plant or driver hear the planner, what their clocks say, and coils that were cut off."""
+"""Commands to plant or driver, whether they arrive, and coils that were cut off."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 import math
 
 from hmsa_ros.control.following import Following
 from hmsa_ros.control.receipts import Receipts
-from hmsa_ros.control.records import Settings, Severity, Verdict
+from hmsa_ros.control.records import Output, Send, Settings, Severity, Verdict
 from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.control.takeover import Takeover
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.planner import Planner
 
 # How often a cut-off is acknowledged, in ns.
 _AGAIN = 100_000_000
@@ -21,9 +21,13 @@ _PATIENCE = 10_000_000_000
 _SHARE = 0.1
 
 
-class Hearing:
+# So far ahead that all there is gets sent.
+_FAR = 2**62
+
+
+class Devices:
     """
-    Follows what devices say of themselves, and draws conclusions for the plans.
+    Sends commands, follows what devices say of themselves, and draws conclusions for the plans.
 
     ``fresh`` are the joints whose device has come after the last level, and has heard none.
     ``cut`` are those whose device refuses commands of before a cut-off, ``open`` those whose
@@ -32,10 +36,13 @@ class Hearing:
     """
 
     def __init__(
-            self, group: PlannerGroup, receipts: Receipts, following: Following,
-            takeover: Takeover, surroundings: Surroundings) -> None:
-        self._group, self._following, self._takeover = group, following, takeover
+            self, planners: Mapping[str, Planner], receipts: Receipts, following: Following,
+            takeover: Takeover, surroundings: Surroundings, outputs: list[Output]) -> None:
+        self._planners, self._following, self._takeover = planners, following, takeover
         self.receipts, self._around = receipts, surroundings
+        #: Takes a command at once: whatever else there is to do comes after it.
+        self.deliver: Callable[[Send], None] = outputs.append
+        self.sent = self.heartbeats = 0
         self._absent: set[str] = set()
         self._reporters: dict[str, frozenset[bytes]] = {}
         self.fresh: set[str] = set()
@@ -50,25 +57,62 @@ class Hearing:
     @property
     def deaf(self) -> bool:
         """Whether no device is heard that was heard before."""
-        return bool(self.receipts.silent) and self.receipts.silent >= self._group.planners.keys()
+        return bool(self.receipts.silent) and self.receipts.silent >= self._planners.keys()
 
     def look(self) -> None:
         """Doubt where joints are whose device has fallen silent, or is heard again."""
         for name in self.receipts.look():
             self._takeover.doubt(name)
 
-    def is_led(self, joint: str) -> bool:
-        """Return whether a device has been led to the last level, which may be repeated to it."""
-        return joint not in self.receipts.silent and joint not in self.cut and (
-            joint not in self.fresh)
+    # -- commands ------------------------------------------------------------------------------
+
+    def send(self, now: int, *, everything: bool = False) -> None:
+        """Send what is due at a time in ns, or everything that is planned."""
+        for name, planner in self._planners.items():
+            if name in self.receipts.silent:
+                # It would arrive when its time has passed.
+                continue
+            for level in planner.due(_FAR if everything else now):
+                self.fresh.discard(name)
+                self._hand_out(name, level.stamp, level.flux_density, now)
+                self.sent += 1
+                self._following.sent(name, level.stamp, now)
+
+    def _hand_out(self, name: str, stamp: int, flux_density: float, now: int) -> None:
+        self.deliver(Send(name, stamp, flux_density))
+        self.receipts.sent(name, stamp, now)
+
+    def beat(self, now: int) -> None:
+        """Send levels in force again: who listens learns that somebody is there."""
+        for name, planner in self._planners.items():
+            if name in self.receipts.silent | self.cut | self.fresh:
+                # It has not been led to the last level.
+                continue
+            stamp, following = planner.beat_stamp(now), planner.next_stamp
+            if following is None or stamp < following:
+                self._hand_out(name, stamp, planner.last_sent.flux_density, now)
+                self.heartbeats += 1
+
+    def acknowledge(self, joint: str) -> None:
+        """
+        Send that its coil is off to a device that was cut off, if it is: seldom.
+
+        It refuses other levels until then.
+        """
+        steady, now = self._around.steady(), self._around.clock()
+        off = joint not in self.open if joint in self.locked else (
+            self._following.newest.get(joint, (0, math.nan))[1] == 0.0)
+        if off and steady - self._acknowledged.get(joint, -_AGAIN) >= _AGAIN:
+            self._acknowledged[joint] = steady
+            self._hand_out(joint, self._planners[joint].soonest(now), 0.0, now)
 
     # -- devices that are new, or cut off ------------------------------------------------------
 
     def look_for_newcomers(self) -> Verdict | None:
         """Find devices that were not found at the last look; return the verdict on a plan."""
         verdict, absent = None, self._absent
-        self._absent = {x for x in self._group.planners if not self._around.found(x)}
-        for joint in sorted(self._group.planners.keys() - self._absent):
+        self._absent = {x for x in self._planners if not self._around.found(x)}
+        for joint in sorted(self._planners.keys() - self._absent):
             before, now = self._reporters.get(joint, frozenset()), self._around.reporters(joint)
             self._reporters[joint] = now or before
             if before and now - before:
@@ -86,7 +130,7 @@ class Hearing:
         """Take in a receipt as `Receipts.received` does; return the verdict on a plan."""
         anew = self.receipts.received(
             joint, time, command, self._around.clock(), comparable=not self._around.one_clock())
-        if not anew or joint not in self._group.planners:
+        if not anew:
             return None
         self._following.newest.pop(joint, None)
         return self._appeared(joint)
@@ -94,7 +138,7 @@ class Hearing:
     def _appeared(self, joint: str) -> Verdict | None:
         """Take in that a device has come that has heard nothing of a plan."""
         self.fresh.add(joint)
-        planner = self._group.planners[joint]
+        planner = self._planners[joint]
         planned = bool(planner.plan.segments)
         planner.restart()
         dropped = self._dropped(
@@ -109,7 +153,7 @@ class Hearing:
         known = joint in (self.open if locked else self.cut)
         self.open.discard(joint)
         if not in_force:
-            if joint in self.cut and self._group.planners[joint].last_sent.flux_density == 0.0:
+            if joint in self.cut and self._planners[joint].last_sent.flux_density == 0.0:
                 # It has heard the level that is to be repeated.
                 self.fresh.discard(joint)
             self.cut.discard(joint)
@@ -119,7 +163,7 @@ class Hearing:
         if locked:
             self.open.add(joint)
             self.locked.add(joint)
-        if known or joint not in self._group.planners:
+        if known:
             return None
         self.cut.add(joint)
         if not self._takeover.engaged:
@@ -128,7 +172,7 @@ class Hearing:
             self._takeover.doubt(joint)
             self._following.astray.add(joint)
             return None
-        self._group.planners[joint].abandon()
+        self._planners[joint].abandon()
         return self._dropped(
             joint, Code.INTERLOCK, f'{self.interlock(joint)}: the rest of the sequence is dropped',
         ) if locked else self._dropped(
@@ -156,16 +200,6 @@ class Hearing:
             Severity.ERROR, code,
             f'{words}, and the next request starts from where the actuator is then')
 
-    def may_acknowledge(self, joint: str) -> bool:
-        """Return whether to tell a device that its cut-off is known: seldom, if it is off."""
-        steady = self._around.steady()
-        off = joint not in self.open if joint in self.locked else (
-            self._following.newest.get(joint, (0, math.nan))[1] == 0.0)
-        if not off or steady - self._acknowledged.get(joint, -_AGAIN) < _AGAIN:
-            return False
-        self._acknowledged[joint] = steady
-        return True
-
     def holds(self, settings: Settings) -> bool:
         """
         Return whether to plan later: once a device that was cut off obeys, and commands arrive.
@@ -177,7 +211,7 @@ class Hearing:
 
         """
         names = self._following.astray
-        lost = [x for x in self._group.planners
+        lost = [x for x in self._planners
                 if self.receipts.lost(x, *((0,) if x in self.cut else ()))]
         if not lost and not self.cut and all(
                 level[1] != 0.0 or self.receipts.since(name, level[0])
@@ -212,7 +246,7 @@ class Hearing:
         """
         offset = self.receipts.offset
         if offset is not None and offset.ahead - offset.error > max(
-                x.options.lead_time for x in self._group.planners.values()):
+                x.options.lead_time for x in self._planners.values()):
             raise RefusedError(
                 Code.CLOCKS_DIFFER,
                 f'every command would come too late, since {offset.words}')
@@ -221,7 +255,7 @@ class Hearing:
     def clocks(self) -> str:
         """How far the clocks differ, where that shifts or spoils moves; else empty."""
         offset, limits = self.receipts.offset, []
-        for planner in self._group.planners.values():
+        for planner in self._planners.values():
             model, plan = planner.model, planner.plan
             stretch = plan.segments[-1].stretch if plan.segments else plan.levels[-1].stretch
             limits += [math.pi / model.frequency(stretch) * model.units.time * NANOSECONDS,
