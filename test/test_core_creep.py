@@ -131,8 +131,9 @@ def test_a_reset_begins_relaxed():
 
 def test_each_of_several_moves_bit_for_bit_as_it_does_alone():
     blocks = [
-        Setup(GENT, 1.1, creep=THREE), Setup(GENT), Setup(YEOH, 1.0, 20.0, creep=THREE),
-        Setup(GENT, 1.0, 30.0, 0.002, Creep((0.5,), (0.01,)))]
+        Setup(replace(GENT, creep=THREE), 1.1), Setup(GENT),
+        Setup(replace(YEOH, creep=THREE), 1.0, 20.0),
+        Setup(replace(GENT, creep=Creep((0.5,), (0.01,))), 1.0, 30.0, 0.002)]
     together, alone = Actuators(blocks), [Actuators([x]) for x in blocks]
     for time in range(MS, 40 * MS, MS):
         if time == 5 * MS:
@@ -182,5 +183,5 @@ def test_branches_of_no_elastomer_are_refused_in_a_sentence(ratio, time, sentenc
 
 def test_a_branch_that_only_damps_is_refused_with_what_to_set_instead():
     with pytest.raises(BadInputError, match=r'at least 4\.36e-06 s.*damping_coefficient'):
-        Setup(GENT, creep=Creep((0.1,), (1e-6,)))
-    Setup(replace(GENT, half_length=1e-3), creep=Creep((0.1,), (1e-6,)))
+        replace(GENT, creep=Creep((0.1,), (1e-6,)))
+    replace(GENT, half_length=1e-3, creep=Creep((0.1,), (1e-6,)))

@@ -37,7 +37,7 @@ class Loop:
         self.now = START
         self.device = SimulatedDevice(
             [SimulatedJoint(
-                Setup(real, real.rest, creep=block.creep),
+                Setup(real, real.rest),
                 errors=SensorErrors(stretch_noise=noise))],
             period=1000 * MS // rate, time=START, measurement_delay=delay, seed=1)
         options = Options(flux_density_min=-0.5, flux_density_max=0.5, lead_time=lead)

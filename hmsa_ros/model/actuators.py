@@ -7,7 +7,7 @@ numbers of another, and one alone moves bit for bit as it does among others.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import math
 import re
 
@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from hmsa_ros import motion
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model import law
-from hmsa_ros.model.creep import Creep, MOST
-from hmsa_ros.model.equations import Array, Material, stretch_limits
-from hmsa_ros.model.laws.coordinate import STRETCH
+from hmsa_ros.model.creep import MOST
+from hmsa_ros.model.equations import Array, stretch_limits
 from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.model.schedule import CommandSchedule
 from hmsa_ros.model.units import NANOSECONDS
@@ -31,14 +30,14 @@ _NEVER = np.iinfo(np.int64).max
 _LARGEST_LOAD = 1e9
 
 
-def check_stretch(stretch: float, material: Material, name: str = 'stretch') -> None:
-    """Refuse with `BadInputError` a stretch beyond the limits of a group, or of a J_lim."""
+def check_stretch(
+        stretch: float, material: NondimensionalParameters, name: str = 'stretch') -> None:
+    """Refuse with `BadInputError` a stretch beyond the limits of a group."""
     lower, upper = stretch_limits(material)
     if not lower < stretch < upper:
-        elastic = getattr(material, 'law', None)
-        coordinate = getattr(material, 'coordinate', STRETCH).name
-        whose = f'J_lim {getattr(material, "j_lim", material):g}' if elastic is None \
-            else f'law {elastic.law}'
+        coordinate = material.coordinate.name
+        whose = f'J_lim {material.j_lim:g}' if material.law is None \
+            else f'law {material.law.law}'
         # Parameters keep their names.
         called = re.sub(r'\bstretch\b', coordinate, name)
         why = f'; {more}' if (more := pulls_in(material)) else ''
@@ -47,11 +46,10 @@ def check_stretch(stretch: float, material: Material, name: str = 'stretch') -> 
             f'between the limits {lower:.4f} and {upper:.4f} of {whose}{why}')
 
 
-def pulls_in(material: Material) -> str:
+def pulls_in(material: NondimensionalParameters) -> str:
     """Return in words where a voltage has no equilibrium that is stable; empty for nowhere."""
-    elastic = getattr(material, 'law', None)
     upper = stretch_limits(material)[1]
-    if elastic is None or not elastic.volts or upper == elastic.limits[1]:
+    if material.law is None or not material.law.volts or upper == material.law.limits[1]:
         return ''
     return (f'above {upper:.4f}, a stretch of {upper ** 0.25:.4f} in the plane, the actuator '
             'pulls in: no constant voltage holds it there')
@@ -83,7 +81,6 @@ class Setup:
     stretch: float = 1.0  #: held at the start by its flux density
     slew_limit: float = math.inf  #: of the level in T/s, above 0; infinite for steps
     coil_time_constant: float = 0.0  #: in s; 0 for no lag
-    creep: Creep = field(default_factory=Creep)  #: what the elastomer adds to its law
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -95,19 +92,13 @@ class Setup:
             raise BadInputError(
                 f'time constant of the coil is {self.coil_time_constant:g} s: expected a '
                 'finite number of at least 0')
-        self.creep.check(self.actuator.time_unit)
-        self.actuator.check_drive(self.slew_limit, self.coil_time_constant, self.creep)
+        self.actuator.check_drive(self.slew_limit, self.coil_time_constant)
 
     def holding(self, stretch: float) -> float:
         """Return the flux density in T that holds a stretch."""
         return float(
             self.actuator.units.level(
                 law.elastic_force(stretch, self.actuator.nondimensional.packed)))
-
-    @property
-    def load_per_newton(self) -> float:
-        """Load of a force of 1 N."""
-        return self.actuator.load_per_newton
 
     def check_level(self, flux_density: float) -> None:
         """Refuse with `BadInputError` a level in T that nobody could follow."""
@@ -120,7 +111,7 @@ class Setup:
             raise BadInputError(
                 f'disturbing force is {force:g} N: expected 0 for law dielectric, whose load is '
                 'no force along the thickness')
-        _check_load('disturbing force', force, 'N', 1.0 / self.load_per_newton)
+        _check_load('disturbing force', force, 'N', 1.0 / self.actuator.load_per_newton)
 
 
 def _check_load(name: str, value: float, unit_name: str, unit: float) -> None:
@@ -129,17 +120,6 @@ def _check_load(name: str, value: float, unit_name: str, unit: float) -> None:
         raise BadInputError(
             f'{name} is {value:g} {unit_name}: expected a finite value below '
             f'{_LARGEST_LOAD * unit:g} {unit_name}')
-
-
-def _branches_of(creeps: Sequence[Creep], time_units: Array) -> Array:
-    """Return the branches of several actuators as `motion.follow` takes them."""
-    if not any(creeps):
-        return np.zeros((0, MOST, motion.BRANCH))
-    rows = np.zeros((len(creeps), MOST, motion.BRANCH))
-    for branches, creep, unit in zip(rows, creeps, time_units.tolist(), strict=True):
-        for branch, row in zip(branches, creep.rows(unit), strict=False):
-            branch[:] = row
-    return rows
 
 
 class Actuators:
@@ -160,7 +140,7 @@ class Actuators:
         self._time_units = np.array([x.time_unit for x in blocks])
         self._units = np.array([x.flux_density_unit for x in blocks])
         self._scales = [x.units for x in blocks]
-        self._per_newton = [x.load_per_newton for x in self.setups]
+        self._per_newton = [x.load_per_newton for x in blocks]
         self._lags = np.array([
             x.coil_time_constant / x.actuator.time_unit for x in self.setups])
         self._slews = [0.0] * count
@@ -174,7 +154,10 @@ class Actuators:
         self._durations = np.zeros(count)
         self._status = np.zeros(count, np.int64)
         self._all = np.ones(count, bool)
-        self._branches = _branches_of([x.creep for x in self.setups], self._time_units)
+        groups = [x.nondimensional.branches for x in blocks]
+        self._branches = np.zeros((count if any(map(len, groups)) else 0, MOST, motion.BRANCH))
+        for branches, group in zip(self._branches, groups, strict=False):
+            branches[:len(group)] = group
         self.schedules = [CommandSchedule(0.0) for _ in blocks]
         self.forces = [CommandSchedule(0.0) for _ in blocks]
         self.changes: list[tuple[int, int, float]] = []

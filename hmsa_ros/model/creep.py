@@ -32,46 +32,36 @@ class Creep:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        self._check_flow()
-        count = max(len(self.ratios), len(self.times))
-        if len(self.ratios) != len(self.times):
+        if self.flow not in FLOWS:
             raise BadInputError(
-                f'viscoelastic.ratio has {len(self.ratios)} values and viscoelastic.time '
-                f'{len(self.times)}: expected one of each for every branch')
-        if count > MOST:
-            raise BadInputError(
-                f'viscoelastic.ratio and viscoelastic.time have {count} values: expected at most '
-                f'{MOST} branches')
-        for ratio in self.ratios:
-            if not 0.0 <= ratio <= _STIFFEST:
+                f'viscoelastic.flow is {excerpt(self.flow)}: expected one of {", ".join(FLOWS)}')
+        named, constants = self._named, self.law.constants
+        for one, other in (('ratio', 'time'), *((x.name, 'ratio') for x in constants)):
+            if len(named[one]) != len(named[other]):
                 raise BadInputError(
-                    f'viscoelastic.ratio has {ratio:g}: expected 0 to {_STIFFEST:g}')
+                    f'viscoelastic.{one} has {len(named[one])} values and viscoelastic.{other} '
+                    f'{len(named[other])}: expected one of each for every branch with '
+                    f'viscoelastic.flow {self.flow}')
+        if len(self.ratios) > MOST:
+            raise BadInputError(
+                f'viscoelastic.ratio and viscoelastic.time have {len(self.ratios)} values: '
+                f'expected at most {MOST} branches')
+        for name, least, most in (
+                ('ratio', 0.0, _STIFFEST), *((x.name, x.minimum, x.maximum) for x in constants)):
+            for value in named[name]:
+                if not least <= value <= most:
+                    raise BadInputError(
+                        f'viscoelastic.{name} has {value:g}: expected {least:g} to {most:g}')
         for time in self.times:
             if not 0.0 < time < math.inf:
                 raise BadInputError(
                     f'viscoelastic.time has {time:g} s: expected finite numbers above 0')
 
-    def _check_flow(self) -> None:
-        if self.flow not in FLOWS:
-            raise BadInputError(
-                f'viscoelastic.flow is {excerpt(self.flow)}: expected one of {", ".join(FLOWS)}')
-        constants = self.law.constants
-        if len(self.constants) not in (0, len(constants)):
-            raise BadInputError(
-                f'creep has {len(self.constants)} constants: expected {len(constants)} of '
-                f'viscoelastic.flow {self.flow}')
-        for constant, values in zip(
-                constants, self.constants or ((),) * len(constants), strict=True):
-            if len(values) != len(self.ratios):
-                raise BadInputError(
-                    f'viscoelastic.{constant.name} has {len(values)} values and '
-                    f'viscoelastic.ratio {len(self.ratios)}: expected one of each for every '
-                    f'branch with viscoelastic.flow {self.flow}')
-            for value in values:
-                if not constant.minimum <= value <= constant.maximum:
-                    raise BadInputError(
-                        f'viscoelastic.{constant.name} has {value:g}: expected '
-                        f'{constant.minimum:g} to {constant.maximum:g}')
+    @property
+    def _named(self) -> dict[str, tuple[float, ...]]:
+        names = [x.name for x in self.law.constants]
+        return {'ratio': self.ratios, 'time': self.times, **dict(
+            zip(names, self.constants or ((),) * len(names), strict=True))}
 
     @property
     def law(self) -> Flow:
@@ -95,17 +85,14 @@ class Creep:
         """The parameters that describe the branches, none where there are none."""
         if not self:
             return {}
-        named = {'ratio': self.ratios, 'time': self.times, **{
-            x.name: y for x, y in zip(self.law.constants, self.constants, strict=True)}}
         flow = {'viscoelastic.flow': self.flow} if self.law is not MAXWELL else {}
-        return {f'viscoelastic.{x}': list(y) for x, y in named.items()} | flow
+        return {f'viscoelastic.{x}': list(y) for x, y in self._named.items()} | flow
 
-    def rows(self, unit: float = 1.0) -> list[list[float]]:
-        """Return the branches that hold anything as `hmsa_ros.motion` takes them; a unit in s."""
-        held = self.held
+    def rows(self) -> list[list[float]]:
+        """Return the branches that hold anything as `hmsa_ros.motion` takes them."""
+        held, rest = self.held, [0.0] * (FLOW_CONSTANTS - len(self.law.constants) + 1)
         return [
-            [ratio, unit / time, float(self.law.kind), *constants,
-             *[0.0] * (FLOW_CONSTANTS - len(constants)), 0.0]
+            [ratio, 1.0 / time, float(self.law.kind), *constants, *rest]
             for ratio, time, *constants in zip(
                 held.ratios, held.times, *held.constants, strict=True)]
 

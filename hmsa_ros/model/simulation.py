@@ -6,6 +6,7 @@ changes of level is integrated on its own.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 import math
 
 import numpy as np
@@ -241,7 +242,7 @@ class ActuatorSimulation:
     coil_time_constant : float
         Time constant of the first-order coil lag in s; 0 for none.
     creep : Creep, optional
-        Viscoelastic branches; none by default.
+        Viscoelastic branches; by default those of the actuator.
 
     Examples
     --------
@@ -259,10 +260,10 @@ class ActuatorSimulation:
             slew_limit: float = math.inf, coil_time_constant: float = 0.0,
             creep: Creep | None = None) -> None:
         """Start at rest."""
-        self.actuator = actuator
+        self.actuator = actuator if creep is None else replace(actuator, creep=creep)
         self._all = Actuators(
-            [Setup(actuator, actuator.rest if stretch is None else stretch, slew_limit,
-                   coil_time_constant, creep or Creep())], time=time)
+            [Setup(self.actuator, actuator.rest if stretch is None else stretch, slew_limit,
+                   coil_time_constant)], time=time)
 
     @property
     def time(self) -> int:

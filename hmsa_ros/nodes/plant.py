@@ -17,7 +17,7 @@ from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces import parameters as shared
 from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.actuator import actuator_from, creep_from
+from hmsa_ros.interfaces.actuator import planned_from
 from hmsa_ros.interfaces.parameters import ParameterSpec
 from hmsa_ros.model.actuators import check_stretch, Setup, unheld
 from hmsa_ros.model.pacer import Pacer
@@ -81,14 +81,13 @@ class PlantJoint(DeviceJoint):
 
 def joint_from(values: Mapping[str, Any]) -> SimulatedJoint:
     """Return the joint that the values of `OWN` describe: the block times the mismatch."""
-    actuator = actuator_from(values)
+    actuator = planned_from(values)
     if values['reset_stretch']:
         check_stretch(
             values['reset_stretch'], actuator.nondimensional, 'reset_stretch')
     return SimulatedJoint(
-        Setup(
-            actuator, values['initial_stretch'], values['slew_limit'] or math.inf,
-            values['coil_time_constant'], creep_from(values)),
+        Setup(actuator, values['initial_stretch'], values['slew_limit'] or math.inf,
+              values['coil_time_constant']),
         fallback_from(values),
         SensorErrors(
             values['stretch_noise'], values['rate_noise'], values['stretch_bias'],
