@@ -52,7 +52,7 @@ from hmsa_ros.recordings.verify import verify
 from hmsa_ros.report.arrivals import Part, timing
 from hmsa_ros.report.charts import MOST_PANELS
 from hmsa_ros.report.curves import BUCKETS, decimate
-from hmsa_ros.report.evaluation import evaluate, period_of, plan_points
+from hmsa_ros.report.evaluation import evaluate, plan_points
 from hmsa_ros.report.looks import RUNS
 from hmsa_ros.report.outcome import level_results
 from hmsa_ros.report.page import page
@@ -466,7 +466,7 @@ def test_plain_steps_are_measured_between_samples_that_are_too_few(tmp_path):
         one(tmp_path / f'{period}', simulated(
             ((1.4, 100.0),), actuator=small, period=period), **parameters(
                 planner=small, plant=small)) for period in (10_000, 1_000_000))
-    assert 1.0 / period_of(coarsely.run) == pytest.approx(836.0, rel=0.01)
+    assert 1.0 / coarsely.run.plant.period == pytest.approx(836.0, rel=0.01)
     expected, = (x.residual_unshaped for x in finely.evaluation.results)
     found, = (x.residual_unshaped for x in coarsely.evaluation.results)
     assert expected > 1.5

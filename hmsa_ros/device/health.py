@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 import math
 
-from hmsa_ros.model.equations import natural_frequency
 from hmsa_ros.model.parameters import ActuatorParameters
 
 _OK, _WARN, _ERROR = 0, 1, 2
@@ -62,8 +61,7 @@ def listed(names: Sequence[str]) -> str:
 
 def enough_samples(actuator: ActuatorParameters) -> float:
     """Return the least sample rate in Hz that shows the actuator's small vibration about rest."""
-    frequency = float(natural_frequency(actuator.rest, actuator.nondimensional))
-    return _SAMPLES_A_PERIOD * frequency / (2.0 * math.pi * actuator.time_unit)
+    return _SAMPLES_A_PERIOD / actuator.period
 
 
 def too_few_samples(actuator: ActuatorParameters, rate: float) -> str:

@@ -141,8 +141,7 @@ class Designer:
         self._free = quantities.check_free(free, actuator.law)
         self._values = quantities.values_of(actuator)
         self._group = actuator.nondimensional
-        self.period = 2.0 * math.pi * actuator.time_unit / float(
-            equations.natural_frequency(self._group.rest, self._group))
+        self.period = actuator.period
         if not (rate > 0.0 and math.isfinite(rate) and noise > 0.0):
             raise BadInputError(
                 f'rate is {rate:g} Hz and noise {noise:g}: expected finite numbers above 0')
@@ -379,8 +378,7 @@ def excite(
     """
     bounds = bounds or Bounds()
     if duration is None:
-        duration = 180.0 * 2.0 * math.pi * actuator.time_unit / float(
-            equations.natural_frequency(actuator.rest, actuator.nondimensional))
+        duration = 180.0 * actuator.period
     designer = Designer(actuator, bounds, duration, rate=rate, noise=noise, free=free)
     best = designer.search()
     nothing = Program(

@@ -17,7 +17,7 @@ from hmsa_ros.device.hardware import Hardware, load, readings, told
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.identification.delays import Delays, delays, field_delays
 from hmsa_ros.identification.recording import Recording
-from hmsa_ros.model.equations import Array, natural_frequency
+from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.units import NANOSECONDS
 
@@ -100,9 +100,7 @@ class _Reader:
 
 def steps_of(actuator: ActuatorParameters, limit: float, count: int) -> list[tuple[float, float]]:
     """Return levels in T and how long each is held in s, so that all phases of samples occur."""
-    random = np.random.default_rng(0)
-    period = 2.0 * math.pi * actuator.time_unit / float(
-        natural_frequency(actuator.rest, actuator.nondimensional))
+    random, period = np.random.default_rng(0), actuator.period
     return [(limit * random.uniform(*(_LOW if i % 2 else _HIGH)),
              max(period * random.uniform(*_PERIODS), _SHORTEST * random.uniform(1.0, 1.5)))
             for i in range(count)]

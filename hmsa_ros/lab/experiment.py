@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from itertools import pairwise
-import math
 from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING
@@ -24,7 +23,6 @@ from hmsa_ros.interfaces.parameters import BLOCK
 from hmsa_ros.interfaces.status import Verdict
 from hmsa_ros.interfaces.topics import PLANNER, PLANT
 from hmsa_ros.lab.processes import NodeProcess, Session
-from hmsa_ros.model.equations import natural_frequency
 from hmsa_ros.recordings.parameters import values_of
 
 if TYPE_CHECKING:
@@ -277,9 +275,7 @@ def simulated_nodes(
     """
     # What the parameter file sets goes before what is chosen here.
     block = actuator_from(values_of(settings, PLANT, BLOCK))
-    period = 2.0 * math.pi * block.time_unit / float(
-        natural_frequency(block.rest, block.nondimensional))
-    rate = _number(settings, 'publish_rate', max(1000.0, _SAMPLES_A_PERIOD / period))
+    rate = _number(settings, 'publish_rate', max(1000.0, _SAMPLES_A_PERIOD / block.period))
     factor = _number(settings, 'real_time_factor', min(1.0, _SAMPLES_A_SECOND / rate))
     return NodeProcess('controller', {
         f'{PLANT}:publish_clock': True, f'{PLANT}:use_sim_time': False,

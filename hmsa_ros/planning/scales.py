@@ -10,7 +10,6 @@ from hmsa_ros.model.equations import (
     critical_zeta,
     elastic_force,
     equilibrium_stretch,
-    natural_frequency,
     stretch_limits,
 )
 from hmsa_ros.model.law import boundary
@@ -115,7 +114,7 @@ def scales(actuator: ActuatorParameters, coil: Coil) -> Scales:
     critical = float(critical_zeta(home, material))
     return Scales(
         time_unit=actuator.time_unit,
-        frequency=float(natural_frequency(home, material)) / (2.0 * math.pi) / actuator.time_unit,
+        frequency=1.0 / actuator.period,
         c1=material.c1, zeta=material.zeta, critical_zeta=critical,
         damping=actuator.damping_coefficient,
         critical_damping=critical * actuator.damping_unit, flux_density_unit=units.load,

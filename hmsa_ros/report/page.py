@@ -28,7 +28,7 @@ from hmsa_ros.recordings.topics import APPLIED
 from hmsa_ros.report import charts, curves, looks
 from hmsa_ros.report.arrivals import NOT_MOVED, Part, residual_text
 from hmsa_ros.report.charts import Figure, TimeUnit
-from hmsa_ros.report.evaluation import FEW_SAMPLES, period_of, plan_points
+from hmsa_ros.report.evaluation import FEW_SAMPLES, plan_points
 from hmsa_ros.table import Column, Table
 
 _FOLDER = Path(__file__).parent
@@ -162,7 +162,7 @@ def _notes_of(part: Part) -> Iterable[str]:
                f'requested {part.run.plant.coordinate.name} or lasts a period of the actuator.')
     if part.evaluation.results and not part.evaluation.plain.known:
         yield 'Unshaped steps cannot be simulated: the levels are too large to follow.'
-    samples = period_of(part.run) / np.median(part.timing.interval) \
+    samples = part.run.plant.period / np.median(part.timing.interval) \
         if len(part.timing.interval) else math.inf
     if samples < FEW_SAMPLES:
         yield (f'The recording has {samples:.3g} samples a period of the actuator: expected at '

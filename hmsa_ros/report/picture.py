@@ -20,7 +20,6 @@ from hmsa_ros.report.arrivals import (
 )
 from hmsa_ros.report.charts import commanded, time_unit, TimeUnit
 from hmsa_ros.report.curves import Curve, decimate
-from hmsa_ros.report.evaluation import period_of
 from hmsa_ros.report.paper import Paper
 
 # Samples are drawn as points where there are so many in a panel at most.
@@ -139,7 +138,7 @@ def _draw_run(
     plain, curve, samples = (
         x.between(*times) for x in (
             found.plain, found.recorded, Curve(found.time, run.stretch, run.rate)))
-    dense: dict[str, Any] = {} if times[1] - times[0] <= _DASHED * period_of(run) else {
+    dense: dict[str, Any] = {} if times[1] - times[0] <= _DASHED * run.plant.period else {
         'linestyle': '-', 'linewidth': _THIN}
     if alone:
         # Several runs are compared by what was recorded.
