@@ -5,7 +5,7 @@ Curves are thinned out to what a screen can show, peaks kept. Colours are those 
 `hmsa_ros.report.looks`; the page replaces them by lighter ones in dark mode.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import html
 import math
@@ -58,9 +58,12 @@ class Figure:
 
 def time_unit(parts: Sequence[Part]) -> TimeUnit:
     """Return the unit for the time axes: milliseconds for short runs."""
-    longest = max(
-        float(np.max(np.abs(x.evaluation.time[[0, -1]]))) for x in parts)
-    return TimeUnit(1e-3, 'ms') if longest <= _LONGEST_IN_MS else TimeUnit(1.0, 's')
+    return unit_for(max(float(np.max(np.abs(x.evaluation.time[[0, -1]]))) for x in parts))
+
+
+def unit_for(seconds: float, most: float = _LONGEST_IN_MS) -> TimeUnit:
+    """Return the unit for an axis of so many seconds, milliseconds up to a bound."""
+    return TimeUnit(1e-3, 'ms') if seconds <= most else TimeUnit(1.0, 's')
 
 
 def text(words: str) -> str:
@@ -68,31 +71,34 @@ def text(words: str) -> str:
     return html.escape(words, quote=False)
 
 
+def curve(name: str, x: Any, y: Any, mode: str = 'lines', **own: Any) -> dict[str, Any]:
+    """Return a curve, or points, as Plotly takes it."""
+    return {
+        'type': 'scatter', 'mode': mode, 'x': numbers(x), 'y': numbers(y), 'name': text(name),
+        **own}
+
+
 def _curve(
-        part: Part, what: str, x: Any, y: Any, *, mode: str = 'lines', **style: Any
-) -> dict[str, Any]:
+        part: Part, what: str, x: Any, y: Any, mode: str = 'lines', *,
+        line: Mapping[str, Any] | None = None, **own: Any) -> dict[str, Any]:
     """
     Return a curve: what it shows of a run.
 
-    Its style is the line's, but for the names of a trace's own settings. The group is what a
-    click in the legend hides.
+    The colour of the run goes before that of line or marker. The group is what a click in the
+    legend hides.
     """
-    if 'lines' in mode and what in _KINDS:
-        style = {**_KINDS[what], **style}
-        if part.colour:
-            style['color'] = part.colour
-            if what in _SIMULATED:
-                style['visible'] = 'legendonly'
-    own: dict[str, Any] = {k: style.pop(k) for k in (
-        'marker', 'visible', 'xaxis', 'yaxis', 'hovertemplate', 'opacity', 'cliponaxis')
-        if k in style}
-    trace = {
-        'type': 'scatter', 'mode': mode, 'x': numbers(x), 'y': numbers(y),
-        'name': text(f'{part.run.label}: {what}' if part.colour else what),
-        'legendgroup': part.run.label if part.colour and what not in _SIMULATED else what, **own}
+    colour, simulated = part.colour, what in _SIMULATED
+    trace = curve(
+        f'{part.run.label}: {what}' if colour else what, x, y, mode,
+        legendgroup=part.run.label if colour and not simulated else what, **own)
     if 'lines' in mode:
         # Plotly's own thinning bends lines at rest by a pixel or two.
-        trace['line'] = {'simplify': False, **style}
+        trace['line'] = {'simplify': False, **_KINDS.get(what, {}), **(line or {})}
+        if simulated and colour:
+            trace['visible'] = 'legendonly'
+    for style in (trace.get('line', {}), trace.get('marker', {})):
+        if colour and 'color' in style:
+            style['color'] = colour
     return trace
 
 
@@ -135,7 +141,7 @@ def _recorded(part: Part, time: Any, curve: Curve, samples: tuple[Any, Any], *,
     if len(samples[0]) < len(curve.time) and len(samples[0]) <= _MOST_SAMPLES:
         data.append(_curve(
             part, 'recorded', *samples, mode='markers',
-            marker={'size': 5, 'color': part.colour or BLUE}))
+            marker={'size': 5, 'color': BLUE}))
     return data
 
 
@@ -158,8 +164,7 @@ def response(parts: Sequence[Part], unit: TimeUnit) -> Figure:
                 part, 'planned arrival', unit.of([x.rests for x in found.results]),
                 [x.stretch for x in found.results], mode='markers',
                 marker={
-                    'symbol': 'diamond-open', 'size': _size(9, found.results),
-                    'color': part.colour or BLACK}))
+                    'symbol': 'diamond-open', 'size': _size(9, found.results), 'color': BLACK}))
         data += _commands(part, unit)
     what = parts[0].run.plant.coordinate
     return Figure(
@@ -226,7 +231,7 @@ def _commands(part: Part, unit: TimeUnit) -> list[dict[str, Any]]:
         x = unit.of([*(found.seconds(x.stamp) for x in told), max(
             found.seconds(told[-1].stamp), float(found.time[-1]))])
         y = np.array([x.flux_density for x in (*told, told[-1])]) * drive.per
-        data.append(_curve(part, in_force, x, y, yaxis='y2', shape='hv'))
+        data.append(_curve(part, in_force, x, y, yaxis='y2', line={'shape': 'hv'}))
     return data
 
 
@@ -250,7 +255,7 @@ def phase(parts: Sequence[Part]) -> tuple[Figure, float]:
                 ('circle-open', 9, [found.start])):
             data.append(_curve(
                 part, 'equilibrium', places, [0.0] * len(places), mode='markers',
-                marker={'symbol': symbol, 'size': size, 'color': part.colour or BLACK}))
+                marker={'symbol': symbol, 'size': size, 'color': BLACK}))
     what = parts[0].run.plant.coordinate
     name, symbol = what.name, what.symbol
     return Figure(
@@ -297,7 +302,7 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
     """Return the zoom on one arrival: distance from the target in percent of the step."""
     data = []
     shown = span(parts, number)
-    unit = TimeUnit(1e-3, 'ms') if shown < 1.0 else TimeUnit(1.0, 's')
+    unit = unit_for(shown, 1.0)
     for part in parts:
         found = part.evaluation
         if number >= len(found.results):
@@ -342,7 +347,7 @@ def residuals(parts: Sequence[Part]) -> Figure:
                 [100.0 * max(x, RESOLVED) for x in values], mode='markers',
                 marker={
                     'symbol': symbol, 'size': _size(10, results), 'line': {'width': 1.5},
-                    'color': part.colour or _KINDS[what]['color']}))
+                    'color': _KINDS[what]['color']}))
             # Here both are results: one click for both.
             data[-1]['legendgroup'] = part.run.label if part.colour else what
     count = max((len(x.evaluation.results) for x in parts), default=0)
@@ -378,7 +383,8 @@ def prediction(parts: Sequence[Part], unit: TimeUnit) -> Figure:
         difference = part.run.stretch - found.planned.at(found.time).stretch
         if np.isfinite(difference).any():
             data.append(_curve(
-                part, 'recorded', *decimate(unit.of(found.time), difference), width=1.2))
+                part, 'recorded', *decimate(unit.of(found.time), difference),
+                line={'width': 1.2}))
             if not part.colour:
                 data[-1]['name'] = 'recorded − predicted'
     what = parts[0].run.plant.coordinate
@@ -400,23 +406,22 @@ def timings(parts: Sequence[Part], unit: TimeUnit) -> Figure:
         if len(timing.lead):
             data.append(_curve(
                 part, 'command lead', stamps, timing.lead * 1e3, **markers,
-                marker={'size': 7, 'color': part.colour or BLUE, 'symbol': 'circle'}))
+                marker={'size': 7, 'color': BLUE, 'symbol': 'circle'}))
         if told.any():
             data.append(_curve(
                 part, 'lateness of the command', stamps[told], timing.lateness[told] * 1e3,
                 **markers,
-                marker={'size': 8, 'color': part.colour or VERMILION, 'symbol': 'x-thin-open'}))
-        colour = part.colour or VERMILION
+                marker={'size': 8, 'color': VERMILION, 'symbol': 'x-thin-open'}))
         if len(timing.delay):
             data.append(_curve(
                 part, 'sample delay', *decimate(time, timing.delay * 1e3), yaxis='y2',
-                color=colour, width=1.2))
+                line={'color': VERMILION, 'width': 1.2}))
         data.append(_curve(
             part, 'interval as recorded', *decimate(time[1:], timing.arrival_interval * 1e3),
-            color=colour, width=0.8, dash='2px,1px', opacity=0.8))
+            line={'color': VERMILION, 'width': 0.8, 'dash': '2px,1px'}, opacity=0.8))
         data.append(_curve(
             part, 'interval of the timestamps', *decimate(time[1:], timing.interval * 1e3),
-            color=part.colour or BLACK, width=1.6))
+            line={'color': BLACK, 'width': 1.6}))
     return Figure(
         'timing', 'Lead of the commands, delay and interval of the samples', 640, _grouped(data), {
             'xaxis': axis(label('time', 't', unit.name), anchor='y'),

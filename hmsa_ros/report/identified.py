@@ -9,8 +9,7 @@ from hmsa_ros.identification.recording import Course
 from hmsa_ros.identification.response import respond
 from hmsa_ros.identification.result import Identification
 from hmsa_ros.model.equations import Array
-from hmsa_ros.report.charts import axis as _axis
-from hmsa_ros.report.charts import Figure, label
+from hmsa_ros.report.charts import axis, curve, Figure, label, TimeUnit, unit_for
 from hmsa_ros.report.curves import BUCKETS, decimate, numbers
 from hmsa_ros.report.looks import BLACK, BLUE, GREY, VERMILION
 from hmsa_ros.report.page import document
@@ -41,70 +40,67 @@ def page(found: Identification) -> str:
             f'{one} and {other} ({x:.3f})' for one, other, x in found.confounded()))
 
 
-def _unit(found: Identification) -> tuple[float, str]:
-    span = float(found.recording.time[-1] - found.recording.time[0])
-    return (1e-3, 'ms') if span < 2.0 else (1.0, 's')
+def _samples(found: Identification, name: str, y: Array, inside: Any = slice(None),
+             mode: str = 'markers') -> dict[str, Any]:
+    """Return a quantity at the samples, over time."""
+    time = _unit(found).of(found.recording.time)
+    return curve(name, *decimate(time[inside], y[inside]), mode, marker={
+        'size': 3 if len(time) > 200 else 6, 'color': BLUE}, line={'color': BLUE, 'width': 1.0})
 
 
-def _curve(name: str, x: Array, y: Array, **style: Any) -> dict[str, Any]:
-    return {'type': 'scatter', 'mode': 'lines', 'name': name, 'x': numbers(x), 'y': numbers(y),
-            **style}
+def _unit(found: Identification) -> TimeUnit:
+    time = found.recording.time
+    return unit_for(float(time[-1] - time[0]))
+
+
+def _time_axis(found: Identification, **more: Any) -> dict[str, Any]:
+    unit = _unit(found)
+    return axis(label('time', 't', unit.name), range=numbers(
+        unit.of(found.recording.time[[0, -1]])), **more)
 
 
 def _motion(found: Identification) -> Figure:
     """Return level, measured and fitted motion over time."""
-    size, unit = _unit(found)
-    recording = found.recording
-    time = recording.time / size
+    recording, unit = found.recording, _unit(found)
     end = max(float(recording.time[-1]), float(recording.level_times[-1]))
-    levels = np.append(recording.levels, recording.levels[-1]) * 1e3
-    level_times = np.append(recording.level_times, end) / size
-    few = len(time) <= BUCKETS
-    data = [
-        _curve('measured', *decimate(time, recording.stretch), mode='markers' if few else 'lines',
-               marker={'size': 3 if len(time) > 200 else 6, 'color': BLUE},
-               line={'color': BLUE, 'width': 1.0}),
-        _curve('fitted', *_fitted(found, size),
-               line={'color': VERMILION, 'width': 1.6}),
-        _curve('level', level_times, levels, yaxis='y2',
-               line={'color': BLACK, 'width': 1.6, 'shape': 'hv'})]
+    time, fitted = _fitted(found)
     what = recording.coordinate
-    return Figure('motion', f'Level, measured and fitted {what.name} over time', 520, data, {
-        'xaxis': _axis(label('time', 't', unit), anchor='y', range=numbers([time[0], time[-1]])),
-        'yaxis': _axis(label(what.name, what.symbol), domain=[0.0, 0.66]),
-        'yaxis2': _axis(label('flux density', 'B', 'mT'), domain=[0.74, 1.0], anchor='x')})
+    return Figure('motion', f'Level, measured and fitted {what.name} over time', 520, [
+        _samples(found, 'measured', recording.stretch,
+                 mode='markers' if len(recording.time) <= BUCKETS else 'lines'),
+        curve('fitted', *decimate(unit.of(time), fitted), line={
+            'color': VERMILION, 'width': 1.6}),
+        curve('level', unit.of(np.append(recording.level_times, end)),
+              np.append(recording.levels, recording.levels[-1]) * 1e3, yaxis='y2',
+              line={'color': BLACK, 'width': 1.6, 'shape': 'hv'})], {
+        'xaxis': _time_axis(found, anchor='y'),
+        'yaxis': axis(label(what.name, what.symbol), domain=[0.0, 0.66]),
+        'yaxis2': axis(label('flux density', 'B', 'mT'), domain=[0.74, 1.0], anchor='x')})
 
 
-def _fitted(found: Identification, size: float) -> tuple[Array, Array]:
-    """Return times and stretch of the fit, between few samples too."""
+def _fitted(found: Identification) -> tuple[Array, Array]:
+    """Return times in s and stretch of the fit, between few samples too."""
     recording = found.recording
-    unit = found.values['time_unit']
-    dense = np.union1d(recording.time, np.arange(
-        recording.time[0], recording.time[-1], _FINE * unit, dtype=np.float64)) if (
-            recording.time[-1] - recording.time[0] < _MOST_FINE * _FINE * unit) else recording.time
+    begin, end = recording.time[[0, -1]]
+    step = _FINE * found.values['time_unit']
+    dense = recording.time if end - begin >= _MOST_FINE * step else np.union1d(
+        recording.time, np.arange(begin, end, step, dtype=np.float64))
     course = Course(dense, recording.level_times, recording.levels, recording.slew_limit,
                     at_rest=recording.at_rest)
     response = None if recording.earlier else respond(course, found.values, ())
-    if response is None:
-        return decimate(recording.time / size, found.fitted)
-    return decimate(dense / size, response.stretch)
+    return (recording.time, found.fitted) if response is None else (dense, response.stretch)
 
 
 def _residuals(found: Identification) -> Figure:
     """Return the residuals over time, outliers apart."""
-    size, unit = _unit(found)
-    time = found.recording.time / size
     out = found.weights == 0.0
-    data = [_curve(
-        'residual', *decimate(time[~out], found.residual[~out]), mode='markers',
-        marker={'size': 3 if len(time) > 200 else 6, 'color': BLUE})]
+    data = [_samples(found, 'residual', found.residual, ~out)]
     if np.any(out):
-        data.append(_curve(
-            'outlier', time[out], found.residual[out], mode='markers',
+        data.append(curve(
+            'outlier', _unit(found).of(found.recording.time[out]), found.residual[out], 'markers',
             marker={'size': 6, 'symbol': 'x', 'color': VERMILION}))
     return Figure('residuals', 'Residuals over time', 300, data, {
-        'xaxis': _axis(label('time', 't', unit), range=numbers([time[0], time[-1]])),
-        'yaxis': _axis('measured less fitted')})
+        'xaxis': _time_axis(found), 'yaxis': axis('measured less fitted')})
 
 
 def _correlation(found: Identification) -> Figure:
@@ -116,11 +112,11 @@ def _correlation(found: Identification) -> Figure:
         'type': 'bar', 'name': 'autocorrelation', 'x': numbers(lags), 'y': numbers(rho),
         'marker': {'color': BLUE}}]
     ends = np.array([0.5, len(rho) + 0.5])
-    data += [_curve(
+    data += [curve(
         'white noise, 95 %', ends, np.full(2, x), showlegend=x > 0.0,
         line={'color': GREY, 'width': 1.2, 'dash': '5px,3px'}) for x in (limit, -limit)]
     return Figure('correlation', 'Autocorrelation of the residuals over the lag', 260, data, {
-        'xaxis': _axis('lag (samples)'), 'yaxis': _axis('autocorrelation')})
+        'xaxis': axis('lag (samples)'), 'yaxis': axis('autocorrelation')})
 
 
 def _parameters(found: Identification) -> Table:
