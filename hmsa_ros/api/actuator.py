@@ -12,15 +12,13 @@ from numpy.typing import ArrayLike
 
 from hmsa_ros.api.arguments import (
     columns_of,
-    creep_values,
-    DEFAULTS,
     file_of,
     grid_of,
-    law_values,
     limits_of,
     mapping_of,
     number,
     numbers,
+    parameters_in,
     setpoints_of,
     whole,
 )
@@ -29,6 +27,7 @@ from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.files import write_text, yaml_text
 from hmsa_ros.interfaces.actuator import actuator_from, model_from, parameters_of
 from hmsa_ros.interfaces.parameters import (
+    ACTUATOR_FIELDS,
     CREEP_TOLERANCE,
     FLUX_DENSITY_MAX,
     LAW_NAME,
@@ -39,7 +38,6 @@ from hmsa_ros.interfaces.parameters import (
 from hmsa_ros.interfaces.topics import PLANNER
 from hmsa_ros.model.delivery import IDEAL
 from hmsa_ros.model.equations import Array, critical_zeta, elastic_force, equilibrium_stretch
-from hmsa_ros.model.laws import LAWS
 from hmsa_ros.model.mismatch import Uncertainty
 from hmsa_ros.model.moves import State
 from hmsa_ros.model.parameters import ActuatorParameters
@@ -121,34 +119,18 @@ class Actuator:
             creep: Sequence[tuple[float, float]] = (),
             flux_density_limits: float | tuple[float, float] = _STRONGEST,
             slew_limit: float = math.inf, coil_time_constant: float = 0.0) -> None:
-        values = {f'actuator.{name}': number(value, name, unit) for name, value, unit in (
-            ('density', density, 'kg/m^3'), ('half_length', half_length, 'm'),
-            ('half_thickness', half_length if half_thickness is None else half_thickness, 'm'),
-            ('remanence', remanence, 'T'), ('chain_limit', chain_limit, ''))}
-        values |= law_values(law, constants, shear_modulus) | creep_values(creep)
-        low, high = limits_of(flux_density_limits)
-        slew_limit = number(slew_limit, 'slew_limit', 'T/s')
-        values |= {
-            'flux_density_min': low, 'flux_density_max': high,
-            'slew_limit': 0.0 if math.isinf(slew_limit) else slew_limit,
-            'coil_time_constant': number(coil_time_constant, 'coil_time_constant', 's')}
-        if slew_limit <= 0.0:
-            raise BadInputError(
-                f'slew_limit is {slew_limit:g} T/s: expected more than 0, or inf for steps')
-        if zeta is not None and damping_coefficient is not None:
-            raise BadInputError(
-                'both zeta and damping_coefficient are given: expected one of them')
-        if damping_coefficient is None:
-            undamped = actuator_from(_checked(values | {'actuator.damping_coefficient': 0.0}))
-            zeta = ZETA if zeta is None else number(zeta, 'zeta', least=0.0)
-            damping_coefficient = zeta * undamped.damping_unit
-        self._take(values | {'actuator.damping_coefficient': number(
-            damping_coefficient, 'damping_coefficient', 'N s/m')})
-
-    def _take(self, values: Mapping[str, Any], belief: 'Belief | Path | None' = None) -> None:
+        given = {
+            'shear_modulus': shear_modulus, 'density': density, 'half_length': half_length,
+            'half_thickness': half_length if half_thickness is None else half_thickness,
+            'remanence': remanence, 'chain_limit': chain_limit, 'zeta': zeta,
+            'damping_coefficient': damping_coefficient, 'law': law, 'constants': constants,
+            'creep': creep, 'flux_density_limits': flux_density_limits, 'slew_limit': slew_limit,
+            'coil_time_constant': coil_time_constant}
+        if zeta is None and damping_coefficient is None:
+            zeta = ZETA
         #: What plans are made with.
-        self.model = model_from(_checked(values))
-        self._belief = belief
+        self.model = _model(parameters_in(given), zeta)
+        self._belief: Belief | Path | None = None
 
     @classmethod
     def from_parameters(
@@ -159,8 +141,13 @@ class Actuator:
         What is left out has its default. ``belief`` is how well they are known, if it is, or the
         file with it. A value of another type or out of range is a `BadInputError`.
         """
+        return cls._of(
+            _model(mapping_of(values, 'parameters', "'actuator.remanence': 0.1")), belief)
+
+    @classmethod
+    def _of(cls, model: Model, belief: 'Belief | Path | None' = None) -> 'Actuator':
         made = cls.__new__(cls)
-        made._take(mapping_of(values, 'parameters', "'actuator.remanence': 0.1"), belief)
+        made.model, made._belief = model, belief
         return made
 
     @classmethod
@@ -218,13 +205,10 @@ class Actuator:
         ['two_step']
 
         """
-        made = {
+        return _damped(cls, damping_ratio, damping_coefficient, {
             'half_length': 0.5 * number(length, 'length', 'm'),
             'half_thickness': 0.5 * number(thickness, 'thickness', 'm'), 'law': 'beam',
-            'constants': {'youngs_modulus': youngs_modulus, 'width': width}, **more}
-        if damping_coefficient is None:
-            return _damped(cls, made, damping_ratio)
-        return cls(**made, damping_coefficient=damping_coefficient)
+            'constants': {'youngs_modulus': youngs_modulus, 'width': width}, **more})
 
     @classmethod
     def dielectric(
@@ -274,14 +258,11 @@ class Actuator:
             raise BadInputError(
                 f'remanence is {excerpt(more["remanence"])}: expected none, since nothing in a '
                 'dielectric elastomer is magnetised')
-        made = {
+        return _damped(cls, damping_ratio, damping_coefficient, {
             'law': 'dielectric', 'constants': {
                 'permittivity': permittivity, 'layer_thickness': layer_thickness},
             'flux_density_limits': (0.0, number(voltage_max, 'voltage_max', 'V', above=0.0)),
-            **more}
-        if damping_coefficient is None:
-            return _damped(cls, made, damping_ratio)
-        return cls(**made, damping_coefficient=damping_coefficient)
+            **more})
 
     # -- what it is ----------------------------------------------------------------------------
 
@@ -387,26 +368,14 @@ class Actuator:
         if unknown:
             raise BadInputError(
                 f'{unknown[0]} is no parameter of an actuator: expected {", ".join(_KEYS)}')
-        block, options = self.block, self.model.options
-        now: dict[str, Any] = {x: getattr(block, x) for x in (
-            'density', 'half_length', 'half_thickness', 'remanence', 'chain_limit')} | {
-            'zeta': self.zeta, 'law': self.law,
-            'creep': block.creep,
-            'flux_density_limits': self.flux_density_limits, 'slew_limit': options.slew_limit,
-            'coil_time_constant': options.coil_time_constant}
-        law = parameters.get('law', self.law)
-        if isinstance(law, str) and law == self.law:
-            now['constants'] = {
-                name.partition('.')[2]: value for name, value in parameters_of(block).items()
-                if name.startswith('law.') and name != LAW_NAME.name}
-        if 'constants' in parameters:
-            now['constants'] = {**now.get('constants', {}), **mapping_of(
-                parameters.pop('constants'), 'constants', "'mu': 5e3")}
-        if LAWS[self.law].scaled is None or not LAWS[self.law].own_modulus:
-            now['shear_modulus'] = block.shear_modulus
-        if 'damping_coefficient' in parameters:
-            del now['zeta']
-        return Actuator(**(now | parameters))
+        changed = parameters_in(parameters, self.law)
+        # What is given anew takes the place of all that was.
+        groups = ('law',) * (changed[LAW_NAME.name] != self.law) + (
+            'viscoelastic',) * ('creep' in parameters)
+        zeta = self.zeta if parameters.get('zeta') is None else parameters['zeta']
+        return self._of(_model({x: y for x, y in self.parameters.items()
+                                if x.partition('.')[0] not in groups} | changed,
+                               None if 'actuator.damping_coefficient' in changed else zeta))
 
     def scaled(self, **factors: float) -> 'Actuator':
         """
@@ -436,17 +405,13 @@ class Actuator:
         12000.0
 
         """
-        unknown = [x for x in factors if x not in DEFAULTS]
+        unknown = [x for x in factors if x not in ACTUATOR_FIELDS]
         if unknown:
             raise BadInputError(
-                f'{unknown[0]} has no factor: expected {", ".join(DEFAULTS)}')
-        values = _checked(self.parameters)
-        made = Actuator.__new__(Actuator)
-        made._belief = None
-        made.model = Model(replace(actuator_from(values | {
-            f'mismatch.{name}': number(x, f'the factor on {name}')
-            for name, x in factors.items()}), creep=self.block.creep), self.model.options)
-        return made
+                f'{unknown[0]} has no factor: expected {", ".join(ACTUATOR_FIELDS)}')
+        block = actuator_from(_checked(self.parameters) | {
+            f'mismatch.{name}': number(x, f'the factor on {name}') for name, x in factors.items()})
+        return self._of(Model(replace(block, creep=self.block.creep), self.model.options))
 
     # -- what it does --------------------------------------------------------------------------
 
@@ -710,7 +675,7 @@ class Actuator:
         1.178
 
         """
-        from hmsa_ros.api.motion import Sampling, simulated
+        from hmsa_ros.api.motion import simulated
         from hmsa_ros.identification.tables import read_levels
 
         if isinstance(levels, (str, Path)):
@@ -718,7 +683,8 @@ class Actuator:
         else:
             times, values = columns_of(levels, ('time', 'flux_density'), 'levels')
         return simulated(
-            self, times, values, start, Sampling(until, rate, noise, seed, label))
+            self, times, values, start, until=until, rate=rate, noise=noise, seed=seed,
+            label=label)
 
     def amplifiers(self, setpoints: Any, **more: Any) -> Table:
         """
@@ -772,14 +738,26 @@ class Actuator:
 
 
 def _damped(
-        cls: type[Actuator], made: Mapping[str, Any], damping_ratio: float | None) -> Actuator:
-    """Return an actuator with a damping ratio about rest, by default 0.05."""
+        cls: type[Actuator], ratio: float | None, coefficient: float | None,
+        made: Mapping[str, Any]) -> Actuator:
+    """Return an actuator with a damping coefficient, or a ratio about rest, by default 0.05."""
+    if coefficient is not None:
+        return cls(**made, damping_coefficient=coefficient)
     undamped = cls(**made, zeta=0.0).model.material
-    ratio = number(0.05 if damping_ratio is None else damping_ratio, 'damping_ratio')
+    ratio = number(0.05 if ratio is None else ratio, 'damping_ratio')
     return cls(**made, zeta=ratio * float(critical_zeta(undamped.rest, undamped)))
 
 
 _KEYS = tuple(x for x in Actuator.__init__.__annotations__ if x != 'return')
+
+
+def _model(values: Mapping[str, Any], zeta: float | None = None) -> Model:
+    """Return what plans with parameters, of which a zeta takes the place of the damping."""
+    if zeta is not None:
+        unit = actuator_from(_checked(values)).damping_unit
+        values = {**values, 'actuator.damping_coefficient': unit * number(
+            zeta, 'zeta', least=0.0)}
+    return model_from(_checked(values))
 
 
 def _checked(values: Mapping[str, Any]) -> dict[str, Any]:

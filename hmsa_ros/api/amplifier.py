@@ -6,7 +6,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from hmsa_ros.api.arguments import number, numbers
+from hmsa_ros.api.arguments import number, numbers, several
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.status import RefusedError
@@ -22,6 +22,17 @@ _SLOWEST, _FASTEST = 0.1, 15.0
 _DECADE = (1.0, 2.0, 5.0)
 # What is known of a coil, with its units.
 _COIL = {'inductance': 'H', 'resistance': 'ohm', 'tesla_per_ampere': 'T/A'}
+# Columns and what they are; the last four take what is known of the coil, the last two all of it.
+_COLUMNS = (
+    (Column('slew', 'T/s', '.4g'), 'of ramps'),
+    (Column('bandwidth', 'Hz', '.4g'), 'of a first-order lag'),
+    (Column('longest move', 'ms', '.4g'), ''),
+    (Column('lost', 'ms', '.3g'), 'against ideal steps, in the longest move'),
+    (Column('field', 'mT', '.4g'), 'largest magnitude of a level'),
+    (Column('current', 'A', '.3g'), 'that of this field'),
+    (Column('change', 'A/s', '.3g'), 'largest rate of the current'),
+    (Column('voltage', 'V', '.3g'), 'L dI/dt + R I, its largest magnitude'),
+    (Column('power', 'W', '.3g'), 'that voltage times the largest current'))
 
 
 def amplifiers(
@@ -45,7 +56,8 @@ def amplifiers(
     ideal = actuator.replace(slew_limit=math.inf, coil_time_constant=0.0)
     best = ideal.plan(setpoints, **more)
     fastest = float(np.min(best.move_times))
-    swing = float(np.max(np.abs(np.diff(np.append(_before(best), best.flux_densities)))))
+    before = ideal.flux_density(best.segments[0].start.stretch)
+    swing = float(np.max(np.abs(np.diff(np.append(before, best.flux_densities)))))
     if not 0.0 < fastest < math.inf or not swing:
         raise BadInputError(
             f'shaper {best.shaper} has no moves of a finite duration here: expected one that has, '
@@ -62,7 +74,7 @@ def amplifiers(
             notes.append(
                 f'{own:.4g} Hz is the bandwidth of the coil itself, R/(2 pi L), on an amplifier '
                 'that sets voltages and not currents')
-    slew_limits, bandwidths = (np.atleast_1d(numbers(x, y)).ravel().tolist() for x, y in (
+    slew_limits, bandwidths = (numbers(several(x), y).ravel().tolist() for x, y in (
         (slew_limits, 'slew limits'), (bandwidths, 'bandwidths')))
     for slew, band in [*((x, math.inf) for x in slew_limits), *(
             (math.inf, x) for x in bandwidths)]:
@@ -72,27 +84,15 @@ def amplifiers(
                     math.pi * number(band, 'bandwidth', 'Hz', above=0.0))).plan(setpoints, **more)
         except RefusedError as error:
             rows.append((slew, band, *(None for _ in rows[0][2:])))
-            notes.append(f'{_named(slew, band)}: {error}')
+            named = f'{slew:g} T/s' if math.isinf(band) else f'{band:g} Hz'
+            notes.append(f'{named}: {error}')
             continue
         rows.append(_row(plan, best, slew, band, coil))
-    columns = [Column('slew', 'T/s', '.4g'), Column('bandwidth', 'Hz', '.4g'),
-               Column('longest move', 'ms', '.4g'), Column('lost', 'ms', '.3g'),
-               Column('field', 'mT', '.4g')]
-    if 'tesla_per_ampere' in coil:
-        columns += [Column('current', 'A', '.3g'), Column('change', 'A/s', '.3g')]
-    if len(coil) == len(_COIL):
-        columns += [Column('voltage', 'V', '.3g'), Column('power', 'W', '.3g')]
-    return Table(tuple(columns), tuple(rows), (
-        '∞: no limit; slew: of ramps; bandwidth: of a first-order lag; lost: against ideal steps, '
-        'in the longest move; field: largest magnitude of a level' + (
-            '; current: that of this field; change: largest rate of the current'
-            if 'tesla_per_ampere' in coil else '') + (
-            '; voltage: L dI/dt + R I, its largest magnitude; power: that voltage times the '
-            'largest current' if len(coil) == len(_COIL) else '')), tuple(notes))
-
-
-def _named(slew: float, band: float) -> str:
-    return f'{slew:g} T/s' if math.isinf(band) else f'{band:g} Hz'
+    shown = _COLUMNS[:len(rows[0])]
+    return Table(
+        tuple(x for x, _ in shown), tuple(rows), '; '.join(
+            ['∞: no limit', *(f'{x.name}: {words}' for x, words in shown if words)]),
+        tuple(notes))
 
 
 def _series(middle: float) -> list[float]:
@@ -102,11 +102,6 @@ def _series(middle: float) -> list[float]:
     found = [x * 10.0 ** y for y in decades for x in _DECADE]
     return [float(f'{x:g}') for x in reversed(found)
             if _SLOWEST * middle <= x <= _FASTEST * middle]
-
-
-def _before(plan: 'Plan') -> float:
-    """Return the flux density in T before a plan."""
-    return float(plan.actuator.flux_density(plan.segments[0].start.stretch))
 
 
 def _row(

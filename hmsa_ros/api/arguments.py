@@ -1,4 +1,4 @@
-"""Arguments of the public functions, checked: numbers, columns of them, laws, branches, limits."""
+"""Arguments of the public functions, checked: numbers, columns of them, those of an actuator."""
 
 from collections.abc import Mapping
 import math
@@ -10,16 +10,14 @@ from typing import Any
 import numpy as np
 
 from hmsa_ros.errors import BadInputError, excerpt
-from hmsa_ros.interfaces.parameters import ACTUATOR, LAW_NAME
-from hmsa_ros.model.creep import Creep
+from hmsa_ros.interfaces.parameters import ACTUATOR, COIL_TIME_CONSTANT, LAW_NAME
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws import LAWS
-from hmsa_ros.model.moves import Limits
 from hmsa_ros.planning.setpoint import impossible
 
-#: Parameters of a block by their names without the group, with their defaults.
-DEFAULTS = {x.name.partition('.')[2]: x.default for x in ACTUATOR}
-
+# Arguments of an actuator that are one number, and those that may be None.
+_NUMBERS = {x.name.rpartition('.')[2]: x for x in (*ACTUATOR, COIL_TIME_CONSTANT)}
+_OPTIONAL = ('shear_modulus', 'half_thickness', 'zeta', 'damping_coefficient', 'constants')
 # Period of a grid in s, below which commands have any time.
 _FINEST = 1e-9
 #: Other names of a column.
@@ -185,17 +183,46 @@ def number(
     return found
 
 
-def law_values(
-        name: Any, constants: Any, modulus: float | None) -> dict[str, Any]:
+def several(value: Any) -> list[Any]:
+    """Return what may be an item or some of them as a list."""
+    return list(value) if np.iterable(value) and not isinstance(value, str) else [value]
+
+
+def parameters_in(given: Mapping[str, Any], law: str = 'gent') -> dict[str, Any]:
     """
-    Return the parameters of a law; a constant of several values may be one number.
+    Return the parameters of the nodes for arguments of `Actuator`, but zeta.
+
+    Constants are of the law that is given, else of that named.
 
     Raises
     ------
     BadInputError
-        If there is no such law or constant, or a constant is of another type.
+        If an argument is of another type, or some of them do not go together.
 
     """
+    given = {x: y for x, y in given.items() if y is not None or x not in _OPTIONAL}
+    if 'zeta' in given and 'damping_coefficient' in given:
+        raise BadInputError('both zeta and damping_coefficient are given: expected one of them')
+    values: dict[str, Any] = {
+        x.name: number(given[name], name, x.unit) for name, x in _NUMBERS.items() if name in given}
+    values |= _law_values(
+        given.get('law', law), given.get('constants'), 'shear_modulus' in given)
+    if 'creep' in given:
+        values |= _creep_values(given['creep'])
+    if 'flux_density_limits' in given:
+        values['flux_density_min'], values['flux_density_max'] = limits_of(
+            given['flux_density_limits'])
+    if 'slew_limit' in given:
+        slew = number(given['slew_limit'], 'slew_limit', 'T/s')
+        if not slew > 0.0:
+            raise BadInputError(
+                f'slew_limit is {slew:g} T/s: expected more than 0, or inf for steps')
+        values['slew_limit'] = 0.0 if math.isinf(slew) else slew
+    return values
+
+
+def _law_values(name: Any, constants: Any, modulus_given: bool) -> dict[str, Any]:
+    """Return the parameters of a law; a constant of several values may be one number."""
     if not isinstance(name, str) or name not in LAWS:
         raise BadInputError(f'law is {excerpt(name)}: expected one of {", ".join(LAWS)}')
     law = LAWS[name]
@@ -206,8 +233,7 @@ def law_values(
         raise BadInputError(
             f'law {name} has no constant {unknown[0]!r}: expected '
             + (', '.join(names) or 'none'))
-    owns = law.scaled is not None and law.own_modulus
-    if owns and modulus is not None:
+    if modulus_given and law.scaled is not None and law.own_modulus:
         raise BadInputError(
             f'shear_modulus is given with law {name}, whose constants it follows from: expected '
             f'constants={{...}} of {", ".join(names)} alone')
@@ -216,19 +242,12 @@ def law_values(
         kind = names[key].kind
         values[names[key].name] = (
             number(value, key, names[key].unit) if kind is float
-            else str(value) if kind is not list else [
-                number(x, key) for x in (
-                    value if np.iterable(value) and not isinstance(value, str) else [value])])
-    if not owns:
-        values['actuator.shear_modulus'] = number(
-            DEFAULTS['shear_modulus'] if modulus is None else modulus, 'shear_modulus', 'Pa')
+            else [number(x, key) for x in several(value)] if kind is list else str(value))
     return values
 
 
-def creep_values(creep: Any) -> dict[str, Any]:
-    """Return the parameters of branches, pairs of ratio and time unless they are `Creep`."""
-    if isinstance(creep, Creep):
-        return creep.parameters
+def _creep_values(creep: Any) -> dict[str, Any]:
+    """Return the parameters of branches, pairs of ratio and time."""
     if isinstance(creep, (tuple, list)) and not creep:
         return {}
     ratios, times = columns_of(creep, ('ratio', 'time'), 'branches of creep')
@@ -245,17 +264,12 @@ def limits_of(limits: Any) -> tuple[float, float]:
         If they are no numbers or not in this order.
 
     """
-    if isinstance(limits, Limits):
-        raise BadInputError('limits are without a dimension: expected flux densities in T')
-    if isinstance(limits, (tuple, list)) or np.ndim(limits):
-        if len(limits) != 2:
-            raise BadInputError(
-                f'limits are {excerpt(limits)}: expected the least and the largest flux density '
-                'in T, or one number for both directions')
-        low, high = (number(x, 'a flux density limit', 'T') for x in limits)
-    else:
-        high = number(limits, 'flux density limit', 'T')
-        low = -high
+    given = [number(x, 'a flux density limit', 'T') for x in several(limits)]
+    if len(given) not in (1, 2):
+        raise BadInputError(
+            f'limits are {excerpt(limits)}: expected the least and the largest flux density '
+            'in T, or one number for both directions')
+    low, high = given if len(given) == 2 else (-given[0], given[0])
     if not low < high:
         raise BadInputError(
             f'flux densities from {low:g} to {high:g} T: expected the least below the largest')

@@ -7,10 +7,10 @@ import math
 import numpy as np
 
 from hmsa_ros.api.actuator import Actuator
-from hmsa_ros.api.arguments import DEFAULTS
 from hmsa_ros.api.plan import Plan
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.known import Known
+from hmsa_ros.interfaces.parameters import ACTUATOR_FIELDS
 
 #: Shapers that are compared, the quickest first.
 CANDIDATES = ('two_step', 'zvd', 'robust', 'minimax', 'smooth')
@@ -58,7 +58,7 @@ def compare_shapers(
         In the order of `CANDIDATES`.
 
     """
-    places = [i for i, x in enumerate(known.names) if x in DEFAULTS and known.values]
+    places = [i for i, x in enumerate(known.names) if x in ACTUATOR_FIELDS and known.values]
     drawn = np.random.default_rng(seed).multivariate_normal(
         np.zeros(len(places)), known.covariance[np.ix_(places, places)], _DRAWS)
     truths = [

@@ -1,6 +1,6 @@
 """A motion, simulated or recorded: its samples, what drove it, and what came of it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
 from pathlib import Path
@@ -8,9 +8,9 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from hmsa_ros.api.arguments import file_of, number, whole
+from hmsa_ros.api.arguments import file_of, number, several, whole
 from hmsa_ros.errors import BadInputError, excerpt
-from hmsa_ros.model.equations import Array, elastic_force, natural_frequency
+from hmsa_ros.model.equations import Array, elastic_force
 from hmsa_ros.model.moves import Level as Load
 from hmsa_ros.model.moves import State
 from hmsa_ros.model.simulation import check_stretch, longest_motion, sampled
@@ -24,8 +24,6 @@ from hmsa_ros.table import frame, Table
 if TYPE_CHECKING:
     from hmsa_ros.api.actuator import Actuator
     from hmsa_ros.api.plan import Plan
-    from hmsa_ros.report.arrivals import Part
-    from hmsa_ros.report.paper import Paper
 
 # Samples a second and, where these are more, a period of the actuator.
 _RATE, _A_PERIOD = 1000.0, 40.0
@@ -94,9 +92,10 @@ class Motion:
         A path writes the page of ``hmsa report`` as well; if it cannot be written, this is a
         `BadInputError`.
         """
+        from hmsa_ros.report.arrivals import Part
         from hmsa_ros.report.comparison import setpoints
 
-        part = self._part()
+        part = Part.of(self.run)
         if path is not None:
             from hmsa_ros.files import write_text
             from hmsa_ros.report.page import page
@@ -131,12 +130,7 @@ class Motion:
             If an argument is out of range, or a file cannot be written.
 
         """
-        return draw_all([self], _paths(path), _paper(paper))
-
-    def _part(self, colour: str = '') -> 'Part':
-        from hmsa_ros.report.arrivals import Part
-
-        return Part.of(self.run, colour)
+        return _draw([self.run], path, paper)
 
     def save(self, path: str | Path) -> list[Path]:
         """
@@ -188,7 +182,9 @@ def read(path: str | Path, *, joint: str = '') -> Motion:
     return Motion(read_run(file_of(path, 'the folder of a bag'), joint=joint))
 
 
-def compare(*motions: Motion, picture: str | Path | None = None, **paper: Any) -> Table:
+def compare(
+        *motions: Motion, picture: str | Path | Sequence[str | Path] | None = None,
+        **paper: Any) -> Table:
     """
     Compare motions in numbers: move time, offset and vibration of each setpoint, and the curves.
 
@@ -196,8 +192,8 @@ def compare(*motions: Motion, picture: str | Path | None = None, **paper: Any) -
     ----------
     *motions : Motion
         Two or more; the others are compared with the first.
-    picture : str or Path, optional
-        Picture of all of them to write.
+    picture : str, Path or sequence of these, optional
+        Pictures of all of them to write.
     **paper
         As of `Motion.plot`.
 
@@ -224,68 +220,40 @@ def compare(*motions: Motion, picture: str | Path | None = None, **paper: Any) -
         raise BadInputError(
             f'got {excerpt(list(motions))} to compare: expected two motions or more, as read and '
             'simulate return them')
-    if picture is not None:
-        draw_all(motions, _paths(picture), _paper(paper))
+    from hmsa_ros.report.arrivals import Part
     from hmsa_ros.report.comparison import comparison
 
-    return comparison([x._part() for x in motions])
+    if picture is not None:
+        _draw([x.run for x in motions], picture, paper)
+    return comparison([Part.of(x.run) for x in motions])
 
 
-def draw_all(motions: Sequence[Motion], paths: Sequence[Path], paper: 'Paper') -> Any:
-    """Draw motions over each other; return the figure of matplotlib."""
-    from hmsa_ros.report.comparison import labelled
-    from hmsa_ros.report.looks import RUNS
+def _draw(runs: list[Run], path: Any, paper: Mapping[str, Any]) -> Any:
+    """Draw runs over each other; return the figure of matplotlib."""
+    from hmsa_ros.report.comparison import parts_of
+    from hmsa_ros.report.paper import Paper
     from hmsa_ros.report.picture import draw
 
-    runs = labelled([x.run for x in motions])
-    return draw(paths, [
-        Motion(x)._part(RUNS[i % len(RUNS)] if len(runs) > 1 else '')
-        for i, x in enumerate(runs)], paper)
-
-
-def _paths(path: Any) -> list[Path]:
-    if path is None:
-        return []
-    from hmsa_ros.report.paper import kind_of
-
-    paths = [file_of(x) for x in (
-        path if np.iterable(path) and not isinstance(path, str) else [path])]
-    for each in paths:
-        kind_of(each)
-    return paths
-
-
-def _paper(settings: dict[str, Any]) -> 'Paper':
-    from hmsa_ros.report.paper import Paper
-
-    checked: dict[str, Any] = {
-        x: y if x == 'data' else number(y, x) for x, y in settings.items()}
+    paths = [] if path is None else [file_of(x) for x in several(path)]
+    checked: dict[str, Any] = {x: y if x == 'data' else number(y, x) for x, y in paper.items()}
     try:
-        return Paper(**checked)
+        size = Paper(**checked)
     except TypeError as error:
         raise BadInputError(
-            f'pictures have {", ".join(settings)}: expected numbers for width (mm), letters (pt) '
+            f'pictures have {", ".join(paper)}: expected numbers for width (mm), letters (pt) '
             'and dpi, and data') from error
-
-
-@dataclass(frozen=True)
-class Sampling:
-    """How a simulated motion is sampled, as the arguments of `Actuator.simulate`."""
-
-    until: float | None
-    rate: float | None
-    noise: float
-    seed: int
-    label: str
+    return draw(paths, parts_of(runs), size)
 
 
 def simulated(
-        truth: 'Actuator', times: Array, levels: Array, start: float | None, sampling: Sampling,
-        plan: 'Plan | None' = None) -> Motion:
+        truth: 'Actuator', times: Array, levels: Array, start: float | None,
+        plan: 'Plan | None' = None, *, until: float | None, rate: float | None, noise: float,
+        seed: int, label: str) -> Motion:
     """
     Simulate levels in T from times in s on; a plan adds what was asked and predicted.
 
-    The start is a stretch at rest, without a field by default. Raises `BadInputError` for what
+    The start is a stretch at rest, without a field by default; what follows is as in
+    `Actuator.simulate`. Raises `BadInputError` for what
     cannot be used, `HmsaError` for levels that cannot be followed.
     """
     model, units, unit = truth.model, truth.model.units, truth.model.units.load_name
@@ -305,19 +273,24 @@ def simulated(
             'flux_density_limits (in a parameter file flux_density_max) that allow it')
     begin = number(model.material.rest if start is None else start, 'start')
     check_stretch(begin, model.material, 'start stretch')
-    end = _end(truth, times, levels, sampling.until, plan)
-    hertz = _rate(truth, sampling.rate)
+    if until is not None:
+        end = number(until, 'until', 's', above=0.0)
+    elif plan is None or math.isinf(end := float(np.sum(plan.setpoints[:, 1]))):
+        left = longest_motion(units.of_level(float(levels[-1])), model.material)
+        end = float(times[-1]) + units.time * (left + model.delivery.settling(0.0))
+    hertz = _rate(truth.block.period) if rate is None else number(
+        rate, 'rate', 'Hz', above=0.0, most=1e9)
     if end * hertz > _MOST_SAMPLES:
         raise BadInputError(
             f'{end:g} s at {hertz:g} Hz are {end * hertz:.3g} samples: expected at most '
             f'{_MOST_SAMPLES}; give a lower rate or an earlier end (until)')
-    noise = number(sampling.noise, 'noise', least=0.0)
+    noise = number(noise, 'noise', least=0.0)
     stamps = np.round(np.arange(int(end * hertz * (1.0 + 1e-12)) + 1) / hertz * NANOSECONDS
                       ).astype(np.int64)
     stretch, speed, field = response(truth, times, levels, stamps / NANOSECONDS, begin)
     switched = np.round(times * NANOSECONDS).astype(np.int64).tolist()
     stretch = stretch + noise * np.random.default_rng(
-        whole(sampling.seed, 'seed', least=0)).standard_normal(len(stretch))
+        whole(seed, 'seed', least=0)).standard_normal(len(stretch))
     commands = tuple(
         Level(stamp, level, -_AHEAD) for stamp, level in zip(
             switched, levels.tolist(), strict=True))
@@ -339,7 +312,7 @@ def simulated(
         f'{node}.{name}': value for node, each in (('planner', believed), ('plant', truth))
         for name, value in each.parameters.items()} | {'plant.stretch_noise': noise}
     return Motion(Run(
-        str(sampling.label), '', Path(str(sampling.label)), stamps, stamps, stretch, speed, field,
+        str(label), '', Path(str(label)), stamps, stamps, stretch, speed, field,
         commands, commands, plans=(planned,) if planned else (), requests=asked,
         parameters=parameters, plant=truth.block, planner=believed.block, parameters_known=True,
         origin='simulated'))
@@ -360,26 +333,8 @@ def response(
     return rows[0], rows[1] / units.time, units.level(rows[2])
 
 
-def _end(
-        truth: 'Actuator', times: Array, levels: Array, until: float | None,
-        plan: 'Plan | None') -> float:
-    """Return when a simulation ends, in s."""
-    if until is not None:
-        return number(until, 'until', 's', above=0.0)
-    if plan is not None and math.isfinite(end := float(np.sum(plan.setpoints[:, 1]))):
-        return end
-    model = truth.model
-    left = longest_motion(model.units.of_level(float(levels[-1])), model.material)
-    return float(times[-1]) + model.units.time * (left + model.delivery.settling(0.0))
-
-
-def _rate(truth: 'Actuator', rate: float | None) -> float:
-    """Return the sample rate in Hz."""
-    if rate is None:
-        material = truth.model.material
-        frequency = float(natural_frequency(material.rest, material)) / (
-            2.0 * math.pi * truth.model.units.time)
-        wanted = max(_RATE, _A_PERIOD * frequency)
-        digits = 10 ** (math.floor(math.log10(wanted)) - 1)
-        return float(math.ceil(wanted / digits) * digits)
-    return number(rate, 'rate', 'Hz', above=0.0, most=1e9)
+def _rate(period: float) -> float:
+    """Return the default sample rate in Hz, a round number, for the period of an actuator."""
+    wanted = max(_RATE, _A_PERIOD / period)
+    digits = 10 ** (math.floor(math.log10(wanted)) - 1)
+    return float(math.ceil(wanted / digits) * digits)

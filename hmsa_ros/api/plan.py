@@ -11,7 +11,7 @@ import numpy as np
 
 from hmsa_ros.api.actuator import Actuator
 from hmsa_ros.api.arguments import file_of, number
-from hmsa_ros.api.motion import Motion, Sampling, simulated
+from hmsa_ros.api.motion import Motion, simulated
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.equations import Array
 from hmsa_ros.planning.sequence import Segment
@@ -179,7 +179,8 @@ class Plan:
                 'block.scaled(shear_modulus=1.1)')
         return simulated(
             truth or self.actuator, self.times, self.flux_densities,
-            self.segments[0].start.stretch, Sampling(until, rate, noise, seed, label), self)
+            self.segments[0].start.stretch, self, until=until, rate=rate, noise=noise, seed=seed,
+            label=label)
 
     def plot(self, path: str | Path | None = None, **paper: Any) -> Any:
         """Draw the motion that the plan predicts, as `Motion.plot` does."""

@@ -10,6 +10,7 @@ example: hmsa compare run_zv run_two_step --picture both.pdf --width 85
 """
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -47,13 +48,12 @@ def run(arguments: argparse.Namespace) -> int:
     if any(repeats):
         return _compare_repeats(arguments, [x or [y] for x, y in zip(
             repeats, arguments.runs, strict=True)], paper)
-    from hmsa_ros.api.motion import compare, draw_all, read
+    from hmsa_ros.api.motion import compare, read
 
     with progress('reading'):
-        motions = [read(x, joint=arguments.joint) for x in arguments.runs]
-        found = compare(*motions)
-        if arguments.picture:
-            draw_all(motions, arguments.picture, paper)
+        found = compare(
+            *(read(x, joint=arguments.joint) for x in arguments.runs),
+            picture=arguments.picture or None, **asdict(paper))
     if arguments.json:
         print(json_text({
             'runs': [str(x) for x in arguments.runs], 'setpoints': found.records(),

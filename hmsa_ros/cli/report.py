@@ -53,9 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from hmsa_ros.recordings.bags import read_runs
     from hmsa_ros.recordings.parameters import read_parameter_file
-    from hmsa_ros.report.arrivals import Part
-    from hmsa_ros.report.comparison import labelled
-    from hmsa_ros.report.looks import RUNS
+    from hmsa_ros.report.comparison import parts_of
     from hmsa_ros.report.page import page
 
     joints = [x for x in arguments.joint.split(',') if x]
@@ -65,11 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
         for bag in bags:
             runs += read_runs(
                 bag, parameters=parameters, joints=joints, progress=update)
-        parts = []
-        for i, each in enumerate(labelled(runs)):
-            update('evaluating', i / len(runs))
-            parts.append(Part.of(
-                each, RUNS[i % len(RUNS)] if len(runs) > 1 else ''))
+        update('evaluating', None)
+        parts = parts_of(runs)
         update('writing', None)
         write_text(out, page(parts))
         if pictures:

@@ -9,6 +9,7 @@ example: hmsa simulate levels.csv --params-file actuator.yaml --picture run.png
 """
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Simulate, write and print."""
     paper = paper_of(arguments)
     from hmsa_ros.api.actuator import Actuator
-    from hmsa_ros.api.motion import draw_all
 
     actuator = Actuator() if arguments.params_file is None else Actuator.from_yaml(
         arguments.params_file)
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
             x: getattr(arguments, x) for x in ('until', 'start', 'rate', 'noise', 'seed')})
         written = [] if arguments.out is None else motion.save(arguments.out)
         if arguments.picture:
-            draw_all([motion], arguments.picture, paper)
+            motion.plot(arguments.picture, **asdict(paper))
     report = motion.report()
     if arguments.json:
         print(json_text({

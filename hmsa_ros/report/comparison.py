@@ -10,6 +10,7 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.recordings.record import Run
 from hmsa_ros.report.arrivals import around, Part
 from hmsa_ros.report.evaluation import judged_from
+from hmsa_ros.report.looks import RUNS
 from hmsa_ros.table import Column, Table
 
 
@@ -26,6 +27,12 @@ def labelled(runs: list[Run]) -> list[Run]:
     return [
         replace(run, label=label if labels.count(label) == 1 else f'{label} ({i})')
         for i, (run, label) in enumerate(zip(runs, labels, strict=True), 1)]
+
+
+def parts_of(runs: list[Run]) -> list[Part]:
+    """Return runs, measured, with labels and, of several, colours of their own."""
+    return [Part.of(run, RUNS[i % len(RUNS)] if len(runs) > 1 else '')
+            for i, run in enumerate(labelled(runs))]
 
 
 def comparison(parts: Sequence[Part]) -> Table:
