@@ -28,42 +28,40 @@ _NEWTON = 60
 
 
 @cache
-def _rule() -> tuple[Array, Array, Array, Array]:
-    """Return nodes and weights along the beam, what integrates up to each node, and f there."""
+def _rule() -> tuple[Array, Array, Array]:
+    """Return weights along the beam, what integrates up to each of its points, and f there."""
     legendre = np.polynomial.legendre
     x, weights = legendre.leggauss(_POINTS)
-    powers = legendre.legvander(x, _POINTS - 1)
-    integrals = np.stack(
-        [legendre.legval(x, legendre.legint(row, lbnd=-1)) for row in np.eye(_POINTS)], axis=1)
-    nodes = 0.5 + 0.5 * x
-    up_to: Array = 0.5 * integrals @ np.linalg.inv(powers)
-    return nodes, 0.5 * weights, up_to, slope(nodes)
+    # Of each polynomial of Legendre its integral, by the polynomials through the points.
+    integrals = legendre.legval(x, legendre.legint(np.eye(_POINTS), lbnd=-1)).T
+    up_to: Array = 0.5 * integrals @ np.linalg.inv(legendre.legvander(x, _POINTS - 1))
+    return 0.5 * weights, up_to, slope(0.5 + 0.5 * x)
 
 
 def slope(share: ArrayLike) -> Array:
     """Return the slope of the first mode at shares of the length, 1 at the tip."""
     ratio = (np.sin(ROOT) - np.sinh(ROOT)) / (np.cos(ROOT) + np.cosh(ROOT))
+    x = ROOT * np.append(np.ravel(share), 1.0)
+    unscaled: Array = np.sinh(x) + np.sin(x) + ratio * (np.cosh(x) - np.cos(x))
+    return (unscaled[:-1] / unscaled[-1]).reshape(np.shape(share))
 
-    def unscaled(x: Array) -> Array:
-        found: Array = np.sinh(x) + np.sin(x) + ratio * (np.cosh(x) - np.cos(x))
-        return found
 
-    made: Array = unscaled(ROOT * np.asarray(share, dtype=np.float64)) / unscaled(np.array(ROOT))
-    return made
+def _turned(angle: ArrayLike) -> Array:
+    """Return by how much the beam is turned at its points, for angles of the tip in rad."""
+    return np.multiply.outer(np.asarray(angle, dtype=np.float64), _rule()[2])
 
 
 def deflection(angle: ArrayLike) -> Array:
     """Return the deflection over length at angles of the tip in rad."""
-    _, weights, _, f = _rule()
-    made: Array = np.sin(np.multiply.outer(np.asarray(angle, dtype=np.float64), f)) @ weights
+    weights, _, _ = _rule()
+    made: Array = np.sin(_turned(angle)) @ weights
     return made
 
 
 def _gain(angle: ArrayLike) -> Array:
     """Return the derivative of `deflection`."""
-    _, weights, _, f = _rule()
-    made: Array = np.cos(np.multiply.outer(np.asarray(angle, dtype=np.float64), f)) @ (
-        f * weights)
+    weights, _, f = _rule()
+    made: Array = np.cos(_turned(angle)) @ (f * weights)
     return made
 
 
@@ -71,8 +69,8 @@ def _gain(angle: ArrayLike) -> Array:
 def fold() -> float:
     """Return the angle at which the tip deflects the most: beyond it a field pulls it back."""
     angle = 1.8
+    weights, _, f = _rule()
     for _ in range(_NEWTON):
-        _, weights, _, f = _rule()
         angle += float(_gain(angle)) / float(np.sin(angle * f) @ (f * f * weights))
     return angle
 
@@ -82,31 +80,28 @@ def angle_of(deflections: ArrayLike) -> Array:
     wanted = np.asarray(deflections, dtype=np.float64)
     most = float(deflection(fold()))
     # What is left of the deflection is about a square of what is left of the angle.
-    angle = np.sign(wanted) * fold() * (
+    angle: Array = np.sign(wanted) * fold() * (
         1.0 - np.sqrt(np.maximum(1.0 - np.abs(wanted) / most, 0.0)))
     for _ in range(_NEWTON):
         step = (deflection(angle) - wanted) / np.maximum(_gain(angle), 1e-9)
         angle = np.clip(angle - step, -fold(), fold())
         if np.max(np.abs(step), initial=0.0) < 1e-9:
             break
-    made: Array = angle
-    return made
+    return angle
 
 
 def inertia_of_angle(angle: ArrayLike) -> Array:
     """Return the integral of the squared velocities at a unit rate of the angle, for length 1."""
-    _, weights, up_to, f = _rule()
-    turned = np.multiply.outer(np.asarray(angle, dtype=np.float64), f)
-    along = (np.sin(turned) * f) @ up_to.T
-    across = (np.cos(turned) * f) @ up_to.T
+    weights, up_to, f = _rule()
+    turned = _turned(angle)
+    along, across = ((of(turned) * f) @ up_to.T for of in (np.sin, np.cos))
     made: Array = (along ** 2 + across ** 2) @ weights
     return made
 
 
 def tangent(deflected: float, share: ArrayLike) -> Array:
     """Return the angle in rad by which a bent beam is turned at shares of its length."""
-    turned: Array = float(angle_of(deflected)) * slope(share)
-    return turned
+    return float(angle_of(deflected)) * slope(share)
 
 
 def centreline(deflected: float, points: int) -> tuple[Array, Array]:
