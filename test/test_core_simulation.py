@@ -19,7 +19,6 @@ from hmsa_ros.model.simulation import (
     longest_motion,
     sampled,
     simulate,
-    unshaped,
 )
 from hmsa_ros.planning.sequence import plan_sequence
 from hmsa_ros.planning.setpoint import Setpoint
@@ -64,7 +63,7 @@ def test_the_unshaped_response_is_scipys(figure, zeta, j_lim, stretches):
     # An unshaped step to 0.999 of the limit throws the actuator against it, where SciPy stops: see
     # below. Everything before is compared.
     times = SAMPLES[SAMPLES <= 20.0] if figure == 'fig_9' else SAMPLES
-    stretch, _ = unshaped(stretches, begins, times, material)
+    stretch, _ = simulate(begins, elastic_force(stretches, material), times, material)
     expected = samples((1.0, 0.0), begins, loads, times, zeta, j_lim, 2.0)
     assert np.max(np.abs(stretch - expected[0])) < ACCURACY
 
@@ -151,8 +150,6 @@ def test_times_out_of_order_are_refused(switches, times):
 def test_starts_outside_the_limits_are_refused(stretch):
     with pytest.raises(BadInputError, match='between the limits 0.2520 and 2.6940'):
         simulate([0.0], [0.1], [1.0], PAPER, stretch=stretch)
-    with pytest.raises(BadInputError, match='between the limits'):
-        unshaped([stretch], [0.0], [1.0], PAPER)
     with pytest.raises(BadInputError, match='between the limits'):
         ActuatorSimulation(ACTUATOR, stretch=stretch)
 

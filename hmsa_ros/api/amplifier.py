@@ -9,6 +9,7 @@ import numpy as np
 from hmsa_ros.api.arguments import number, numbers, several
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import Array
+from hmsa_ros.model.simulation import response
 from hmsa_ros.model.status import RefusedError
 from hmsa_ros.table import Column, Table
 
@@ -108,8 +109,6 @@ def _row(
         plan: 'Plan', best: 'Plan', slew: float, band: float,
         coil: dict[str, float]) -> tuple[Any, ...]:
     """Return what an amplifier has to give for a plan."""
-    from hmsa_ros.api.motion import response
-
     longest, lost = (1e3 * float(np.max(x)) for x in (
         plan.move_times, plan.move_times - best.move_times))
     most = float(np.max(np.abs(plan.flux_densities)))
@@ -119,7 +118,7 @@ def _row(
     factor = coil['tesla_per_ampere']
     # The field of each level where it begins, and where the next one does.
     fields = response(
-        plan.actuator, plan.times, plan.flux_densities,
+        plan.actuator.block, plan.actuator.model.delivery, plan.times, plan.flux_densities,
         np.append(plan.times, plan.times[-1] + 1.0), plan.segments[0].start.stretch)[2]
     change: Array = np.full(2, slew / factor)
     current: Array = np.array([most, -most]) / factor

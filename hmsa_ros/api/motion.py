@@ -10,10 +10,8 @@ import numpy as np
 
 from hmsa_ros.api.arguments import file_of, number, several, whole
 from hmsa_ros.errors import BadInputError, excerpt
-from hmsa_ros.model.equations import Array, elastic_force
-from hmsa_ros.model.moves import Level as Load
-from hmsa_ros.model.moves import State
-from hmsa_ros.model.simulation import check_stretch, longest_motion, sampled
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.simulation import check_stretch, longest_motion, response
 from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.levels import Level
@@ -287,7 +285,8 @@ def simulated(
     noise = number(noise, 'noise', least=0.0)
     stamps = np.round(np.arange(int(end * hertz * (1.0 + 1e-12)) + 1) / hertz * NANOSECONDS
                       ).astype(np.int64)
-    stretch, speed, field = response(truth, times, levels, stamps / NANOSECONDS, begin)
+    stretch, speed, field = response(
+        truth.block, model.delivery, times, levels, stamps / NANOSECONDS, begin)
     switched = np.round(times * NANOSECONDS).astype(np.int64).tolist()
     stretch = stretch + noise * np.random.default_rng(
         whole(seed, 'seed', least=0)).standard_normal(len(stretch))
@@ -304,7 +303,8 @@ def simulated(
             (x.setpoint.stretch, round(y * NANOSECONDS) if math.isfinite(y) else None)
             for x, y in zip(plan.segments, ends.tolist(), strict=True)),
             round(plan.move_times[0] * NANOSECONDS) if followed else None),)
-        predicted = response(believed, times, levels, times, begin)
+        predicted = response(
+            believed.block, believed.model.delivery, times, levels, times, begin)
         planned = tuple(
             Level(stamp, level, -_AHEAD, x, y) for stamp, level, x, y in zip(
                 switched, levels.tolist(), *(z.tolist() for z in predicted[:2]), strict=True))
@@ -316,21 +316,6 @@ def simulated(
         commands, commands, plans=(planned,) if planned else (), requests=asked,
         parameters=parameters, plant=truth.block, planner=believed.block, parameters_known=True,
         origin='simulated'))
-
-
-def response(
-        truth: 'Actuator', times: Array, levels: Array, at: Array,
-        start: float) -> tuple[Array, Array, Array]:
-    """Return stretch, rate in 1/s and flux density in T at times in s."""
-    model = truth.model
-    units, material, delivery = model.units, model.material, model.delivery
-    held = float(elastic_force(start, material))
-    loads = [Load(x / units.time, units.of_level(y)) for x, y in zip(
-        times.tolist(), levels.tolist(), strict=True)]
-    if loads[0].time > 0.0:
-        loads.insert(0, Load(0.0, held))
-    rows = sampled(loads, State(start, load=held), at / units.time, material, delivery)
-    return rows[0], rows[1] / units.time, units.level(rows[2])
 
 
 def _rate(period: float) -> float:

@@ -58,17 +58,16 @@ def path_of(actuator: 'Actuator', columns: tuple[Any, ...]) -> Path:
             f'the columns of the path have {", ".join(str(len(x)) for x in given)} numbers: '
             'expected as many in each, of at least 2 points')
     times, stretches, *more = given
-    unit = actuator.model.units.time
-    rows = [stretches, *(x * unit ** (i + 1) for i, x in enumerate(more))]
-    none = np.full(len(times), np.nan)
-    rates, accelerations = (*more, none, none)[:2]
+    # Without them the path is checked as one at rest in all points.
+    rates, accelerations = (*more, *[0.0 * times, np.full_like(times, np.nan)][len(more):])
     check_path(
-        [(x, round(NANOSECONDS * t)) for *x, t in zip(  # type: ignore[misc]
-            stretches.tolist(), (0.0 * times if rates is none else rates).tolist(),
-            accelerations.tolist(), (times - times[0]).tolist(), strict=True)],
-        actuator.model.material.rest)
+        [((x, y, z), round(NANOSECONDS * t)) for x, y, z, t in zip(
+            stretches.tolist(), rates.tolist(), accelerations.tolist(),
+            (times - times[0]).tolist(), strict=True)], actuator.model.material.rest)
+    unit = actuator.model.units.time
     since = (times - times[0]) / unit
-    return Path.through(since, *rows) if more else Path.smooth(since, stretches)
+    return Path.through(since, stretches, *(
+        x * unit ** i for i, x in enumerate(more, 1))) if more else Path.smooth(since, stretches)
 
 
 def _column(values: Any) -> Array:

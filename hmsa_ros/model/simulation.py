@@ -25,8 +25,8 @@ from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParamete
 from hmsa_ros.model.schedule import CommandSchedule
 
 __all__ = [
-    'ActuatorSimulation', 'check_stretch', 'follow', 'longest_motion', 'RTOL', 'sampled',
-    'simulate', 'too_large', 'unshaped']
+    'ActuatorSimulation', 'check_stretch', 'follow', 'longest_motion', 'response', 'RTOL',
+    'sampled', 'simulate', 'too_large']
 
 # Time constants after which nothing is left of a motion, and periods after which nobody knows
 # its phase.
@@ -148,6 +148,25 @@ def sampled(
     return _sampled(pieces, state, times, material, delivery.lag, rtol)
 
 
+def response(
+        actuator: ActuatorParameters, delivery: Delivery, times: Array, levels: Array, at: Array,
+        start: float) -> tuple[Array, Array, Array]:
+    """
+    Return stretch, rate in 1/s and level in force at times in s (n,), from rest at a stretch.
+
+    Levels (m,), in T or V, are in force from their times in s on; before the first, the level
+    that holds the start. Raises as `sampled`.
+    """
+    units, material = actuator.units, actuator.nondimensional
+    held = float(law.elastic_force(start, material.packed))
+    loads = [Level(x / units.time, units.of_level(y)) for x, y in zip(
+        times.tolist(), levels.tolist(), strict=True)]
+    if times[0] > at[0]:
+        loads.insert(0, Level(float(at[0]) / units.time, held))
+    rows = sampled(loads, State(start, load=held), at / units.time, material, delivery)
+    return rows[0], rows[1] / units.time, units.level(rows[2])
+
+
 def _sampled(
         pieces: Sequence[Piece] | Array, state: State, times: Array,
         material: NondimensionalParameters, lag: float = 0.0, rtol: float = RTOL) -> Array:
@@ -267,12 +286,8 @@ class ActuatorSimulation:
 
     @property
     def time(self) -> int:
-        """Time in ns that the state belongs to; setting it skips what lies between."""
+        """Time in ns that the state belongs to."""
         return self._all.time
-
-    @time.setter
-    def time(self, time: int) -> None:
-        self._all.time = time
 
     @property
     def stretch(self) -> float:
@@ -329,18 +344,3 @@ def too_large(time: int, flux_density: float) -> str:
     """Return the sentence for a load that cannot be followed, at a time in ns and in T."""
     return (f'the integration stopped at {time} ns under {flux_density:g} T: the load is too '
             'large to follow')
-
-
-def unshaped(
-        targets: Sequence[float], begins: Sequence[float], times: ArrayLike,
-        material: NondimensionalParameters, *, start: float | None = None) -> tuple[Array, Array]:
-    """
-    Sample stretch and rate (n,) under unshaped steps to targets, the paper's unshaped input.
-
-    Each step begins at its time with the load that holds its target. The start is at rest, by
-    default without a field. A stretch or times out of range are a `BadInputError`.
-    """
-    for target in targets:
-        check_stretch(target, material, 'target')
-    loads = [law.elastic_force(float(x), material.packed) for x in targets]
-    return simulate(begins, loads, times, material, stretch=start)

@@ -87,39 +87,22 @@ def decimate(x: Array, y: Array, buckets: int = BUCKETS) -> tuple[Array, Array]:
 
     Where values are missing (NaN) inside, one of each gap stays, so that no line crosses it.
     """
-    known = np.isfinite(y)
-    if not known.any():
-        return x[known], y[known]
-    first, last = (int(z) for z in np.flatnonzero(known)[[0, -1]])
-    x, y, known = x[first:last + 1], y[first:last + 1], known[first:last + 1]
-    if known.all():
-        keep = _extremes(y, buckets)
-        return (x, y) if keep is None else (x[keep], y[keep])
-    gaps = np.flatnonzero(~known[1:] & known[:-1]) + 1
-    places = np.flatnonzero(known)
-    keep = _extremes(y[places], buckets)
-    if keep is not None:
-        places = places[keep]
-        # Of many gaps most are narrower than what is seen.
-        gaps = gaps[np.unique(np.searchsorted(places, gaps), return_index=True)[1]]
-    chosen = np.union1d(places, gaps)
+    known, missing = np.flatnonzero(np.isfinite(y)), np.flatnonzero(~np.isfinite(y))
+    kept = known[_extremes(y[known], buckets)] if len(known) else known
+    gaps, firsts = np.unique(np.searchsorted(kept, missing), return_index=True)
+    chosen = np.union1d(kept, missing[firsts[(gaps > 0) & (gaps < len(kept))]])
     return x[chosen], y[chosen]
 
 
 def _extremes(y: Array, buckets: int) -> Any:
-    """Return where the ends and the extremes of each interval are; None to keep all."""
+    """Return where the ends and the extremes of each interval are, or all of few places."""
     size = -(-len(y) // buckets)
     if size <= 2:
-        return None
-    whole = len(y) // size * size
-    begins = np.arange(0, whole, size)
-    rows = y[:whole].reshape(-1, size)
-    keep: list[Any] = [
-        begins + rows.argmin(axis=1), begins + rows.argmax(axis=1), [0, len(y) - 1]]
-    if whole < len(y):
-        rest = y[whole:]
-        keep.append([whole + int(rest.argmin()), whole + int(rest.argmax())])
-    return np.unique(np.concatenate(keep))
+        return slice(None)
+    begins = np.arange(0, len(y), size)
+    rows = np.pad(y, (0, -len(y) % size), mode='edge').reshape(-1, size)
+    return np.unique(np.concatenate([
+        begins + rows.argmin(axis=1), begins + rows.argmax(axis=1), [0, len(y) - 1]]))
 
 
 def numbers(values: Any) -> list[float | None]:

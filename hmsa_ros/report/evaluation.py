@@ -24,7 +24,7 @@ from hmsa_ros.model.moves import Level as PlannedLoad
 from hmsa_ros.model.moves import State
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.residual import residual_vibration
-from hmsa_ros.model.simulation import follow, sampled
+from hmsa_ros.model.simulation import follow, response, sampled
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.levels import in_force, Level, without_repeats
 from hmsa_ros.recordings.parameters import creep_of
@@ -193,8 +193,7 @@ def _plain(
     nothing = Curve(time, np.full_like(time, np.nan), np.full_like(time, np.nan))
     if not moves:
         return nothing
-    unit = run.plant.time_unit
-    begins = [(x.begin - zero) / NANOSECONDS for x in moves]
+    begins = np.array([(x.begin - zero) / NANOSECONDS for x in moves])
     before = time[time < begins[0]]
     grid = fine(np.union1d(begins[:1], time[len(before):]), run.plant.period)
     lower, upper = stretch_limits(run.plant.nondimensional)
@@ -202,18 +201,14 @@ def _plain(
     start = min(max(start, lower + margin), upper - margin)
     try:
         # By the same amplifier, coil and elastomer as in the run.
-        material = replace(
-            run.plant, creep=creep_of(run.parameters, run.joint)).nondimensional
-        held = float(elastic_force(start, material))
-        stretch, rate, *_ = sampled(
-            [PlannedLoad(x / unit, run.plant.units.of_level(y.flux_densities[-1]))
-             for x, y in zip(begins, moves, strict=True)], State(start, load=held), grid / unit,
-            material, _delivery(run, run.plant, 'plant'))
+        stretch, rate, _ = response(
+            replace(run.plant, creep=creep_of(run.parameters, run.joint)),
+            _delivery(run, run.plant, 'plant'), begins,
+            np.array([x.flux_densities[-1] for x in moves]), grid, start)
     except HmsaError:
         return nothing
-    return Curve(
-        np.concatenate([before, grid]), np.concatenate([np.full_like(before, start), stretch]),
-        np.concatenate([np.zeros_like(before), rate / unit]))
+    return Curve(*(np.concatenate(x) for x in (
+        (before, grid), (np.full_like(before, start), stretch), (np.zeros_like(before), rate))))
 
 
 def _delivery(run: Run, actuator: ActuatorParameters, node: str) -> Delivery:

@@ -23,19 +23,15 @@ _END = 2**62
 _MOST_LEVELS = 12
 
 
-def tolerances_of(run: Run) -> Tolerances:
-    """Return what counted as arrived for the planner of a run."""
-    own = {x: number_of(of_joint(run.parameters, run.joint, f'planner.{x}_tolerance'))
-           for x in ('arrival', 'vibration', 'stretch')}
-    return Tolerances(**{x: y for x, y in own.items() if y is not None and y >= 0.0})
-
-
 def findings_of(
         run: Run, tolerances: Tolerances | None = None, *,
         asked: Sequence[Requested] | None = None) -> list[Finding]:
     """Judge each setpoint that was requested, by default as the planner of the run did."""
-    allowed = tolerances_of(run) if tolerances is None else tolerances
-    return [_judged(run, x, allowed) for x in (setpoints_of(run) if asked is None else asked)]
+    if tolerances is None:
+        own = {x: number_of(of_joint(run.parameters, run.joint, f'planner.{x}_tolerance'))
+               for x in ('arrival', 'vibration', 'stretch')}
+        tolerances = Tolerances(**{x: y for x, y in own.items() if y is not None and y >= 0.0})
+    return [_judged(run, x, tolerances) for x in (setpoints_of(run) if asked is None else asked)]
 
 
 def _judged(run: Run, asked: Requested, tolerances: Tolerances) -> Finding:
