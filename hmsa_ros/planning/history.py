@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import math
+from typing import Any
 
-from hmsa_ros.planning.timeline import PlannedLevel
+from hmsa_ros.planning.timeline import Plan, PlannedLevel
 
 # How near a prediction must come to the planned one for what follows to hold as planned: half a
 # nanosecond, to which stamps are rounded, makes some 1e-8 of stretch at full speed. The rate is
@@ -35,18 +36,21 @@ class Deviation:
 
 @dataclass(frozen=True)
 class History:
-    """
-    The levels of a plan, and how much of it has happened.
+    """A plan, and how much of it has happened."""
 
-    Only what has been handed out is predicted anew where reality differs, so that the work
-    does not grow with the plan; `predicted` catches up as far as somebody needs it.
-    """
-
-    levels: tuple[PlannedLevel, ...]
-    sent: int = 1  #: how many, the first ones, have been handed out; at least 1
-    known: int = 0  #: place of the last one known to have taken effect
+    plan: Plan
+    sent: int = 1  #: how many levels, the first ones, have been handed out; at least 1
+    known: int = 0  #: place of the last level known to have taken effect
     #: Place of the first level, not handed out yet, whose prediction holds no more.
     stale: int | None = None
+
+    @property
+    def levels(self) -> tuple[PlannedLevel, ...]:
+        """The levels of the plan."""
+        return self.plan.levels
+
+    def _with(self, levels: tuple[PlannedLevel, ...], **known: Any) -> 'History':
+        return replace(self, plan=replace(self.plan, levels=levels), **known)
 
     def unheard(self, now: int) -> int:
         """Count the levels after the last known one that never took effect (time in ns)."""
@@ -60,15 +64,11 @@ class History:
                 return i + 1 - first
         return 0
 
-    def handed_out(self, end: int) -> 'History':
-        """Return the history after all levels up to a place have been handed out."""
-        return replace(self.predicted(end), sent=end)
-
     def without(self, start: int, end: int) -> 'History':
         """Return the history without levels ``start`` to ``end``, which never were in force."""
         sent = self.sent - max(min(self.sent, end) - start, 0)
-        return History(
-            self.levels[:start] + self.levels[end:], sent, self.known, start).predicted(sent)
+        return self._with(
+            self.levels[:start] + self.levels[end:], sent=sent, stale=start).predicted(sent)
 
     def with_news(
             self, stamp: int, flux_density: float,
@@ -86,42 +86,43 @@ class History:
         if found is None:
             found = short = self._short(sent, stamp, flux_density, tolerance)
         if found is not None:
-            passed = range(known + 1, found)
-            # As the hardware rounds it.
-            news = replace(
-                levels[found], stamp=stamp, flux_density=flux_density, sent_for=None)
-            rest = found + 1
+            rest, taken = found + 1, replace(levels[found], sent_for=None)
             deviation = Deviation(
-                stamp - levels[found].due, self._changes(passed),
-                asked=None if short is None else levels[found].flux_density)
+                stamp - levels[found].due, self._changes(range(known + 1, found)),
+                asked=None if short is None else taken.flux_density)
         else:
-            passed = range(known + 1, known + 1 + sum(levels[i].stamp < stamp for i in sent))
-            before = levels[passed[-1] if passed else known]
-            if self._near(before.flux_density, flux_density):
+            rest = known + 1 + sum(levels[i].stamp < stamp for i in sent)
+            taken = levels[rest - 1]
+            if self._near(taken.flux_density, flux_density):
                 return self, None
             # Somebody else's command, or what a watchdog does.
-            news = replace(before, stamp=stamp, flux_density=flux_density)
-            rest = passed.stop
-            deviation = Deviation(lost=self._changes(passed), foreign=True)
+            deviation = Deviation(lost=self._changes(range(known + 1, rest)), foreign=True)
+        # As the hardware rounds it.
+        news = replace(taken, stamp=stamp, flux_density=flux_density)
         deviation = replace(deviation, change=flux_density - levels[known].flux_density)
         after = tuple(
             replace(x, stamp=stamp, sent_for=x.due) if x.stamp < stamp else x
             for x in levels[rest:self.sent])
         changed = (*levels[:known + 1], news, *after, *levels[self.sent:])
         count = known + 2 + len(after)
+        stale: int | None = known + 1
         if short is not None:
             # Nor does it reach what is to come.
             changed = (*changed[:known + 2], *(
                 replace(x, flux_density=flux_density) if _beyond(x.flux_density, flux_density)
                 else x for x in changed[known + 2:]))
-        elif deviation == Deviation() and _same(
-                flux_density, levels[found if found is not None else known].flux_density):
+        elif deviation == Deviation() and _same(flux_density, taken.flux_density):
             stale = None if self.stale is None else self.stale + count - self.sent
-            return History(changed, count, known + 1, stale), deviation
-        return History(changed, count, known + 1, known + 1).predicted(count), deviation
+        return self._with(
+            changed, sent=count, known=known + 1, stale=stale).predicted(count), deviation
 
     def predicted(self, end: int) -> 'History':
-        """Predict stale levels anew up to a place, or until a prediction is as planned."""
+        """
+        Predict stale levels anew up to a place, or until a prediction is as planned.
+
+        Only what has been handed out is predicted where reality differs, so that the work does not
+        grow with the plan; this catches up as far as somebody needs it.
+        """
         if self.stale is None or self.stale >= end:
             return self
         anew: list[PlannedLevel] = []
@@ -133,8 +134,8 @@ class History:
         stop = self.stale + len(anew)
         settled = stop < end or stop == len(self.levels) or (
             stop > self.sent and agree(anew[-1], self.levels[stop - 1]))
-        return replace(
-            self, levels=self.levels[:self.stale] + tuple(anew) + self.levels[stop:],
+        return self._with(
+            self.levels[:self.stale] + tuple(anew) + self.levels[stop:],
             stale=None if settled else stop)
 
     def _find(

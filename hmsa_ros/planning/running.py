@@ -43,10 +43,14 @@ class RunningPlan:
         self.delay = 0
         self._strayed = 0.0
         self._initial = stretch
-        self.plan = Plan(0, (), ())
-        self._history = History(())
+        self._history = History(Plan(0, (), ()))
         self.revision = 0
         self.restart()
+
+    @property
+    def plan(self) -> Plan:
+        """What is going to happen."""
+        return self._history.plan
 
     def restart(self) -> None:
         """Drop all plans: at rest where it was before the first request, as the clock begins."""
@@ -57,17 +61,15 @@ class RunningPlan:
 
     def clock_set(self, by: int) -> None:
         """Take in that the clock was set ahead by some ns: what is planned goes on as before."""
-        self.plan = self.plan.shifted(by)
-        self._history = replace(self._history, levels=self.plan.levels)
+        self._history = replace(self._history, plan=self.plan.shifted(by))
         self.revision += 1
 
     def _begin_with(self, level: PlannedLevel, *, keep: bool = False) -> None:
         """Begin anew from a level; if its setpoints are kept, so is what was not sent yet."""
-        old, ahead = self.plan, self._history.levels[self._history.sent:] if keep else ()
-        self._history = History((level, *ahead), stale=1 if ahead else None)
-        self.plan = Plan(
-            old.number, self._history.levels, old.segments if keep else (),
-            old.kept if keep else 0)
+        old, ahead = self.plan, self.plan.levels[self._history.sent:] if keep else ()
+        self._history = History(Plan(
+            old.number, (level, *ahead), old.segments if keep else (), old.kept if keep else 0),
+            stale=1 if ahead else None)
         self.revision += 1
 
     def take_over(
@@ -113,48 +115,41 @@ class RunningPlan:
 
     def abandon(self) -> None:
         """Drop what is not known to have taken effect, and the setpoints: nobody obeys."""
-        place = self._history.known
-        self._remember(self._history.predicted(place + 1))
-        self._history = History(self._history.levels[:place + 1], place + 1, place)
-        self.plan = Plan(self.plan.number, self._history.levels, ())
+        count = self._history.known + 1
+        plan = self._history.predicted(count).plan
+        self._history = History(Plan(plan.number, plan.levels[:count], ()), count, count - 1)
         self.revision += 1
 
     def take(self, draft: Draft | None, now: int) -> Plan:
         """Replace everything from a draft of the present revision on; return the plan in force."""
         if draft is None:
             return self.plan
-        old, history, begin = self.plan, self._history, draft.begin
+        history, old, begin = self._history, self.plan, draft.begin
         kept = bisect_left(old.levels, begin, key=lambda x: x.stamp)
         begun = bisect_right(old.levels, now, key=lambda x: x.stamp)
         # What is over and handed out is forgotten, but for the level in force, and for those
         # that there may still be news of.
         over = max(min(history.sent, kept, begun) - 1, 0)
         first = max(min(over, history.known), over - _REMEMBERED)
+        new = draft.resumed is None
+        before = _running(old, begin, now) if new else old.segments[:draft.resumed]
         stale = history.stale
         self._history = History(
-            old.levels[first:kept] + draft.levels, min(history.sent, kept) - first,
-            max(min(history.known, kept - 1) - first, 0),
+            Plan(old.number + new, old.levels[first:kept] + draft.levels, before + draft.segments,
+                 len(before) if new else min(old.kept, len(before))),
+            min(history.sent, kept) - first, max(min(history.known, kept - 1) - first, 0),
             stale - first if stale is not None and stale < kept else None)
-        levels = self._history.levels
-        if draft.resumed is None:
-            segments = _running(old, begin, now)
-            self.plan = Plan(
-                old.number + 1, levels, segments + draft.segments, len(segments))
-        else:
-            before = old.segments[:draft.resumed]
-            self.plan = Plan(
-                old.number, levels, before + draft.segments, min(old.kept, len(before)))
         self.revision += 1
         return self.plan
 
     def due(self, now: int) -> tuple[PlannedLevel, ...]:
         """Hand out the commands to send now, each once: those stamped up to lead_time ahead."""
-        history, latest = self._history, now + self.model.options.lead_time
-        if not self.pending or history.levels[history.sent].stamp > latest:
+        first, latest = self._history.sent, now + self.model.options.lead_time
+        if not self.pending or self.plan.levels[first].stamp > latest:
             return ()
-        end = bisect_right(history.levels, latest, history.sent, key=lambda x: x.stamp)
-        self._remember(history.handed_out(end))
-        return self._history.levels[history.sent:end]
+        end = bisect_right(self.plan.levels, latest, first, key=lambda x: x.stamp)
+        self._history = replace(self._history.predicted(end), sent=end)
+        return self.plan.levels[first:end]
 
     def moves(self, now: int) -> bool:
         """Return whether setpoints are under way at a time in ns."""
@@ -164,17 +159,17 @@ class RunningPlan:
     @property
     def pending(self) -> bool:
         """Whether commands remain to be handed out."""
-        return self._history.sent < len(self._history.levels)
+        return self._history.sent < len(self.plan.levels)
 
     @property
     def next_stamp(self) -> int | None:
         """Stamp in ns of the next command to be handed out; None if there is none."""
-        return self._history.levels[self._history.sent].stamp if self.pending else None
+        return self.plan.levels[self._history.sent].stamp if self.pending else None
 
     @property
     def last_sent(self) -> PlannedLevel:
         """Level that was handed out last, or the one in force before the first."""
-        return self._history.levels[self._history.sent - 1]
+        return self.plan.levels[self._history.sent - 1]
 
     def beat_stamp(self, now: int) -> int:
         """Return the time in ns to stamp the level handed out last with when it is repeated."""
@@ -187,33 +182,31 @@ class RunningPlan:
 
         Those that are less than lead_time ahead belong to a motion that will not happen.
         """
-        history = self._history
-        first = history.sent
-        if not self.pending or history.levels[first].stamp >= now - tolerance:
+        first = self._history.sent
+        if not self.pending or self.plan.levels[first].stamp >= now - tolerance:
             return 0
         soonest = now + self.model.options.lead_time
-        end = bisect_left(history.levels, soonest, first, key=lambda x: x.stamp)
+        end = bisect_left(self.plan.levels, soonest, first, key=lambda x: x.stamp)
         self._leave_out(first, end, soonest)
         return end - first
 
     def _leave_out(self, first: int, end: int, now: int) -> None:
         """Take levels out of the plan: what is over by a time in ns and needs them is not done."""
-        plan, missing = self.plan, self._history.levels[first].stamp
+        plan, missing = self.plan, self.plan.levels[first].stamp
         over = max(plan.under_way(now), 0)
         reached = bisect_left(plan.segments[:over], missing, key=lambda x: x.arrival or x.begin)
         if reached < over:
-            self.plan = replace(plan, segments=(
+            self._history = replace(self._history, plan=replace(plan, segments=(
                 *plan.segments[:reached],
                 *(replace(x, carried_out=False) for x in plan.segments[reached:over]),
-                *plan.segments[over:]))
-        self._remember(self._history.without(first, end))
+                *plan.segments[over:])))
+        self._history = self._history.without(first, end)
         self.revision += 1
 
     def unheard(self, now: int) -> int | None:
         """Return the stamp in ns of the last level that never took effect; None for none."""
-        history = self._history
-        count = history.unheard(now)
-        return history.levels[history.known + count].stamp if count else None
+        count = self._history.unheard(now)
+        return self.plan.levels[self._history.known + count].stamp if count else None
 
     def drop_unheard(self, stamp: int) -> None:
         """Take out of the plan what `unheard` has found."""
@@ -222,8 +215,7 @@ class RunningPlan:
 
     def applied(self, stamp: int, flux_density: float, tolerance: int) -> Deviation | None:
         """Take in a change of level as `History.with_news` does; None if it is no news."""
-        history, deviation = self._history.with_news(stamp, flux_density, tolerance)
-        self._remember(history)
+        self._history, deviation = self._history.with_news(stamp, flux_density, tolerance)
         if deviation is not None:
             deviation = replace(deviation, effect=self._effect(deviation, tolerance))
             self._strayed += deviation.effect
@@ -243,7 +235,7 @@ class RunningPlan:
     def vibration(self, late: int, change: float) -> float:
         """Return the amplitude of stretch that a change in T leaves which is so many ns late."""
         # It has had as much less momentum: omega times the delay, of the change of its rest.
-        level = self._history.levels[self._history.known]
+        level = self.plan.levels[self._history.known]
         model = level.model
         stretch = equilibrium_stretch(level.load, model.material)
         stiffness = elastic_stiffness(stretch, model.material)
@@ -258,21 +250,16 @@ class RunningPlan:
 
     def unknown(self, now: int) -> tuple[PlannedLevel, tuple[PlannedLevel, ...]]:
         """Return what is in force at a time in ns, as far as there is news, and what follows."""
-        history = self._history
-        known, rest = history.levels[history.known], history.levels[history.known + 1:]
+        levels, place = self.plan.levels, self._history.known
+        known, rest = levels[place], levels[place + 1:]
         time = min(now, rest[0].stamp) if self.awaiting else now
         if time > known.stamp:
             known = PlannedLevel(time, known.flux_density, known.at(time), known.model)
         return known, rest
 
-    def _remember(self, history: History) -> None:
-        if history.levels is not self._history.levels:
-            self.plan = replace(self.plan, levels=history.levels)
-        self._history = history
-
     def state(self, time: int) -> State:
         """Predict the nondimensional state at a time in ns, in the units of the next request."""
-        self._remember(self._history.predicted(self.plan.place(time) + 1))
+        self._history = self._history.predicted(self.plan.place(time) + 1)
         level = self.plan.level(time)
         return self.model.taken_from(level.at(time), level.model)
 
