@@ -1,8 +1,7 @@
 """
 Paths of the stretch that are followed, as a dense trajectory with velocities asks for.
 
-The stretch is a flat output (M. Fliess, J. Lévine, P. Martin, P. Rouchon, Int. J. Control 61,
-1327 (1995)): a path gives the load by the equation of motion. Commands carry a staircase of it, or
+The stretch is a flat output (`hmsa_ros.planning.flat`). Commands carry a staircase of the load, or
 ramps. The double integral of a staircase is a quadratic spline, and the stretch answers to the
 double integral of what the staircase lacks; so the levels are those whose spline comes nearest,
 in the mean square, to the double integral of the load (of the amplifier's output where the field
@@ -21,8 +20,9 @@ from hmsa_ros import motion
 from hmsa_ros.model import law
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.moves import Level, Move, State
-from hmsa_ros.model.simulation import follow, followed_by, sampled, with_followed
+from hmsa_ros.model.simulation import follow, followed_by, sampled
 from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.planning.flat import held_along, loads_for
 from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.shapers.two_step import two_step
 from hmsa_ros.planning.shooting import Attempt, solve, Template
@@ -219,16 +219,12 @@ class _Follower:
         spans = np.diff(edges)
         times: Array = (edges[:-1, np.newaxis] + spans[:, np.newaxis] * _POINTS).ravel()
         stretch, rate, wanted = self._course(times)
-        packed = material.packed
-        loads = loads_for(stretch, rate, wanted, packed)
+        loads = loads_for(stretch, rate, wanted, material)
         if material.creep:
             # With the edges, at each of which branches are where the next block begins.
             every = np.append(np.column_stack([edges[:-1], times.reshape(-1, 6)]), edges[-1])
-            forces = np.empty_like(every)
-            law.evaluate(law.FORCE, np.ascontiguousarray(self._course(every)[0]), packed, forces)
-            behind = np.empty((len(every), len(self._followed)))
-            motion.trail(every, forces, with_followed(material, self._followed), behind)
-            held = (forces[:, np.newaxis] - behind) @ material.branches[:, motion.RATIO]
+            held, behind = held_along(
+                every, self._course(every)[0], self._followed, material)
             loads = loads + held[:-1].reshape(-1, 7)[:, 1:].ravel()
             self._followed = tuple(behind[7 * keep].tolist())
         return stretch.reshape(-1, 6), loads.reshape(-1, 6)
@@ -317,7 +313,7 @@ class _Follower:
         limits, delivery, material = request.limits, request.delivery, request.material
         packed, state, found = material.packed, self._states[-1], levels.copy()
         stretch, rate, wanted = self._course(edges)
-        field = loads_for(stretch, rate, wanted, packed)
+        field = loads_for(stretch, rate, wanted, material)
         for i, span in enumerate(np.diff(edges).tolist()):
             inertia = float(law.mass(state.stretch, packed))
             quick = speed * float(law.natural_frequency(state.stretch, packed))
@@ -406,16 +402,6 @@ def prepare() -> None:
         import_module(f'scipy.{name}')
 
 
-def loads_for(stretch: Array, rate: Array, wanted: Array, packed: Array) -> Array:
-    """Return the loads that give wanted accelerations, which are linear in them, (n,) each."""
-    stretch, rate = np.ascontiguousarray(stretch), np.ascontiguousarray(rate)
-    zero, one = np.empty((2, len(stretch)))
-    law.accelerations(stretch, rate, np.zeros(len(stretch)), packed, zero)
-    law.accelerations(stretch, rate, np.ones(len(stretch)), packed, one)
-    found: Array = (wanted - zero) / (one - zero)
-    return found
-
-
 def _integrals(loads: Array, spans: Array) -> tuple[Array, Array, Array]:
     """Return integral, double integral and value of a load (n, 6), at points and ends, (n, 7)."""
     once, twice = spans * (loads @ _ONCE.T), spans ** 2 * (loads @ _TWICE.T)
@@ -461,7 +447,7 @@ def _edges(request: Request, path: Path, tolerance: float) -> tuple[float, Array
             f'{request.units.time_text(times[outside][0])}: expected a path between '
             f'{packed[law.LOWER]:.6g} and {packed[law.UPPER]:.6g}')
     span = max(float(np.ptp(np.append(stretch, request.target))), _LEAST_RANGE)
-    loads = loads_for(stretch, rate, wanted, packed).reshape(-1, 6)
+    loads = loads_for(stretch, rate, wanted, material).reshape(-1, 6)
     gaps = spans * np.diff(_POINTS)
     slopes = np.diff(loads) / gaps
     steep = np.max(np.abs(slopes), axis=1)

@@ -17,6 +17,7 @@ import numpy as np
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model import law
 from hmsa_ros.model.delivery import Delivery, IDEAL
+from hmsa_ros.model.equations import acceleration
 from hmsa_ros.model.mismatch import Uncertainty
 from hmsa_ros.model.moves import Level, Limits, State
 from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters
@@ -132,11 +133,7 @@ class Model:
 
     def acceleration(self, state: State) -> float:
         """Return the nondimensional acceleration in a state whose branches have relaxed."""
-        found = np.empty(1)
-        law.accelerations(
-            np.array([state.stretch]), np.array([state.rate]), np.array([state.load]),
-            self.material.packed, found)
-        return float(found[0])
+        return float(acceleration(state.stretch, state.rate, state.load, self.material))
 
     def follow(self, state: State, load: float, duration: float) -> State:
         """Predict the state after a load has been commanded for a nondimensional time."""

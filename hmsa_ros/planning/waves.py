@@ -13,8 +13,9 @@ import numpy as np
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model import law
-from hmsa_ros.model.equations import Array
-from hmsa_ros.planning.path import loads_for, Path
+from hmsa_ros.model.equations import Array, elastic_force
+from hmsa_ros.planning.flat import fade, loads_for
+from hmsa_ros.planning.path import Path
 from hmsa_ros.planning.shapers.request import Request
 
 #: Value and two derivatives by the phase, whose period is 1, shape (n,) each.
@@ -123,10 +124,8 @@ class Wave:
             rising = t < 0.5 * edges[-1]
             span, sign = np.where(rising, fades[0], fades[1]), np.where(rising, 1.0, -1.0)
             share = np.clip(np.where(rising, t, edges[-1] - t) / span, 0.0, 1.0)
-            left = 1.0 - share
-            faded = share ** 4 * (35.0 - 84.0 * share + 70.0 * share ** 2 - 20.0 * share ** 3)
-            fading = sign * 140.0 * (share * left) ** 3 / span
-            curved = 420.0 * (share * left) ** 2 * (left - share) / span ** 2
+            faded, fading, curved = fade(share)
+            fading, curved = sign * fading / span, curved / span ** 2
             return (start + faded * away, fading * away + faded * speed,
                     curved * away + 2.0 * fading * speed + faded * pull)
 
@@ -146,11 +145,10 @@ class Wave:
             return False
         found = loads_for(
             stretch, self.amplitude * frequency * slope,
-            self.amplitude * frequency ** 2 * curve, packed)
+            self.amplitude * frequency ** 2 * curve, material)
         if material.creep:
             # At most: as if branches did not relax during a cycle.
-            forces = np.empty(_PHASES)
-            law.evaluate(law.FORCE, stretch, packed, forces)
+            forces = elastic_force(stretch, material)
             found = found + material.branches[:, 0].sum() * (forces - forces.mean())
         step = 1.0 / (_PHASES * frequency)
         if delivery.lag > 0.0:
