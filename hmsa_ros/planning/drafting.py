@@ -41,8 +41,6 @@ _PATIENCE = (0.0, 0.15, 0.3, 0.45, 0.6)
 _SETTLED = 1e-6
 # Rate in 1/s that is rest at the end of a path.
 _STOPPED = 1e-7
-# Codes of plans that do not do what was requested.
-_WARNINGS = (Code.TOO_DAMPED, Code.INDISTINGUISHABLE, Code.SPELL_TOO_SHORT)
 # Share of a natural period in which a path is joined again: in a longer one vibration swings
 # farther than if it were left alone.
 _BACK = 0.4
@@ -73,39 +71,31 @@ class Outset:
     #: Place of the first level of the plan whose prediction holds no more.
     stale: int | None = None
 
-    def on_grid(self, time: int) -> int:
-        """Return the next multiple of the command period."""
-        return on_grid(time, self.model)
-
-
-def on_grid(time: int, model: Model) -> int:
-    """Return the next time in ns that a command may be stamped with."""
-    period = model.options.period
-    return time if period == 0 else -(-time // period) * period
-
 
 def check_points(points: Sequence[tuple[float, int]], rest: float) -> Steps[None]:
     """Refuse points (stretch, end in ns from the start) that are no sequence: `RefusedError`."""
-    check_any(points)
-    previous = -1
-    for number, (stretch, time) in enumerate(points):
-        check_target(stretch, rest)
-        if time <= previous:
-            raise RefusedError(
-                Code.NOT_INCREASING,
-                f'time_from_start of point {number} is {time / NANOSECONDS:g} s'
-                + (f' after {previous / NANOSECONDS:g} s: expected strictly increasing '
-                   'times' if number else ': expected at least 0 s'))
-        previous = time
-        if number % _CHECKED == _CHECKED - 1:
-            yield
+    for begin in range(0, max(len(points), 1), _CHECKED):
+        part = points[begin:begin + _CHECKED]
+        for stretch, _ in part:
+            check_target(stretch, rest)
+        check_times(part, 'point', begin, points[begin - 1][1] if begin else -1)
+        yield
 
 
-def check_any(points: Sequence[tuple[float | PathPoint, int]]) -> None:
-    """Refuse a request without points with `RefusedError`."""
+def check_times(
+        points: Sequence[tuple[Any, int]], name: str, first: int = 0, previous: int = -1) -> None:
+    """Refuse with `RefusedError` where there are no points, or times in ns do not increase."""
     if not points:
         raise RefusedError(
             Code.BAD_INPUT, 'the trajectory has no points: expected at least one')
+    for number, (_, time) in enumerate(points, first):
+        if time <= previous:
+            raise RefusedError(
+                Code.NOT_INCREASING,
+                f'time_from_start of {name} {number} is {time / NANOSECONDS:g} s'
+                + (f' after {previous / NANOSECONDS:g} s: expected strictly increasing '
+                   'times' if number else ': expected at least 0 s'))
+        previous = time
 
 
 def check_target(stretch: float, rest: float) -> None:
@@ -138,7 +128,7 @@ def draft_sequence(
     left = begin
     for number, (stretch, time) in enumerate(points):
         if base + time > begin:
-            end = outset.on_grid(base + time)
+            end = outset.model.on_grid(base + time)
             if end == left:
                 raise RefusedError(
                     Code.SPELL_TOO_SHORT,
@@ -154,9 +144,9 @@ def draft_sequence(
 
 def check_path(points: Sequence[tuple[PathPoint, int]], rest: float) -> None:
     """Refuse points and times in ns that are no path to rest: `RefusedError`."""
-    check_any(points)
-    previous, given = -1, math.isnan(points[0][0][2])
-    for number, ((stretch, *more), time) in enumerate(points):
+    check_times(points, 'point')
+    given = math.isnan(points[0][0][2])
+    for number, ((stretch, *more), _) in enumerate(points):
         check_target(stretch, rest)
         # Accelerations are of all points or of none.
         if not (math.isfinite(more[0]) and math.isnan(more[1]) is given
@@ -165,12 +155,6 @@ def check_path(points: Sequence[tuple[PathPoint, int]], rest: float) -> None:
                 Code.BAD_INPUT,
                 f'point {number} has velocity {more[0]:g} and acceleration {more[1]:g}: expected '
                 'finite velocities, and accelerations in all points or in none')
-        if time <= previous:
-            raise RefusedError(
-                Code.NOT_INCREASING,
-                f'time_from_start of point {number} is {time / NANOSECONDS:g} s: expected '
-                + (f'more than {previous / NANOSECONDS:g} s' if number else 'at least 0 s'))
-        previous = time
     if abs(points[-1][0][1]) > _STOPPED:
         raise RefusedError(
             Code.BAD_INPUT,
@@ -241,8 +225,7 @@ def _along(
         replace(_frame(outset.model, outset.state), target=target), wanted, tolerance)
     draft = yield from draft_moves(
         outset, [Setpoint(target, math.inf)], first=lambda request: move)
-    segment = replace(draft.segments[0], **known)
-    return replace(draft, segments=(segment,), warning=draft.warning and segment)
+    return replace(draft, segments=(replace(draft.segments[0], **known),))
 
 
 def draft_setpoints(outset: Outset, setpoints: Sequence[Setpoint]) -> Steps[Draft | None]:
@@ -297,7 +280,7 @@ def later_outsets(outset: Outset) -> Iterator[int]:
     model = outset.model
     period = 2.0 * math.pi / model.frequency(outset.state.stretch)
     for share in _PATIENCE:
-        yield outset.on_grid(outset.begin + model.ns(share * period))
+        yield model.on_grid(outset.begin + model.ns(share * period))
 
 
 def draft_resumption(outset: Outset, arrival: int | None = None) -> Steps[Draft | None]:
@@ -310,12 +293,15 @@ def draft_resumption(outset: Outset, arrival: int | None = None) -> Steps[Draft 
     # Setpoints end when they did; one that there is no time left for is left out. From where the
     # new plan meets the running one it goes on as that.
     planned = outset.plan.segments
-    first = max(outset.plan.under_way(outset.begin), 0)
+    begun = max(outset.plan.under_way(outset.begin), 0)
+    first = None if arrival is None else partial(
+        through, duration=outset.model.time(arrival - outset.begin))
     refusal: RefusedError | None = None
-    for index in range(first, len(planned)):
+    for index in range(begun, len(planned)):
         # Left out setpoints make room for the next one, which is gone to at once.
         try:
-            draft = yield from _rejoining(outset, index, arrival)
+            draft = yield from draft_moves(
+                outset, _left(outset, index), first=first, index=index)
         except RefusedError as error:
             refusal = refusal or error
             if error.code is not Code.SPELL_TOO_SHORT or arrival is not None:
@@ -325,32 +311,10 @@ def draft_resumption(outset: Outset, arrival: int | None = None) -> Steps[Draft 
         anew = replace(
             draft.segments[0], since=min(planned[index].since, draft.segments[0].since))
         return replace(
-            draft, segments=(anew, *draft.segments[1:]), resumed=first, missed=index - first)
+            draft, segments=(anew, *draft.segments[1:]), resumed=begun, missed=index - begun)
     if refusal is not None:
         raise refusal
     return None
-
-
-def _rejoining(outset: Outset, index: int, arrival: int | None) -> Steps[Draft]:
-    """Plan the setpoints from a place on, until the running plan is met."""
-    first = None if arrival is None else partial(
-        through, duration=outset.model.time(arrival - outset.begin))
-    planned = outset.plan.segments
-    levels: list[PlannedLevel] = []
-    placed: list[PlannedSegment] = []
-    for segment in _planned(
-            outset.model, outset.state, _left(outset, index), first=first):
-        more, one = yield from _placed(outset.model, outset.begin, segment)
-        levels += more
-        placed.append(one)
-        following = index + len(placed)
-        place = _meeting(outset, segment.end, following) if following < len(planned) else None
-        if place is not None:
-            levels += outset.plan.levels[place:]
-            placed += planned[following:]
-            break
-        yield
-    return Draft(outset.begin, tuple(levels), tuple(placed))
 
 
 def _left(outset: Outset, index: int) -> Iterator[Setpoint]:
@@ -378,27 +342,29 @@ def _meeting(outset: Outset, state: State, following: int) -> int | None:
 
 def draft_moves(
         outset: Outset, setpoints: Iterable[Setpoint], shaper: str = '',
-        first: Shaper | None = None) -> Steps[Draft]:
-    """Plan setpoints and place them on the timeline; the shaper is that of the options."""
+        first: Shaper | None = None, index: int | None = None) -> Steps[Draft]:
+    """
+    Plan setpoints and place them on the timeline; the shaper is that of the options.
+
+    Where they are those of the running plan from a place on, they go on as that once they meet it.
+    """
+    model, planned = outset.model, outset.plan.segments
     levels: list[PlannedLevel] = []
     placed: list[PlannedSegment] = []
-    warning: PlannedSegment | None = None
-    for segment in _planned(outset.model, outset.state, setpoints, shaper, first):
-        more, one = yield from _placed(outset.model, outset.begin, segment)
+    for segment in segments(
+            _frame(model, outset.state), setpoints, get_shaper(shaper or model.options.shaper),
+            model.options.short_spell, first=first):
+        more, one = yield from _placed(model, outset.begin, segment)
         levels += more
         placed.append(one)
-        if warning is None and (one.code in _WARNINGS or one.code is Code.PATH and one.reason):
-            warning = one
+        following = len(planned) if index is None else index + len(placed)
+        place = _meeting(outset, segment.end, following) if following < len(planned) else None
+        if place is not None:
+            levels += outset.plan.levels[place:]
+            placed += planned[following:]
+            break
         yield
-    return Draft(outset.begin, tuple(levels), tuple(placed), warning=warning)
-
-
-def _planned(
-        model: Model, state: State, setpoints: Iterable[Setpoint], shaper: str = '',
-        first: Shaper | None = None) -> Iterator[Segment]:
-    return segments(
-        _frame(model, state), setpoints, get_shaper(shaper or model.options.shaper),
-        model.options.short_spell, first=first)
+    return Draft(outset.begin, tuple(levels), tuple(placed))
 
 
 def _frame(model: Model, state: State) -> Request:

@@ -104,9 +104,7 @@ class Planner(RunningPlan):
         changes nothing; what cannot be carried out is a `RefusedError`.
         """
         yield from drafting.check_points(points, self.model.material.rest)
-        soonest = self.soonest(now)
-        base = soonest if stamp is None else stamp
-        outset = self._outset(drafting.on_grid(max(base, soonest), self.model))
+        base, outset = self._begin(stamp, now)
         return (yield from drafting.draft_sequence(outset, points, base, now))
 
     def draft_levels(
@@ -119,7 +117,7 @@ class Planner(RunningPlan):
         """
         check_levels(points, self.model)
         soonest = self.soonest(now)
-        begin = drafting.on_grid((soonest if stamp is None else stamp) + points[0][1], self.model)
+        begin = self.model.on_grid((soonest if stamp is None else stamp) + points[0][1])
         if begin < soonest:
             raise RefusedError(
                 Code.IN_THE_PAST, f'the first level applies {(now - begin) / NANOSECONDS:.3f} s '
@@ -136,9 +134,7 @@ class Planner(RunningPlan):
         is followed as near as they allow: the draft has a warning then.
         """
         drafting.check_path(points, self.model.material.rest)
-        soonest = self.soonest(now)
-        base = soonest if stamp is None else stamp
-        outset = self._outset(drafting.on_grid(max(base, soonest), self.model))
+        base, outset = self._begin(stamp, now)
         return (yield from drafting.draft_path(outset, points, base, now))
 
     def draft_setpoint(self, stretch: float, now: int) -> Steps[Draft | None]:
@@ -188,6 +184,12 @@ class Planner(RunningPlan):
         anew = replace(draft.segments[0], stretch=segment.stretch, since=segment.since)
         return replace(draft, segments=(anew,), resumed=place)
 
+    def _begin(self, stamp: int | None, now: int) -> tuple[int, Outset]:
+        """Return the start of a request in ns, and what is worked out from the soonest time."""
+        soonest = self.soonest(now)
+        base = soonest if stamp is None else stamp
+        return base, self._outset(self.model.on_grid(max(base, soonest)))
+
     def _outset(self, begin: int) -> Outset:
         return self._from(begin, self.model, self.believed(begin + self.delay))
 
@@ -207,4 +209,4 @@ class Planner(RunningPlan):
 
     def soonest(self, now: int) -> int:
         """Return the first time that a command can still reach in time."""
-        return drafting.on_grid(now + self.model.options.lead_time, self.model)
+        return self.model.on_grid(now + self.model.options.lead_time)

@@ -13,7 +13,7 @@ from hmsa_ros.model.equations import equilibrium_stretch, stretch_limits
 from hmsa_ros.model.moves import State
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.planning.drafting import check_any, draft_moves, Outset, Steps
+from hmsa_ros.planning.drafting import check_times, draft_moves, Outset, Steps
 from hmsa_ros.planning.setpoint import Setpoint
 from hmsa_ros.planning.timeline import Draft, Model, PlannedLevel, PlannedSegment
 
@@ -33,9 +33,7 @@ def check_levels(points: Sequence[tuple[float, int]], model: Model) -> None:
     """
     least, most = model.options.flux_density_min, model.options.flux_density_max
     unit = model.units.load_name
-    check_any(points)
-    previous = -1
-    for number, (level, time) in enumerate(points):
+    for number, (level, _) in enumerate(points):
         if not math.isfinite(level):
             raise RefusedError(
                 Code.BAD_INPUT, f'level {number} is {level:g}{unit}: expected a finite number')
@@ -44,12 +42,7 @@ def check_levels(points: Sequence[tuple[float, int]], model: Model) -> None:
                 Code.FLUX_LIMIT,
                 f'level {number} is {level:g}{unit}: expected {least:g} to {most:g}{unit}, the '
                 'limits of the coil (flux_density_min, flux_density_max)')
-        if time <= previous:
-            raise RefusedError(
-                Code.NOT_INCREASING,
-                f'time_from_start of level {number} is {time / NANOSECONDS:g} s after '
-                f'{previous / NANOSECONDS:g} s: expected strictly increasing times of at least 0')
-        previous = time
+    check_times(points, 'level')
 
 
 def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Steps[Draft]:
@@ -62,7 +55,7 @@ def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Steps[D
     model, state = outset.model, outset.state
     levels: list[PlannedLevel] = []
     for number, (flux_density, time) in enumerate(points):
-        stamp = outset.on_grid(outset.begin + time - points[0][1])
+        stamp = model.on_grid(outset.begin + time - points[0][1])
         if levels:
             before = levels[-1]
             if stamp <= before.stamp:

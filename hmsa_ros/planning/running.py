@@ -12,7 +12,6 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.equations import elastic_stiffness, equilibrium_stretch
 from hmsa_ros.model.moves import State
 from hmsa_ros.model.simulation import check_stretch, longest_motion
-from hmsa_ros.planning.drafting import on_grid
 from hmsa_ros.planning.history import Deviation, History
 from hmsa_ros.planning.timeline import ALWAYS, Draft, Model, Plan, PlannedLevel, PlannedSegment
 
@@ -173,8 +172,8 @@ class RunningPlan:
 
     def beat_stamp(self, now: int) -> int:
         """Return the time in ns to stamp the level handed out last with when it is repeated."""
-        return on_grid(
-            max(now + self.model.options.lead_time, self.last_sent.stamp), self.model)
+        return self.model.on_grid(
+            max(now + self.model.options.lead_time, self.last_sent.stamp))
 
     def drop_missed(self, now: int, tolerance: int) -> int:
         """

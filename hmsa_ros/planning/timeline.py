@@ -32,6 +32,8 @@ from hmsa_ros.planning.shapers.request import as_errors, ERRORS
 
 #: Options that are of coil and block, and can be estimated.
 ESTIMATED = ('coil_time_constant', 'constant_force')
+# Codes of plans that do not do what was requested.
+_WARNINGS = (Code.TOO_DAMPED, Code.INDISTINGUISHABLE, Code.SPELL_TOO_SHORT)
 #: Stamp of a level that has been in force at rest for ever.
 ALWAYS = -2**62
 
@@ -134,6 +136,11 @@ class Model:
     def acceleration(self, state: State) -> float:
         """Return the nondimensional acceleration in a state whose branches have relaxed."""
         return float(acceleration(state.stretch, state.rate, state.load, self.material))
+
+    def on_grid(self, time: int) -> int:
+        """Return the next time in ns that a command may be stamped with."""
+        period = self.options.period
+        return time if period == 0 else -(-time // period) * period
 
     def follow(self, state: State, load: float, duration: float) -> State:
         """Predict the state after a load has been commanded for a nondimensional time."""
@@ -304,8 +311,12 @@ class Draft:
     #: Place of the first setpoint of the running plan that it plans anew; None for a new request.
     resumed: int | None = None
     missed: int = 0  #: setpoints left out, since their time is over
-    #: The first that is only roughly reached, by another command than requested.
-    warning: PlannedSegment | None = None
+
+    @property
+    def warning(self) -> PlannedSegment | None:
+        """The first setpoint that is only roughly reached, by another command than requested."""
+        return next((x for x in self.segments if x.code in _WARNINGS
+                     or x.code is Code.PATH and x.reason), None)
 
     def delayed(self, delays: Sequence[int]) -> 'Draft':
         """Return the draft with the move of each segment delayed by so many ns."""
