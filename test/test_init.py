@@ -20,12 +20,12 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import elastic_force, natural_frequency
 from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters, paper_actuator
 from hmsa_ros.model.simulation import simulate
-from hmsa_ros.planning.scales import Coil, scales
+from hmsa_ros.planning.scales import scales
 from hmsa_ros.planning.two_step import plan_two_step
 
 ROOT = Path(__file__).resolve().parent.parent
 PAPER = paper_actuator()
-COIL = Coil(-0.5, 0.5)
+COIL = (-0.5, 0.5)
 OWN = ['--half-length', '5mm', '--half-thickness', '4 mm', '--shear-modulus', '30kPa',
        '--density', '1.9 g/cm3', '--remanence', '80mT', '--j-lim', '20', '--zeta', '0.1',
        '--flux-max', '200mT']
@@ -53,7 +53,7 @@ def parameters(path):
 # What follows --------------------------------------------------------------------------------
 
 def test_scales_are_those_of_the_equations():
-    found = scales(PAPER, COIL)
+    found = scales(PAPER, *COIL)
     assert found.time_unit == PAPER.time_unit
     material = PAPER.nondimensional
     assert found.frequency == pytest.approx(
@@ -79,14 +79,14 @@ def test_the_frequency_is_that_of_small_motion():
     middle = stretch - stretch.mean()
     rises = time[:-1][(middle[:-1] < 0.0) & (middle[1:] >= 0.0)]
     period = np.mean(np.diff(rises)) * actuator.time_unit
-    assert scales(actuator, COIL).frequency == pytest.approx(1.0 / period, rel=1e-3)
+    assert scales(actuator, *COIL).frequency == pytest.approx(1.0 / period, rel=1e-3)
 
 
 @pytest.mark.parametrize(('zeta', 'limits'), [
     (0.2, (-0.1, 0.05)), (0.0, (-0.5, 0.5)), (0.2, (0.0, 0.2)), (1.5, (-0.1, 0.1))])
 def test_reach_is_where_two_steps_end_to_be_within_the_coils_range(zeta, limits):
     actuator = paper_actuator(NondimensionalParameters(zeta))
-    found = scales(actuator, Coil(*limits))
+    found = scales(actuator, *limits)
     loads = [x / actuator.flux_density_unit for x in limits]
 
     def reached(stretch):
@@ -104,17 +104,17 @@ def test_reach_is_where_two_steps_end_to_be_within_the_coils_range(zeta, limits)
 
 
 def test_without_a_two_step_command_there_is_no_duration():
-    found = scales(paper_actuator(NondimensionalParameters(zeta=50.0)), COIL)
+    found = scales(paper_actuator(NondimensionalParameters(zeta=50.0)), *COIL)
     assert found.reached == (1.0, 1.0)
     assert math.isnan(found.target)
     assert math.isnan(found.duration)
 
 
 @pytest.mark.parametrize('values', [
-    (0.1, 0.1), (0.2, 0.1), (math.nan, 0.1), (-math.inf, 0.1), (0.0, 0.1, -1.0)])
+    (0.1, 0.1), (0.2, 0.1), (math.nan, 0.1), (-math.inf, 0.1)])
 def test_coils_that_cannot_be_are_refused(values):
     with pytest.raises(BadInputError, match='expected'):
-        Coil(*values)
+        scales(PAPER, *values)
 
 
 # The file ------------------------------------------------------------------------------------
@@ -143,7 +143,7 @@ def test_a_small_actuator_is_sampled_often_enough(run, tmp_path):
     rate = values['publish_rate']
     actuator = ActuatorParameters(**{
         x.partition('.')[2]: y for x, y in values.items() if x.startswith('actuator.')})
-    period = 1.0 / scales(actuator, COIL).frequency
+    period = 1.0 / scales(actuator, *COIL).frequency
     # More than a plant keeps up with in real time: no more than shows the peaks.
     assert rate > 4000.0
     assert 10.0 <= rate * period < 11.0

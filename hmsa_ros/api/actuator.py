@@ -41,7 +41,7 @@ from hmsa_ros.model.equations import Array, critical_zeta, elastic_force, equili
 from hmsa_ros.model.mismatch import Uncertainty
 from hmsa_ros.model.moves import State
 from hmsa_ros.model.parameters import ActuatorParameters
-from hmsa_ros.planning.scales import Coil, Scales, scales
+from hmsa_ros.planning.scales import Scales, scales
 from hmsa_ros.planning.sequence import plan_sequence
 from hmsa_ros.planning.setpoint import Setpoint
 from hmsa_ros.planning.shapers.pace import Pace
@@ -304,8 +304,7 @@ class Actuator:
     @cached_property
     def scales(self) -> Scales:
         """What follows from the parameters: times in s, flux densities in T, and reach."""
-        return scales(
-            self.block, Coil(*self.flux_density_limits, self.parameters['slew_limit']))
+        return scales(self.block, *self.flux_density_limits)
 
     def flux_density(self, stretch: ArrayLike) -> Any:
         """Return the flux density in T that holds a stretch, or an array of them."""

@@ -30,27 +30,8 @@ _OVERDAMPED = 3.0
 
 
 @dataclass(frozen=True)
-class Coil:
-    """What the coil and its amplifier can do."""
-
-    flux_density_min: float  #: in T
-    flux_density_max: float  #: in T
-    slew_limit: float = 0.0  #: ramps in T/s; 0 for steps
-
-    def __post_init__(self) -> None:
-        """Check the range."""
-        if not -math.inf < self.flux_density_min < self.flux_density_max < math.inf:
-            raise BadInputError(
-                f'flux densities from {self.flux_density_min:g} to {self.flux_density_max:g} T: '
-                'expected the least below the largest')
-        if not 0.0 <= self.slew_limit < math.inf:
-            raise BadInputError(
-                f'slew limit is {self.slew_limit:g} T/s: expected 0 for steps, or more')
-
-
-@dataclass(frozen=True)
 class Scales:
-    """What follows from an actuator's parameters and its coil."""
+    """What follows from an actuator's parameters and the range of its coil."""
 
     time_unit: float  #: L sqrt(rho/G) in s
     frequency: float  #: undamped, about rest without field, in Hz
@@ -70,12 +51,19 @@ class Scales:
     duration: float  #: of the two-step command for it, in s
 
 
-def scales(actuator: ActuatorParameters, coil: Coil) -> Scales:
-    """Work out what follows from parameters and coil; ramps are left out of account."""
+def scales(actuator: ActuatorParameters, least: float, most: float) -> Scales:
+    """
+    Work out what follows from parameters and the range of a coil in T.
+
+    Ramps are left out of account. A range that is none is a `BadInputError`.
+    """
+    if not -math.inf < least < most < math.inf:
+        raise BadInputError(
+            f'flux densities from {least:g} to {most:g} T: expected the least below the largest')
     material = actuator.nondimensional
     home = material.rest
     units = actuator.units
-    loads = units.range(coil.flux_density_min, coil.flux_density_max)
+    loads = units.range(least, most)
     lower, upper = stretch_limits(material)
     held = tuple(float(equilibrium_stretch(x, material)) for x in loads)
 
