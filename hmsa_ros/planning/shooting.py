@@ -149,7 +149,7 @@ def approach(
     return found
 
 
-def on_time(found: Attempt, count: int, request: 'Request') -> Attempt:
+def on_time(found: Attempt, request: 'Request') -> Attempt:
     """Solve once more for the first heights, at times that commands can carry if they can."""
     if found is None or request.delivery.resolution == 0.0:
         return found
@@ -157,5 +157,5 @@ def on_time(found: Attempt, count: int, request: 'Request') -> Attempt:
     resolution = request.delivery.resolution
     rounded = [Level(request.delivery.rounded(x.time) + i * resolution, x.load)
                for i, x in enumerate(found[0])]
-    free = [('load', i) for i in range(count)]
-    return solve(Template.of(rounded, free), request) or found
+    return solve(Template.of(
+        rounded, [('load', i) for i in range(request.unknowns)]), request) or found

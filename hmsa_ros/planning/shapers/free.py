@@ -45,18 +45,13 @@ def at_rest(request: Request) -> bool:
         request.load - holding) * (not math.isinf(delivery.slew))) <= AT_REST * stiffness
 
 
-def unknowns(request: Request) -> int:
-    """Return how many numbers of a command are free."""
-    return 2 + (request.delivery.lag > 0.0)
-
-
 def free_heights(request: Request) -> Attempt:
     """Return the shortest levels of free heights that keep the limits, if there are any."""
     delivery = request.delivery
     if delivery.period > 0.0 or delivery.lag > 0.0 or math.isinf(delivery.slew):
         return first_kept(_equal(request), request)
     found = soonest_kept(_swings(request), request) or first_kept(_equal(request), request)
-    return on_time(found, 2, request)
+    return on_time(found, request)
 
 
 def free_levels(request: Request) -> Move:
@@ -73,7 +68,7 @@ def through(request: Request, duration: float) -> Move:
 
     Where the limits have no such move: `RefusedError`.
     """
-    count, period, holding = unknowns(request), request.delivery.period, request.holding_load()
+    count, period, holding = request.unknowns, request.delivery.period, request.holding_load()
     edges = duration / count * np.arange(count + 1)
     if period > 0.0:
         edges = period * np.round(edges / period)
@@ -93,12 +88,12 @@ def no_single(request: Request) -> str:
     level = request.units.drive.name
     return (f'no single intermediate {level}{settled} within the limits leads as soon from '
             f'{request.named_state} to rest at {request.target:g}: '
-            f'{_NUMBERS[unknowns(request)]} are used')
+            f'{_NUMBERS[request.unknowns]} are used')
 
 
 def _equal(request: Request) -> Iterator[Template]:
     """Yield guesses of levels that are all as long."""
-    delivery, holding, count = request.delivery, request.holding_load(), unknowns(request)
+    delivery, holding, count = request.delivery, request.holding_load(), request.unknowns
     half, before = math.pi / request.frequency, 0.0
     for share in _LENGTHS:
         each = (share * half + delivery.lag + delivery.ramp(holding - request.load)) / count

@@ -11,7 +11,7 @@ from hmsa_ros.model import law
 from hmsa_ros.model.moves import Level, Move, State
 from hmsa_ros.model.simulation import paces, sampled
 from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.shapers.free import at_rest, free_levels, unknowns
+from hmsa_ros.planning.shapers.free import at_rest, free_levels
 from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.shooting import (
     approach,
@@ -37,15 +37,14 @@ _STRIDE, _MOST_STEPS = 0.05, 8_000
 _SHORTEST_STRIDE = 0.03
 
 
-def push_brake(request: Request, reason: str = '') -> Move:
+def push_brake(request: Request) -> Move:
     """
     Push with the load limit on one side, brake with the other, then hold.
 
     With bounded load the fastest transfer is bang-bang with one switch, and behind a lag with two.
     It exists from any state, moving ones and those above critical damping included, as long as the
     limits leave room on both sides of the target's own load: `RefusedError` otherwise. Without
-    limits, a push of twice the move's change of load is used. ``reason`` is why it takes the place
-    of another.
+    limits, a push of twice the move's change of load is used.
     """
     holding = request.holding_load()
     if at_rest(request):
@@ -55,17 +54,17 @@ def push_brake(request: Request, reason: str = '') -> Move:
     if lags and request.delivery.period > 0.0:
         found = _fastest_on_grid(request, least, most)
         if found is not None:
-            return Move(Code.MINIMUM_TIME, *found, reason)
-        return replace(free_levels(request), reason=reason)
+            return Move(Code.MINIMUM_TIME, *found)
+        return replace(free_levels(request), reason='')
     for share in _SHARES:
         # On a grid and through ramps full height may leave no time to switch.
         low, high = holding + share * (least - holding), holding + share * (most - holding)
         up = _direction(request, low, high) > 0.0
         found = _attempt(request, *((high, low) if up else (low, high)))
         if found is not None and request.keeps(found[0]):
-            return Move(Code.MINIMUM_TIME, *found, reason)
+            return Move(Code.MINIMUM_TIME, *found)
     if lags:
-        return replace(free_levels(request), reason=reason)
+        return replace(free_levels(request), reason='')
     raise RefusedError(
         Code.NOT_CONVERGED,
         f'no command of two levels within the limits was found from {request.named_state} to '
@@ -93,7 +92,7 @@ def _attempt(request: Request, push: float, brake: float) -> Attempt:
         replace(delivery, lag=0.0))
     if found is not None and (request.material.creep or delivery.lag > 0.0):
         found = _carried(request, found[0])
-    return on_time(found, unknowns(request), request)
+    return on_time(found, request)
 
 
 def _carried(request: Request, plain: tuple[Level, ...]) -> Attempt:

@@ -130,6 +130,11 @@ class Request:
         """Whether the actuator does not move, though nothing may hold it there."""
         return abs(self.state.rate) <= AT_REST * self.frequency
 
+    @property
+    def unknowns(self) -> int:
+        """How many numbers of a command are free: for stretch, rate and a field that lags."""
+        return 2 + (self.delivery.lag > 0.0)
+
     def keeps(self, levels: Sequence[Level]) -> bool:
         """Return whether levels are inside the load limits."""
         return all(self.limits.minimum <= x.load <= self.limits.maximum for x in levels)

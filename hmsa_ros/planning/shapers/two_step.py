@@ -73,7 +73,7 @@ def two_step(request: Request) -> Move:
     if request.still and not lags and (code is Code.TWO_STEP or not creeps):
         request.check(levels)
     if at_once and not lags and not creeps:
-        return push_brake(request, no_single(request))
+        return replace(push_brake(request), reason=no_single(request))
     try:
         return free_levels(request)
     except RefusedError:
