@@ -53,16 +53,13 @@ def push_brake(request: Request) -> Move:
     lags = request.delivery.lag > 0.0
     if lags and request.delivery.period > 0.0:
         found = _fastest_on_grid(request, least, most)
-        if found is not None:
-            return Move(Code.MINIMUM_TIME, *found)
-        return replace(free_levels(request), reason='')
-    for share in _SHARES:
+    else:
         # On a grid and through ramps full height may leave no time to switch.
-        low, high = holding + share * (least - holding), holding + share * (most - holding)
-        up = _direction(request, low, high) > 0.0
-        found = _attempt(request, *((high, low) if up else (low, high)))
-        if found is not None and request.keeps(found[0]):
-            return Move(Code.MINIMUM_TIME, *found)
+        found = next(filter(None, (_attempt(
+            request, *(holding + share * (x - holding) for x in (least, most)))
+            for share in _SHARES)), None)
+    if found is not None:
+        return Move(Code.MINIMUM_TIME, *found)
     if lags:
         return replace(free_levels(request), reason='')
     raise RefusedError(
@@ -71,8 +68,9 @@ def push_brake(request: Request) -> Move:
         f'rest at {request.target:g}')
 
 
-def _attempt(request: Request, push: float, brake: float) -> Attempt:
-    """Push and brake with given loads; None if no command comes of it."""
+def _attempt(request: Request, low: float, high: float) -> Attempt:
+    """Push and brake with given loads; None if no command within the limits comes of it."""
+    push, brake = (high, low) if _upwards(request, low, high) else (low, high)
     elastic = replace(request, material=request.material.elastic)
     try:
         pushing, braking = _durations(elastic, push, brake)
@@ -92,7 +90,8 @@ def _attempt(request: Request, push: float, brake: float) -> Attempt:
         replace(delivery, lag=0.0))
     if found is not None and (request.material.creep or delivery.lag > 0.0):
         found = _carried(request, found[0])
-    return on_time(found, request)
+    found = on_time(found, request)
+    return found if found is not None and request.keeps(found[0]) else None
 
 
 def _carried(request: Request, plain: tuple[Level, ...]) -> Attempt:
@@ -186,35 +185,34 @@ def _bounds(request: Request, holding: float) -> tuple[float, float]:
     return least, most
 
 
-def _direction(request: Request, least: float, most: float) -> float:
-    """Return where to push: +1 if full braking would stop short of the target, seen upwards."""
+def _turn(request: Request, state: State, load: float) -> tuple[float, float] | None:
+    """Return time and stretch at which a load turns a motion, None if it cannot be followed."""
+    status, time, stretch, _, _ = motion.turning_point(
+        state.stretch, state.rate, math.copysign(1.0, state.rate), load, 1.0,
+        request.material.packed, _RTOL)
+    return (time, stretch) if status == motion.DONE else None
+
+
+def _upwards(request: Request, least: float, most: float) -> bool:
+    """Return whether to push up: full braking would stop short of the target, seen upwards."""
     state = request.state
-    stop = state.stretch
-    if state.rate != 0.0:
-        up = state.rate > 0.0
-        status, _, stop, _, _ = motion.turning_point(
-            state.stretch, state.rate, 1.0 if up else -1.0, least if up else most, 1.0,
-            request.material.packed, _RTOL)
-        if status != motion.DONE:
-            stop = state.stretch
-    return 1.0 if request.target > stop else -1.0
+    turned = None if state.rate == 0.0 else _turn(
+        request, state, least if state.rate > 0.0 else most)
+    return request.target > (state.stretch if turned is None else turned[1])
 
 
 def _durations(request: Request, push: float, brake: float) -> tuple[float, float]:
     """Return about how long to push so that braking turns at the target, and how long to brake."""
     material, target = request.material, request.target
-    packed, direction = material.packed, math.copysign(1.0, push - brake)
+    direction = math.copysign(1.0, push - brake)
     pushed, stride = (Level(0.0, push),), _STRIDE / (request.frequency + material.zeta)
 
     def turn(start: State, way: float, load: float) -> tuple[float, float]:
         if way * start.rate <= 0.0:
             return 0.0, start.stretch
-        status, time, stretch, _, _ = motion.turning_point(
-            start.stretch, start.rate, way, load, 1.0, packed, _RTOL)
-        if status != motion.DONE:
-            # Too hard against a limiting stretch to be followed: far beyond the target.
-            return 0.0, float(packed[law.UPPER if way > 0.0 else law.LOWER])
-        return time, stretch
+        # Too hard against a limiting stretch to be followed: far beyond the target.
+        return _turn(request, start, load) or (
+            0.0, float(material.packed[law.UPPER if way > 0.0 else law.LOWER]))
 
     # Moving away, the push first has to bring it to a stop.
     begin, stretch = turn(request.state, -direction, push)
