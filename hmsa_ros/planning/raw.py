@@ -10,7 +10,6 @@ from dataclasses import replace
 import math
 
 from hmsa_ros.model.equations import equilibrium_stretch, stretch_limits
-from hmsa_ros.model.moves import State
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.drafting import check_times, draft_moves, Outset, Steps
@@ -63,15 +62,15 @@ def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Steps[D
                     Code.NOT_INCREASING,
                     f'levels {number - 1} and {number} apply within one command period of '
                     f'{model.options.period / NANOSECONDS:g} s: expected levels farther apart')
-            _check_motion(number - 1, before, state, stamp)
+            _check_motion(number - 1, before, stamp)
             state = model.follow(
                 state, before.load, model.time(stamp - before.stamp))
         levels.append(PlannedLevel(stamp, flux_density, state, model))
         yield
     last = levels[-1]
-    _check_motion(len(points) - 1, last, state, None)
+    _check_motion(len(points) - 1, last, None)
     rest = float(equilibrium_stretch(last.load, model.material))
-    settled = model.ns(_settling(last, state))
+    settled = model.ns(last.ramped)
     period = _period(model, rest)
     times = [last.stamp + settled + round(i * period / _SAMPLES)
              for i in range(round(_PERIODS * _SAMPLES))]
@@ -93,11 +92,6 @@ def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Steps[D
         rest, outset.begin, arrival, Code.LEVELS, '', outset.begin),))
 
 
-def _settling(level: PlannedLevel, state: State) -> float:
-    """Return the nondimensional time that the field takes to get to a level."""
-    return level.model.delivery.settling(level.load - state.ramps_from)
-
-
 def _period(model: Model, stretch: float) -> float:
     """Return the shorter period, in ns, of vibration about a stretch and about rest."""
     return min(
@@ -105,7 +99,7 @@ def _period(model: Model, stretch: float) -> float:
         for x in (model.material.rest, stretch))
 
 
-def _check_motion(number: int, level: PlannedLevel, state: State, end: int | None) -> None:
+def _check_motion(number: int, level: PlannedLevel, end: int | None) -> None:
     """Refuse a level under which the block would come too near to the limits of its law."""
     model = level.model
     lower, upper = stretch_limits(model.material)
@@ -114,8 +108,7 @@ def _check_motion(number: int, level: PlannedLevel, state: State, end: int | Non
     rest = float(equilibrium_stretch(level.load, model.material))
     if least < rest < most:
         step = _period(model, rest) / _SAMPLES
-        last = level.stamp + model.ns(_settling(level, state)) + round(
-            _PERIODS * _SAMPLES * step)
+        last = level.stamp + model.ns(level.ramped) + round(_PERIODS * _SAMPLES * step)
         last = last if end is None else min(end, last)
         times = [level.stamp + round(i * step) for i in range(
             int((last - level.stamp) / step) + 1)]

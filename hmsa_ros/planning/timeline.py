@@ -212,10 +212,14 @@ class PlannedLevel:
             min(max(self.model.time(time - self.stamp), 0.0),
                 math.inf if self.model.material.creep else self._settled()))
 
+    @property
+    def ramped(self) -> float:
+        """Nondimensional time that the field takes to get to the level."""
+        return self.model.delivery.settling(self.load - self.state.ramps_from)
+
     def _settled(self) -> float:
         """Return the time after which nothing moves, but for creep."""
-        return self.model.delivery.settling(self.load - self.state.ramps_from) \
-            + longest_motion(self.load, self.model.material)
+        return self.ramped + longest_motion(self.load, self.model.material)
 
     def sample(self, times: Sequence[int]) -> list[tuple[float, float]]:
         """Predict stretch and rate (1/s) at times in ns, not decreasing, from the stamp on."""
