@@ -69,13 +69,12 @@ class PlannerGroup:
             self, points: Mapping[str, Sequence[tuple[Any, int]]], stamp: int | None,
             now: int, *, raw: bool = False, path: bool = False) -> Steps[dict[str, Draft]]:
         """Work out a sequence, levels if raw, or a path, without joints that change nothing."""
-        if raw or path:
-            draft = Planner.draft_levels if raw else Planner.draft_path
-            return (yield from self._each(
-                points, lambda name: draft(self.planners[name], points[name], stamp, now)))
+        draft: Callable[..., Steps[Draft | None]] = (
+            Planner.draft_levels if raw else Planner.draft_path if path
+            else Planner.draft_request)
         drafts = yield from self._each(
-            points, lambda name: self.planners[name].draft_request(points[name], stamp, now))
-        if self.simultaneous:
+            points, lambda name: draft(self.planners[name], points[name], stamp, now))
+        if self.simultaneous and not (raw or path):
             return (yield from self._together(drafts))
         return drafts
 

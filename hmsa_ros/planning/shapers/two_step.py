@@ -121,19 +121,14 @@ def _late(request: Request, lag: float) -> tuple[Code, tuple[Level, ...]]:
 
 def _without(request: Request, code: Code, holding: float) -> Move:
     """Return what takes the place of two levels where there are none."""
-    zeta = request.material.zeta
     if code is Code.HOLD:
         return Move(code, (Level(0.0, holding),), 0.0)
-    if code is Code.TOO_DAMPED:
-        return request.plain(
-            code,
-            f'zeta {zeta:g} is too damped for the response to cross {request.named_target}: no '
-            'two-step command exists, the unshaped step approaches without overshoot (shaper '
-            'minimum_time can arrive in finite time)')
-    return request.plain(
-        code,
-        f'zeta {zeta:g} is so close to critical damping at {request.named_target} that beta_p '
-        'equals beta_1 to rounding: the unshaped step is used')
+    return request.plain(code, f'zeta {request.material.zeta:g} ' + (
+        f'is too damped for the response to cross {request.named_target}: no two-step command '
+        'exists, the unshaped step approaches without overshoot (shaper minimum_time can arrive '
+        'in finite time)' if code is Code.TOO_DAMPED else
+        f'is so close to critical damping at {request.named_target} that beta_p equals beta_1 to '
+        'rounding: the unshaped step is used'))
 
 
 def _delivered(request: Request, levels: tuple[Level, ...]) -> Attempt:
