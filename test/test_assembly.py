@@ -50,14 +50,14 @@ def driven(coil, period=0):
 
 def test_levels_go_out_as_currents_and_come_back_as_levels_and_readings_as_stretch():
     supply, laser, device = driven(CoilModel(0.05), period=MS)
-    assert device.limits == [pytest.approx(0.4)]
-    instrument = device.instruments[0]
+    assert device.coils[0].limit == pytest.approx(0.4)
+    instrument = device.coils[0].instrument
     assert (instrument.resolution, instrument.slew) == pytest.approx((5e-5, 50.0))
     device.receive(0, 0, 0.2)
     laser.length = 22.0
     device.advance(START + MS)
     assert supply.currents == pytest.approx([0.0, 4.0])
-    assert device.levels == pytest.approx([0.2])
+    assert device.coils[0].level == pytest.approx(0.2)
     sample = device.samples()[-1]
     assert sample.stretch[0] == pytest.approx(1.1)
     assert sample.rate[0] == pytest.approx(0.05)
@@ -103,7 +103,7 @@ def test_a_coil_that_is_too_warm_is_switched_off_and_refused_until_it_has_cooled
     assert not at(2.9)
     (text,) = at(3.1)
     assert 'the coil is too warm: 2.04 A effective over 10 s' in text
-    assert (supply.currents[-1], device.levels) == (0.0, [0.0])
+    assert (supply.currents[-1], device.coils[0].level) == (0.0, 0.0)
     (text,) = at(4.0, 0.1)
     assert 'wait 1.6 s' in text
     assert not at(6.0, 0.15)

@@ -107,7 +107,7 @@ def test_a_level_that_is_held_through_a_silence_is_no_cut_off(make):
 @BOTH
 def test_before_the_first_command_nothing_is_refused(make):
     device = make()
-    device.cut_off(0, device.time)
+    device.guards[0].cut_off(device.time)
     device.changes()
     assert not refused(device, START - MS, 0.05)
 

@@ -1,5 +1,6 @@
 """The simulated plant without ROS: what it decides and what it says."""
 
+from collections import deque
 from dataclasses import replace
 import math
 
@@ -12,7 +13,7 @@ from hmsa_ros.device.health import enough_samples, judge_commands, too_few_sampl
 from hmsa_ros.device.protocol import Kind, Sample
 from hmsa_ros.device.sensor import Sensor, SensorErrors, Transport
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.device.watchdog import Fallback, Watchdog
+from hmsa_ros.device.watchdog import Fallback, GuardedJoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.actuators import Setup
 from hmsa_ros.model.parameters import paper_actuator
@@ -278,7 +279,8 @@ def test_settings_out_of_range_are_refused(make, sentence):
 
 
 def test_the_watchdog_waits_for_a_first_command_and_leaves_pauses_out():
-    dog = Watchdog(Fallback(1e-8))
+    notices = deque()
+    dog = GuardedJoint(0, Fallback(1e-8), notices)
 
     def trips(now):
         before = dog.trips
@@ -286,18 +288,20 @@ def test_the_watchdog_waits_for_a_first_command_and_leaves_pauses_out():
         return dog.trips > before
 
     assert not trips(1000)
-    assert not dog.feed(1000)
+    dog.feed(1000)
+    assert not notices
     assert not trips(1010)
-    assert dog.due == 1011
+    assert dog.watch_due == 1011
     assert trips(1011)
     assert not trips(1012)
-    assert dog.feed(1020)
+    dog.feed(1020)
+    assert [x.kind for x in notices] == [Kind.SILENT, Kind.HEARD]
     dog.pass_over(50)
     assert not trips(1080)
     assert trips(1081)
-    dog.disarm()
+    dog.stand_by()
     assert not trips(5000)
-    dog = Watchdog(Fallback(0.0))
+    dog = GuardedJoint(0, Fallback(0.0), notices)
     dog.feed(0)
     assert not trips(10**18)
 

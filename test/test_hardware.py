@@ -464,8 +464,8 @@ def test_samples_of_a_device_with_a_clock_are_stamped_in_the_time_of_the_host():
     errors = np.array([x.time for x in samples]) - np.array(board.exposed)
     assert np.abs(errors).max() < 30_000
     assert np.abs(errors[100:]).max() < 10_000
-    assert device.instruments[0].clock_map.drift == pytest.approx(80e-6, abs=15e-6)
-    assert device.instruments[0].clock_map.error < 50e-6
+    assert device.coils[0].instrument.clock_map.drift == pytest.approx(80e-6, abs=15e-6)
+    assert device.coils[0].instrument.clock_map.error < 50e-6
 
 
 def test_a_board_whose_clock_begins_anew_has_lost_its_state():
@@ -477,7 +477,7 @@ def test_a_board_whose_clock_begins_anew_has_lost_its_state():
     for k in range(100, 1200):
         step(board, device, START + k * MS)
     (notice,) = device.notices()
-    assert (notice.kind, device.levels) == (Kind.LOST, [0.0])
+    assert (notice.kind, device.coils[0].level) == (Kind.LOST, 0.0)
     assert 'its clock is another one' in notice.text
     # It goes on by the new clock.
     device.receive(0, START + 1300 * MS, 0.1)
@@ -694,7 +694,7 @@ def test_a_coil_that_is_too_warm_goes_off_and_is_obeyed_again_once_it_has_cooled
         bench.degrees = degrees
         go_on(device.time + second // 2)
         assert bench.levels[-1] == 0.0
-        assert device.levels == [0.0]
+        assert device.coils[0].level == 0.0
         with pytest.raises(BadInputError, match=said):
             device.receive(0, 0, 0.1)
         device.receive(0, 0, 0.0)

@@ -165,7 +165,7 @@ def test_an_open_interlock_finds_a_board_that_has_rebooted():
     driver.lock('the door', START + 2 * MS)
     driver.advance(START + 3 * MS)
     assert coil.told[-1] == 0.0
-    assert math.isclose(driver.levels[0], 0.0)
+    assert math.isclose(driver.coils[0].level, 0.0)
     driver.lock('', START + 5 * MS)
     driver.receive(0, 0, 0.2)
     assert 'expected 0 T first' in driver.notices()[-1].text

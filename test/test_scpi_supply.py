@@ -46,12 +46,12 @@ def test_a_supply_sets_currents_that_its_driver_confirms_and_is_off_in_the_end(t
     assert (simulated.mode, simulated.current, simulated.on) == ('CURR', 0.0, True)
     device = HardwareDevice([HardwareJoint(hardware, 1.0, Fallback(0.0))], time=START)
     assert device.switch_off(START) == ''
-    assert device.limits == [pytest.approx(0.5)]
+    assert device.coils[0].limit == pytest.approx(0.5)
     # An answer that is damaged is asked for again.
     faults += [lambda x: b'\xff' + x[:3] + b'\n']
     device.receive(0, 0, 0.2)
     device.advance(START + 1)
-    assert device.levels == [pytest.approx(0.2, abs=1e-4)]
+    assert device.coils[0].level == pytest.approx(0.2, abs=1e-4)
     assert simulated.current == pytest.approx(4.0, abs=1e-3)
     assert device.counts['saturated'] == 0
     assert device.switch_off(START + 2) == device.close() == ''

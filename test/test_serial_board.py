@@ -219,7 +219,7 @@ def go_on(device, done, what):
 
 
 def reached(device, level):
-    return lambda: device.levels == pytest.approx([level])
+    return lambda: device.coils[0].level == pytest.approx(level)
 
 
 def test_a_board_that_restarts_is_noticed_and_obeys_by_its_new_clock(line):
@@ -230,7 +230,7 @@ def test_a_board_that_restarts_is_noticed_and_obeys_by_its_new_clock(line):
     go_on(device, lambda: device.counts['state_lost'], 'the loss')
     (notice,) = [x for x in device.notices() if x.kind == Kind.LOST]
     assert f'the board on {line.path} has restarted' in notice.text
-    assert device.levels == [0.0]
+    assert device.coils[0].level == 0.0
     device.changes()
     device.receive(0, time_ns() + 100 * MS, 0.15)
     go_on(device, reached(device, 0.15), 'the next level')

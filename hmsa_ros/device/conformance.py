@@ -174,7 +174,7 @@ class Trial:
         progress('levels and samples', 0.0)
         bench = _ProbedBench(self._make, self._level, self._rate)
         self._tolerance = max(
-            bench.worker.device.instruments[0].resolution or 0.0, 1e-3 * self._level)
+            bench.worker.device.coils[0].instrument.resolution or 0.0, 1e-3 * self._level)
         rest = bench.hold(_PHASE, [0.0])
         up, down = (bench.hold(_PHASE, [x * self._level]) for x in (1.0, -1.0))
         progress('timing', 0.3)
@@ -373,7 +373,7 @@ class Trial:
                 'give calls a time limit of their own; nothing else is written meanwhile')
 
     def _check_clock(self, bench: _ProbedBench) -> None:
-        known = bench.worker.device.instruments[0].clock_map
+        known = bench.worker.device.coils[0].instrument.clock_map
         if known is not None:
             self._note(
                 'clock', known.error, 's', _CLOCK,
@@ -382,7 +382,7 @@ class Trial:
 
     def _check_temperature(self, bench: _ProbedBench) -> None:
         device = bench.worker.device
-        if device.instruments[0].has('temperature'):
+        if device.coils[0].instrument.has('temperature'):
             found = next(iter(device.temperatures.values()), math.nan)
             self._note(
                 'temperature', abs(found), 'deg C', _HOTTEST,

@@ -10,14 +10,16 @@ from numbers import Real
 import os
 import sys
 from time import monotonic
-from typing import Any, cast, NamedTuple, Protocol
+from typing import Any, cast, NamedTuple, Protocol, TypeVar
 
-from hmsa_ros.device.clock_map import ClockMap
+from hmsa_ros.device.clock_map import ClockMap, ENOUGH
 from hmsa_ros.device.protocol import StateLostError
 from hmsa_ros.device.watchdog import ANOTHER_CLOCK
 from hmsa_ros.ending import Deadline, encoded
 from hmsa_ros.errors import BadInputError, excerpt, HmsaError
 from hmsa_ros.model.units import NANOSECONDS
+
+T = TypeVar('T')
 
 #: Hardware of this package, by the short names that `load` takes, too.
 SHIPPED = {
@@ -236,6 +238,9 @@ class Instrument:
     """
     The hardware of a joint, with what it returns checked, and ``name`` for sentences.
 
+    Its calls raise `HardwareError` where they fail, or answer what cannot be used, and
+    `StateLostError` where the hardware says so.
+
     Raises
     ------
     BadInputError
@@ -244,13 +249,24 @@ class Instrument:
     """
 
     def __init__(self, hardware: Hardware, joint: str, calls: Calls) -> None:
-        self._hardware, self._calls = hardware, calls
-        self.name, self._joint = type(hardware).__name__, joint
+        self.hardware, self._calls = hardware, calls
+        self.name = type(hardware).__name__
         self._names = {x: f'{self.name}.{x} of joint {joint}' for x in _TAKES}
         for method, arguments in _TAKES.items():
-            self._check_signature(method, arguments)
-        self.limit, self.resolution, self.slew, self._capacity = (
+            try:
+                inspect.signature(getattr(hardware, method, lambda *_: 0)).bind(*arguments)
+            except ValueError:  # of something that is no Python
+                pass
+            except TypeError as error:
+                raise BadInputError(
+                    f'{self.name}.{method} does not take what it is given ({error}): expected '
+                    f'{method}({", ".join(arguments)})') from error
+        self.limit, self.resolution, self.slew, capacity = (
             self._number(x) for x in ('limit', 'resolution', 'slew', 'capacity'))
+        #: How many levels it takes ahead; None for any number.
+        self.capacity = None if capacity is None else int(capacity)
+        #: Whether it takes levels ahead.
+        self.keeps_levels = self.has('schedule')
         #: What was found, in its words.
         self.description = str(getattr(hardware, 'description', '') or '')
         #: The device's clock against that of this host; None where there is one clock.
@@ -258,19 +274,9 @@ class Instrument:
         # Stamps of ours, in the device's clock as it was known when they were handed over.
         self._handed: dict[int, int] = {}
 
-    def _check_signature(self, method: str, arguments: Sequence[str]) -> None:
-        try:
-            inspect.signature(getattr(self._hardware, method, lambda *_: 0)).bind(*arguments)
-        except ValueError:  # of something that is no Python
-            pass
-        except TypeError as error:
-            raise BadInputError(
-                f'{self.name}.{method} does not take what it is given ({error}): expected '
-                f'{method}({", ".join(arguments)})') from error
-
     def _number(self, name: str) -> float | None:
         try:
-            value = getattr(self._hardware, name, None)
+            value = getattr(self.hardware, name, None)
         except BaseException as error:  # of a property
             raise BadInputError(f'{self.name}.{name} raised {told(error)}') from error
         if value is not None and not (is_number(value) and value > 0.0):
@@ -280,7 +286,7 @@ class Instrument:
 
     def has(self, method: str) -> bool:
         """Return whether it has a method."""
-        return callable(getattr(self._hardware, method, None))
+        return callable(getattr(self.hardware, method, None))
 
     def tolerance(self, limit: float) -> float:
         """Return which difference in T between levels asked and set is none."""
@@ -293,10 +299,13 @@ class Instrument:
     # -- calls ---------------------------------------------------------------------------------
 
     def _call(self, method: str, *arguments: object) -> Any:
+        """Call a method, and return its answer; do nothing without one that is optional."""
+        if not self.has(method):
+            return None
         name = self._names[method]
 
         def act() -> Any:
-            answer = getattr(self._hardware, method)(*arguments)
+            answer = getattr(self.hardware, method)(*arguments)
             # What is yielded is waited for and fails as the call itself does.
             return answer if not isinstance(answer, Iterator) else [
                 *islice(answer, _MOST_PIECES + 1)]
@@ -308,19 +317,23 @@ class Instrument:
         except BaseException as error:  # whatever a laboratory's code raises, sys.exit too
             raise HardwareError(f'{name} raised {told(error)}') from error
 
+    def _ask(
+            self, method: str, *arguments: object, take: Callable[[Any], T], expected: str) -> T:
+        """Return what `take` makes of an answer; it raises TypeError or ValueError for none."""
+        answer = self._call(method, *arguments)
+        try:
+            return take(answer)
+        except (TypeError, ValueError) as error:
+            raise HardwareError(
+                f'{self._names[method]} returned {excerpt(answer)}: expected {expected}'
+            ) from error
+
     def write(self, level: float, now: int) -> tuple[int, float]:
-        """
-        Set a level in T at a time in ns; return when it took effect, and the one really set.
-
-        Raises
-        ------
-        HardwareError
-            If it fails.
-        StateLostError
-            If the hardware says so.
-
-        """
-        return self._written(self._call('write', level, self._theirs(now)), level, now)
+        """Set a level in T at a time in ns; return when it took effect, and the one really set."""
+        return self._ask(
+            'write', level, self._theirs(now), take=lambda x: self._written(x, level, now),
+            expected=f'when the level took effect in ns, near now, {now}, that and the level '
+            'really set in T, or None')
 
     def _theirs(self, time: int) -> int:
         """Return a time in ns as the hardware counts it."""
@@ -328,47 +341,27 @@ class Instrument:
 
     def _ours(self, time: Any) -> int:
         """Return a time in ns of the hardware as one of this host."""
-        return int(time) if self.clock_map is None else self.clock_map.to_host(int(time))
+        whole = int(_number(time))
+        return whole if self.clock_map is None else self.clock_map.to_host(whole)
 
-    def _may_be(self, time: int, now: int) -> bool:
-        """Return whether a level may have taken effect at a time, both in ns."""
-        return abs(time - now) <= _ABSURD + self._calls.limit * NANOSECONDS
+    def _happened(self, time: Any, now: int) -> int:
+        """Return when a level took effect, as a time in ns of this host."""
+        found = self._ours(time)
+        if abs(found - now) > _ABSURD + self._calls.limit * NANOSECONDS:
+            raise ValueError
+        return found
 
     def _written(self, answer: Any, level: float, now: int) -> tuple[int, float]:
         pair = isinstance(answer, (tuple, list)) and len(answer) == 2
-        when, really = (answer[0], answer[1]) if pair else (answer, level)
-        if when is None:
-            when = now
-        elif is_number(when):
-            when = self._ours(when)
-        if not (is_number(when) and self._may_be(when, now) and is_number(really)):
-            raise HardwareError(
-                f'{self.name}.write of joint {self._joint} returned {excerpt(answer)}: expected '
-                f'when the level took effect in ns, near now, {now}, that and the level really '
-                'set in T, or None')
-        return int(when), float(really)
+        when, really = answer if pair else (answer, level)
+        return now if when is None else self._happened(when, now), float(_number(really))
 
     def read(self, now: int) -> list[Reading]:
-        """
-        Return what is new at a time in ns.
-
-        Raises
-        ------
-        HardwareError
-            If it fails.
-        StateLostError
-            If the hardware says so.
-
-        """
-        answer = self._call('read', self._theirs(now))
-        try:
-            return [self._stamped(x, now) for x in readings(answer)]
-        except (TypeError, ValueError) as error:
-            raise HardwareError(
-                f'{self.name}.read of joint {self._joint} returned {excerpt(answer)}: expected '
-                f'stretch, (stretch, rate), (stretch, rate, timestamp in ns, near now, {now}) or '
-                f'a list of the latter, at most {_MOST_PIECES}, with NaN for what is not measured'
-            ) from error
+        """Return what is new at a time in ns."""
+        return self._ask(
+            'read', self._theirs(now), take=lambda x: [self._stamped(y, now) for y in readings(x)],
+            expected=f'stretch, (stretch, rate), (stretch, rate, timestamp in ns, near now, {now})'
+            f' or a list of the latter, at most {_MOST_PIECES}, with NaN for what is not measured')
 
     def _stamped(self, found: Reading, now: int) -> Reading:
         if found.stamp is None:
@@ -378,28 +371,8 @@ class Instrument:
             raise ValueError
         return found._replace(stamp=stamp)
 
-    @property
-    def keeps_levels(self) -> bool:
-        """Whether it takes levels ahead."""
-        return self.has('schedule')
-
-    @property
-    def capacity(self) -> int | None:
-        """How many levels it takes ahead; None for any number."""
-        return None if self._capacity is None else int(self._capacity)
-
     def schedule(self, levels: Sequence[tuple[int, float]]) -> None:
-        """
-        Have it keep levels in T from stamps in ns on; they replace all from the first one on.
-
-        Raises
-        ------
-        HardwareError
-            If it fails.
-        StateLostError
-            If the hardware says so.
-
-        """
+        """Have it keep levels in T from stamps in ns on; they replace all from the first on."""
         begin = levels[0][0] if levels else math.inf
         known, self._handed = self._handed, {
             x: y for x, y in self._handed.items() if begin - _ABSURD < x < begin or not levels}
@@ -409,141 +382,69 @@ class Instrument:
         self._call('schedule', [(self._handed[x], y) for x, y in levels])
 
     def applied(self, now: int) -> list[tuple[int, float]]:
-        """
-        Return stamps in ns and levels in T that have taken effect by a time, since the last call.
+        """Return stamps in ns and levels in T that have taken effect since the last call."""
+        return self._ask(
+            'applied', expected='a list of (timestamp in ns, level in T)',
+            take=lambda answer: [
+                (self._happened(x, now), float(_number(y))) for x, y in answer])
 
-        Raises
-        ------
-        HardwareError
-            If it fails.
-        StateLostError
-            If the hardware says so.
-
-        """
-        answer = self._call('applied')
-        try:
-            if not all(is_number(x) and is_number(y) for x, y in answer):
-                raise TypeError
-            found = [(self._ours(x), float(y)) for x, y in answer]
-            if not all(self._may_be(x, now) for x, _ in found):
-                raise ValueError
-        except (TypeError, ValueError) as error:
-            raise HardwareError(
-                f'{self._names["applied"]} returned {excerpt(answer)}: expected a list of '
-                '(timestamp in ns, level in T)') from error
-        return found
-
-    def forget_clock(self) -> None:
-        """Forget what its clock has shown, where it has one."""
+    def synchronise(self, clock: Callable[[], int]) -> None:
+        """Learn its time anew, where it has a clock, by that of this host in ns."""
         self._handed.clear()
         if self.clock_map is not None:
             self.clock_map = ClockMap()
+            for _ in range(ENOUGH):
+                self.ask_clock(clock)
 
     def ask_clock(self, clock: Callable[[], int]) -> bool:
-        """
-        Compare its clock with that of this host, in ns; return whether it is still the same.
-
-        Raises
-        ------
-        HardwareError
-            If it fails, or answers no time.
-        StateLostError
-            If the hardware says so.
-
-        """
+        """Compare its clock with that of this host, in ns; return whether it is still the same."""
         if self.clock_map is None:
             return True
         before = clock()
-        answer = self._call('clock')
-        after = clock()
-        if not is_number(answer):
-            raise HardwareError(
-                f'{self._names["clock"]} returned {excerpt(answer)}: expected its time in ns')
-        return self.clock_map.add(before, int(answer), after)
+        answer = self._ask(
+            'clock', take=lambda x: int(_number(x)), expected='its time in ns')
+        return self.clock_map.add(before, answer, clock())
 
     def temperature(self) -> float:
-        """
-        Return the temperature of its coil in degrees Celsius; NaN if it is not known.
-
-        Raises
-        ------
-        HardwareError
-            If it fails, or answers none.
-        StateLostError
-            If the hardware says so.
-
-        """
-        answer = self._call('temperature') if self.has('temperature') else math.nan
-        if not is_number(answer, finite=False):
-            raise HardwareError(
-                f'{self._names["temperature"]} returned {excerpt(answer)}: expected degrees '
-                'Celsius, NaN if they are not known')
-        return float(answer)
+        """Return the temperature of its coil in degrees Celsius; NaN if it is not known."""
+        return math.nan if not self.has('temperature') else self._ask(
+            'temperature', take=lambda x: float(_number(x, finite=False)),
+            expected='degrees Celsius, NaN if they are not known')
 
     def arm(self) -> None:
-        """
-        Have it made ready for levels, where it can.
-
-        Raises
-        ------
-        HardwareError
-            If it fails.
-        StateLostError
-            If the hardware says so.
-
-        """
-        if self.has('arm'):
-            self._call('arm')
+        """Have it made ready for levels, where it can."""
+        self._call('arm')
 
     def disarm(self) -> None:
-        """
-        Undo `arm`, where it can.
-
-        Raises
-        ------
-        HardwareError
-            If it fails.
-
-        """
-        if self.has('disarm'):
-            with suppress(StateLostError):
-                self._call('disarm')
+        """Undo `arm`, where it can."""
+        with suppress(StateLostError):
+            self._call('disarm')
 
     def open(self) -> None:
         """Connect again, where it can; an error is passed over, as the next `write` shows."""
-        if self.has('open'):
-            with suppress(HardwareError, StateLostError):
-                self._call('open')
+        with suppress(HardwareError, StateLostError):
+            self._call('open')
 
     def close(self) -> None:
-        """
-        End with it, where it can.
-
-        Raises
-        ------
-        HardwareError
-            If it fails.
-
-        """
-        if self.has('close'):
-            with suppress(StateLostError):
-                self._call('close')
+        """End with it, where it can."""
+        with suppress(StateLostError):
+            self._call('close')
 
     def cut(self, now: int) -> bool:
         """Write 0 past the call that blocks, at a time in ns; return whether that is done."""
         try:
-            self._written(self._hardware.write(0.0, self._theirs(now)), 0.0, now)
+            self._written(self.hardware.write(0.0, self._theirs(now)), 0.0, now)
         except BaseException:
             return False
         finally:
             with suppress(BaseException):
-                getattr(self._hardware, 'disarm', lambda: None)()
+                getattr(self.hardware, 'disarm', lambda: None)()
         return True
 
     def drop(self) -> None:
         """Close it past the call that blocks."""
         with suppress(BaseException):
-            getattr(self._hardware, 'close', lambda: None)()
+            getattr(self.hardware, 'close', lambda: None)()
 
 
 def readings(answer: Any) -> list[Reading]:
@@ -562,22 +463,22 @@ def readings(answer: Any) -> list[Reading]:
     if len(values) > _MOST_PIECES:
         raise ValueError(f'read returned more than {_MOST_PIECES} readings')
     if any(is_number(x, finite=False) for x in values):
-        return [_reading(values)]
-    return [_reading(x) for x in values]
+        return [_reading(*values)]
+    return [_reading(*x) for x in values]
 
 
-def _reading(values: Sequence[Any]) -> Reading:
-    """Return stretch, rate and stamp; raise TypeError or ValueError if they are none."""
-    if len(values) > 3:
-        raise TypeError
-    stretch, rate, stamp = [*values, None, None][:3]
-    if not is_number(stretch, finite=False) or not (
-            rate is None or is_number(rate, finite=False)) or not (
-            stamp is None or is_number(stamp)):
-        raise TypeError
+def _reading(stretch: Any, rate: Any = None, stamp: Any = None) -> Reading:
     return Reading(
-        float(stretch), math.nan if rate is None else float(rate),
-        None if stamp is None else int(stamp))
+        float(_number(stretch, finite=False)),
+        math.nan if rate is None else float(_number(rate, finite=False)),
+        None if stamp is None else int(_number(stamp)))
+
+
+def _number(value: Any, *, finite: bool = True) -> Any:
+    """Return a real number; raise TypeError for anything else."""
+    if not is_number(value, finite=finite):
+        raise TypeError
+    return value
 
 
 def is_number(value: Any, *, finite: bool = True) -> bool:

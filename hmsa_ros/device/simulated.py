@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
+from hmsa_ros.device.protocol import Change, Kind, Sample
 from hmsa_ros.device.sensor import Sensor, SensorErrors, Transport
-from hmsa_ros.device.watchdog import Device, Fallback
+from hmsa_ros.device.watchdog import Device, Fallback, GuardedJoint
 from hmsa_ros.model.actuators import Actuators, Setup
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.simulation import too_large
@@ -48,7 +48,9 @@ class SimulatedDevice(Device):
     def __init__(
             self, joints: Sequence[SimulatedJoint], *, period: int, time: int = 0,
             command_delay: int = 0, measurement_delay: int = 0, seed: int = 0) -> None:
-        super().__init__(x.fallback for x in joints)
+        super().__init__()
+        self.guards = [
+            GuardedJoint(i, x.fallback, self._notices) for i, x in enumerate(joints)]
         self.period = period
         self.next_sample = time
         self._actuators = Actuators([x.setup for x in joints], time=time)
@@ -115,12 +117,13 @@ class SimulatedDevice(Device):
 
     def _obey(self, joint: int, stamp: int, level: float) -> None:
         self._actuators.setups[joint].check_level(level)
-        if self._refuses(joint, stamp, level, self.level(joint)):
+        guard = self.guards[joint]
+        if guard.refuses(stamp, level, self.time, self.level(joint)):
             return
         late = self._actuators.command(joint, stamp or self.time, level)
-        self._feed(joint, self.time)
+        guard.feed(self.time)
         if late:
-            self._note_late(joint, late)
+            guard.note_late(late)
 
     # -- time ----------------------------------------------------------------------------------
 
@@ -141,17 +144,17 @@ class SimulatedDevice(Device):
         for known, command in self._transit.arrived(time):
             self._integrate(known)
             self._obey(*command)
-        for i in range(len(self._watchdogs)):
-            for stamp, level in self._safe_levels(i, self.time, time, self.level(i)):
+        for i, guard in enumerate(self.guards):
+            for stamp, level in guard.watch(self.time, time, self.level(i)):
                 self._actuators.command(i, stamp, level)
         self._integrate(time)
 
     def _integrate(self, time: int) -> None:
         """Advance all joints; those whose load is too large start again."""
         for i, reached in self._actuators.advance(time):
-            self._notices.append(Notice(
-                Kind.FAILED, i, f'{too_large(reached, self.level(i))}; the joint starts again '
-                'from its initial state'))
+            self.guards[i].note(
+                Kind.FAILED, f'{too_large(reached, self.level(i))}; the joint starts again from '
+                'its initial state')
             self.restart(i)
 
     def follow(self, now: int, *, standing: bool = False) -> int:
@@ -165,7 +168,7 @@ class SimulatedDevice(Device):
         if gap < -self.period:
             self._go_on_from(now)
             self._transit.clear()
-            for i in range(len(self._watchdogs)):
+            for i in range(len(self.guards)):
                 self.restart(i)
             return gap
         if standing:
@@ -176,9 +179,9 @@ class SimulatedDevice(Device):
         return 0
 
     def _go_on_from(self, now: int) -> None:
-        for watchdog in self._watchdogs:
+        for guard in self.guards:
             # Time that was not simulated is no silence.
-            watchdog.pass_over(now - self.time)
+            guard.pass_over(now - self.time)
         self._actuators.time = now
         self.next_sample = -(-now // self.period) * self.period
 
@@ -188,8 +191,8 @@ class SimulatedDevice(Device):
         """Put a joint back to its initial or another state (rate in 1/s); time goes on."""
         self._actuators.reset(joint, stretch, rate)
         # A first command arms it again.
-        self._watchdogs[joint].disarm()
-        self._cut_offs[joint].end()
+        self.guards[joint].stand_by()
+        self.guards[joint].end_cut_off()
         self._sensor.forget()
 
     def drop_commands(self) -> None:

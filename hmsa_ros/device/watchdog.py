@@ -1,14 +1,17 @@
-"""Devices, and their watchdogs: what a coil does when nobody commands it any more."""
+"""Devices, and what guards their joints: watchdogs, and what is refused after a cut-off."""
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import math
+from typing import TypeVar
 
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.units import NANOSECONDS
+
+T = TypeVar('T')
 
 #: What to do: keep the last level, go to zero at once, or ramp to zero.
 SAFE_FLUX = ('hold', 'zero', 'ramp')
@@ -48,16 +51,23 @@ class Fallback:
             raise BadInputError(f'ramp rate is {self.ramp_rate:g} T/s: expected above 0')
 
 
-class Watchdog:
+class GuardedJoint:
     """
-    Notices that commands and heartbeats have ceased, and commands the safe flux then.
+    What a coil does when nobody commands it any more, and what is refused after it was cut off.
 
-    Armed by the first command, so that an actuator nobody has moved yet raises no alarm. While
-    the silence is too long it is ``tripped``; ``trips`` counts how often it was.
+    Its watchdog notices that commands and heartbeats have ceased, and commands the safe flux then.
+    It is armed by the first command, so that an actuator nobody has moved yet raises no alarm.
+    While the silence is too long it is ``tripped``; ``trips`` counts how often it was.
+
+    After a cut-off, levels that were meant for before are refused. Whoever was out of reach
+    repeats its last level as soon as it is back, and what it sent in vain is sent again: either
+    would put the field on in one step that nobody has asked for.
+
+    What there is to log is appended to ``notices``, with the ``number`` of the joint.
     """
 
-    def __init__(self, fallback: Fallback) -> None:
-        self._fallback = fallback
+    def __init__(self, number: int, fallback: Fallback, notices: deque[Notice]) -> None:
+        self.number, self._fallback, self._notices = number, fallback, notices
         self._timeout = round(fallback.timeout * NANOSECONDS)
         self._last: int | None = None
         # When it began, from which level, and how many of its levels were given.
@@ -65,35 +75,56 @@ class Watchdog:
         self._steps = 0
         self.tripped = False
         self.trips = 0
+        # What was commanded, and since when that is refused.
+        self._before: deque[float] = deque(maxlen=_REMEMBERED)
+        self._since: int | None = None
+        self._zero_first = False
 
-    @property
-    def cuts_off(self) -> bool:
-        """Whether the coil is off after an alarm."""
-        return self._fallback.safe_flux != 'hold'
+    def note(self, kind: Kind, text: str, late: int = 0) -> None:
+        """Note something to log; ``late`` is a lateness in ns."""
+        self._notices.append(Notice(kind, self.number, text, late))
+
+    def note_late(self, late: int) -> None:
+        """Note that a command came some ns after its stamp."""
+        self.note(
+            Kind.LATE, f'command arrived {late / 1e6:.3f} ms after the time it applies and was '
+            'applied at once: raise lead_time of the planner', late)
+
+    def pass_over(self, span: int) -> None:
+        """Leave out a span of time in ns, which was no silence."""
+        if self._last is not None:
+            self._last += span
+        if self._ramp is not None:
+            begin, level = self._ramp
+            self._ramp = begin + span, level
+        if self._since is not None:
+            self._since += span
+
+    # -- the watchdog --------------------------------------------------------------------------
 
     @property
     def ramps(self) -> bool:
         """Whether the coil is to be ramped down rather than switched off."""
         return self._fallback.safe_flux == 'ramp'
 
-    @property
-    def alarm(self) -> str:
-        """What to log when it trips."""
-        return (f'no command and no heartbeat for {self._fallback.timeout:g} s: '
-                f'{_REASONS[self._fallback.safe_flux]}; is the planner running?')
-
-    def feed(self, now: int) -> bool:
-        """Take a sign of life at a time in ns; return whether it ends an alarm."""
-        recovered = self.tripped
+    def feed(self, now: int) -> None:
+        """Take a sign of life at a time in ns."""
+        if self.tripped:
+            self.note(Kind.HEARD, 'commands have come back')
         self.tripped = False
         self._ramp = None
         self._last = now
-        return recovered
 
     def watch(self, now: int, until: int, level: float) -> Iterator[tuple[int, float]]:
         """Yield stamps (ns) and levels (T) of the safe flux once commands have ceased."""
         if self._trips(now):
-            if self._fallback.safe_flux == 'zero':
+            safe = self._fallback.safe_flux
+            self.note(
+                Kind.SILENT, f'no command and no heartbeat for {self._fallback.timeout:g} s: '
+                f'{_REASONS[safe]}; is the planner running?')
+            if safe != 'hold':
+                self.cut_off(now)
+            if safe == 'zero':
                 yield now, 0.0
             elif self.ramps:
                 self.ramp_down(now, level)
@@ -123,7 +154,7 @@ class Watchdog:
         return True
 
     @property
-    def due(self) -> int | None:
+    def watch_due(self) -> int | None:
         """When to `watch` next, in ns; None if there is nothing to watch."""
         if self._ramp is not None:
             return self._ramp[0] + self._steps * _RAMP_STEP_NS
@@ -131,39 +162,19 @@ class Watchdog:
             return None
         return self._last + self._timeout + 1
 
-    def pass_over(self, span: int) -> None:
-        """Leave out a span of time in ns, which was no silence."""
-        if self._last is not None:
-            self._last += span
-        if self._ramp is not None:
-            begin, level = self._ramp
-            self._ramp = begin + span, level
-
-    def disarm(self) -> None:
+    def stand_by(self) -> None:
         """Wait for a first command again."""
         self._last = self._ramp = None
         self.tripped = False
 
-
-class CutOff:
-    """
-    What a joint refuses after its coil was cut off: levels that were meant for before.
-
-    Whoever was out of reach repeats its last level as soon as it is back, and what it sent in vain
-    is sent again: either would put the field on in one step that nobody has asked for.
-    """
-
-    def __init__(self) -> None:
-        self._before: deque[float] = deque(maxlen=_REMEMBERED)
-        self._since: int | None = None
-        self._zero_first = False
+    # -- after a cut-off -----------------------------------------------------------------------
 
     @property
-    def in_force(self) -> bool:
-        """Whether levels are refused."""
+    def is_cut_off(self) -> bool:
+        """Whether levels of before are refused."""
         return self._since is not None
 
-    def begin(self, now: int, *, zero_first: bool = False) -> None:
+    def cut_off(self, now: int, *, zero_first: bool = False) -> None:
         """
         Refuse what was commanded before a time in ns, if anything was.
 
@@ -173,37 +184,32 @@ class CutOff:
             self._since = now
             self._zero_first = self._zero_first or zero_first
 
-    def clock_set(self, by: int) -> None:
-        """Take in that the clock was set ahead by some ns."""
-        if self._since is not None:
-            self._since += by
-
-    def end(self) -> None:
+    def end_cut_off(self) -> None:
         """Forget it, and what was commanded."""
         self._since, self._zero_first = None, False
         self._before.clear()
 
-    def refusal(self, stamp: int, level: float, now: int, current: float) -> str:
-        """Return why a level in T from a stamp in ns on is refused now; empty if it is obeyed."""
-        if self._since is None:
-            self._remember(level)
-            return ''
-        if self._zero_first and (level or current):
-            return (
-                f'{level:g} T, and the interlock was opened '
-                f'{(now - self._since) / NANOSECONDS:.3f} s ago: expected 0 T first, with the '
-                'coil off')
-        off = f'the coil was cut off {(now - self._since) / NANOSECONDS:.3f} s ago'
-        if stamp and stamp < max(now, self._since):
-            self._remember(level)
-            return (f'{level:g} T applied {(now - stamp) / NANOSECONDS:.3f} s ago, and {off}: '
-                    'expected a command for a time that has not passed')
-        if level != current and level in self._before:
-            return (f'{level:g} T was commanded before, and {off}: expected another level, or '
-                    f'the one in force, {current:g} T, first')
-        self.end()
+    def refuses(self, stamp: int, level: float, now: int, current: float) -> bool:
+        """Return whether a level in T, other than the current one, is one of before a cut-off."""
+        if self._since is not None:
+            why, ago = '', (now - self._since) / NANOSECONDS
+            if self._zero_first and (level or current):
+                why = (f'{level:g} T, and the interlock was opened {ago:.3f} s ago: expected 0 T '
+                       'first, with the coil off')
+            elif stamp and stamp < max(now, self._since):
+                self._remember(level)
+                why = (f'{level:g} T applied {(now - stamp) / NANOSECONDS:.3f} s ago, and the '
+                       f'coil was cut off {ago:.3f} s ago: expected a command for a time that '
+                       'has not passed')
+            elif level != current and level in self._before:
+                why = (f'{level:g} T was commanded before, and the coil was cut off {ago:.3f} s '
+                       f'ago: expected another level, or the one in force, {current:g} T, first')
+            if why:
+                self.note(Kind.REFUSED, why)
+                return True
+            self.end_cut_off()
         self._remember(level)
-        return ''
+        return False
 
     def _remember(self, level: float) -> None:
         if not self._before or level != self._before[-1]:
@@ -214,16 +220,17 @@ class Device(ABC):
     """
     Actuators with their amplifiers, sensors and watchdogs.
 
-    Whoever drives it says what time it is, and collects what came of it: `changes`, `samples` and
-    `notices` return what is new since they were last called, in the order in which it happened.
+    Whoever drives it says what time it is, and collects what came of it, also in another thread:
+    `changes`, `samples` and `notices` return what is new since they were last called, in the order
+    in which it happened.
     """
 
-    def __init__(self, fallbacks: Iterable[Fallback]) -> None:
-        self._watchdogs = [Watchdog(x) for x in fallbacks]
-        self._cut_offs = [CutOff() for _ in self._watchdogs]
-        self._changes: list[Change] = []
-        self._samples: list[Sample] = []
-        self._notices: list[Notice] = []
+    guards: Sequence[GuardedJoint]  # of each joint
+
+    def __init__(self) -> None:
+        self._changes: deque[Change] = deque()
+        self._samples: deque[Sample] = deque()
+        self._notices: deque[Notice] = deque()
         #: Why no command is obeyed; empty where they are.
         self.locked = ''
 
@@ -242,44 +249,30 @@ class Device(ABC):
 
     def changes(self) -> list[Change]:
         """Return which levels took effect."""
-        found, self._changes = self._changes, []
-        return found
+        return _emptied(self._changes)
 
     def samples(self) -> list[Sample]:
         """Return what was measured."""
-        found, self._samples = self._samples, []
-        return found
+        return _emptied(self._samples)
 
     def notices(self) -> list[Notice]:
         """Return what there is to log."""
-        found, self._notices = self._notices, []
-        return found
+        return _emptied(self._notices)
 
     @property
     def silent(self) -> list[int]:
         """Joints that nobody commands any more."""
-        return [i for i, x in enumerate(self._watchdogs) if x.tripped]
+        return [x.number for x in self.guards if x.tripped]
 
     @property
     def trips(self) -> int:
         """How often a joint fell silent."""
-        return sum(x.trips for x in self._watchdogs)
+        return sum(x.trips for x in self.guards)
 
     @property
     def cut_offs(self) -> list[int]:
         """Joints whose coil was cut off, and whose levels of before are refused."""
-        return [i for i, x in enumerate(self._cut_offs) if x.in_force]
-
-    def cut_off(self, joint: int, now: int) -> None:
-        """From a time in ns on, refuse levels of before, since the coil is off or unknown."""
-        self._cut_offs[joint].begin(now)
-
-    def _refuses(self, joint: int, stamp: int, level: float, current: float) -> bool:
-        """Return whether a level in T, other than the current one, is one of before a cut-off."""
-        why = self._cut_offs[joint].refusal(stamp, level, self.time, current)
-        if why:
-            self._notices.append(Notice(Kind.REFUSED, joint, why))
-        return bool(why)
+        return [x.number for x in self.guards if x.is_cut_off]
 
     def _check_clock(self, stamp: int) -> None:
         """Refuse a stamp in ns of a clock that began at another time, before it is obeyed."""
@@ -289,24 +282,7 @@ class Device(ABC):
                 f'{self.time / NANOSECONDS:.3f} s: expected one clock for both (use_sim_time the '
                 'same on both sides, no time since a start beside the time of day)')
 
-    def _feed(self, joint: int, now: int) -> None:
-        """Take a sign of life at a time in ns."""
-        if self._watchdogs[joint].feed(now):
-            self._notices.append(Notice(Kind.HEARD, joint, 'commands have come back'))
 
-    def _safe_levels(
-            self, joint: int, now: int, until: int, level: float) -> Iterator[tuple[int, float]]:
-        """Yield stamps (ns) and levels (T) of the safe flux, and note that a joint fell silent."""
-        watchdog = self._watchdogs[joint]
-        trips = watchdog.trips
-        yield from watchdog.watch(now, until, level)
-        if watchdog.trips > trips:
-            if watchdog.cuts_off:
-                self.cut_off(joint, now)
-            self._notices.append(Notice(Kind.SILENT, joint, watchdog.alarm))
-
-    def _note_late(self, joint: int, late: int) -> None:
-        """Note that a command came some ns after its stamp."""
-        self._notices.append(Notice(
-            Kind.LATE, joint, f'command arrived {late / 1e6:.3f} ms after the time it applies and '
-            'was applied at once: raise lead_time of the planner', late))
+def _emptied(queue: deque[T]) -> list[T]:
+    """Return what is in a queue, which another thread may be filling."""
+    return [queue.popleft() for _ in range(len(queue))]

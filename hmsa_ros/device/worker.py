@@ -7,20 +7,20 @@ thread publishes nothing: what hangs there would keep the coil waiting.
 
 from collections import deque
 from collections.abc import Callable
+import math
 import sys
 from threading import Condition, Event, Thread
 from time import monotonic, monotonic_ns, time_ns
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
-from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
+from hmsa_ros.device.coil import HardwareJoint
+from hmsa_ros.device.driven import HardwareDevice
 from hmsa_ros.device.hardware import Calls, Hardware, HardwareError, told
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.device.watchdog import Fallback
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.timekeeping import StepWatch
-
-T = TypeVar('T')
 
 # In ns: a thread that sleeps wakes up late, by some 50 us, and then waits for Python's lock. It
 # gets that within the switch interval, and keeps it as long: both are this time before a level.
@@ -75,9 +75,6 @@ class HardwareWorker:
         self._saver: Thread | None = None
         # Levels, reasons of an interlock, and None to switch off.
         self._commands: deque[_Command | str | None] = deque()
-        self._changes: deque[Change] = deque()
-        self._samples: deque[Sample] = deque()
-        self._notices: deque[Notice] = deque()
         self.failure: HmsaError | None = None
         self.trouble = self._locked = ''
         sys.setswitchinterval(_WATCHED / NANOSECONDS)
@@ -159,15 +156,15 @@ class HardwareWorker:
 
     def changes(self) -> list[Change]:
         """Return which levels took effect."""
-        return _emptied(self._changes)
+        return self.device.changes()
 
     def samples(self) -> list[Sample]:
         """Return what was measured."""
-        return _emptied(self._samples)
+        return self.device.samples()
 
     def notices(self) -> list[Notice]:
         """Return what there is to log."""
-        return _emptied(self._notices)
+        return self.device.notices()
 
     def look_after(self) -> None:
         """See whether the thread lives and its calls return; if not, switch off without it."""
@@ -203,7 +200,6 @@ class HardwareWorker:
             if left := self.device.switch_off(self._clock()):
                 raise HmsaError(
                     f'{left}: the coil could NOT be switched off at the start; {_MEND}')
-            self._hand_over()
         except BaseException as error:  # whatever it is, nobody else would hear of it
             self.failure = error if isinstance(error, HmsaError) else HmsaError(
                 f'the driver does not start ({told(error)})')
@@ -226,7 +222,6 @@ class HardwareWorker:
                 self._see_clock()
                 self._hear()
                 self.device.advance(self._clock())
-                self._hand_over()
                 self._wait()
         except BaseException as error:
             return self._end(
@@ -257,14 +252,9 @@ class HardwareWorker:
                 try:
                     self.device.hear(*command[:3], self._clock() - self._steady() + command.came)
                 except BadInputError as error:
-                    self._notices.append(Notice(Kind.REFUSED, command.joint, str(error)))
+                    self.device.coils[command.joint].note(Kind.REFUSED, str(error))
             elif left := self.device.switch_off(self._clock()):
                 raise HardwareError(left)
-
-    def _hand_over(self) -> None:
-        self._notices.extend(self.device.notices())
-        self._changes.extend(self.device.changes())
-        self._samples.extend(self.device.samples())
 
     def _wait(self) -> None:
         """Sleep until something is due; the last of the time to a level is watched instead."""
@@ -302,7 +292,6 @@ class HardwareWorker:
                     f'{why or left}: the coil could NOT be switched off and may be on'
                     f'{f" ({left})" if why and left != why else ""}; cut the power of the '
                     'amplifier; the driver goes on trying')
-            self._hand_over()
             if self._ended:
                 last = last or monotonic() + _LAST_ATTEMPTS
                 if monotonic() > last:
@@ -311,7 +300,6 @@ class HardwareWorker:
                 self._turn.wait(_PAUSE if self._ended else pause)
             pause = min(2.0 * pause, _LONGEST_PAUSE)
             self.device.open()
-        self._hand_over()
         if again and not self._ended:
             with self._turn:
                 # What fails again at once keeps nobody busy.
@@ -345,21 +333,21 @@ class HardwareWorker:
         device, now = self.device, self._clock()
         done: dict[int, bool] = {}
         for act in (
-                lambda i, x: done.update({i: x.cut(now)}), lambda _, x: x.drop()):
-            threads = [Thread(target=act, args=x, daemon=True)
-                       for x in enumerate(device.instruments)]
+                lambda x: done.update({x.number: x.instrument.cut(now)}),
+                lambda x: x.instrument.drop()):
+            threads = [Thread(target=act, args=(x,), daemon=True) for x in device.coils]
             for x in threads:
                 x.start()
             until = monotonic() + _PAST
             for x in threads:
                 x.join(max(until - monotonic(), 0.0))
-        for i in range(len(device.instruments)):
-            device.forget(i, 0.0 if done.get(i) else float('nan'))
-        self._changes.extend(device.changes())
+        for coil in device.coils:
+            level = 0.0 if done.get(coil.number) else math.nan
+            coil.set(device.time, level, level)
         self.failure = HmsaError(
             f'{why}: ' + (
                 f'the coil is switched off from another thread; {_MEND}'
-                if len(done) == len(device.instruments) and all(done.values()) else
+                if all(done.get(x.number) for x in device.coils) else
                 'the coil could NOT be switched off and may be on; cut the power of the '
                 'amplifier'))
 
@@ -380,8 +368,3 @@ def lone_worker(
             f'the hardware has not started within {_START:g} s, or its first write not returned: '
             'expected one that does')
     return worker
-
-
-def _emptied(queue: deque[T]) -> list[T]:
-    """Return what is in a queue, which another thread may be filling."""
-    return [queue.popleft() for _ in range(len(queue))]

@@ -11,7 +11,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import ParameterDescriptor
 from std_msgs.msg import Bool
 
-from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
+from hmsa_ros.device.coil import HardwareJoint
+from hmsa_ros.device.driven import HardwareDevice
 from hmsa_ros.device.hardware import Calls, load, OPTIONAL
 from hmsa_ros.device.health import judge_hardware, judge_interlock, listed
 from hmsa_ros.device.interlock import Interlock
@@ -254,15 +255,15 @@ def _make_device(
 def _described(device: HardwareDevice, values: JointParameters) -> str:
     """Return what was found, in a line."""
     each = []
-    for name, coil, limit in zip(values.names, device.instruments, device.limits, strict=True):
-        own = values.of(name)
+    for joint in device.coils:
+        own, coil = values.of(joint.name), joint.instrument
         rate, safe = own[PUBLISH_RATE.name], own['safe_flux']
         optional = [x for x in OPTIONAL if coil.has(x)]
         each.append(
-            f'{coil.name} for joint {name}'
+            f'{coil.name} for joint {joint.name}'
             f'{f" ({coil.description})" if coil.description else ""}'
-            f'{f" with {listed(optional)}" if optional else ""}: limit {limit:g} T, resolution '
-            f'{_known(coil.resolution, "T")}, slew {_known(coil.slew, "T/s")}, '
+            f'{f" with {listed(optional)}" if optional else ""}: limit {joint.limit:g} T, '
+            f'resolution {_known(coil.resolution, "T")}, slew {_known(coil.slew, "T/s")}, '
             + (f'read at {rate:g} Hz' if rate else 'not read')
             + ('' if coil.clock_map is None else
                f', its clock known to {coil.clock_map.error * 1e6:.0f} us')
