@@ -7,6 +7,7 @@ example: hmsa calibrate coil readings.csv --out coil.yaml
 """
 
 import argparse
+from contextlib import nullcontext
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -23,10 +24,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from hmsa_ros.device.assembly import SensorScale
+    from hmsa_ros.device.bench import Bench
     from hmsa_ros.device.calibration import CoilCalibration
     from hmsa_ros.device.iron_core import IronCore
     from hmsa_ros.identification.delays import Interval
-    from hmsa_ros.lab.calibrating import Source
     from hmsa_ros.model.equations import Array
 
 # Readings of a probe that are averaged.
@@ -113,18 +114,31 @@ def _add_source(parser: Any) -> None:
         parser, ('--simulate', 'calibrate a simulated bench with delays and noise'), _SET, _LIMIT)
 
 
-def _source(arguments: argparse.Namespace) -> 'Source':
-    """Return what is to be calibrated, of valid options."""
-    from hmsa_ros.lab.calibrating import Source
-
+def _checked(arguments: argparse.Namespace) -> str:
+    """Return the name of what is to be calibrated, of valid options."""
     check_targets([] if arguments.out is None else [arguments.out])
     if arguments.simulate is (arguments.source is not None):
         raise BadInputError('expected either MODULE:NAME of hardware or --simulate')
     if arguments.steps < 2:
         raise BadInputError(f'--steps is {arguments.steps}: expected at least 2')
-    return Source(
-        f'{_SIMULATED}SimulatedBench' if arguments.simulate else arguments.source,
-        dict(setting(x) for x in arguments.set), arguments.limit)
+    if not 0.0 < arguments.limit < math.inf:
+        raise BadInputError(f'--limit is {arguments.limit:g} T: expected a number above 0')
+    return f'{_SIMULATED}SimulatedBench' if arguments.simulate else str(arguments.source)
+
+
+def _bench(name: str, arguments: argparse.Namespace, rate: float = 1000.0) -> 'Bench':
+    """Return hardware in force, whose sensor is read at a rate in Hz."""
+    from hmsa_ros.device.bench import Bench
+
+    return Bench(name, dict(setting(x) for x in arguments.set), arguments.limit, rate)
+
+
+def _scale(bench: 'Bench') -> 'SensorScale | None':
+    """Return what the readings of a sensor mean; None where it does not say."""
+    from hmsa_ros.device.assembly import SensorScale
+
+    found = getattr(bench.coil.instrument.hardware, 'scale', None)
+    return found if isinstance(found, SensorScale) else None
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -204,21 +218,34 @@ def _readings(arguments: argparse.Namespace) -> 'tuple[Array, Array]':
 
         columns = read_table(path, ('current', 'flux_density')).columns
         return columns['current'], columns['flux_density']
-    from hmsa_ros.device.calibration import decay, held_coil, loop, read_loop
+    import numpy as np
+
+    from hmsa_ros.device.assembly import CoilModel
+    from hmsa_ros.device.calibration import decay, loop
 
     read = _typed if arguments.probe is None else _probe(arguments.probe)
-    settings = dict(setting(x) for x in arguments.set)
-    with held_coil(arguments.source, settings, arguments.limit) as held:
+    rows = []
+    with _bench(arguments.source, arguments, rate=0.0) as bench:
+        coil = getattr(bench.coil.instrument.hardware, 'coil', None)
+        if not isinstance(coil, CoilModel):
+            raise BadInputError(
+                f'{arguments.source} has no coil of currents: expected an Assembly of a source '
+                'and a CoilModel (hmsa_ros.device.assembly); for another class, give a CSV of '
+                'readings with the columns current and flux_density')
         levels = loop(arguments.limit, arguments.steps)
-        if arguments.probe is None:
-            found = read_loop(held, levels, arguments.settle, read, lambda text, share: None)
-        else:
-            with progress('starting') as update:
-                found = read_loop(held, levels, arguments.settle, read, update)
+        # Nothing is drawn over what is typed.
+        with progress('starting') if arguments.probe else nullcontext() as update:
+            for i, level in enumerate(levels):
+                bench.hold(arguments.settle, [level])
+                current = coil.current(level)
+                if update is not None:
+                    update(f'{current:.4g} A', i / len(levels))
+                rows.append((current, read(current)))
         if arguments.hysteresis:
             for level in decay(arguments.limit):
-                held.hold(level, arguments.settle)
-    return found
+                bench.hold(arguments.settle, [level])
+    current, flux = np.array(rows).T
+    return current, flux
 
 
 def _typed(current: float) -> float:
@@ -302,7 +329,7 @@ def _latency(arguments: argparse.Namespace) -> int:
 
     example: hmsa calibrate latency my_lab:Bench --probe my_lab:Hall --limit 0.05 --out delays.yaml
     """
-    paper, source = paper_of(arguments), _source(arguments)
+    paper, name = paper_of(arguments), _checked(arguments)
     if arguments.lag is not None and not 0.0 <= arguments.lag < 1.0:
         raise BadInputError(f'--lag is {arguments.lag:g} s: expected 0 to 1 s')
     if arguments.lag is not None and (arguments.probe is not None or arguments.simulate):
@@ -313,22 +340,23 @@ def _latency(arguments: argparse.Namespace) -> int:
     actuator = read_belief(arguments.params_file).actuator
     probe = _made(f'{_SIMULATED}SimulatedProbe', '--simulate') if arguments.simulate else (
         None if arguments.probe is None else _made(arguments.probe, '--probe'))
-    with progress() as update:
+    with _bench(name, arguments) as bench, progress() as update:
+        scale = _scale(bench)
         found = measure_delays(
-            source, steps_of(actuator, arguments.limit, arguments.steps), probe, actuator,
+            bench, steps_of(actuator, arguments.limit, arguments.steps), probe, actuator,
             arguments.lag, update)
     if arguments.picture:
         from hmsa_ros.report.calibration import draw_delays
 
         draw_delays(arguments.picture, found, paper)
     shown = {'transport': found.transport, 'lag': found.lag, 'latency': found.latency}
-    notes, scale = list(found.notes), source.scale
+    notes = list(found.notes)
     if arguments.out is not None:
         nodes: dict[str, dict[str, Any]] = {'driver': {}, 'planner': {}}
         if scale is not None:
             nodes['driver'] = {'hardware.sensor.latency': scale.latency + found.setting.value}
         else:
-            notes.append(f'{source.name} has no setting sensor.latency: take '
+            notes.append(f'{name} has no setting sensor.latency: take '
                          f'{found.setting.value:.6g} s off the timestamps of its samples')
         if math.isfinite(found.lag.value):
             nodes['planner'] = {'coil_time_constant': max(found.lag.value, 0.0)}
@@ -366,7 +394,7 @@ def _static(arguments: argparse.Namespace) -> int:
 
     example: hmsa calibrate static my_lab:Bench --limit 0.05 --settle 5 --out static.yaml
     """
-    paper, source = paper_of(arguments), _source(arguments)
+    paper, name = paper_of(arguments), _checked(arguments)
     if arguments.steps < 3:
         raise BadInputError(
             f'--steps is {arguments.steps}: expected at least 3, since a table needs six levels')
@@ -376,17 +404,18 @@ def _static(arguments: argparse.Namespace) -> int:
     from hmsa_ros.lab.calibrating import hold_staircase
 
     gauge = None if arguments.gauge is None else _made(arguments.gauge, '--gauge')
-    with progress() as update:
+    with _bench(name, arguments) as bench, progress() as update:
+        scale = _scale(bench)
         level, stretch, length, drift = hold_staircase(
-            source, arguments.steps, arguments.settle,
+            bench, arguments.limit, arguments.steps, arguments.settle,
             None if gauge is None else lambda _: float(gauge.read()), update)
-    found, scale, misses = statics(level, stretch), source.scale, math.nan
+    found, misses = statics(level, stretch), math.nan
     notes = []
     if drift > _SETTLED:
         notes.append(f'the stretch still goes by {100.0 * drift:.2g} % of the range at the end of '
                      'a level: raise --settle')
     if scale is None:
-        notes.append(f'{source.name} has no scale of its sensor (an Assembly has): it shows '
+        notes.append(f'{name} has no scale of its sensor (an Assembly has): it shows '
                      f'{found.rest:.6g} without a field, expected 1')
     elif gauge is not None:
         scale, misses = scale_by_gauge(scale, level, stretch, length)

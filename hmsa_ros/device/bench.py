@@ -1,21 +1,29 @@
 """A coil and its sensor on the bench: levels handed over, and what comes of them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 import math
+from threading import Event, Lock, Thread
 from time import monotonic, sleep, time_ns
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from hmsa_ros.device.hardware import Hardware
+from hmsa_ros.device.coil import Coil, HardwareJoint
+from hmsa_ros.device.driven import HardwareDevice
+from hmsa_ros.device.hardware import Calls, load
 from hmsa_ros.device.protocol import Change, Sample
-from hmsa_ros.device.worker import lone_worker
+from hmsa_ros.device.watchdog import Fallback
+from hmsa_ros.device.worker import HardwareWorker
+from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.units import NANOSECONDS
 
 # In s: how far ahead levels are handed over, between signs of life, silence after which the coil
-# is cut off, and how often events are looked at.
-LEAD, _BEAT, SILENCE, _LOOK = 0.1, 0.05, 0.5, 2e-3
+# is cut off, the longest start, and how long whoever waits sleeps.
+LEAD, _BEAT, SILENCE, _START, _LOOK = 0.1, 0.05, 1.0, 10.0, 2e-3
+# How often a level that has not been set is waited for.
+_PATIENCE = 10
 
 
 class Seen(NamedTuple):
@@ -39,48 +47,101 @@ class Seen(NamedTuple):
 
 
 class Bench:
-    """A worker with one joint, and a commander that repeats the last level as a planner does."""
+    """
+    Hardware of one joint, and a commander that repeats the last level as a planner does.
 
-    def __init__(self, make: Callable[[], Hardware], limit: float, rate: float) -> None:
-        self._rate = rate
+    A context manager: the coil is off at the end, however that comes.
+
+    Parameters
+    ----------
+    name : str
+        ``MODULE:NAME``, or one that is shipped.
+    settings : mapping
+        Its keyword arguments.
+    limit : float
+        Largest flux density in T.
+    rate : float
+        Rate in Hz at which it is read; 0 for never.
+    joint : str
+        Name it is called with.
+    calls : Calls, optional
+        What is told of each call.
+
+    Raises
+    ------
+    HmsaError
+        If it does not start.
+
+    """
+
+    def __init__(
+            self, name: str, settings: Mapping[str, Any], limit: float, rate: float,
+            joint: str = 'actuator', calls: Calls | None = None) -> None:
+        self.name = name
         #: How late in s the host wakes whoever sleeps.
         self.slept: list[float] = []
-        self.worker = lone_worker(make, limit, rate, SILENCE)
-        # The newest command, which is repeated as a sign of life, and when next.
-        self._newest, self._beat = (0, 0.0), 0.0
+        #: Whether signs of life are given.
+        self.beats = True
+        self.worker = HardwareWorker(lambda: HardwareDevice(
+            [HardwareJoint(load(name)(joint, settings), limit, Fallback(SILENCE, 'zero'))],
+            time=time_ns(), period=round(NANOSECONDS / rate) if rate else 0, calls=calls), time_ns)
+        if not self.worker.started(_START):
+            raise HmsaError(
+                f'the hardware has not started within {_START:g} s, or its first write not '
+                'returned: expected one that does')
+        # The newest command, which is repeated as a sign of life.
+        self._newest, self._turn = (0, 0.0), Lock()
+        self._over = Event()
+        self._beating = Thread(target=self._beat, name='beat', daemon=True)
+        self._beating.start()
 
-    def run(self, seconds: float, levels: Sequence[float] = (), *, beat: bool = True) -> Seen:
-        """Let time pass; hand over levels in T, spread over it, and repeat the last in between."""
-        begin, seen = time_ns() + round(LEAD * NANOSECONDS), Seen([], [], [])
-        apart = seconds / max(len(levels), 1)
-        for i, level in enumerate(levels):
-            stamp = begin + round(i * apart * NANOSECONDS)
-            self.worker.receive(0, stamp, level)
-            seen.asked.append((stamp, level))
-            self._newest = stamp, level
+    def __enter__(self) -> 'Bench':
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._beating.join()
+        self.worker.close()
+
+    @property
+    def coil(self) -> Coil:
+        """What is known of the coil."""
+        return self.worker.device.coils[0]
+
+    def _beat(self) -> None:
+        while not self._over.wait(_BEAT):
+            # What has failed refuses all.
+            with self._turn, suppress(BadInputError):
+                if self.beats:
+                    self.worker.receive(0, *self._newest)
+            self.worker.look_after()
+
+    def run(self, seconds: float, levels: Sequence[float] = ()) -> Seen:
+        """Let time pass, with levels in T spread over it; the last one stays."""
+        begin, apart = time_ns() + round(LEAD * NANOSECONDS), seconds / max(len(levels), 1)
+        asked = [(begin + round(i * apart * NANOSECONDS), x) for i, x in enumerate(levels)]
+        with self._turn:
+            for self._newest in asked:
+                self.worker.receive(0, *self._newest)
         until = monotonic() + seconds + (LEAD if levels else 0.0)
         while monotonic() < until and self.worker.failure is None:
-            if beat and monotonic() > self._beat:
-                self._beat = monotonic() + _BEAT
-                self.worker.receive(0, *self._newest)
             begun = monotonic()
             sleep(_LOOK)
             self.slept.append(monotonic() - begun - _LOOK)
-            self.worker.look_after()
-            self._collect(seen)
-        self._collect(seen)
-        return seen
+        return Seen(self.worker.changes(), self.worker.samples(), asked)
 
     def hold(self, seconds: float, levels: Sequence[float]) -> Seen:
-        """Run; raise `HmsaError` where the hardware fails."""
+        """Run, longer where the last level comes late; raise `HmsaError` if it fails."""
         seen = self.run(seconds, levels)
-        if self.worker.failure is not None:
-            raise self.worker.failure
-        return seen
-
-    def _collect(self, seen: Seen) -> None:
-        seen.changes.extend(self.worker.changes())
-        seen.samples.extend(self.worker.samples())
+        for _ in range(_PATIENCE):
+            if failure := self.worker.failure or self.worker.trouble:
+                raise HmsaError(str(failure))
+            if not levels or self.coil.asked == levels[-1]:
+                return seen
+            seen = seen.joined(self.run(max(seconds, LEAD)))
+        raise HmsaError(
+            f'{self.name} has not set {levels[-1]:g} T: expected that within a second; see hmsa '
+            'check-driver')
 
 
 def matched(seen: Seen) -> list[tuple[Change, tuple[int, float]]]:

@@ -1,21 +1,14 @@
 """What readings of a field probe say of a coil: its constant, saturation, table and hysteresis."""
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 import math
-from threading import Event, Thread
-from time import time_ns
 from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
-from hmsa_ros.device.assembly import CoilModel
-from hmsa_ros.device.hardware import Hardware, load
-from hmsa_ros.device.worker import HardwareWorker, lone_worker
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import Array
 
 # Readings that a fit needs at the least.
@@ -23,10 +16,6 @@ _FEWEST = 4
 # Share of the range that a model may miss where scatter does not explain it, and a saturation that
 # the readings do not show, in units of the largest field.
 _MISSES, _FAR = 0.005, 20.0
-# In s: between signs of life for a watchdog, and silence that switches off.
-_BEAT, _SILENCE = 0.1, 1.0
-# Rate in Hz at which the hardware is looked after.
-_RATE = 50.0
 # Levels that demagnetise a core.
 _DECAY = 12
 # Currents closer than this share of their range are one.
@@ -191,9 +180,6 @@ def branch_means(current: Array, flux_density: Array) -> tuple[Array, Array, flo
     return np.array(at), np.array(mean), float(np.nanmax(apart)) if len(apart) > 1 else math.nan
 
 
-# -- the guided run ---------------------------------------------------------------------------
-
-
 def loop(largest: float, steps: int) -> list[float]:
     """Return levels from 0 up to the largest one, down to its negative, and back to 0."""
     up = np.linspace(0.0, largest, steps + 1)
@@ -203,134 +189,3 @@ def loop(largest: float, steps: int) -> list[float]:
 def decay(largest: float) -> list[float]:
     """Return levels that demagnetise a core: to both sides, ever smaller, and 0."""
     return [largest * (1.0 - i / _DECAY) * (-1.0)**i for i in range(_DECAY)] + [0.0]
-
-
-class HeldCoil:
-    """A coil that holds a level, with signs of life for its watchdog; `held_coil` makes it."""
-
-    def __init__(self, worker: HardwareWorker, coil: CoilModel) -> None:
-        self._worker, self.coil = worker, coil
-        self._level = self._sent = 0.0
-        self._over = Event()
-        self._beats = Thread(target=self._beat, name='beat', daemon=True)
-        self._beats.start()
-
-    def _beat(self) -> None:
-        while not self._over.wait(_BEAT):
-            level = self._level
-            self._worker.receive(0, time_ns(), level)
-            self._sent = level
-            self._worker.look_after()
-            for queue in (self._worker.changes, self._worker.samples, self._worker.notices):
-                queue()
-
-    def hold(self, level: float, seconds: float) -> float:
-        """
-        Hold a level in T for some time in s; return the current in A that it needs.
-
-        Raises
-        ------
-        HmsaError
-            If the hardware fails.
-
-        """
-        self._level = level
-        while self._sent != level and self._worker.failure is None:
-            self._over.wait(_BEAT)
-        self._over.wait(seconds)
-        if failure := self._worker.failure or self._worker.trouble:
-            raise HmsaError(f'the coil does not hold {level:g} T: {failure}')
-        return self.coil.current(level)
-
-    def release(self) -> None:
-        """Give no more signs of life."""
-        self._over.set()
-        self._beats.join()
-
-
-@contextmanager
-def held_coil(
-        name: str, settings: Mapping[str, Any], limit: float,
-        joint: str = 'actuator') -> Iterator[HeldCoil]:
-    """
-    Start hardware whose coil is to be calibrated; it is off at the end, however that comes.
-
-    Parameters
-    ----------
-    name : str
-        ``MODULE:NAME``, or one that is shipped.
-    settings : mapping
-        Its keyword arguments.
-    limit : float
-        Largest flux density in T.
-    joint : str
-        Name it is called with.
-
-    Yields
-    ------
-    HeldCoil
-        In force.
-
-    Raises
-    ------
-    BadInputError
-        If it does not start, or has no coil of currents.
-    HmsaError
-        If it hangs at the start.
-
-    """
-    made: list[Hardware] = []
-
-    def make() -> Hardware:
-        made.append(load(name)(joint, settings))
-        return made[0]
-
-    worker = lone_worker(make, limit, _RATE, _SILENCE)
-    try:
-        coil = getattr(made[0], 'coil', None)
-        if not isinstance(coil, CoilModel):
-            raise BadInputError(
-                f'{name} has no coil of currents: expected an Assembly of a source and a '
-                'CoilModel (hmsa_ros.device.assembly); for another class, give a CSV of readings '
-                'with the columns current and flux_density')
-        held = HeldCoil(worker, coil)
-        try:
-            yield held
-        finally:
-            held.release()
-    finally:
-        worker.close()
-
-
-def read_loop(
-        held: HeldCoil, levels: list[float], settle: float, read: Callable[[float], float],
-        progress: Callable[[str, float], None]) -> tuple[Array, Array]:
-    """
-    Hold each level, and have the field read.
-
-    Parameters
-    ----------
-    held : HeldCoil
-        In force.
-    levels : list of float
-        In T.
-    settle : float
-        Time in s at each level before it is read.
-    read : callable
-        Called with the current in A; returns the flux density in T.
-    progress : callable
-        Called with what is going on and the share that is done.
-
-    Returns
-    -------
-    (ndarray, ndarray), shape (n,)
-        Currents in A and readings in T.
-
-    """
-    rows = []
-    for i, level in enumerate(levels):
-        current = held.hold(level, settle)
-        progress(f'{current:.4g} A', i / len(levels))
-        rows.append((current, read(current)))
-    found: Array = np.array(rows)
-    return found[:, 0], found[:, 1]

@@ -1,7 +1,7 @@
 """
 Whether a class of hardware does what a driver needs, tried at small levels.
 
-The trial drives it as a driver does, by a `HardwareWorker`, and judges by what it returned and by
+The trial drives it as a driver does, on a `Bench`, and judges by what it returned and by
 what its sensor saw.
 """
 
@@ -19,7 +19,7 @@ from typing import Any, cast, IO, NamedTuple
 import numpy as np
 
 from hmsa_ros.device.bench import Bench, matched, Seen, SILENCE
-from hmsa_ros.device.hardware import Calls, Hardware, Instrument, load
+from hmsa_ros.device.hardware import Calls, Instrument, load
 from hmsa_ros.device.protocol import StateLostError
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import Array
@@ -71,42 +71,24 @@ class Conformance(NamedTuple):
             'untried': list(self.untried)}
 
 
-class _Probe:
-    """Hardware with the duration of each call noted, and an error to be raised when asked for."""
+class _TimedCalls(Calls):
+    """Notes how long each call takes, and has reading fail once it is to."""
 
-    def __init__(self, hardware: Hardware) -> None:
-        self._hardware = hardware
+    def __init__(self) -> None:
+        super().__init__(1.0)
         self.durations: dict[str, list[float]] = {}
-        self.fails = False
+        self.read_fails = False
 
-    def __getattr__(self, name: str) -> Any:
-        found = getattr(self._hardware, name)
-        return self._timed(name, found) if callable(found) else found
-
-    def _timed(self, name: str, act: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*arguments: object) -> Any:
-            if self.fails and name == 'read':
-                raise RuntimeError('raised by the trial')
-            begun = monotonic()
-            try:
-                return act(*arguments)
-            finally:
-                self.durations.setdefault(name, []).append(monotonic() - begun)
-        return call
-
-
-class _ProbedBench(Bench):
-    """A bench whose hardware notes the duration of each call."""
-
-    #: Set by the worker's thread before the worker has started.
-    probe: _Probe
-
-    def __init__(self, make: Callable[[], Hardware], limit: float, rate: float) -> None:
-        super().__init__(lambda: self._probed(make), limit, rate)
-
-    def _probed(self, make: Callable[[], Hardware]) -> Hardware:
-        self.probe = _Probe(make())
-        return cast(Hardware, self.probe)
+    def __call__(self, name: str, act: Callable[..., Any], *arguments: object) -> Any:
+        """Call a method of hardware."""
+        method = name.partition(' ')[0].rpartition('.')[2]
+        if self.read_fails and method == 'read':
+            raise RuntimeError('raised by the trial')
+        begun = monotonic()
+        try:
+            return super().__call__(name, act, *arguments)
+        finally:
+            self.durations.setdefault(method, []).append(monotonic() - begun)
 
 
 class Trial:
@@ -144,8 +126,9 @@ class Trial:
         self._level, self._rate = level, rate
         self._checks: list[Check] = []
         self._untried: list[str] = []
-        # Mean stretch at rest and at the level, where the sensor tells them apart.
-        self._rest = self._lifted = math.nan
+        self._calls = _TimedCalls()
+        # Mean stretch at rest, and how far off a level is at least, where the sensor shows it.
+        self._rest = self._apart = math.nan
         # Of a level, in T.
         self._tolerance = 1e-3 * level
 
@@ -172,38 +155,46 @@ class Trial:
 
         """
         progress('levels and samples', 0.0)
-        bench = _ProbedBench(self._make, self._level, self._rate)
-        self._tolerance = max(
-            bench.worker.device.coils[0].instrument.resolution or 0.0, 1e-3 * self._level)
-        rest = bench.hold(_PHASE, [0.0])
-        up, down = (bench.hold(_PHASE, [x * self._level]) for x in (1.0, -1.0))
-        progress('timing', 0.3)
-        timed = self._timed(bench)
-        self._check_levels([rest, up, down, timed], timed)
-        self._check_lateness(_lateness(timed), bench.slept)
-        self._check_samples([rest, up, down, timed], timed)
-        self._check_response(rest, up, down)
-        progress('silence and ends', 0.6)
-        self._check_silence(bench)
-        bench.worker.close()
+        with self._bench() as bench:
+            instrument = bench.coil.instrument
+            self._tolerance = max(instrument.resolution or 0.0, 1e-3 * self._level)
+            rest = bench.hold(_PHASE, [0.0])
+            up, down = (bench.hold(_PHASE, [x * self._level]) for x in (1.0, -1.0))
+            progress('timing', 0.3)
+            timed = self._timed(bench)
+            self._check_levels([rest, up, down, timed], timed)
+            self._check_lateness(_lateness(timed), bench.slept)
+            self._check_samples([rest, up, down, timed], timed)
+            self._check_response(rest, up, down)
+            progress('silence and ends', 0.6)
+            self._check_silence(bench)
         self._check_end('off_at_close', 'after close', bench.worker.failure is None, str(
             bench.worker.failure or ''))
-        durations = {x: np.array(y) for x, y in bench.probe.durations.items()}
+        durations = {x: np.array(y) for x, y in self._calls.durations.items()}
         self._check_calls(durations, bench.slept)
-        self._check_clock(bench)
-        self._check_temperature(bench)
+        if (known := instrument.clock_map) is not None:
+            self._note(
+                'clock', known.error, 's', _CLOCK,
+                f'its clock is known to {known.error * 1e6:.3g} us, and drifts by '
+                f'{known.drift * 1e6:.3g} ppm', 'clock() must answer at once')
+        if instrument.has('temperature'):
+            found = bench.coil.temperature
+            self._note(
+                'temperature', abs(found), 'deg C', _HOTTEST,
+                f'the coil is at {found:g} degrees Celsius',
+                'return the temperature of the coil in degrees Celsius')
         self._check_exception()
         progress('SIGTERM', 0.8)
         self._check_sigterm()
-        lateness = np.array(_lateness(timed))
         return Conformance(
             self.name, tuple(self._checks), tuple(self._untried),
-            {**durations, 'lateness': lateness})
+            {**durations, 'lateness': np.array(_lateness(timed))})
 
-    def _make(self) -> Hardware:
-        return load(self.name)(self._joint, self._settings)
+    def _bench(self) -> Bench:
+        return Bench(
+            self.name, self._settings, self._level, self._rate, self._joint, self._calls)
 
-    def _timed(self, bench: _ProbedBench) -> Seen:
+    def _timed(self, bench: Bench) -> Seen:
         """Time a series of levels: again, a few times, where the host slept through one."""
         for _ in range(_TRIES):
             bench.slept.clear()
@@ -288,14 +279,14 @@ class Trial:
             'polarity', -apart, '', 0.0,
             f'{self._level:g} T lengthens the actuator by {apart / 2:.3g} of its length',
             'turn the leads of the coil, or the sign of the sensor')
-        self._rest, self._lifted = means[0], means[1]
+        self._rest, self._apart = means[0], abs(means[1] - means[0])
 
     # -- ends ----------------------------------------------------------------------------------
 
-    def _check_silence(self, bench: _ProbedBench) -> None:
+    def _check_silence(self, bench: Bench) -> None:
         bench.hold(0.2, [self._level])
-        begun = time_ns()
-        seen = bench.run(SILENCE + 0.5, beat=False)
+        begun, bench.beats = time_ns(), False
+        seen = bench.run(SILENCE + 0.5)
         off = [x.stamp for x in seen.changes if abs(x.level) <= self._tolerance]
         after = (off[0] - begun) / NANOSECONDS if off else math.inf
         self._note(
@@ -304,10 +295,11 @@ class Trial:
 
     def _off(self) -> bool | None:
         """Return whether the sensor of new hardware sees rest; None if it cannot tell."""
-        if math.isnan(self._lifted):
+        if math.isnan(self._apart):
             return None
-        instrument = Instrument(self._make(), self._joint, Calls(1.0))
-        instrument.ask_clock(time_ns)
+        instrument = Instrument(
+            load(self.name)(self._joint, self._settings), self._joint, Calls(1.0))
+        instrument.synchronise(time_ns)
         found: list[float] = []
         until = monotonic() + 2.0 * _PHASE
         while monotonic() < until:
@@ -319,7 +311,7 @@ class Trial:
         if not found:
             return None
         last = float(np.mean(found[len(found) // 2:]))
-        return abs(last - self._rest) < 0.3 * abs(self._lifted - self._rest)
+        return abs(last - self._rest) < 0.3 * self._apart
 
     def _check_end(self, name: str, when: str, orderly: bool, why: str) -> None:
         off = self._off()
@@ -333,12 +325,11 @@ class Trial:
             'write(0.0) and close must leave it without a current')
 
     def _check_exception(self) -> None:
-        bench = _ProbedBench(self._make, self._level, self._rate)
-        bench.run(0.2, [self._level])
-        bench.probe.fails = True
-        bench.run(0.5)
-        failure = str(bench.worker.failure or 'not noticed')
-        bench.worker.close()
+        with self._bench() as bench:
+            bench.run(0.2, [self._level])
+            self._calls.read_fails = True
+            bench.run(0.5)
+            failure = str(bench.worker.failure or 'not noticed')
         self._check_end('off_at_exception', 'after an exception', 'is switched off' in failure,
                         failure)
 
@@ -372,23 +363,6 @@ class Trial:
                 f'{name} takes {np.median(found) * 1e3:.3g} ms (at most {found.max() * 1e3:.3g})',
                 'give calls a time limit of their own; nothing else is written meanwhile')
 
-    def _check_clock(self, bench: _ProbedBench) -> None:
-        known = bench.worker.device.coils[0].instrument.clock_map
-        if known is not None:
-            self._note(
-                'clock', known.error, 's', _CLOCK,
-                f'its clock is known to {known.error * 1e6:.3g} us, and drifts by '
-                f'{known.drift * 1e6:.3g} ppm', 'clock() must answer at once')
-
-    def _check_temperature(self, bench: _ProbedBench) -> None:
-        device = bench.worker.device
-        if device.coils[0].instrument.has('temperature'):
-            found = next(iter(device.temperatures.values()), math.nan)
-            self._note(
-                'temperature', abs(found), 'deg C', _HOTTEST,
-                f'the coil is at {found:g} degrees Celsius',
-                'return the temperature of the coil in degrees Celsius')
-
 
 def _lateness(seen: Seen) -> list[float]:
     """Return how much after their time levels took effect, in s."""
@@ -399,12 +373,11 @@ def _serve(name: str, joint: str, settings: str, level: str, rate: str) -> int:
     """Keep a level, as a driver does, until SIGTERM comes."""
     ended = Event()
     signal.signal(signal.SIGTERM, lambda *_: ended.set())
-    bench = Bench(lambda: load(name)(joint, json.loads(settings)), float(level), float(rate))
-    bench.run(0.3, [float(level)])
-    print('ready', flush=True)
-    while not ended.is_set() and bench.worker.failure is None:
-        bench.run(0.02)
-    bench.worker.close()
+    with Bench(name, json.loads(settings), float(level), float(rate), joint) as bench:
+        bench.run(0.3, [float(level)])
+        print('ready', flush=True)
+        while not ended.is_set() and bench.worker.failure is None:
+            bench.run(0.02)
     return int(bench.worker.failure is not None)
 
 

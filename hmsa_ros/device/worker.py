@@ -10,14 +10,12 @@ from collections.abc import Callable
 import math
 import sys
 from threading import Condition, Event, Thread
-from time import monotonic, monotonic_ns, time_ns
+from time import monotonic, monotonic_ns
 from typing import NamedTuple
 
-from hmsa_ros.device.coil import HardwareJoint
 from hmsa_ros.device.driven import HardwareDevice
-from hmsa_ros.device.hardware import Calls, Hardware, HardwareError, told
+from hmsa_ros.device.hardware import HardwareError, told
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
-from hmsa_ros.device.watchdog import Fallback
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.timekeeping import StepWatch
@@ -33,8 +31,6 @@ _PATIENCE, _PAST, _HANGING = 0.8, 0.4, 2.5
 # After hardware has failed and obeys again, in s: a pause, and for how long commands are refused
 # then, so that planners hear of it.
 _BREATH, _AWAY = 0.2, 1.0
-# Longest start of a lone coil, in s.
-_START = 10.0
 _MEND = 'correct it, then start the driver again'
 
 
@@ -350,21 +346,3 @@ class HardwareWorker:
                 if all(done.get(x.number) for x in device.coils) else
                 'the coil could NOT be switched off and may be on; cut the power of the '
                 'amplifier'))
-
-
-def lone_worker(
-        make: Callable[[], Hardware], limit: float, rate: float, silence: float) -> HardwareWorker:
-    """
-    Return a started worker of one coil, which is off after a silence in s.
-
-    The limit is in T, and the rate, at which the hardware is looked after, in Hz. Hardware that
-    does not start is a `HmsaError`.
-    """
-    worker = HardwareWorker(lambda: HardwareDevice(
-        [HardwareJoint(make(), limit, Fallback(silence, 'zero'))], time=time_ns(),
-        period=round(NANOSECONDS / rate), calls=Calls(1.0)), time_ns)
-    if not worker.started(_START):
-        raise HmsaError(
-            f'the hardware has not started within {_START:g} s, or its first write not returned: '
-            'expected one that does')
-    return worker

@@ -1,8 +1,6 @@
 """Guided runs on a bench: how late field and samples are, and what a slow staircase holds."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 import math
 from threading import Event, Thread
 from time import time_ns
@@ -10,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from hmsa_ros.device.assembly import SensorScale
 from hmsa_ros.device.bench import Bench, LEAD, matched, Seen
 from hmsa_ros.device.calibration import loop
-from hmsa_ros.device.hardware import Hardware, load, readings, told
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.device.hardware import readings, told
+from hmsa_ros.errors import HmsaError
 from hmsa_ros.identification.delays import Delays, delays, field_delays
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.model.equations import Array
@@ -28,42 +25,8 @@ _PERIODS, _SHORTEST = (0.8, 1.6), 0.12
 _HIGH, _LOW = (0.6, 1.0), (-0.4, 0.2)
 # In s, between readings of a probe that does not wait for one itself.
 _PAUSE = 2e-4
-_RATE = 1000.0
 # How often samples of a level are waited for.
 _PATIENCE = 10
-
-
-@dataclass(frozen=True)
-class Source:
-    """Hardware to calibrate."""
-
-    name: str  #: ``MODULE:NAME``, or one that is shipped
-    settings: Mapping[str, Any]
-    limit: float  #: largest flux density in T
-    made: list[Hardware] = field(default_factory=list)  #: since it was opened
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.limit < math.inf:
-            raise BadInputError(f'--limit is {self.limit:g} T: expected a number above 0')
-
-    @contextmanager
-    def opened(self) -> Iterator[Bench]:
-        """Start it; its coil is off at the end, however that comes."""
-        def make() -> Hardware:
-            self.made.append(load(self.name)('actuator', self.settings))
-            return self.made[-1]
-
-        bench = Bench(make, self.limit, _RATE)
-        try:
-            yield bench
-        finally:
-            bench.worker.close()
-
-    @property
-    def scale(self) -> SensorScale | None:
-        """What the readings of its sensor mean; None where it does not say."""
-        found = getattr(self.made[-1], 'scale', None)
-        return found if isinstance(found, SensorScale) else None
 
 
 class _Reader:
@@ -107,15 +70,15 @@ def steps_of(actuator: ActuatorParameters, limit: float, count: int) -> list[tup
 
 
 def measure_delays(
-        source: Source, steps: Sequence[tuple[float, float]], probe: Any,
+        bench: Bench, steps: Sequence[tuple[float, float]], probe: Any,
         actuator: ActuatorParameters, lag: float | None, progress: Tell) -> Delays:
     """
     Step through levels, and tell transport, lag and latency apart.
 
     Parameters
     ----------
-    source : Source
-        What is measured.
+    bench : Bench
+        With what is measured.
     steps : sequence of (float, float)
         Levels in T, and how long each is held in s.
     probe : object or None
@@ -139,20 +102,19 @@ def measure_delays(
 
     """
     seen = Seen([], [], [])
-    with source.opened() as bench:
-        reader = None if probe is None else _Reader(probe)
-        try:
-            for i, (level, seconds) in enumerate(steps):
-                progress(f'{level:.3g} T', i / len(steps))
-                seen = seen.joined(bench.hold(seconds, [level]))
-        finally:
-            field_seen = np.zeros((0, 2)) if reader is None else reader.close()
+    reader = None if probe is None else _Reader(probe)
+    try:
+        for i, (level, seconds) in enumerate(steps):
+            progress(f'{level:.3g} T', i / len(steps))
+            seen = seen.joined(bench.hold(seconds, [level]))
+    finally:
+        field_seen = np.zeros((0, 2)) if reader is None else reader.close()
     progress('evaluating', 1.0)
     pairs = matched(seen)
     samples = {x.time: float(x.stretch[0]) for x in seen.samples if math.isfinite(x.stretch[0])}
     if not samples or len(pairs) < len(steps):
         raise HmsaError(
-            f'{source.name} gave {len(samples)} samples and set {len(pairs)} of {len(steps)} '
+            f'{bench.name} gave {len(samples)} samples and set {len(pairs)} of {len(steps)} '
             'levels: expected a sensor, and all levels; see hmsa check-driver')
     zero = min(*samples, *(x.stamp for x, _ in pairs)) - NANOSECONDS
 
@@ -165,7 +127,7 @@ def measure_delays(
     return delays(
         Recording(
             seconds_of(times), np.array([samples[x] for x in times]), np.append(0.0, begins),
-            np.append(0.0, levels), label=source.name),
+            np.append(0.0, levels), label=bench.name),
         np.append(math.nan, seconds_of([stamp for _, (stamp, _) in pairs])),
         None if reader is None else field_delays(
             seconds_of(field_seen[:, 0]), field_seen[:, 1], begins, levels),
@@ -173,15 +135,18 @@ def measure_delays(
 
 
 def hold_staircase(
-        source: Source, steps: int, settle: float, gauge: Callable[[float], float] | None,
-        progress: Tell) -> tuple[Array, Array, Array, float]:
+        bench: Bench, limit: float, steps: int, settle: float,
+        gauge: Callable[[float], float] | None, progress: Tell
+) -> tuple[Array, Array, Array, float]:
     """
     Hold a slow staircase of levels up, down and back.
 
     Parameters
     ----------
-    source : Source
-        What is measured.
+    bench : Bench
+        With what is measured.
+    limit : float
+        Largest level in T.
     steps : int
         Levels on each quarter.
     settle : float
@@ -203,27 +168,26 @@ def hold_staircase(
         If the hardware fails or has no sensor.
 
     """
-    levels, rows = loop(source.limit, steps), []
-    with source.opened() as bench:
-        for i, level in enumerate(levels):
-            progress(f'{level:.3g} T', i / len(levels))
-            seen = bench.hold(settle, [level])
-            parts: list[list[float]] = [[], []]
-            for _ in range(_PATIENCE):
-                parts = [[float(x.stretch[0]) for x in seen.samples if math.isfinite(x.stretch[0])
-                          and seen.asked[0][0] + y * settle * NANOSECONDS <= x.time]
-                         for y in (0.5, 0.75)]
-                if parts[1]:
-                    break
-                # On a busy machine samples are late.
-                seen = seen.joined(bench.hold(LEAD, []))
-            if not parts[1]:
-                raise HmsaError(
-                    f'{source.name} gave no sample at {level:.3g} T: expected a sensor, and a '
-                    f'settle time well above {LEAD:g} s')
-            second, late = (float(np.mean(x)) for x in parts)
-            rows.append((
-                level, second, math.nan if gauge is None else gauge(level), late - second))
+    levels, rows = loop(limit, steps), []
+    for i, level in enumerate(levels):
+        progress(f'{level:.3g} T', i / len(levels))
+        seen = bench.hold(settle, [level])
+        parts: list[list[float]] = [[], []]
+        for _ in range(_PATIENCE):
+            parts = [[float(x.stretch[0]) for x in seen.samples if math.isfinite(x.stretch[0])
+                      and seen.asked[0][0] + y * settle * NANOSECONDS <= x.time]
+                     for y in (0.5, 0.75)]
+            if parts[1]:
+                break
+            # On a busy machine samples are late.
+            seen = seen.joined(bench.hold(LEAD, []))
+        if not parts[1]:
+            raise HmsaError(
+                f'{bench.name} gave no sample at {level:.3g} T: expected a sensor, and a settle '
+                f'time well above {LEAD:g} s')
+        second, late = (float(np.mean(x)) for x in parts)
+        rows.append((
+            level, second, math.nan if gauge is None else gauge(level), late - second))
     found = np.array(rows)
     return found[:, 0], found[:, 1], found[:, 2], float(
         2.0 * np.max(np.abs(found[:, 3])) / max(float(np.ptp(found[:, 1])), 1e-300))
