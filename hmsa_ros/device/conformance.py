@@ -36,8 +36,9 @@ _CALL, _LATE, _CLOCK, _REPEATED = 0.02, 2e-3, 1e-3, 0.6
 _HOTTEST = 150.0
 # The share of calls that must keep their limit.
 _MOST = 0.95
-# How many deviations of its mean a response must be to be seen.
-_SEEN = 6.0
+# How many deviations of its mean a response must be to be seen, and the share of it that must lie
+# between rest and either level for 0 T to count as off.
+_SEEN, _DISTINCT = 6.0, 0.1
 
 
 class Check(NamedTuple):
@@ -279,7 +280,9 @@ class Trial:
             'polarity', -apart, '', 0.0,
             f'{self._level:g} T lengthens the actuator by {apart / 2:.3g} of its length',
             'turn the leads of the coil, or the sign of the sensor')
-        self._rest, self._apart = means[0], abs(means[1] - means[0])
+        # What 0 T moves as much as a level is never off.
+        near = min(abs(means[1] - means[0]), abs(means[2] - means[0]))
+        self._rest, self._apart = means[0], near if near > _DISTINCT * abs(apart) else 0.0
 
     # -- ends ----------------------------------------------------------------------------------
 
