@@ -1,9 +1,10 @@
 """Lines to instruments: the ports of pyserial, and simulated ones."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from importlib import import_module
 import sys
+from time import monotonic
 from typing import Any
 
 from hmsa_ros.errors import BadInputError, HmsaError
@@ -12,11 +13,13 @@ from hmsa_ros.errors import BadInputError, HmsaError
 SIMULATED = 'sim'
 
 
-def open_line(
-        port: Any, baud: int, timeout: float, patience: float,
-        simulate: Callable[[str], Any]) -> Any:
+class OnLine:
     """
-    Return a port, as of pyserial.
+    What speaks over a line that is opened when it is used, and again once it was lost.
+
+    A class has the ``error`` that reports a lost line, the longest time in s of an attempt and of
+    a write as ``times``, and ``simulate``, which makes a simulated instrument of what follows
+    the colon of `SIMULATED`.
 
     Parameters
     ----------
@@ -24,45 +27,7 @@ def open_line(
         A device, a URL such as ``socket://host:port``, or `SIMULATED`.
     baud : int
         Bits per second.
-    timeout, patience : float
-        Longest time in s that a read, and a write, may take.
-    simulate : callable
-        Returns a simulated instrument for what follows the colon.
 
-    Returns
-    -------
-    object
-        With ``read``, ``write`` and ``close`` as of `serial.Serial`.
-
-    Raises
-    ------
-    BadInputError
-        If there is no such port to be had.
-
-    """
-    if not isinstance(port, str) or not port:
-        raise BadInputError(
-            f'port is {port!r}: expected a serial port, as /dev/ttyACM0, or {SIMULATED} for a '
-            'simulated instrument')
-    kind, _, rest = port.partition(':')
-    if kind == SIMULATED:
-        return simulate(rest)
-    try:
-        serial = import_module('serial')
-    except ImportError as error:
-        raise BadInputError(
-            'pyserial, which serial ports need, is not installed: install it (pip install '
-            f'pyserial), or use the port {SIMULATED} for a simulated instrument') from error
-    return serial.serial_for_url(
-        port, baud, timeout=timeout, write_timeout=patience, exclusive=True)
-
-
-class OnLine:
-    """
-    What speaks over a line that is opened when it is used, and again once it was lost.
-
-    A class has the ``error`` that reports a lost line, the longest time in s of a read and of a
-    write as ``times``, and ``simulate``, which makes a simulated instrument as of `open_line`.
     """
 
     error: type[HmsaError]
@@ -73,12 +38,30 @@ class OnLine:
     def __init__(self, port: Any, baud: int) -> None:
         self._port, self._baud = port, int(baud)
 
+    def _open(self) -> Any:
+        """Return a line, as of `serial.Serial`; raise `BadInputError` if none is to be had."""
+        port = self._port
+        if not isinstance(port, str) or not port:
+            raise BadInputError(
+                f'port is {port!r}: expected a serial port, as /dev/ttyACM0, or {SIMULATED} for a '
+                'simulated instrument')
+        kind, _, rest = port.partition(':')
+        if kind == SIMULATED:
+            return self.simulate(rest)
+        try:
+            serial = import_module('serial')
+        except ImportError as error:
+            raise BadInputError(
+                'pyserial, which serial ports need, is not installed: install it (pip install '
+                f'pyserial), or use the port {SIMULATED} for a simulated instrument') from error
+        return serial.serial_for_url(
+            port, self._baud, timeout=self.times[0], write_timeout=self.times[1], exclusive=True)
+
     def _use(self, act: Callable[[], Any]) -> Any:
         """Do something with the line; return None if it takes nothing in time."""
         try:
             if self._line is None:
-                self._line = open_line(
-                    self._port, self._baud, *self.times, simulate=self.simulate)
+                self._line = self._open()
             return act()
         except HmsaError:
             raise
@@ -86,12 +69,32 @@ class OnLine:
             if isinstance(error, getattr(
                     sys.modules.get('serial'), 'SerialTimeoutException', ())):
                 return None
-            line, self._line = self._line, None
             with suppress(Exception):
-                line.close()
+                OnLine.close(self)
             raise self.error(
                 f'the line {self._port} failed ({error}): check hardware.port, its cable, and '
                 'that no other program uses it') from error
+
+    def _lines(self, request: bytes) -> Iterator[bytes]:
+        """Send a request; yield the lines that come, and what is left when an attempt is over."""
+        self._line.reset_input_buffer()
+        self._line.write(request)
+        text, until = b'', monotonic() + self.times[0]
+        while monotonic() < until:
+            text += self._line.read(max(self._line.in_waiting, 1))
+            *lines, text = text.split(b'\n')
+            yield from lines
+        yield text
+
+    def close(self, last_words: bytes = b'') -> None:
+        """Leave the line."""
+        line, self._line = self._line, None
+        if line is not None:
+            try:
+                if last_words:
+                    line.write(last_words)
+            finally:
+                line.close()
 
 
 class SimulatedLine:

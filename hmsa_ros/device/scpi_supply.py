@@ -98,7 +98,7 @@ class Supply(OnLine):
     Parameters
     ----------
     port : str
-        As of `open_line`: ``socket://host:port`` for TCP.
+        As of `OnLine`: ``socket://host:port`` for TCP.
     baud : int
         Bits per second of a serial port.
     voltage : float
@@ -136,14 +136,9 @@ class Supply(OnLine):
         self._set(f'FUNC:MODE CURR;:{limit}CURR 0;:OUTP ON')
         self.limit = float(self._ask('CURR? MAX', re.compile(_NUMBER))[0])
 
-    def close(self) -> None:
+    def close(self, last_words: bytes = b'OUTP OFF\n') -> None:
         """Switch the output off, and leave the line."""
-        line, self._line = self._line, None
-        if line is not None:
-            try:
-                line.write(b'OUTP OFF\n')
-            finally:
-                line.close()
+        super().close(last_words)
 
     def write(self, current: float, now: int) -> tuple[int, float]:
         """
@@ -175,23 +170,16 @@ class Supply(OnLine):
 
     def _ask(self, text: str, expected: 're.Pattern[str]') -> tuple[str, ...]:
         """Return the parts of an answer; ask again where it is not as expected."""
-        until, answer = monotonic() + _PATIENCE, ''
+        until, answer, request = monotonic() + _PATIENCE, '', f'{text}\n'.encode()
         while True:
-            answer = self._use(lambda: self._attempt(text)) or answer
-            if found := expected.fullmatch(answer):
-                return found.groups()
+            found = self._use(lambda: next(self._lines(request)))
+            answer = (found or b'').decode('ascii', 'replace').strip() or answer
+            if parts := expected.fullmatch(answer):
+                return parts.groups()
             if monotonic() > until:
                 raise SupplyError(
                     f'the supply on {self._port} answers {answer!r} to {text}: expected a supply '
                     'that speaks SCPI, at the same baud')
-
-    def _attempt(self, request: str) -> str:
-        self._line.reset_input_buffer()
-        self._line.write(f'{request}\n'.encode())
-        text, until = b'', monotonic() + _ATTEMPT
-        while not text.endswith(b'\n') and monotonic() < until:
-            text += self._line.read(max(self._line.in_waiting, 1))
-        return text.decode('ascii', 'replace').strip()
 
 
 class ScpiSupply(Assembly):

@@ -50,7 +50,7 @@ class Board(OnLine):
     Parameters
     ----------
     port : str
-        As of `open_line`; ``sim:FILE`` writes the true motion of a simulated board.
+        As of `OnLine`; ``sim:FILE`` writes the true motion of a simulated board.
     baud : int
         Bits per second; of no effect on USB.
     watchdog : float
@@ -69,7 +69,7 @@ class Board(OnLine):
 
     @staticmethod
     def simulate(rest: str) -> Any:
-        """Return a simulated board (see `open_line`)."""
+        """Return a simulated board (see `OnLine`)."""
         from hmsa_ros.device.simulated_board import SimulatedBoard  # others need no simulation
 
         return SimulatedBoard(rest)
@@ -92,12 +92,6 @@ class Board(OnLine):
     def open(self) -> None:
         """Connect again, without a board that restarts if its port is still open."""
         self._begin(_PATIENCE)
-
-    def close(self) -> None:
-        """Leave the line; the board switches off after its watchdog's time, if it is not off."""
-        if self._line is not None:
-            line, self._line = self._line, None
-            line.close()
 
     def _begin(self, patience: float) -> None:
         """Begin a session, and see whether that before has been lost."""
@@ -151,18 +145,9 @@ class Board(OnLine):
 
     def _attempt(self, verb: str, values: Sequence[int]) -> _Answer | None:
         self._number = (self._number + 1) % 65536
-        self._line.reset_input_buffer()
-        self._line.write(b'\n' + framed(
-            ' '.join(map(str, (self._number, self._session, verb, *values)))))
-        text, until = b'', monotonic() + _ATTEMPT
-        while monotonic() < until:
-            text += self._line.read(max(self._line.in_waiting, 1))
-            *lines, text = text.split(b'\n')
-            for line in lines:
-                answer = _read(line, self._number)
-                if answer is not None:
-                    return answer
-        return None
+        request = ' '.join(map(str, (self._number, self._session, verb, *values)))
+        answers = (_read(x, self._number) for x in self._lines(b'\n' + framed(request)))
+        return next((x for x in answers if x is not None), None)
 
     # -- what hardware has ---------------------------------------------------------------------
 
