@@ -570,7 +570,7 @@ def test_a_worker_sees_that_the_clock_is_set():
     by[0] = 7200 * 1000 * MS
     worker.receive(0, monotonic_ns() + by[0], 0.2)
     wait_until(lambda: bench.levels[-1] == 0.2, 'the level by the other clock')
-    assert (worker.trips, bench.levels) == (0, [0.0, 0.1, 0.2])
+    assert (worker.device.trips, bench.levels) == (0, [0.0, 0.1, 0.2])
     worker.close()
 
 
@@ -625,8 +625,8 @@ def test_a_worker_writes_each_level_at_its_stamp_and_switches_off_in_the_end():
     assert bench.levels == [0.0, 0.1, 0.2, 0.0]
     assert bench.closed == [0.0]
     assert all(now >= stamp for (now, _), stamp in zip(bench.writes[1:], stamps, strict=False))
-    assert [x.level for x in worker.changes()] == [0.0, 0.1, 0.2, 0.0]
-    times = [x.time for x in worker.samples()]
+    assert [x.level for x in worker.device.changes()] == [0.0, 0.1, 0.2, 0.0]
+    times = [x.time for x in worker.device.samples()]
     assert len(times) > 2
     assert times == sorted(times)
     assert worker.failure is None
@@ -757,11 +757,11 @@ def test_a_coil_that_could_not_be_switched_off_is_said_to_be_and_tried_until_it_
     tries = cable.tries
     wait_until(lambda: cable.tries > tries + 2, 'more attempts')
     # What flows is not known.
-    assert [str(x.level) for x in worker.changes()] == ['0.0', '0.1', 'nan']
+    assert [str(x.level) for x in worker.device.changes()] == ['0.0', '0.1', 'nan']
     cable.out = False
     wait_until(lambda: worker.failure is not None, 'the end')
     assert 'the coil is switched off at last, after' in str(worker.failure)
-    assert [x.level for x in worker.changes()] == [0.0]
+    assert [x.level for x in worker.device.changes()] == [0.0]
     assert cable.levels == [0.0, 0.1, 0.0]
 
 
@@ -783,7 +783,7 @@ def test_a_worker_that_is_to_reconnect_goes_on_from_zero_once_the_cable_is_in_ag
         wait_until(lambda: 'the coil is switched off, and what was' in worker.trouble, 'the off')
         # Time enough for a planner to hear of it; then 0 T comes first.
         wait_until(lambda: worker.look_after() or not worker.trouble, 'the end of it')
-        assert worker.cut_offs == [0, 1]
+        assert worker.device.cut_offs == [0, 1]
         for level in (0.15, 0.0, 0.12):
             worker.receive(0, 0, level)
         wait_until(lambda: cable.levels[-1] == 0.12, 'a new level')
@@ -856,8 +856,8 @@ def test_nobody_waits_for_a_call_that_blocks_and_then_only_the_newest_level_is_w
     # With a lock around the call, none of these would return.
     for k in range(2, 5):
         worker.receive(0, 0, k / 10)
-    assert (worker.samples(), worker.notices(), worker.silent) == ([], [], [])
-    assert [x.level for x in worker.changes()] == [0.0]
+    assert (worker.device.samples(), worker.device.notices(), worker.device.silent) == ([], [], [])
+    assert [x.level for x in worker.device.changes()] == [0.0]
     gate.go.set()
     wait_until(lambda: 0.4 in gate.levels, 'the newest level')
     assert gate.levels == [0.0, 0.1, 0.4]
@@ -905,8 +905,8 @@ def test_a_level_of_before_a_cut_off_is_not_written_when_a_call_returns_late():
     gate.go.set()
     wait_until(lambda: gate.levels == [0.0, 0.1, 0.0], 'the coil to be off')
     worker.close()
-    assert [x.kind for x in worker.notices()] == [Kind.SILENT, Kind.REFUSED]
-    assert [x.level for x in worker.changes()] == [0.0, 0.1, 0.0]
+    assert [x.kind for x in worker.device.notices()] == [Kind.SILENT, Kind.REFUSED]
+    assert [x.level for x in worker.device.changes()] == [0.0, 0.1, 0.0]
 
 
 def test_hardware_that_does_not_start_says_why():

@@ -128,7 +128,7 @@ class Bench:
             begun = monotonic()
             sleep(_LOOK)
             self.slept.append(monotonic() - begun - _LOOK)
-        return Seen(self.worker.changes(), self.worker.samples(), asked)
+        return Seen(self.worker.device.changes(), self.worker.device.samples(), asked)
 
     def hold(self, seconds: float, levels: Sequence[float]) -> Seen:
         """Run, longer where the last level comes late; raise `HmsaError` if it fails."""

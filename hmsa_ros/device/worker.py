@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from hmsa_ros.device.driven import HardwareDevice
 from hmsa_ros.device.hardware import HardwareError, told
-from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
+from hmsa_ros.device.protocol import Kind
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.timekeeping import StepWatch
@@ -49,7 +49,8 @@ class HardwareWorker:
 
     ``make`` is called in its thread, as all of the hardware is. ``failure`` says why it has ended
     by itself, and ``trouble`` what keeps it from obeying: an error, while it goes on trying to
-    switch off. That other thread calls `look_after` at times, and may look at the ``device``.
+    switch off. That other thread calls `look_after` at times, and takes from the ``device`` what
+    came of it.
 
     If it is to ``reconnect``, an error of hardware ends nothing: once the coils are off, it goes
     on as after an interlock.
@@ -72,7 +73,8 @@ class HardwareWorker:
         # Levels, reasons of an interlock, and None to switch off.
         self._commands: deque[_Command | str | None] = deque()
         self.failure: HmsaError | None = None
-        self.trouble = self._locked = ''
+        self.trouble = ''
+        self.locked = ''  # why no command is obeyed
         sys.setswitchinterval(_WATCHED / NANOSECONDS)
         self._thread = Thread(target=self._work, name='hardware', daemon=True)
         self._thread.start()
@@ -95,26 +97,6 @@ class HardwareWorker:
             raise self.failure
         return True
 
-    @property
-    def time(self) -> int:
-        """Time in ns at which it last looked after the hardware."""
-        return self.device.time
-
-    @property
-    def silent(self) -> list[int]:
-        """Joints that nobody commands any more."""
-        return self.device.silent
-
-    @property
-    def cut_offs(self) -> list[int]:
-        """Joints whose levels of before a cut-off are refused."""
-        return self.device.cut_offs
-
-    @property
-    def trips(self) -> int:
-        """How often a joint fell silent."""
-        return self.device.trips
-
     def receive(self, joint: int, stamp: int, level: float) -> None:
         """
         Have the device take a level in T that applies from a stamp in ns on.
@@ -134,33 +116,16 @@ class HardwareWorker:
         """Have all coils switched off, with nothing ahead."""
         self._put(None)
 
-    @property
-    def locked(self) -> str:
-        """Why no command is obeyed; empty where they are."""
-        return self._locked
-
     def lock(self, why: str) -> None:
         """Have coils off and commands refused while there is a reason; an empty one ends it."""
-        if why != self._locked:
-            self._locked = why
+        if why != self.locked:
+            self.locked = why
             self._put(why)
 
     def _put(self, command: _Command | str | None) -> None:
         self._commands.append(command)
         with self._turn:
             self._turn.notify()
-
-    def changes(self) -> list[Change]:
-        """Return which levels took effect."""
-        return self.device.changes()
-
-    def samples(self) -> list[Sample]:
-        """Return what was measured."""
-        return self.device.samples()
-
-    def notices(self) -> list[Notice]:
-        """Return what there is to log."""
-        return self.device.notices()
 
     def look_after(self) -> None:
         """See whether the thread lives and its calls return; if not, switch off without it."""
@@ -213,7 +178,7 @@ class HardwareWorker:
             while not self._ended:
                 if self._resumes and monotonic() >= self._resumes:
                     self._resumes = 0.0
-                    self.device.lock(self._locked, self._clock())
+                    self.device.lock(self.locked, self._clock())
                     self.trouble = ''
                 self._see_clock()
                 self._hear()

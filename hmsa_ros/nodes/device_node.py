@@ -87,6 +87,7 @@ class DeviceJoint:
         names = node.values.names
         self.name = names[number]
         self._node, self._device, self._number = node, node.device, number
+        self._commanded = node.commanded
         self._of_me = '' if len(names) == 1 else f'joint {self.name}: '
         self._crowded = False
         self._tell_refused, self._tell_late = Seldom(), Seldom()
@@ -126,7 +127,7 @@ class DeviceJoint:
     @property
     def refuses(self) -> str:
         """What keeps commands from being obeyed, as in a receipt."""
-        if self._device.locked or self._node.away:
+        if self._commanded.locked or self._node.away:
             return conversions.INTERLOCK
         return conversions.CUT_OFF if self._number in self._device.cut_offs else ''
 
@@ -205,7 +206,7 @@ class DeviceJoint:
         try:
             stamp, level = read()
             self._newest, self._came = stamp, self._node.now()
-            self._device.receive(self._number, stamp, level)
+            self._commanded.receive(self._number, stamp, level)
         except BadInputError as error:
             self._refuse(str(error))
 
@@ -255,6 +256,11 @@ class DeviceNode(ManagedNode):
     @abstractmethod
     def _go_on(self) -> None:
         """Let the device go on to the present time."""
+
+    @property
+    def commanded(self) -> Any:
+        """What takes commands, and says whether it is `locked`: the device, or its thread."""
+        return self.device
 
     @property
     def leading_time(self) -> int | None:

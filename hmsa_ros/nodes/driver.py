@@ -106,7 +106,8 @@ PARAMETERS = (
 class DriverNode(DeviceNode):
     """Passes commands to hardware, which a thread serves, and publishes what comes of it."""
 
-    device: HardwareWorker
+    device: HardwareDevice
+    worker: HardwareWorker
 
     def __init__(self) -> None:
         super().__init__(topics.DRIVER)
@@ -151,16 +152,22 @@ class DriverNode(DeviceNode):
         self.trouble = self.away = ''
         ENDING.go_on()
         with ENDING.by_default():
-            self.device = HardwareWorker(
+            self.worker = HardwareWorker(
                 partial(_make_device, name, self.values, self._settings), time_ns,
                 reconnect=self.values[RECONNECT.name])
-            while not self.device.started(_PATIENCE):
+            while not self.worker.started(_PATIENCE):
                 self.get_logger().warning(
                     f'waiting for {name}: it has not started yet, or its first write not returned')
-        self.get_logger().info(_described(self.device.device, self.values))
+        self.device = self.worker.device
+        self.get_logger().info(_described(self.device, self.values))
         self._lock = endpoints.listen(self, topics.INTERLOCK)
         self._mind_interlock()
         self._open(DeviceJoint)
+
+    @property
+    def commanded(self) -> HardwareWorker:
+        """What takes commands: the thread that serves the hardware."""
+        return self.worker
 
     def now(self) -> int:
         """Return the machine's time in ns."""
@@ -168,13 +175,13 @@ class DriverNode(DeviceNode):
 
     def deactivate(self) -> None:
         """Switch the coils off."""
-        self.device.switch_off()
+        self.worker.switch_off()
 
     def cleanup(self) -> None:
         """Switch the coils off, and leave the hardware alone."""
         if self._joints:
-            self.device.close()
-            self.failure = self.device.failure
+            self.worker.close()
+            self.failure = self.worker.failure
             self._lock.destroy()
         super().cleanup()
 
@@ -189,8 +196,8 @@ class DriverNode(DeviceNode):
             self._interlock.hear(
                 taken.publisher, now, closed=closed,
                 present=lambda: publishers_of(self, topics.INTERLOCK))
-        before, why = self.device.locked, self._interlock.look(now)
-        self.device.lock(why)
+        before, why = self.worker.locked, self._interlock.look(now)
+        self.worker.lock(why)
         if bool(why) != bool(before):
             if why:
                 self.get_logger().error(f'interlock open, the coil goes off: {why}')
@@ -201,8 +208,8 @@ class DriverNode(DeviceNode):
 
     def _go_on(self) -> None:
         self._mind_interlock()
-        self.device.look_after()
-        trouble = self.device.trouble
+        self.worker.look_after()
+        trouble = self.worker.trouble
         if trouble != (self.trouble or self.away):
             if trouble:
                 self.get_logger().error(trouble)
@@ -216,8 +223,8 @@ class DriverNode(DeviceNode):
                     # Nobody takes commands any more, and planners can see that.
                     joint.close()
             self._diagnose()
-        if self.device.failure is not None:
-            self.failure, self.finished = self.device.failure, True
+        if self.worker.failure is not None:
+            self.failure, self.finished = self.worker.failure, True
 
     def _report(self) -> Iterable[DiagnosticStatus]:
         yield from super()._report()
@@ -225,9 +232,9 @@ class DriverNode(DeviceNode):
             f'{self.get_name()}: interlock', ', '.join(self.values.names),
             *judge_interlock(self._interlock.why),
             {'required': self._interlock.required, 'openings': self._interlock.openings})
-        device = self.device.device
+        device = self.device
         level, message = judge_hardware(
-            self.device.trouble or device.too_warm, **device.counts)
+            self.worker.trouble or device.too_warm, **device.counts)
         yield conversions.to_status(
             f'{self.get_name()}: hardware', ', '.join(self.values.names), level, message,
             {**device.counts, **device.clocks, **{
