@@ -72,15 +72,16 @@ def make_folder(folder: Path) -> None:
 
 def json_text(document: object) -> str:
     """Return a document as JSON, with null for each number that is not finite."""
-    return json.dumps(_known(document), indent=2, allow_nan=False)
+    return json.dumps(finite(document), indent=2, allow_nan=False)
 
 
-def _known(value: object) -> object:
+def finite(value: Any) -> Any:
+    """Return what JSON can say of a document: None for each number that is not finite."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {key: _known(x) for key, x in value.items()}
-    return [_known(x) for x in value] if isinstance(value, (list, tuple)) else value
+        return {key: finite(x) for key, x in value.items()}
+    return [finite(x) for x in value] if isinstance(value, (list, tuple)) else value
 
 
 def read_at_most(path: Path, size: int, expected: str) -> bytes:

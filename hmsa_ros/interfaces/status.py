@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 import json
+import math
 import re
 from typing import Any
 
@@ -25,6 +26,14 @@ def texts(status: Any) -> dict[str, str]:
 def whole(text: str | None) -> int:
     """Return the whole number in a status, 0 where it has none."""
     return int(text) if text and _WHOLE.fullmatch(text) else 0
+
+
+def real(text: str | None) -> float:
+    """Return the number in a status, NaN where it has none."""
+    try:
+        return float(text or '')
+    except ValueError:
+        return math.nan
 
 
 def _object(text: str) -> Mapping[str, object]:

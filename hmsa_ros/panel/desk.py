@@ -19,8 +19,9 @@ from std_srvs.srv import Trigger
 from hmsa_ros.control.feedback import MODES
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, HmsaError, printable
+from hmsa_ros.files import finite
 from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.status import texts
+from hmsa_ros.interfaces.status import real, texts
 from hmsa_ros.lab.client import PlannerClient
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.service_call import ServiceCall
@@ -110,7 +111,7 @@ class Desk:
         self._follow_rest(now)
         # A page that comes later gets none that is old by then.
         self._server.frame = json.dumps(
-            self._frame(scene, now), separators=(',', ':')) if self._pages else ''
+            finite(self._frame(scene, now)), separators=(',', ':')) if self._pages else ''
 
     def _tell(self, text: str, level: int = 0) -> None:
         self._note = {
@@ -224,7 +225,7 @@ class Desk:
                 self._estimates[status.hardware_id] = {
                     'joint': status.hardware_id, 'level': LEVELS[min(status.level[0], 3)],
                     'message': printable(status.message), 'rows': [
-                        [name, *(_known(values.get(f'{name}{end}', ''))
+                        [name, *(real(values.get(f'{name}{end}'))
                                  for end in ('', '.std', '.nominal'))]
                         for name in values if f'{name}.std' in values]}
 
@@ -237,7 +238,7 @@ class Desk:
         if recording.report is not None:
             reports[recording.report.parent.name] = recording.report
         tail = SLOTS if now - self._news < _NEW_SECONDS else _TAIL
-        seen = dict(as_json(scene))
+        seen = as_json(scene)
         if scene.request is not None:
             # What was measured in words; anybody may send figures.
             seen['request']['finding'] = scene.request.finding
@@ -259,16 +260,6 @@ class Desk:
             'stopping': self._stopping > -math.inf, 'note': self._note}
 
 
-def _tail(history: History, now: float, count: int) -> list[list[float | None]]:
+def _tail(history: History, now: float, count: int) -> list[list[float]]:
     """Return the least and largest values in the last slots of a history."""
-    return [[None if math.isnan(x) else x for x in np.round(side[-count:], 7).tolist()]
-            for side in history.ranges(now, SLOTS)]
-
-
-def _known(text: str) -> float | None:
-    """Return the finite number in a text, else None."""
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
+    return [np.round(side[-count:], 7).tolist() for side in history.ranges(now, SLOTS)]

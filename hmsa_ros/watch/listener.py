@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 
 from hmsa_ros.errors import BadInputError, printable
 from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.status import texts, Verdict, whole
+from hmsa_ros.interfaces.status import real, texts, Verdict, whole
 from hmsa_ros.model.laws.coordinate import COORDINATES
 from hmsa_ros.model.schedule import CommandSchedule
 from hmsa_ros.model.units import NANOSECONDS
@@ -182,7 +182,7 @@ class Listener:
             # One joint has no name there; of several each has its own.
             self._name_coordinates(message.hardware_id, values)
             self._targets = {
-                key.rpartition('.')[0] or printable(message.hardware_id): _number(value)
+                key.rpartition('.')[0] or printable(message.hardware_id): real(value)
                 for key, value in values.items() if key.rpartition('.')[2] == 'stretch'}
             self._request = Verdict.read(message)
 
@@ -325,10 +325,3 @@ class Listener:
             'that publishes them, or remap its topic'
             for x in self._sources if now - x.complained < _FORGET_SECONDS]
         return sentences
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan

@@ -1,6 +1,6 @@
 """The scene as text: a screen for a terminal, a line for a log, or JSON for a program."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -9,6 +9,7 @@ import numpy as np
 from rich.cells import cell_len
 from rich.text import Text
 
+from hmsa_ros.files import finite
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import drive_of, shared_name
 from hmsa_ros.model.status import Code
@@ -334,25 +335,23 @@ def line(scene: Scene) -> str:
     return '; '.join(parts)
 
 
-def as_json(scene: Scene) -> Mapping[str, Any]:
+def as_json(scene: Scene) -> dict[str, Any]:
     """Return a scene for JSON, None for what is not known."""
-    def known(value: float) -> float | None:
-        return float(value) if np.isfinite(value) else None
-
-    return {
-        'where': scene.where, 'stamp': known(scene.stamp), 'age': known(scene.age),
-        'sample_rate': known(scene.sample_rate),
+    request = scene.request
+    found: dict[str, Any] = finite({
+        'where': scene.where, 'stamp': scene.stamp, 'age': scene.age,
+        'sample_rate': scene.sample_rate,
         'joints': [{
-            'name': x.name, 'stretch': known(x.stretch), 'stretch_rate': known(x.rate),
-            'flux_density': known(x.flux_density), 'target': known(x.target),
-            'flux_density_command': known(x.commanded)} for x in scene.joints],
-        'request': None if scene.request is None else {
-            'level': LEVELS[min(scene.request.level, 3)], 'message': scene.request.message,
-            'code': scene.request.code, 'state': scene.request.state,
-            'setpoint': scene.request.setpoint, 'setpoints': scene.request.setpoints,
-            'finding': dict(scene.request.figures) or None},
-        'progress': known(scene.progress),
+            'name': x.name, 'stretch': x.stretch, 'stretch_rate': x.rate,
+            'flux_density': x.flux_density, 'target': x.target,
+            'flux_density_command': x.commanded} for x in scene.joints],
+        'request': request and {
+            'level': LEVELS[min(request.level, 3)], 'message': request.message,
+            'code': request.code, 'state': request.state, 'setpoint': request.setpoint,
+            'setpoints': request.setpoints, 'finding': dict(request.figures) or None},
+        'progress': scene.progress,
         'reports': [{
             'name': x.name, 'level': LEVELS[min(x.level, 3)], 'message': x.message,
             'counts': x.counts, 'age': x.age} for x in scene.reports],
-        'waiting': list(scene.waiting)}
+        'waiting': list(scene.waiting)})
+    return found
