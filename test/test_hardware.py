@@ -686,7 +686,7 @@ def test_a_coil_that_is_too_warm_goes_off_and_is_obeyed_again_once_it_has_cooled
     device.receive(0, START + 3 * second, 0.2)
     go_on(START + second // 2)
     assert bench.levels[-1] == 0.1
-    assert (device.temperatures, device.too_warm) == ({'actuator': 20.0}, '')
+    assert (device.coils[0].temperature, device.too_warm) == (20.0, '')
     for degrees, said in ((80.1, 'is at 80.1 degrees Celsius: expected at most 75'),
                           # The limit of before does not do.
                           (79.0, 'expected at most 75 .temperature_limit 80'),

@@ -172,15 +172,9 @@ class Coil(GuardedJoint):
         times = [self.watch_due, self._schedule.next_stamp, self._next_question]
         if self.instrument.keeps_levels:
             times.append(now + _POLL if self._awaited else None)
-            if self._changed is not None and self._room:
+            if self._changed is not None and len(self._handed) < (self.instrument.capacity or 0):
                 times.append(now)
         return min((x for x in times if x is not None), default=None)
-
-    @property
-    def _room(self) -> int | None:
-        """How many levels the device still takes; None for any number."""
-        capacity = self.instrument.capacity
-        return None if capacity is None else max(capacity - len(self._handed), 0)
 
     def advance(self, now: int) -> None:
         """

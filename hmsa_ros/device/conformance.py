@@ -207,11 +207,10 @@ class Trial:
 
     def _note(
             self, name: str, figure: float, unit: str, limit: float, text: str,
-            mend: str = '') -> None:
+            mend: str) -> None:
         passed = bool(figure <= limit)
         self._checks.append(Check(
-            name, passed, float(figure), unit, limit,
-            text if passed or not mend else f'{text}: {mend}'))
+            name, passed, float(figure), unit, limit, text if passed else f'{text}: {mend}'))
 
     # -- levels --------------------------------------------------------------------------------
 

@@ -77,19 +77,17 @@ class HardwareDevice(Device):
                 'state_lost': sum(x.lost for x in self.coils)}
 
     @property
-    def clocks(self) -> dict[str, str]:
-        """What is known of the clocks of hardware, in words by name."""
+    def facts(self) -> dict[str, str]:
+        """What is known of clocks, temperatures and calls, in words by name."""
         found: dict[str, str] = {}
         for x in self.coils:
             if (known := x.instrument.clock_map) is not None:
                 found |= {f'clock of {x.name}: error in us': f'{known.error * 1e6:.1f}',
                           f'clock of {x.name}: drift in ppm': f'{known.drift * 1e6:.2f}'}
-        return found
-
-    @property
-    def temperatures(self) -> dict[str, float]:
-        """Temperatures of coils in degrees Celsius by joint, where they are known."""
-        return {x.name: x.temperature for x in self.coils if not math.isnan(x.temperature)}
+            if not math.isnan(x.temperature):
+                found[f'temperature of {x.name} in deg C'] = f'{x.temperature:.1f}'
+        return found | {f'longest {name} in ms': f'{seconds * 1e3:.3f}'
+                        for name, seconds in [*self.calls.longest.items()]}
 
     @property
     def too_warm(self) -> str:

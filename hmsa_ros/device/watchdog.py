@@ -117,7 +117,11 @@ class GuardedJoint:
 
     def watch(self, now: int, until: int, level: float) -> Iterator[tuple[int, float]]:
         """Yield stamps (ns) and levels (T) of the safe flux once commands have ceased."""
-        if self._trips(now):
+        if self._last is not None:
+            self._last = min(self._last, now)
+        if self._alarm is not None and now >= self._alarm:
+            self.tripped = True
+            self.trips += 1
             safe = self._fallback.safe_flux
             self.note(
                 Kind.SILENT, f'no command and no heartbeat for {self._fallback.timeout:g} s: '
@@ -143,21 +147,15 @@ class GuardedJoint:
         """Begin to ramp a level in T to zero at a time in ns."""
         self._ramp, self._steps = (now, level), 0
 
-    def _trips(self, now: int) -> bool:
-        if self._last is None or self.tripped or self._timeout == 0:
-            return False
-        self._last = min(self._last, now)
-        if now - self._last <= self._timeout:
-            return False
-        self.tripped = True
-        self.trips += 1
-        return True
-
     @property
     def watch_due(self) -> int | None:
         """When to `watch` next, in ns; None if there is nothing to watch."""
-        if self._ramp is not None:
-            return self._ramp[0] + self._steps * _RAMP_STEP_NS
+        return self._alarm if self._ramp is None else (
+            self._ramp[0] + self._steps * _RAMP_STEP_NS)
+
+    @property
+    def _alarm(self) -> int | None:
+        """When the silence will be too long, in ns; None where none is."""
         if self._last is None or self.tripped or self._timeout == 0:
             return None
         return self._last + self._timeout + 1

@@ -237,11 +237,7 @@ class DriverNode(DeviceNode):
             self.worker.trouble or device.too_warm, **device.counts)
         yield conversions.to_status(
             f'{self.get_name()}: hardware', ', '.join(self.values.names), level, message,
-            {**device.counts, **device.clocks, **{
-                f'temperature of {name} in deg C': f'{x:.1f}'
-                for name, x in device.temperatures.items()}, **{
-                f'longest {name} in ms': f'{seconds * 1e3:.3f}'
-                for name, seconds in [*device.calls.longest.items()]}})
+            {**device.counts, **device.facts})
 
 
 def _make_device(
