@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import cache
 from importlib import import_module
 import inspect
 from itertools import islice
@@ -152,6 +153,13 @@ def load(text: str) -> Callable[[str, Mapping[str, Any]], Hardware]:
     return made
 
 
+@cache
+def _last_words(name: str, seconds: float) -> bytes:
+    return encoded(
+        f'{name} lets nothing else run for {seconds:g} s: the driver ends, and whether the coil '
+        'is off is not known; release the GIL in what it calls')
+
+
 class Calls:
     """
     What is called, one at a time, and for how long; ``longest`` has the longest time in s.
@@ -169,7 +177,6 @@ class Calls:
         self.limit = limit
         self.longest: dict[str, float] = {}
         self._deadline = deadline
-        self._texts: dict[str, bytes] = {}
         self._armed = False
         # Name of the call under way, in a tuple of its own for each.
         self._begun: tuple[str] | None = None
@@ -188,12 +195,7 @@ class Calls:
         """Call a method of hardware; ``name`` is its name for a sentence."""
         self.make_ready()
         if self._deadline is not None:
-            if name not in self._texts:
-                self._texts[name] = encoded(
-                    f'{name} lets nothing else run for {self.limit + _GRACE:g} s: the driver '
-                    'ends, and whether the coil is off is not known; release the GIL in what it '
-                    'calls')
-            self._deadline.say(self._texts[name])
+            self._deadline.say(_last_words(name, self.limit + _GRACE))
         begun = monotonic()
         self._begun = (name,)
         try:

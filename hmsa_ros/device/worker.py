@@ -7,11 +7,11 @@ thread publishes nothing: what hangs there would keep the coil waiting.
 
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 import math
 import sys
 from threading import Condition, Event, Thread
 from time import monotonic, monotonic_ns
-from typing import NamedTuple
 
 from hmsa_ros.device.driven import HardwareDevice
 from hmsa_ros.device.hardware import HardwareError, told
@@ -32,15 +32,6 @@ _PATIENCE, _PAST, _HANGING = 0.8, 0.4, 2.5
 # then, so that planners hear of it.
 _BREATH, _AWAY = 0.2, 1.0
 _MEND = 'correct it, then start the driver again'
-
-
-class _Command(NamedTuple):
-    """A level in T from a stamp in ns on, and when it came by the steady clock."""
-
-    joint: int
-    stamp: int
-    level: float
-    came: int
 
 
 class HardwareWorker:
@@ -70,8 +61,8 @@ class HardwareWorker:
         self._ready = Event()
         self._ended = False
         self._saver: Thread | None = None
-        # Levels, reasons of an interlock, and None to switch off.
-        self._commands: deque[_Command | str | None] = deque()
+        # What is asked for.
+        self._commands: deque[Callable[[], None]] = deque()
         self.failure: HmsaError | None = None
         self.trouble = ''
         self.locked = ''  # why no command is obeyed
@@ -110,19 +101,19 @@ class HardwareWorker:
         if self.trouble:
             raise BadInputError(self.trouble)
         self.device.check(joint, stamp, level)
-        self._put(_Command(joint, stamp, level, self._steady()))
+        self._put(partial(self._obey, joint, stamp, level, self._steady()))
 
     def switch_off(self) -> None:
         """Have all coils switched off, with nothing ahead."""
-        self._put(None)
+        self._put(self._switch_off)
 
     def lock(self, why: str) -> None:
         """Have coils off and commands refused while there is a reason; an empty one ends it."""
         if why != self.locked:
             self.locked = why
-            self._put(why)
+            self._put(lambda: self.device.lock(why, self._clock()))
 
-    def _put(self, command: _Command | str | None) -> None:
+    def _put(self, command: Callable[[], None]) -> None:
         self._commands.append(command)
         with self._turn:
             self._turn.notify()
@@ -181,7 +172,8 @@ class HardwareWorker:
                     self.device.lock(self.locked, self._clock())
                     self.trouble = ''
                 self._see_clock()
-                self._hear()
+                while self._commands:
+                    self._commands.popleft()()
                 self.device.advance(self._clock())
                 self._wait()
         except BaseException as error:
@@ -203,19 +195,16 @@ class HardwareWorker:
         if by := self._steps.step(self._steady(), self._clock(), self._steady()):
             self.device.clock_set(by)
 
-    def _hear(self) -> None:
-        """Take what has come, with the time at which it came: calls may have blocked since."""
-        while self._commands:
-            command = self._commands.popleft()
-            if isinstance(command, str):
-                self.device.lock(command, self._clock())
-            elif command is not None:
-                try:
-                    self.device.hear(*command[:3], self._clock() - self._steady() + command.came)
-                except BadInputError as error:
-                    self.device.coils[command.joint].note(Kind.REFUSED, str(error))
-            elif left := self.device.switch_off(self._clock()):
-                raise HardwareError(left)
+    def _obey(self, joint: int, stamp: int, level: float, came: int) -> None:
+        """Take a level that came at a time by the steady clock: calls may have blocked since."""
+        try:
+            self.device.hear(joint, stamp, level, self._clock() - self._steady() + came)
+        except BadInputError as error:
+            self.device.coils[joint].note(Kind.REFUSED, str(error))
+
+    def _switch_off(self) -> None:
+        if left := self.device.switch_off(self._clock()):
+            raise HardwareError(left)
 
     def _wait(self) -> None:
         """Sleep until something is due; the last of the time to a level is watched instead."""
