@@ -36,27 +36,16 @@ class ClockMap:
     """
     Times of a host, and of a device whose clock has another beginning and rate.
 
-    ``lost`` counts how often the clock turned out to be another one, as after a reboot; ``drift``
-    is the rate of the device's clock against the host's, less 1.
+    ``drift`` is the rate of the device's clock against the host's, less 1.
     """
 
     def __init__(self) -> None:
-        self.lost = 0
         self._answers: deque[_Answer] = deque(maxlen=_KEPT)
-        self._begin()
-
-    def _begin(self) -> None:
-        self._answers.clear()
         self._origin = 0, 0
         self._strange = 0
         # Device time less host time is offset + drift (host - centre), about the centre in ns.
         self._centre = self._offset = self.drift = 0.0
         self._offset_std = self._rate_std = math.inf
-
-    @property
-    def ready(self) -> bool:
-        """Whether there are enough answers."""
-        return len(self._answers) >= ENOUGH
 
     def add(self, before: int, device: int, after: int) -> bool:
         """
@@ -72,7 +61,7 @@ class ClockMap:
         Returns
         -------
         bool
-            Whether it is still the same clock.
+            Whether it is still the same clock, and not one that began anew, as after a reboot.
 
         """
         if not self._answers:
@@ -80,21 +69,15 @@ class ClockMap:
         host, clock = self._origin
         answer = _Answer(
             (before + after) // 2 - host, device - clock, max((after - before) // 2, 1))
-        if self.ready and abs(self._residual(answer)) > answer.half + self._error(answer.host):
+        off = answer.device - answer.host - self._offset - self.drift * (
+            answer.host - self._centre)
+        if len(self._answers) >= ENOUGH and abs(off) > answer.half + self._error(answer.host):
             self._strange += 1
-            if self._strange < _STRANGE:
-                return True
-            self._begin()
-            self.lost += 1
-            self.add(before, device, after)
-            return False
+            return self._strange < _STRANGE
         self._strange = 0
         self._answers.append(answer)
         self._fit()
         return True
-
-    def _residual(self, x: _Answer) -> float:
-        return x.device - x.host - self._offset - self.drift * (x.host - self._centre)
 
     def _error(self, host: float) -> float:
         """Return a bound of the error at a time since the first answer: two deviations."""
