@@ -1,6 +1,7 @@
 """A simulated coil, actuator, laser and field probe, late as real ones are; for guided runs."""
 
 from collections import deque
+import math
 from time import time_ns
 
 from hmsa_ros.device.sensor import SensorErrors
@@ -39,8 +40,8 @@ class SimulatedBench:
         self._device = SimulatedDevice(
             [SimulatedJoint(
                 Setup(paper_actuator(), coil_time_constant=lag),
-                errors=SensorErrors(stretch_noise=noise))], period=_PERIOD, time=time_ns())
-        self._ready: deque[tuple[float, float, int]] = deque()
+                errors=SensorErrors(stretch_noise=noise))],
+            period=_PERIOD, time=time_ns(), measurement_delay=self._latency)
         _FIELDS.clear()
 
     def schedule(self, levels: list[tuple[int, float]]) -> None:
@@ -56,14 +57,9 @@ class SimulatedBench:
     def read(self, now: int) -> list[tuple[float, float, int]]:
         """Return the samples that have arrived."""
         self._device.advance(now)
-        for x in self._device.samples():
-            self._ready.append((
-                float(x.stretch[0]), float('nan'), x.time + self._latency))
-            _FIELDS.append((float(x.flux_density[0]), float('nan'), x.time))
-        found = []
-        while self._ready and self._ready[0][2] <= now:
-            found.append(self._ready.popleft())
-        return found
+        samples = self._device.samples()
+        _FIELDS.extend((float(x.flux_density[0]), math.nan, x.time) for x in samples)
+        return [(float(x.stretch[0]), math.nan, x.time + self._latency) for x in samples]
 
 
 class SimulatedProbe:
