@@ -26,7 +26,7 @@ from benchmarks.laboratory import Bench, Iron, Plant
 from benchmarks.sheet import Sheet
 from hmsa_ros.control.loop import Loop
 from hmsa_ros.control.records import Output, Settings, StatusChanged, Trajectory
-from hmsa_ros.device import _board, serial_board
+from hmsa_ros.device import _board, line, serial_board
 from hmsa_ros.device.assembly import Assembly, CoilModel, SensorScale
 from hmsa_ros.device.calibration import calibrate_coil, decay, loop
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
@@ -187,7 +187,8 @@ class Driver:
         self.board = board
         serial = type('Serial', (serial_board.Board,), {'simulate': lambda *_: board})
         # It waits for answers in simulated time, too.
-        serial_board.monotonic = lambda: 1e-9 * board.now  # type: ignore[assignment]
+        for module in (line, serial_board):
+            module.monotonic = lambda: 1e-9 * board.now  # type: ignore[assignment]
         hardware = Assembly(
             serial('sim'), coil, SensorScale(rest_length=REST_LENGTH))
         self.device = HardwareDevice(

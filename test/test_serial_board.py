@@ -177,7 +177,7 @@ class Line:
 @pytest.fixture
 def line(tmp_path, monkeypatch):
     # A busy machine is slow to serve the line.
-    monkeypatch.setattr(serial_board, '_ATTEMPT', 0.2)
+    monkeypatch.setattr(Board, 'times', (0.2, 0.4))
     monkeypatch.setattr(serial_board, '_PATIENCE', 20.0)
     made = Line(tmp_path / 'ttyBoard')
     yield made
