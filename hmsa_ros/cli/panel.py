@@ -48,14 +48,14 @@ def run(arguments: argparse.Namespace) -> int:
         raise BadInputError(
             'Tornado, which serves the panel, is not installed: install it (pip install '
             'tornado)') from error
-    from hmsa_ros.panel.desk import Desk, Options
+    from hmsa_ros.panel.desk import Desk
     from hmsa_ros.panel.server import Server
 
     ENDING.note()
     with Server(arguments.port) as server:
-        desk = Desk(server, Options(
-            _setpoint, arguments.out, arguments.namespace, tuple(arguments.joint.split(',')),
-            span, arguments.stop_on_close))
+        desk = Desk(
+            server, _setpoint, arguments.out, arguments.namespace,
+            tuple(arguments.joint.split(',')), span, stop_on_close=arguments.stop_on_close)
         print(f'panel: {server.address}', flush=True)
         desk.run()
     return 0

@@ -1,7 +1,7 @@
 """What the panel does with ROS, in one thread that never waits for an answer."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 import json
 import math
 from pathlib import Path
@@ -39,26 +39,34 @@ _ASK_SECONDS = 1.0
 _RESTING = ('at_rest', 'idle')
 
 
-@dataclass(frozen=True)
-class Options:
-    """What the panel drives, and how."""
-
-    parse: Callable[[str], tuple[Sequence[float], float]]  #: one setpoint from its text
-    out: Path  #: folder of recordings
-    namespace: str = ''
-    joints: tuple[str, ...] = ('actuator',)
-    span: float = 10.0  #: of the charts in s
-    stop_on_close: bool = True  #: come to rest when the last page is closed
-
-
 class Desk:
-    """Carries out what the pages of a server ask for, and tells them what is seen."""
+    """
+    Carries out what the pages of a server ask for, and tells them what is seen.
 
-    def __init__(self, server: Server, options: Options) -> None:
-        self._server, self._options = server, options
-        self._client = PlannerClient(namespace=options.namespace, joints=options.joints)
-        self._listener = Listener(
-            namespace=options.namespace, joints=options.joints, span=options.span)
+    Parameters
+    ----------
+    server : Server
+        That gives the page.
+    parse : callable
+        Returns one setpoint from its text.
+    out : Path
+        Folder of recordings.
+    namespace, joints : str, tuple of str
+        What it drives.
+    span : float
+        Of the charts in s.
+    stop_on_close : bool
+        Whether to come to rest when the last page is closed.
+
+    """
+
+    def __init__(
+            self, server: Server, parse: Callable[[str], tuple[Sequence[float], float]], out: Path,
+            namespace: str, joints: tuple[str, ...], span: float, *, stop_on_close: bool) -> None:
+        self._server, self._parse, self._joints, self._span = server, parse, joints, span
+        self._stop_on_close = stop_on_close
+        self._client = PlannerClient(namespace=namespace, joints=joints)
+        self._listener = Listener(namespace=namespace, joints=joints, span=span)
         node = self._client.node
         self._stop = endpoints.call(node, topics.STOP, topics.PLANNER, Trigger.Request())
         self._get = ServiceCall(
@@ -66,7 +74,7 @@ class Desk:
             GetParameters.Request(names=['feedback', 'use_sim_time']))
         self._set: ServiceCall | None = None
         endpoints.subscribe(node, topics.ESTIMATE, self._on_estimate, topics.PLANNER)
-        self._recording = Recording(options.out, options.namespace, options.joints)
+        self._recording = Recording(out, namespace, joints)
         self._estimates: dict[str, dict[str, Any]] = {}
         self._known: Mapping[str, Any] = {}
         self._next_ask = 0.0
@@ -86,7 +94,7 @@ class Desk:
         except KeyboardInterrupt:
             pass
         finally:
-            if self._options.stop_on_close and self._moves:
+            if self._stop_on_close and self._moves:
                 self._client.stop()
             self._recording.close()
             self._listener.__exit__()
@@ -136,7 +144,7 @@ class Desk:
         self._pages = pages
         if now - self._left > _RELOAD_SECONDS:
             self._left = math.inf
-            if self._options.stop_on_close and self._moves:
+            if self._stop_on_close and self._moves:
                 self._begin_stop(now)
 
     # -- stop ----------------------------------------------------------------------------------
@@ -182,7 +190,7 @@ class Desk:
     def _send(self, words: str, now: float) -> None:
         if self._stopping > -math.inf:
             raise HmsaError('not sent, since the actuator is being stopped: send it again')
-        setpoints = [self._options.parse(x) for x in words.split()]
+        setpoints = [self._parse(x) for x in words.split()]
         if not setpoints:
             raise BadInputError('no setpoint: expected STRETCH:SECONDS ..., such as 1.10:1 1.00:1')
         if not self._client.listened:
@@ -221,7 +229,7 @@ class Desk:
         for status in message.status:
             values = texts(status)
             # Of one joint or of several, whose names are known.
-            if status.hardware_id in self._options.joints:
+            if status.hardware_id in self._joints:
                 self._estimates[status.hardware_id] = {
                     'joint': status.hardware_id, 'level': LEVELS[min(status.level[0], 3)],
                     'message': printable(status.message), 'rows': [
@@ -244,8 +252,8 @@ class Desk:
             seen['request']['finding'] = scene.request.finding
         return {
             **seen,
-            'slot': math.floor(scene.now / (self._options.span / SLOTS)),
-            'span': self._options.span, 'slots': SLOTS, 'charts': {
+            'slot': math.floor(scene.now / (self._span / SLOTS)),
+            'span': self._span, 'slots': SLOTS, 'charts': {
                 x.name: {
                     'coordinate': x.coordinate, 'drive': asdict(x.drive),
                     'stretch': _tail(x.stretches, scene.now, tail),
