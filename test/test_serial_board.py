@@ -85,7 +85,7 @@ def test_a_board_tells_the_temperature_of_its_coil_if_it_measures_one(line):
     without.close()
     line.board.temperature = 41.25
     device = driver(line)
-    assert device.temperatures == {'actuator': 41.25}
+    assert device.coils[0].temperature == 41.25
     assert device.close() == ''
 
 
