@@ -45,9 +45,13 @@ def _rerun() -> Any:
     return rerun
 
 
+def _root(namespace: str) -> str:
+    return f'/{namespace.strip("/")}'.rstrip('/')
+
+
 def views(namespace: str = '', coordinate: str = STRETCH.name) -> dict[str, str]:
     """Return the entity path of each view by its title, which names what a position is."""
-    root = '/' + namespace.strip('/') if namespace.strip('/') else ''
+    root = _root(namespace)
     return {
         coordinate.capitalize(): f'{root}/{JOINT_STATES}/position',
         f'{coordinate.capitalize()} rate (1/s)': f'{root}/{JOINT_STATES}/velocity',
@@ -71,7 +75,7 @@ def blueprint(namespace: str = '', coordinate: str = STRETCH.name) -> Any:
 
 def show(bag: str | os.PathLike[str], recording: Any, namespace: str = '') -> None:
     """Log a bag and the blueprint; raise `BadInputError` without samples in that namespace."""
-    root = '/' + namespace.strip('/') if namespace.strip('/') else ''
+    root = _root(namespace)
     reader = BagReader(bag)
     found = set(reader.topics)
     if f'{root}/{JOINT_STATES}' not in found:
@@ -99,41 +103,39 @@ def _coordinate(custom_data: Mapping[str, str], root: str) -> str:
 def _log_marker(recording: Any, root: str, marker: Any) -> None:
     """Log a marker as what Rerun knows."""
     rr = _rerun()
-    path = f'{root}/{marker.ns}/{marker.id}'
     if marker.action == _DELETE_ALL:
         recording.log(root, rr.Clear(recursive=True))
         return
-    if marker.action == _DELETE:
-        recording.log(path, rr.Clear(recursive=False))
-        return
+    shape = rr.Clear(recursive=False) if marker.action == _DELETE else _shape(rr, marker)
+    if shape is not None:
+        recording.log(f'{root}/{marker.ns}/{marker.id}', shape)
+
+
+def _shape(rr: Any, marker: Any) -> Any:
+    """Return what Rerun shows for a marker; None for nothing."""
     colour = [round(255 * x) for x in (
         marker.color.r, marker.color.g, marker.color.b, marker.color.a)]
-    position = marker.pose.position
+    position, scale, *points = (
+        np.array([p.x, p.y, p.z]) for p in (marker.pose.position, marker.scale, *marker.points))
     if marker.type == _CUBE:
-        recording.log(path, rr.Boxes3D(
-            centers=[[position.x, position.y, position.z]],
-            sizes=[[marker.scale.x, marker.scale.y, marker.scale.z]], colors=[colour],
-            fill_mode='solid'))
-    elif marker.type == _ARROW and len(marker.points) == 2:
-        start, end = marker.points
-        recording.log(path, rr.Arrows3D(
-            origins=[[start.x, start.y, start.z]],
-            vectors=[[end.x - start.x, end.y - start.y, end.z - start.z]],
-            radii=[marker.scale.x / 2], colors=[colour]))
-    elif marker.type == _TRIANGLES:
-        corners = np.array([
-            (position.x + p.x, position.y + p.y, position.z + p.z) for p in marker.points])
+        return rr.Boxes3D(
+            centers=[position], sizes=[scale], colors=[colour], fill_mode='solid')
+    if marker.type == _ARROW and len(points) == 2:
+        return rr.Arrows3D(
+            origins=points[:1], vectors=[points[1] - points[0]], radii=[scale[0] / 2],
+            colors=[colour])
+    if marker.type == _TRIANGLES:
+        corners = position + points
         # Without normals nothing is shaded.
         a, b, c = corners[0::3], corners[1::3], corners[2::3]
         normals = np.cross(b - a, c - a)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-        recording.log(path, rr.Mesh3D(
+        return rr.Mesh3D(
             vertex_positions=corners, vertex_normals=np.repeat(normals, 3, axis=0),
-            albedo_factor=colour))
-    elif marker.type == _TEXT:
-        recording.log(path, rr.Points3D(
-            [[position.x, position.y, position.z]], radii=[0.0], labels=[marker.text],
-            colors=[colour]))
+            albedo_factor=colour)
+    if marker.type == _TEXT:
+        return rr.Points3D([position], radii=[0.0], labels=[marker.text], colors=[colour])
+    return None
 
 
 def main(args: Sequence[str] | None = None) -> int:
