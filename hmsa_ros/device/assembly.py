@@ -85,8 +85,8 @@ class CoilModel:
         """Return the current in A for a flux density in T, or the largest one there is."""
         if self._table is not None:
             current, flux = self._table
-            return float(np.interp(level, flux, current) if flux[-1] > flux[0] else np.interp(
-                level, flux[::-1], current[::-1]))
+            way = 1 if flux[-1] > flux[0] else -1
+            return float(np.interp(level, flux[::way], current[::way]))
         if self.saturation != math.inf:
             level = self.saturation * math.atanh(
                 max(-_SATURATED, min(level / self.saturation, _SATURATED)))
@@ -109,8 +109,8 @@ class CoilModel:
 def _table_in(path: Path) -> tuple[Array, Array]:
     found = read_table(path, ('current', 'flux_density')).columns
     current, flux = found['current'], found['flux_density']
-    rises = np.diff(flux) if len(flux) > 1 and flux[-1] > flux[0] else -np.diff(flux)
-    if not (len(current) > 2 and np.all(np.diff(current) > 0.0) and np.all(rises > 0.0)):
+    if not (len(current) > 2 and np.all(np.diff(current) > 0.0)
+            and np.all(np.diff(flux) * (flux[-1] - flux[0]) > 0.0)):
         raise BadInputError(
             f'{path}: expected at least three rows of current and flux_density, both numbers that '
             'rise from row to row (or a flux density that falls)')
