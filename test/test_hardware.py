@@ -936,11 +936,10 @@ class Coil:
 """)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(BadInputError, match="'ends_here:Coil' cannot be loaded .SystemExit: 'no "):
-        load('ends_here:Coil')
-    make = load('a_lab:Coil')
-    assert make('left', {'port': 'x'}).port == 'x'
+        load('ends_here:Coil', 'left', {})
+    assert load('a_lab:Coil', 'left', {'port': 'x'}).port == 'x'
     with pytest.raises(BadInputError, match=r"joint left does not start \(SystemExit: 'no port'"):
-        make('left', {})
+        load('a_lab:Coil', 'left', {})
 
 
 def test_the_verdict_on_hardware_names_what_is_wrong():

@@ -131,20 +131,19 @@ def test_a_field_that_takes_no_level_is_refused(ros):
     ros.collect(ARRAY, '/coils')
     for settings, text in BAD:
         with pytest.raises(BadInputError, match=text):
-            load('topic')('left', settings)
+            load('topic', 'left', settings)
 
 
 @pytest.mark.ros
 def test_a_topic_that_nobody_subscribes_to_and_a_field_of_two_joints_are_refused(
         ros, monkeypatch):
     ros.collect(ARRAY, '/coils')
-    make = load('topic')
-    left = make('left', {'topic': '/coils'})
+    left = load('topic', 'left', {'topic': '/coils'})
     with pytest.raises(BadInputError, match="'data.0.' for joints left and right"):
-        make('right', {'topic': '/coils'})
+        load('topic', 'right', {'topic': '/coils'})
     left.close()
     monkeypatch.setattr('hmsa_ros.nodes.topic_coil._PATIENCE', 0.2)
     # Another type under the same name reaches nobody.
     for settings in ({'topic': '/nowhere'}, {'topic': '/coils', 'type': VECTOR}):
         with pytest.raises(BadInputError, match='no node subscribes to'):
-            make('left', settings)
+            load('topic', 'left', settings)

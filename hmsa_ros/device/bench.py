@@ -83,7 +83,7 @@ class Bench:
         #: Whether signs of life are given.
         self.beats = True
         self.worker = HardwareWorker(lambda: HardwareDevice(
-            [HardwareJoint(load(name)(joint, settings), limit, Fallback(SILENCE, 'zero'))],
+            [HardwareJoint(load(name, joint, settings), limit, Fallback(SILENCE, 'zero'))],
             time=time_ns(), period=round(NANOSECONDS / rate) if rate else 0, calls=calls), time_ns)
         if not self.worker.started(_START):
             raise HmsaError(

@@ -80,14 +80,14 @@ class _TimedCalls(Calls):
         self.durations: dict[str, list[float]] = {}
         self.read_fails = False
 
-    def __call__(self, name: str, act: Callable[..., Any], *arguments: object) -> Any:
+    def __call__(self, name: str, act: Callable[[], Any]) -> Any:
         """Call a method of hardware."""
         method = name.partition(' ')[0].rpartition('.')[2]
         if self.read_fails and method == 'read':
             raise RuntimeError('raised by the trial')
         begun = monotonic()
         try:
-            return super().__call__(name, act, *arguments)
+            return super().__call__(name, act)
         finally:
             self.durations.setdefault(method, []).append(monotonic() - begun)
 
@@ -300,7 +300,7 @@ class Trial:
         if math.isnan(self._apart):
             return None
         instrument = Instrument(
-            load(self.name)(self._joint, self._settings), self._joint, Calls(1.0))
+            load(self.name, self._joint, self._settings), self._joint, Calls(1.0))
         instrument.synchronise(time_ns)
         found: list[float] = []
         until = monotonic() + 2.0 * _PHASE

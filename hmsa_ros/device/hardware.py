@@ -11,7 +11,7 @@ from numbers import Real
 import os
 import sys
 from time import monotonic
-from typing import Any, cast, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from hmsa_ros.device.clock_map import ClockMap, ENOUGH
 from hmsa_ros.device.protocol import StateLostError
@@ -109,16 +109,16 @@ def imported(text: str) -> Any:
     return getattr(import_module(module), name)
 
 
-def load(text: str) -> Callable[[str, Mapping[str, Any]], Hardware]:
+def load(text: str, joint: str, settings: Mapping[str, Any]) -> Hardware:
     """
-    Return what makes the hardware of a joint by its name, ``'MODULE:NAME'`` or one of `SHIPPED`.
+    Return the hardware of a joint by its name, ``'MODULE:NAME'`` or one of `SHIPPED`.
 
-    It also takes settings, which are keyword arguments.
+    Settings are its keyword arguments.
 
     Raises
     ------
     BadInputError
-        If there is no such thing; what is returned raises it, too, where it fails.
+        If there is no such thing, or it fails.
 
     """
     path = SHIPPED.get(text, text)
@@ -132,25 +132,22 @@ def load(text: str) -> Callable[[str, Mapping[str, Any]], Hardware]:
         raise BadInputError(
             f'hardware {text!r} cannot be loaded ({told(error)}): expected a module that Python '
             'finds, or in the working directory, with that name in it') from error
-
-    def made(joint: str, settings: Mapping[str, Any]) -> Hardware:
-        try:
-            found = make(joint, **settings)
-        except HmsaError as error:
-            raise BadInputError(
-                f'hardware {text!r} of joint {joint} does not start: {error}') from error
-        except BaseException as error:
-            takes = ' and the settings ' + ', '.join(
-                f'hardware.{x}' for x in settings) if settings else ''
-            raise BadInputError(
-                f'hardware {text!r} of joint {joint} does not start ({told(error)}): expected it '
-                f'to take the name of a joint{takes}') from error
-        if not all(callable(getattr(found, x, None)) for x in ('write', 'read')):
-            raise BadInputError(
-                f'hardware {text!r} made a {type(found).__name__}: expected something with the '
-                'methods write and read')
-        return cast(Hardware, found)
-    return made
+    try:
+        found: Hardware = make(joint, **settings)
+    except HmsaError as error:
+        raise BadInputError(
+            f'hardware {text!r} of joint {joint} does not start: {error}') from error
+    except BaseException as error:
+        takes = ' and the settings ' + ', '.join(
+            f'hardware.{x}' for x in settings) if settings else ''
+        raise BadInputError(
+            f'hardware {text!r} of joint {joint} does not start ({told(error)}): expected it to '
+            f'take the name of a joint{takes}') from error
+    if not all(callable(getattr(found, x, None)) for x in ('write', 'read')):
+        raise BadInputError(
+            f'hardware {text!r} made a {type(found).__name__}: expected something with the '
+            'methods write and read')
+    return found
 
 
 @cache
@@ -191,7 +188,7 @@ class Calls:
             self._deadline.set(self.limit + _GRACE)
             self._armed = True
 
-    def __call__(self, name: str, act: Callable[..., Any], *arguments: object) -> Any:
+    def __call__(self, name: str, act: Callable[[], Any]) -> Any:
         """Call a method of hardware; ``name`` is its name for a sentence."""
         self.make_ready()
         if self._deadline is not None:
@@ -199,7 +196,7 @@ class Calls:
         begun = monotonic()
         self._begun = (name,)
         try:
-            return act(*arguments)
+            return act()
         finally:
             self._begun = None
             self.relax()

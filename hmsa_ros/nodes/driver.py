@@ -244,12 +244,11 @@ def _make_device(
         name: str, values: JointParameters,
         settings: Mapping[str, Mapping[str, Any]]) -> HardwareDevice:
     """Return the device that parameters and the name of its hardware describe."""
-    make = load(name)
     rate = values[PUBLISH_RATE.name]
     return HardwareDevice(
         [HardwareJoint(
-            make(joint, settings[joint]), own['flux_density_limit'], fallback_from(own), joint,
-            own['temperature_limit'] or math.inf)
+            load(name, joint, settings[joint]), own['flux_density_limit'], fallback_from(own),
+            joint, own['temperature_limit'] or math.inf)
          for joint, own in ((x, values.of(x)) for x in values.names)],
         time=time_ns(), period=max(round(NANOSECONDS / rate), 1) if rate else 0,
         calls=Calls(values[TIMEOUT.name], Deadline()))
