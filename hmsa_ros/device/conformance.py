@@ -117,13 +117,13 @@ class Trial:
     """
 
     def __init__(
-            self, name: str, joint: str = 'actuator', settings: Mapping[str, Any] | None = None,
-            *, level: float = 1e-3, rate: float = 200.0) -> None:
+            self, name: str, joint: str, settings: Mapping[str, Any], *, level: float,
+            rate: float) -> None:
         if not 0.0 < level < math.inf:
             raise BadInputError(f'limit is {level:g} T: expected a number above 0')
         if not 1.0 <= rate <= 1e4:
             raise BadInputError(f'rate is {rate:g} Hz: expected 1 to 10,000')
-        self.name, self._joint, self._settings = name, joint, dict(settings or {})
+        self.name, self._joint, self._settings = name, joint, settings
         self._level, self._rate = level, rate
         self._checks: list[Check] = []
         self._untried: list[str] = []
@@ -133,7 +133,7 @@ class Trial:
         # Of a level, in T.
         self._tolerance = 1e-3 * level
 
-    def run(self, progress: Callable[[str, float], None] = lambda text, part: None) -> Conformance:
+    def run(self, progress: Callable[[str, float], None]) -> Conformance:
         """
         Try the hardware.
 
