@@ -122,9 +122,6 @@ class HardwareWorker:
         """See whether the thread lives and its calls return; if not, switch off without it."""
         if self.failure is not None or self._saver is not None:
             return
-        if self._resumes and monotonic() >= self._resumes:
-            with self._turn:
-                self._turn.notify()
         if not self._thread.is_alive():
             self._save('the thread that serves the hardware has ended')
         elif overdue := self.device.calls.overdue():
@@ -210,8 +207,8 @@ class HardwareWorker:
         """Sleep until something is due; the last of the time to a level is watched instead."""
         device = self.device
         due, level = device.due, device.next_level
-        left = 0 if due is None else due - self._clock()
-        if due is not None and due == level and left <= _WATCHED:
+        left = math.inf if due is None else due - self._clock()
+        if due == level and left <= _WATCHED:
             device.calls.make_ready()
             # By the steady clock: the other may be set meanwhile.
             end = self._steady() + left
@@ -224,7 +221,9 @@ class HardwareWorker:
                 return
             if due == level:
                 left -= _WATCHED
-            self._turn.wait(None if due is None else max(left, 0) / NANOSECONDS)
+            if self._resumes:
+                left = min(left, (self._resumes - monotonic()) * NANOSECONDS)
+            self._turn.wait(None if left == math.inf else max(left, 0.0) / NANOSECONDS)
 
     def _end(self, why: str, *, again: bool) -> bool:
         """
