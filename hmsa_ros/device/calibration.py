@@ -5,7 +5,7 @@ import math
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import curve_fit
 from scipy.special import stdtrit
 
 from hmsa_ros.errors import BadInputError
@@ -142,18 +142,11 @@ def _model(current: Array, slope: float, offset: float, saturation: float = math
 def _fit(current: Array, flux_density: Array, *, saturating: bool) -> tuple[Array, float, Array]:
     """Return slope, offset and, with saturation, B_s; the slope's deviation; and residuals."""
     slope, offset = np.polyfit(current, flux_density, 1)
-    largest = float(np.max(np.abs(flux_density - offset))) or 1.0
-    scale = np.array([slope or 1.0, largest, largest])[:3 if saturating else 2]
-    start = np.array([slope, offset, 2.0 * largest])[:len(scale)] / scale
-
-    def off(values: Array) -> Array:
-        found: Array = (_model(current, *(values * scale)) - flux_density) / largest
-        return found
-
-    found = least_squares(off, start, x_scale='jac', xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    freedom = max(len(current) - len(scale), 1)
-    covariance = np.linalg.pinv(found.jac.T @ found.jac) * 2.0 * found.cost / freedom
-    return found.x * scale, float(abs(scale[0]) * math.sqrt(covariance[0, 0])), found.fun
+    start = [slope, offset, 2.0 * np.max(np.abs(flux_density - offset))][:3 if saturating else 2]
+    values, covariance = curve_fit(
+        _model, current, flux_density, start, method='trf', x_scale='jac', xtol=1e-15, ftol=1e-15,
+        gtol=1e-15)
+    return values, math.sqrt(covariance[0, 0]), _model(current, *values) - flux_density
 
 
 def branch_means(current: Array, flux_density: Array) -> tuple[Array, Array, float]:
