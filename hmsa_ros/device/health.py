@@ -20,33 +20,29 @@ def judge_commands(
     Of counts, of the joints that nobody (``silent``) or several (``crowded``) command, and of what
     other devices there are (``rivals``).
     """
-    level, notes = _OK, []
-    if late or refused or refused_source:
-        level = _WARN
-        notes.append(f'{late} commands late, {refused + refused_source} refused')
-    if crowded:
-        level = _WARN
-        notes.append(f'several publishers command {listed(crowded)}')
-    if failed:
-        level = _ERROR
-        notes.append(f'{failed} times started again after a load too large to follow')
-    if silent:
-        level = _ERROR
-        notes.append(f'no command and no heartbeat for {listed(silent)}')
-    if rivals:
-        level = _ERROR
-        notes.insert(0, rivals)
-    return level, '; '.join(notes) or 'commands in time'
+    refused += refused_source
+    return _verdict(
+        'commands in time', (_ERROR, rivals),
+        (_WARN, f'{late} commands late, {refused} refused' if late or refused else ''),
+        (_WARN, f'several publishers command {listed(crowded)}' if crowded else ''),
+        (_ERROR, f'{failed} times started again after a load too large to follow'
+         if failed else ''),
+        (_ERROR, f'no command and no heartbeat for {listed(silent)}' if silent else ''))
 
 
 def judge_hardware(trouble: str, *, saturated: int, state_lost: int) -> tuple[int, str]:
     """Return the verdict on hardware, of what keeps a coil off and of counts."""
-    if trouble:
-        return _ERROR, trouble
-    notes = [text for count, text in (
-        (saturated, f'{saturated} levels not reached: the amplifier is saturated'),
-        (state_lost, f'its state was lost, times: {state_lost}')) if count]
-    return (_WARN, '; '.join(notes)) if notes else (_OK, 'hardware obeys')
+    return (_ERROR, trouble) if trouble else _verdict(
+        'hardware obeys',
+        (_WARN, f'{saturated} levels not reached: the amplifier is saturated'
+         if saturated else ''),
+        (_WARN, f'its state was lost, times: {state_lost}' if state_lost else ''))
+
+
+def _verdict(fine: str, *notes: tuple[int, str]) -> tuple[int, str]:
+    """Return the worst level of what there is to say, and all of it."""
+    said = [x for x in notes if x[1]]
+    return max((x for x, _ in said), default=_OK), '; '.join(x for _, x in said) or fine
 
 
 def judge_interlock(why: str) -> tuple[int, str]:
