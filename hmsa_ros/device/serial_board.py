@@ -7,6 +7,7 @@ again: a line that was lost or damaged costs an attempt.
 
 from binascii import crc_hqx
 from collections.abc import Callable, Sequence
+from itertools import accumulate
 import math
 from secrets import randbelow
 from time import monotonic
@@ -46,6 +47,8 @@ def framed(text: str) -> bytes:
 class Board(OnLine):
     """
     The board as the source of a current (or voltage) in A, and as a sensor.
+
+    When its line is closed, it switches off after the time of its watchdog, if it is not off.
 
     Parameters
     ----------
@@ -182,10 +185,9 @@ class Board(OnLine):
         found: list[tuple[float, int]] = []
         for _ in range(_ANSWERS):
             first, *values = self._ask(verb, self._seen[series] + 1, count=1)
-            when = 0
-            for since, value in zip(values[::2], values[1::2], strict=True):
-                when += since
-                found.append((value / _MILLION, 1000 * when))
+            # Each time is given since the one before.
+            found += [(value / _MILLION, 1000 * when) for when, value in zip(
+                accumulate(values[::2]), values[1::2], strict=True)]
             if values:
                 self._seen[series] = first - 1 + len(values) // 2
             if len(values) < 2 * _PER_ANSWER:
