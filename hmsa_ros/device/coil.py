@@ -56,7 +56,7 @@ class Coil(GuardedJoint):
     """
     What is known of a coil; NaN where a level in T is not known.
 
-    All times are in ns, and ``now`` never goes back but with `clock_set`.
+    All times are in ns.
 
     Parameters
     ----------
