@@ -1,4 +1,4 @@
-"""A coil that a driver serves: what it is written, keeps ahead and has in force, and how warm."""
+"""A coil that a driver serves: levels ahead, handed over and in force, and its temperature."""
 
 from bisect import bisect_right
 from collections import deque
