@@ -317,22 +317,22 @@ class Instrument:
             raise HardwareError(f'{name} raised {told(error)}') from error
 
     def _ask(
-            self, method: str, *arguments: object, take: Callable[[Any], T], expected: str) -> T:
+            self, method: str, *arguments: object, take: Callable[[Any], T],
+            wrong: Callable[[str], HardwareError]) -> T:
         """Return what `take` makes of an answer; it raises TypeError or ValueError for none."""
         answer = self._call(method, *arguments)
         try:
             return take(answer)
         except (TypeError, ValueError) as error:
-            raise HardwareError(
-                f'{self._names[method]} returned {excerpt(answer)}: expected {expected}'
-            ) from error
+            raise wrong(f'{self._names[method]} returned {excerpt(answer)}') from error
 
     def write(self, level: float, now: int) -> tuple[int, float]:
         """Set a level in T at a time in ns; return when it took effect, and the one really set."""
         return self._ask(
             'write', level, self._theirs(now), take=lambda x: self._written(x, level, now),
-            expected=f'when the level took effect in ns, near now, {now}, that and the level '
-            'really set in T, or None')
+            wrong=lambda what: HardwareError(
+                f'{what}: expected when the level took effect in ns, near now, {now}, that and '
+                'the level really set in T, or None'))
 
     def _theirs(self, time: int) -> int:
         """Return a time in ns as the hardware counts it."""
@@ -359,8 +359,10 @@ class Instrument:
         """Return what is new at a time in ns."""
         return self._ask(
             'read', self._theirs(now), take=lambda x: [self._stamped(y, now) for y in readings(x)],
-            expected=f'stretch, (stretch, rate), (stretch, rate, timestamp in ns, near now, {now})'
-            f' or a list of the latter, at most {_MOST_PIECES}, with NaN for what is not measured')
+            wrong=lambda what: HardwareError(
+                f'{what}: expected stretch, (stretch, rate), (stretch, rate, timestamp in ns, '
+                f'near now, {now}) or a list of the latter, at most {_MOST_PIECES}, with NaN for '
+                'what is not measured'))
 
     def _stamped(self, found: Reading, now: int) -> Reading:
         if found.stamp is None:
@@ -383,9 +385,10 @@ class Instrument:
     def applied(self, now: int) -> list[tuple[int, float]]:
         """Return stamps in ns and levels in T that have taken effect since the last call."""
         return self._ask(
-            'applied', expected='a list of (timestamp in ns, level in T)',
-            take=lambda answer: [
-                (self._happened(x, now), float(_number(y))) for x, y in answer])
+            'applied',
+            take=lambda answer: [(self._happened(x, now), float(_number(y))) for x, y in answer],
+            wrong=lambda what: HardwareError(
+                f'{what}: expected a list of (timestamp in ns, level in T)'))
 
     def synchronise(self, clock: Callable[[], int]) -> None:
         """Learn its time anew, where it has a clock, by that of this host in ns."""
@@ -401,14 +404,16 @@ class Instrument:
             return True
         before = clock()
         answer = self._ask(
-            'clock', take=lambda x: int(_number(x)), expected='its time in ns')
+            'clock', take=lambda x: int(_number(x)),
+            wrong=lambda what: HardwareError(f'{what}: expected its time in ns'))
         return self.clock_map.add(before, answer, clock())
 
     def temperature(self) -> float:
         """Return the temperature of its coil in degrees Celsius; NaN if it is not known."""
         return math.nan if not self.has('temperature') else self._ask(
             'temperature', take=lambda x: float(_number(x, finite=False)),
-            expected='degrees Celsius, NaN if they are not known')
+            wrong=lambda what: HardwareError(
+                f'{what}: expected degrees Celsius, NaN if they are not known'))
 
     def arm(self) -> None:
         """Have it made ready for levels, where it can."""
