@@ -251,6 +251,7 @@ class Instrument:
         self.hardware, self._calls = hardware, calls
         self.name = type(hardware).__name__
         self._names = {x: f'{self.name}.{x} of joint {joint}' for x in _TAKES}
+        self._methods = {x for x in _TAKES if callable(getattr(hardware, x, None))}
         for method, arguments in _TAKES.items():
             try:
                 inspect.signature(getattr(hardware, method, lambda *_: 0)).bind(*arguments)
@@ -285,7 +286,7 @@ class Instrument:
 
     def has(self, method: str) -> bool:
         """Return whether it has a method."""
-        return callable(getattr(self.hardware, method, None))
+        return method in self._methods
 
     def tolerance(self, limit: float) -> float:
         """Return which difference in T between levels asked and set is none."""
