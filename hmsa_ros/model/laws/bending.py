@@ -48,7 +48,8 @@ def slope(share: ArrayLike) -> Array:
 
 def _turned(angle: ArrayLike) -> Array:
     """Return by how much the beam is turned at its points, for angles of the tip in rad."""
-    return np.multiply.outer(np.asarray(angle, dtype=np.float64), _rule()[2])
+    made: Array = np.multiply.outer(np.asarray(angle, dtype=np.float64), _rule()[2])
+    return made
 
 
 def deflection(angle: ArrayLike) -> Array:
