@@ -25,9 +25,8 @@ class Errors:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for name, value, least in (
-                ('shear_modulus', self.shear_modulus, False), ('zeta', self.zeta, True),
-                ('j_lim', self.j_lim, False), ('remanence', self.remanence, False)):
+        for name, value in vars(self).items():
+            least = name == 'zeta'
             if not (-1.0 < value < math.inf or (least and value == -1.0)):
                 raise BadInputError(
                     f'error of {name} is {value:g}: expected a finite number '
