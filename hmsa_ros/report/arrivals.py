@@ -131,9 +131,8 @@ def reach(parts: Sequence[Part], number: int) -> float:
         110.0 * x.error for x in results_of(parts, number) if math.isfinite(x.error))]))
 
 
-def around(part: Part, number: int, curve: Curve) -> tuple[Array, Array]:
+def around(x: MoveResult, curve: Curve) -> tuple[Array, Array]:
     """Return a curve about an arrival: s after the move began, and off target in % of the step."""
-    x = part.evaluation.results[number]
     inside = curve.between(x.begin, min(x.end, x.begin + _PANEL_SPAN * max(x.arrival, 1e-9)))
     return inside.time - x.begin, 100.0 * (inside.stretch - x.stretch) / abs(x.step)
 

@@ -45,8 +45,8 @@ def _curves(group: Sequence[Part], number: int, grid: Array) -> Array:
     """Return the error in % of the step of each repeat that has an arrival, NaN where unknown."""
     found = []
     for part in group:
-        if number < len(part.evaluation.results):
-            time, off = around(part, number, part.evaluation.recorded)
+        for result in part.evaluation.results[number:number + 1]:
+            time, off = around(result, part.evaluation.recorded)
             known = np.isfinite(off)
             if np.count_nonzero(known) > 1:
                 found.append(np.interp(grid, time[known], off[known], np.nan, np.nan))

@@ -17,7 +17,7 @@ from hmsa_ros.model.equations import Array, elastic_force
 from hmsa_ros.model.residual import RESOLVED
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.report import looks
-from hmsa_ros.report.arrivals import around, Part, reach, results_of, span, title, worst
+from hmsa_ros.report.arrivals import around, Part, reach, results_of, span, title
 from hmsa_ros.report.curves import BUCKETS, Curve, decimate, numbers
 from hmsa_ros.report.evaluation import MoveResult
 from hmsa_ros.report.looks import BLACK, BLUE, GREY, VERMILION
@@ -293,11 +293,6 @@ def _orbit(stretch: Array, rate: Array) -> tuple[Array, Array, float]:
     return x[places], y[places], share
 
 
-def panels(parts: Sequence[Part]) -> list[tuple[int, str]]:
-    """Return number, from 0 on, and title of each arrival to show; those of a number share one."""
-    return [(i, title(parts, i)) for i in worst(parts, MOST_PANELS)]
-
-
 def arrival(parts: Sequence[Part], number: int) -> Figure:
     """Return the zoom on one arrival: distance from the target in percent of the step."""
     data = []
@@ -307,14 +302,14 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
         found = part.evaluation
         if number >= len(found.results):
             continue
+        result = found.results[number]
         for kind, curve in (('unshaped steps', found.plain), ('plan', found.planned)):
             if not part.colour:
-                time, distance = around(part, number, curve)
+                time, distance = around(result, curve)
                 data.append(_curve(
                     part, kind, *decimate(unit.of(time), distance, _PANEL_BUCKETS)))
-        time, distance = around(part, number, found.recorded)
-        samples, away = around(
-            part, number, Curve(found.time, part.run.stretch, part.run.rate))
+        time, distance = around(result, found.recorded)
+        samples, away = around(result, Curve(found.time, part.run.stretch, part.run.rate))
         data += _recorded(
             part, unit.of(time), Curve(time, distance, distance), (unit.of(samples), away),
             buckets=_PANEL_BUCKETS)

@@ -9,7 +9,7 @@ import numpy as np
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.recordings.record import Run
 from hmsa_ros.report.arrivals import around, Part
-from hmsa_ros.report.evaluation import judged_from
+from hmsa_ros.report.evaluation import judged_from, MoveResult
 from hmsa_ros.report.looks import RUNS
 from hmsa_ros.table import Column, Table
 
@@ -89,8 +89,7 @@ _CAPTION = (
 
 def _measured(part: Part, number: int) -> tuple[float, ...]:
     """Return the values of `_MEASURED`; NaN for what was not measured."""
-    found, place = part.evaluation.findings[number], _place(part, number)
-    result = None if place is None else part.evaluation.results[place]
+    found, result = part.evaluation.findings[number], _result(part, number)
     return (
         found.setpoint.target, *((math.nan, math.nan) if result is None else (
             1e3 * result.arrival, 100.0 * result.residual)), 1e3 * judged_from(found),
@@ -102,28 +101,24 @@ def _verdict(part: Part, number: int) -> str:
     return str(part.evaluation.findings[number].verdict).replace('_', ' ')
 
 
-def _place(part: Part, number: int) -> int | None:
-    """Return the place of a setpoint among the moves that were reached; None for another."""
-    return next(
-        (i for i, x in enumerate(part.evaluation.results) if x.place == number), None)
+def _result(part: Part, number: int) -> MoveResult | None:
+    """Return the result of a setpoint that was reached; None for another."""
+    return next((x for x in part.evaluation.results if x.place == number), None)
 
 
 def _apart(first: Part, part: Part, number: int) -> float:
     """Return the largest distance of two curves about an arrival, in percent of the step."""
-    places = _place(first, number), _place(part, number)
-    if part is first or None in places:
+    reference, move = _result(first, number), _result(part, number)
+    if part is first or reference is None or move is None:
         return math.nan
-    curves = []
-    for each, place in zip((first, part), places, strict=True):
-        time, off = around(each, place or 0, each.evaluation.recorded)
-        known = np.isfinite(off)
-        move = each.evaluation.results[place or 0]
-        curves.append((time[known], off[known], move.stretch, move.step))
-    (time, off, target, step), (other, values, its, size) = curves
+    (time, off), (other, values) = (
+        (time[np.isfinite(off)], off[np.isfinite(off)]) for time, off in (
+            around(reference, first.evaluation.recorded), around(move, part.evaluation.recorded)))
     if len(other) < 2 or len(time) < 2:
         return math.nan
     inside = (time >= other[0]) & (time <= other[-1])
     # Each is in percent of its own step, about its own target.
-    shift = 100.0 * (its - target) / abs(step)
-    away = np.interp(time[inside], other, values) * abs(size / step) + shift - off[inside]
+    step = abs(reference.step)
+    shift = 100.0 * (move.stretch - reference.stretch) / step
+    away = np.interp(time[inside], other, values) * abs(move.step) / step + shift - off[inside]
     return float(np.max(np.abs(away), initial=0.0))

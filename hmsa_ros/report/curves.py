@@ -26,11 +26,6 @@ class Curve:
     stretch: Array  #: shape (n,)
     rate: Array  #: in 1/s, shape (n,)
 
-    @property
-    def known(self) -> bool:
-        """Whether any of it is known."""
-        return bool(np.isfinite(self.stretch).any())
-
     def between(self, begin: float, end: float) -> 'Curve':
         """Return the part between two times, both included."""
         inside = (self.time >= begin) & (self.time <= end)

@@ -26,7 +26,7 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.record import Run
 from hmsa_ros.recordings.topics import APPLIED
 from hmsa_ros.report import charts, curves, looks
-from hmsa_ros.report.arrivals import NOT_MOVED, Part, residual_text
+from hmsa_ros.report.arrivals import NOT_MOVED, Part, residual_text, title, worst
 from hmsa_ros.report.charts import Figure, TimeUnit
 from hmsa_ros.report.evaluation import FEW_SAMPLES, plan_points
 from hmsa_ros.table import Column, Table
@@ -44,7 +44,8 @@ def page(parts: Sequence[Part]) -> str:
     unit = charts.time_unit(parts)
     phase, shown = charts.phase(parts)
     drawn = {'response': charts.response(parts, unit), 'phase': phase}
-    arrivals = [(title, charts.arrival(parts, i)) for i, title in charts.panels(parts)]
+    arrivals = [(title(parts, i), charts.arrival(parts, i))
+                for i in worst(parts, charts.MOST_PANELS)]
     if arrivals:
         drawn['residuals'] = charts.residuals(parts)
     if any(x.evaluation.plan for x in parts):
@@ -160,7 +161,8 @@ def _notes_of(part: Part) -> Iterable[str]:
     if part.run.commands and not part.evaluation.results:
         yield ('No setpoint could be identified from the commands: none of them holds a '
                f'requested {part.run.plant.coordinate.name} or lasts a period of the actuator.')
-    if part.evaluation.results and not part.evaluation.plain.known:
+    if part.evaluation.results and not np.isfinite(
+            part.evaluation.plain.stretch).any():
         yield 'Unshaped steps cannot be simulated: the levels are too large to follow.'
     samples = part.run.plant.period / np.median(part.timing.interval) \
         if len(part.timing.interval) else math.inf

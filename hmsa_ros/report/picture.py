@@ -163,11 +163,11 @@ def _draw_run(
 def _draw_arrival(
         panel: Axes, part: Part, number: int, look: looks.Look, *, alone: bool) -> None:
     """Draw the zoom on one arrival, in ms and percent of the step."""
-    found = part.evaluation
+    found, result = part.evaluation, part.evaluation.results[number]
     end = span([part], number)
 
     def shown(curve: Curve) -> tuple[Any, Any]:
-        time, distance = around(part, number, curve)
+        time, distance = around(result, curve)
         return 1e3 * time[time <= end], distance[time <= end]
 
     if alone:
@@ -177,7 +177,7 @@ def _draw_arrival(
         panel, part, decimate(*shown(found.recorded)),
         shown(Curve(found.time, part.run.stretch, part.run.rate)), look, alone=alone)
     # Of an unshaped step it is when a shaped one would have arrived.
-    panel.axvline(1e3 * found.results[number].arrival, **style.ARRIVAL, label='end of the move')
+    panel.axvline(1e3 * result.arrival, **style.ARRIVAL, label='end of the move')
 
 
 def _title(parts: Sequence[Part], number: int) -> str:
