@@ -539,12 +539,11 @@ class Actuator:
         []
 
         """
-        from hmsa_ros.api.paths import path_of, segments_along
-        from hmsa_ros.api.plan import Plan
+        from hmsa_ros.api.paths import followed, path_of
 
         path = path_of(self, (times, stretches, rates, accelerations))
         ends = float(np.asarray(stretches)[0]), float(np.asarray(stretches)[-1])
-        return Plan(self, segments_along(self, path, ends, tolerance, period), 'path')
+        return followed(self, path, ends, tolerance, period)
 
     def wave(
             self, shape: Any, frequency: float, amplitude: float, *, offset: float | None = None,
@@ -593,20 +592,17 @@ class Actuator:
         ['arrived']
 
         """
-        from hmsa_ros.api.paths import segments_along, wave_of, wave_path
-        from hmsa_ros.api.plan import Plan
+        from hmsa_ros.api.paths import followed, wave_of, wave_path
 
+        wave = wave_of(self, shape, amplitude, offset)
         if isinstance(shape, str) and shape == 'square':
-            wave = wave_of(self, 'sine', amplitude, offset)
             half = 0.5 / number(frequency, 'frequency', 'Hz', above=0.0)
             count = round(number(cycles, 'cycles', least=1.0, most=1e5))
             return self.plan([(wave.mean + amplitude, half), (
                 wave.mean - amplitude, half)] * count + [(self.block.rest, half)])
         path = wave_path(
-            self, wave_of(self, shape, amplitude, offset),
-            (frequency, frequency if last is None else last), cycles)
-        return Plan(self, segments_along(
-            self, path, (self.block.rest,) * 2, tolerance, 0.0), 'path')
+            self, wave, (frequency, frequency if last is None else last), cycles)
+        return followed(self, path, (self.block.rest,) * 2, tolerance)
 
     def wave_bands(self, shape: Any, amplitude: float, offset: float | None = None) -> Array:
         """

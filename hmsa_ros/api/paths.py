@@ -23,10 +23,10 @@ from hmsa_ros.planning.waves import sampled_shape, Shape, sine, triangle, Wave
 
 if TYPE_CHECKING:
     from hmsa_ros.api.actuator import Actuator
-    from hmsa_ros.planning.sequence import Segment
+    from hmsa_ros.api.plan import Plan
 
-# Shapes of waves that are followed as paths.
-SHAPES: dict[str, Shape] = {'sine': sine, 'triangle': triangle}
+# Shapes of waves; a square one is a sequence of moves between its extremes.
+_SHAPES: dict[str, Shape] = {'square': sine, 'sine': sine, 'triangle': triangle}
 # Points between two breaks of a wave.
 _OF_EACH = 8
 # Frequencies at which a sweep is held against the limits.
@@ -89,11 +89,11 @@ def wave_of(
     mean = number(rest if offset is None else offset, 'offset')
     size = number(amplitude, 'amplitude', above=0.0)
     if isinstance(shape, str):
-        if shape not in SHAPES:
+        if shape not in _SHAPES:
             raise BadInputError(
-                f'shape is {excerpt(shape)}: expected one of square, {", ".join(SHAPES)}, or one '
+                f'shape is {excerpt(shape)}: expected one of {", ".join(_SHAPES)}, or one '
                 'period of times and stretches')
-        form = SHAPES[shape]
+        form = _SHAPES[shape]
     else:
         times, stretches = columns_of(shape, ('time', 'stretch'), 'samples of a wave')
         form = sampled_shape(times, stretches)
@@ -106,10 +106,8 @@ def wave_of(
 
 def bands(actuator: 'Actuator', shape: Any, amplitude: float, offset: float | None) -> Array:
     """Return the bands of frequencies in Hz that an actuator's limits allow, shape (n, 2)."""
-    square = isinstance(shape, str) and shape == 'square'
-    wave = wave_of(actuator, 'sine' if square else shape, amplitude, offset)
-    frame = _frame(actuator)
-    if square:
+    wave, frame = wave_of(actuator, shape, amplitude, offset), _frame(actuator)
+    if isinstance(shape, str) and shape == 'square':
         high, low, rest = wave.mean + wave.amplitude, wave.mean - wave.amplitude, frame.target
         try:
             moves = [float(actuator.plan([(y, 1e9)], start=x).move_times[0])
@@ -172,18 +170,21 @@ def _frame(actuator: 'Actuator') -> Request:
         model.material, limits=model.limits, units=model.units, delivery=model.delivery)
 
 
-def segments_along(
+def followed(
         actuator: 'Actuator', path: Path, ends: tuple[float, float], tolerance: float,
-        period: float) -> 'tuple[Segment, ...]':
+        period: float = 0.0) -> 'Plan':
     """
     Plan to follow a path between rests at its ends, on a grid with a period in s.
 
     A number out of range is a `BadInputError`, what cannot be followed a `RefusedError`.
     """
+    from hmsa_ros.api.plan import Plan
+
     tolerance = number(tolerance, 'tolerance', above=0.0, most=1.0)
     frame = replace(_frame(actuator), state=State(ends[0]), target=ends[0])
     if period := grid_of(period):
         frame = replace(frame, delivery=replace(
             frame.delivery, period=period / actuator.model.units.time))
     move = finish(along(replace(frame, target=ends[1]), path, tolerance))
-    return plan_sequence([Setpoint(ends[1], np.inf)], frame, lambda request: move)
+    return Plan(actuator, plan_sequence(
+        [Setpoint(ends[1], np.inf)], frame, lambda request: move), 'path')
