@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.schedule import CommandSchedule, Superseding
@@ -34,6 +35,12 @@ def in_force(messages: Iterable[Sequence[Level]]) -> tuple[Level, ...]:
         for level in sorted(message, key=lambda x: x.stamp):
             levels.put(level.stamp, level)
     return tuple(levels)
+
+
+def held_at(levels: Sequence[Level], stamps: NDArray[np.int64]) -> Array:
+    """Return the level in T, of those by stamp, in force at stamps in ns; NaN before the first."""
+    place = np.searchsorted([x.stamp for x in levels], stamps, side='right')
+    return np.array([math.nan, *(x.flux_density for x in levels)])[place]
 
 
 def without_repeats(commands: Sequence[Level]) -> tuple[tuple[Level, ...], int]:

@@ -12,6 +12,7 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import replacing, require_arrow
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.recordings.levels import held_at
 from hmsa_ros.recordings.record import Run
 
 SUFFIXES = ('.csv', '.parquet', '.mat')
@@ -25,11 +26,8 @@ def samples_of(run: Run) -> dict[str, Array]:
     in T: measured, else the level in force, else NaN.
     """
     field = run.flux_density
-    levels = run.levels
-    if levels and not np.isfinite(field).any():
-        place = np.searchsorted([x.stamp for x in levels], run.time, side='right') - 1
-        values = np.array([x.flux_density for x in levels])
-        field = np.where(place >= 0, values[np.maximum(place, 0)], np.nan)
+    if not np.isfinite(field).any():
+        field = held_at(run.levels, run.time)
     return {'time': _seconds(run, run.time), 'stretch': run.stretch, 'stretch_rate': run.rate,
             'flux_density': field}
 

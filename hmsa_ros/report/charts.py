@@ -16,6 +16,7 @@ import numpy as np
 from hmsa_ros.model.equations import Array, elastic_force
 from hmsa_ros.model.residual import RESOLVED
 from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.recordings.levels import held_at
 from hmsa_ros.report import looks
 from hmsa_ros.report.arrivals import around, Part, reach, results_of, span, title
 from hmsa_ros.report.curves import BUCKETS, Curve, decimate, numbers
@@ -216,11 +217,10 @@ def _commands(part: Part, unit: TimeUnit) -> list[dict[str, Any]]:
         data.append(_curve(
             part, 'command', unit.of(times), values, mode='lines+markers', yaxis='y2',
             marker={'size': sizes}))
-        place = np.searchsorted([x.stamp for x in found.levels], run.time, side='right') - 1
-        expected = np.array([*(x.flux_density for x in found.levels)])[np.maximum(place, 0)]
-        follows = np.abs(run.flux_density - expected)[place >= 0]
+        expected = held_at(found.levels, run.time)
+        follows = np.abs(run.flux_density - expected)
         if np.isfinite(follows).any() and (
-                np.nanmax(follows) <= 1e-9 * np.max(np.abs(expected))):
+                np.nanmax(follows) <= 1e-9 * np.nanmax(np.abs(expected))):
             return data
     if np.isfinite(run.flux_density).any():
         data.append(_curve(
