@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-import math
 import os
 from pathlib import Path
 from typing import Any
@@ -146,11 +145,10 @@ def identify(
     known, uncertain = ({x: number(y, x) for x, y in mapping_of(
         values, what, "'sensor_latency': 2e-3").items()} for what, values in (
             ('known values', known), ('standard deviations', uncertain)))
-    block = None if actuator is None else actuator.block
+    base = actuator or Actuator()
+    block, options = base.block, base.model.options
     given: dict[str, float] = {} if actuator is None else {
-        'coil_time_constant': actuator.model.options.coil_time_constant}
-    slew = math.inf if actuator is None else actuator.model.options.slew_limit
-    coordinate = (actuator or Actuator()).block.coordinate
+        'coil_time_constant': options.coil_time_constant}
     if isinstance(samples, (str, os.PathLike)):
         samples = file_of(samples)
         if os.path.isdir(samples) or samples.suffix == '.mcap':
@@ -160,17 +158,14 @@ def identify(
             raise BadInputError(
                 'commands are given with a motion that has its own: expected samples alone as '
                 'pairs of time and stretch, or no commands')
-        recording, found, theirs = recording_of(samples.run, block)
-        given = {**theirs, **given}
-        actuator = actuator or Actuator.from_parameters(samples.actuator.parameters)
-        block = found
+        recording, block, theirs = recording_of(
+            samples.run, None if actuator is None else block)
+        given, base = {**theirs, **given}, actuator or samples.actuator
     elif isinstance(samples, Path):
-        if not (commands is None or isinstance(commands, (str, os.PathLike))):
-            raise BadInputError(
-                f'commands are {excerpt(commands)} with the file {samples}: expected a file, too')
         recording = read_csv(
-            samples, None if commands is None else file_of(commands), slew_limit=slew,
-            coordinate=coordinate)
+            samples, None if commands is None else file_of(
+                commands, f'that of the commands, since samples are the file {samples}'),
+            slew_limit=options.slew_limit, coordinate=block.coordinate)
     else:
         if commands is None:
             raise BadInputError(
@@ -181,13 +176,13 @@ def identify(
             # As a coil is before anybody commands it.
             times, levels = np.append(time[0], times), np.append(0.0, levels)
         recording = Recording(
-            time - time[0], stretch, times - time[0], levels, slew, coordinate=coordinate)
-    base = actuator or Actuator()
+            time - time[0], stretch, times - time[0], levels, options.slew_limit,
+            coordinate=block.coordinate)
     others = {x: y for x, y in {**given, **known}.items() if y or x in known}
     names = [] if free is None else names_of(free, 'free')
     result = find(
         recording, free=free_of(','.join(names), base.block.law, others), known=others,
-        actuator=block or base.block, uncertain=uncertain)
+        actuator=block, uncertain=uncertain)
     text = file_text(
         result, Belief(result.actuator, others, base.parameters, Known()),
         recording.label, datetime.now().astimezone())
