@@ -4,6 +4,8 @@ from dataclasses import dataclass, replace
 from itertools import product
 import math
 
+import numpy as np
+
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.delivery import Delivery
 from hmsa_ros.model.parameters import NondimensionalParameters
@@ -77,18 +79,10 @@ class Ellipsoid:
     def offs(self, largest: float) -> list[Offs]:
         """Return the ends of the axes, the middles of the first, and points in between."""
         count = len(self.axes)
-        ends = [tuple(sign * float(i == j) for j in range(count))
-                for i in range(count) for sign in (-1.0, 1.0)]
-        between = [tuple(x / math.sqrt(count) for x in signs)
-                   for signs in product((-1.0, 1.0), repeat=count)]
-        middles = [tuple(0.5 * x for x in end) for end in ends[:2]]
-        found = []
-        for shares in (*middles, *ends, *between):
-            sums = [math.fsum(share * axis[i] for share, axis in zip(
-                shares, self.axes, strict=True)) for i in range(4)]
-            a, b, c, d = (min(max(x, -largest), largest) for x in sums)
-            found.append((a, b, c, d))
-        return found
+        ends = np.repeat(np.eye(count), 2, axis=0) * np.tile([[-1.0], [1.0]], (count, 1))
+        between = np.array(list(product((-1.0, 1.0), repeat=count))) / math.sqrt(count)
+        offs = np.concatenate([0.5 * ends[:2], ends, between]) @ np.array(self.axes)
+        return [(a, b, c, d) for a, b, c, d in np.clip(offs, -largest, largest).tolist()]
 
 
 #: Largest errors of G, damping coefficient and J_lim by themselves, or of all together.
