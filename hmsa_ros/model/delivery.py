@@ -30,14 +30,12 @@ class Delivery:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        if not 0.0 <= self.period < math.inf:
-            raise BadInputError(
-                f'command period is {self.period:g}: expected a finite number of at least 0')
+        for name, value in (('command period', self.period), ('coil time constant', self.lag)):
+            if not 0.0 <= value < math.inf:
+                raise BadInputError(
+                    f'{name} is {value:g}: expected a finite number of at least 0')
         if not self.slew > 0.0:
             raise BadInputError(f'slew limit is {self.slew:g}: expected a number above 0')
-        if not 0.0 <= self.lag < math.inf:
-            raise BadInputError(
-                f'coil time constant is {self.lag:g}: expected a finite number of at least 0')
         if not 0.0 < self.ripple <= 1.0:
             raise BadInputError(f'creep tolerance is {self.ripple:g}: expected above 0 to 1')
 

@@ -25,20 +25,19 @@ _SMALLEST = 1e-100
 def _check(record: object) -> None:
     """Refuse a record with a field that is out of range."""
     for field in fields(record):  # type: ignore[arg-type]
-        value = getattr(record, field.name)
-        if field.name in _NO_NUMBERS:
+        name, value = field.name, getattr(record, field.name)
+        if name in _NO_NUMBERS:
             continue
         if not isinstance(value, (int, float)) or isinstance(value, bool):
-            raise BadInputError(f'{field.name} is {value!r}: expected a number')
-        zero_allowed = field.name in _ZERO_ALLOWED
-        endless = field.name in _INFINITE_ALLOWED
+            raise BadInputError(f'{name} is {value!r}: expected a number')
+        zero, endless = name in _ZERO_ALLOWED, name in _INFINITE_ALLOWED
         # Compared, since a whole number may be too large to convert.
-        if not (0.0 <= value <= sys.float_info.max or (endless and value == math.inf)) or (
-                value == 0.0 and not zero_allowed):
-            least = 'of at least 0' if zero_allowed else 'greater than 0'
-            least += ', or inf' if endless else ''
-            raise BadInputError(f'{field.name} is {value!r}: expected a finite number {least}')
-        object.__setattr__(record, field.name, float(value))
+        if not (0.0 < value <= sys.float_info.max or zero and value == 0.0
+                or endless and value == math.inf):
+            raise BadInputError(
+                f'{name} is {value!r}: expected a finite number '
+                f'{"of at least 0" if zero else "greater than 0"}{", or inf" if endless else ""}')
+        object.__setattr__(record, name, float(value))
 
 
 @dataclass(frozen=True)
