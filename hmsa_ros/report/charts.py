@@ -135,11 +135,11 @@ def axis(name: str, **more: Any) -> dict[str, Any]:
     return {'title': {'text': name}, 'exponentformat': 'power', **more}
 
 
-def _recorded(part: Part, time: Any, curve: Curve, samples: tuple[Any, Any], *,
+def _recorded(part: Part, x: Array, y: Array, samples: tuple[Array, Array], *,
               buckets: int = BUCKETS) -> list[dict[str, Any]]:
     """Return what was recorded: the curve through the samples, and these where they are few."""
-    data = [_curve(part, 'recorded', *decimate(time, curve.stretch, buckets))]
-    if len(samples[0]) < len(curve.time) and len(samples[0]) <= _MOST_SAMPLES:
+    data = [_curve(part, 'recorded', *decimate(x, y, buckets))]
+    if len(samples[0]) < len(x) and len(samples[0]) <= _MOST_SAMPLES:
         data.append(_curve(
             part, 'recorded', *samples, mode='markers',
             marker={'size': 5, 'color': BLUE}))
@@ -154,7 +154,7 @@ def response(parts: Sequence[Part], unit: TimeUnit) -> Figure:
         for kind, curve in (('unshaped steps', found.plain), ('plan', found.planned)):
             data.append(_curve(part, kind, *decimate(unit.of(curve.time), curve.stretch)))
         data[-1:-1] = _recorded(
-            part, unit.of(found.recorded.time), found.recorded,
+            part, unit.of(found.recorded.time), found.recorded.stretch,
             (unit.of(found.time), run.stretch))
         if found.results:
             spans = [(x.begin, x.end, math.nan) for x in found.results]
@@ -311,8 +311,7 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
         time, distance = around(result, found.recorded)
         samples, away = around(result, Curve(found.time, part.run.stretch, part.run.rate))
         data += _recorded(
-            part, unit.of(time), Curve(time, distance, distance), (unit.of(samples), away),
-            buckets=_PANEL_BUCKETS)
+            part, unit.of(time), distance, (unit.of(samples), away), buckets=_PANEL_BUCKETS)
     arrivals = sorted({float(unit.of(x.arrival)) for x in results_of(parts, number)})
     height = reach(parts, number)
     return Figure(
