@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from string import ascii_lowercase
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ def draw_bands(
             style.finish(
                 panel, style.axis('time in the move', unit='ms'), style.axis(
                     'error', unit='% of step') if number % columns == 0 else '',
-                'abcdefghijklmnopqrstuvwxyz'[number % 26])
+                ascii_lowercase[number % 26])
             targets = dict.fromkeys(f'{x.stretch:.5g}' for x in results_of(parts, number))
             panel.set_title(f'to {"/".join(targets)}', loc='right', fontsize='small')
         style.legend_below(figure, *panels[:count])

@@ -17,8 +17,6 @@ from hmsa_ros.table import Column, Table
 def labelled(runs: list[Run]) -> list[Run]:
     """Return the runs with labels of their own."""
     labels = [x.label for x in runs]
-    if len(set(labels)) == len(labels):
-        return runs
     # Bags of one name lie in different folders, unless one is named twice.
     labels = [
         f'{run.path.resolve().parent.name}/{run.label}'
