@@ -221,9 +221,10 @@ def compare(
     from hmsa_ros.report.arrivals import Part
     from hmsa_ros.report.comparison import comparison
 
+    found = comparison([Part.of(x.run) for x in motions])
     if picture is not None:
         _draw([x.run for x in motions], picture, paper)
-    return comparison([Part.of(x.run) for x in motions])
+    return found
 
 
 def _draw(runs: list[Run], path: Any, paper: Mapping[str, Any]) -> Any:
