@@ -42,14 +42,14 @@ def slope(share: ArrayLike) -> Array:
     """Return the slope of the first mode at shares of the length, 1 at the tip."""
     ratio = (np.sin(ROOT) - np.sinh(ROOT)) / (np.cos(ROOT) + np.cosh(ROOT))
     x = ROOT * np.append(np.ravel(share), 1.0)
-    unscaled: Array = np.sinh(x) + np.sin(x) + ratio * (np.cosh(x) - np.cos(x))
-    return (unscaled[:-1] / unscaled[-1]).reshape(np.shape(share))
+    unscaled = np.sinh(x) + np.sin(x) + ratio * (np.cosh(x) - np.cos(x))
+    made: Array = (unscaled[:-1] / unscaled[-1]).reshape(np.shape(share))
+    return made
 
 
 def _turned(angle: ArrayLike) -> Array:
     """Return by how much the beam is turned at its points, for angles of the tip in rad."""
-    made: Array = np.multiply.outer(np.asarray(angle, dtype=np.float64), _rule()[2])
-    return made
+    return np.multiply.outer(np.asarray(angle, dtype=np.float64), _rule()[2])
 
 
 def deflection(angle: ArrayLike) -> Array:
