@@ -365,7 +365,7 @@ def test_judging_several_joints_does_not_keep_commands_waiting(monkeypatch):
 
 def test_a_setpoint_that_a_plan_comes_back_to_is_not_missed():
     setpoint = Setpoint(1.2, 1.0, START, START + 10 * MS, None, 600.0, 30.0)
-    hold = holds.Hold(setpoint, last=True)
+    hold = holds.Hold(replace(setpoint, held=True))
     hold.miss('left out')
     hold.move(setpoint.arrival, corrected=True)
     assert hold.found is None

@@ -39,9 +39,9 @@ class Hold:
     """
 
     def __init__(
-            self, setpoint: Setpoint, *, last: bool, goal: GoalTolerances | None = None,
+            self, setpoint: Setpoint, goal: GoalTolerances | None = None,
             doing: Doing = here) -> None:
-        self.setpoint = replace(setpoint, held=last)
+        self.setpoint = setpoint
         self.found: Finding | None = None
         self.over = False
         self.untold = False  # whether it is missed, which nobody has been told
@@ -50,7 +50,7 @@ class Hold:
         self._answer: tuple[Setpoint, Finding] | None = None
         self._doing = doing
         self._judging: Awaited[Finding | None] | None = None
-        self._last, self._end, self._goal = last, setpoint.end, goal
+        self._end, self._goal = setpoint.end, goal
         self._samples: dict[int, float] = {}
         self._moving: set[int] = set()  # parts of the move of which there is one
         # Newest sample by its stamp; newest of all that were looked at, and when that was.
@@ -66,9 +66,9 @@ class Hold:
         self._judging = None
         self._begin, self._length = begin, setpoint.look
         # The last one is held on, so that there is always time for a look, at rare samples too.
-        least = begin + 2 * self._length if self._last else begin
+        least = begin + 2 * self._length if setpoint.held else begin
         self._enough = least if setpoint.end is None else max(setpoint.end, least)
-        self._closes = max(self._enough, begin + _RARE) if self._last else self._enough
+        self._closes = max(self._enough, begin + _RARE) if setpoint.held else self._enough
         # Until when it may arrive.
         self._grace = begin + (0 if self._goal is None else self._goal.time)
         self._closes = max(self._closes, self._grace)
@@ -79,14 +79,15 @@ class Hold:
     def move(self, arrival: int, *, corrected: bool) -> None:
         """Take in that another plan arrives at a time in ns, perhaps one corrected on the way."""
         # What is held on is corrected as long as it is.
-        end = None if corrected and self._last else self._end
+        held = self.setpoint.held
+        end = None if corrected and held else self._end
         if arrival == self._begin and (
                 self.found is None or self.found.verdict is not Code.MISSED):
             self.setpoint = replace(self.setpoint, end=end)
             return
         self.setpoint = replace(
             self.setpoint, end=end, moved=None if arrival == self.setpoint.arrival else arrival)
-        if not self._last and end is not None and arrival >= end:
+        if not held and end is not None and arrival >= end:
             self.miss('a plan that was made anew reaches it only after its time')
             return
         self.found, self.over, self.untold = None, False, False

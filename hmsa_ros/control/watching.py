@@ -1,7 +1,7 @@
 """The setpoints of a request as they were requested, and what samples show of each."""
 
-from bisect import bisect_left, insort
-from collections.abc import Iterable, Mapping
+from bisect import bisect_left
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from hmsa_ros.control.aside import Doing
@@ -39,13 +39,16 @@ class _Joint:
     request: int  # its number in the group
     goal: GoalTolerances | None = None  # what counts as having arrived at the last setpoint
     following: int = 0  # number, from 0, of the next setpoint to watch
-    left_out: list[int] = field(default_factory=list)  # numbers that new plans left out
+    left: Sequence[int] = field(init=False)  # numbers that no new plan has left out
     holds: list[Hold] = field(default_factory=list)  # the last one stays when it is over
     news: list[Finding] = field(default_factory=list)  # of setpoints that need no samples
     corrected: bool = False  # whether the plan that is to come corrects the one in force
     needed: bool = False  # whether the plan was made anew in need
     newest: Finding | None = None
     closed: Finding | None = None  # the worst of the setpoints that are over
+
+    def __post_init__(self) -> None:
+        self.left = range(self.count)
 
     @property
     def count(self) -> int:
@@ -74,14 +77,14 @@ class _Joint:
 
     def segment(self, number: int) -> PlannedSegment | None:
         """Return a setpoint as it is planned now; None for one that was left out."""
-        place = bisect_left(self.left_out, number)
-        if self.left_out[place:place + 1] == [number]:
+        place = bisect_left(self.left, number)
+        if place == len(self.left) or self.left[place] != number:
             return None
         # All plans reach to the last setpoint.
-        back = self.count - number - (len(self.left_out) - place)
+        back = len(self.left) - place
         return self.plan.segments[-back] if back <= len(self.plan.segments) else None
 
-    def leave_out(self, plan: Plan, now: int) -> list[int]:
+    def leave_out(self, plan: Plan, now: int) -> Sequence[int]:
         """Go over to a plan that was made anew, and return the numbers that it leaves out."""
         before, after = self.plan.segments, plan.segments
         # What is over stays as it is.
@@ -89,15 +92,10 @@ class _Joint:
         while place < min(len(before), len(after)) and before[place] is after[place]:
             place += 1
         self.plan = plan
-        number = place - (len(before) - self.count + len(self.left_out))
-        for left in self.left_out:
-            number += left <= number
-        gone: list[int] = []
-        while len(gone) < len(before) - len(after) and number < self.count:
-            if number >= 0 and number not in self.left_out:
-                gone.append(number)
-                insort(self.left_out, number)
-            number += 1
+        at = max(place + len(self.left) - len(before), 0)
+        gone = self.left[at:at + max(len(before) - len(after), 0)]
+        if gone:
+            self.left = [*self.left[:at], *self.left[at + len(gone):]]
         return gone
 
     def undone(self) -> set[int]:
@@ -110,8 +108,7 @@ class _Joint:
         self.plan = plan
         for hold in self.holds:
             hold.miss(_STOPPED)
-        self._miss(
-            (x for x in range(self.following, self.count) if x not in self.left_out), _STOPPED)
+        self._miss((x for x in self.left if x >= self.following), _STOPPED)
         self.following = self.count
 
     def change(self, plan: Plan, now: int) -> None:
@@ -135,7 +132,7 @@ class _Joint:
     def open_next(self) -> None:
         """Watch the next setpoint."""
         number, self.following = self.following, self.following + 1
-        if number in self.left_out:
+        if number not in self.left:
             return
         for hold in self.holds:
             if hold.over:
@@ -150,10 +147,8 @@ class _Joint:
 
     def _hold(self, number: int) -> Hold:
         """Return what gathers samples of a setpoint."""
-        last = number + 1 == self.count
-        hold = Hold(
-            self._setpoint(number), last=last, goal=self.goal if last else None,
-            doing=self.doing)
+        setpoint = self._setpoint(number)
+        hold = Hold(setpoint, self.goal if setpoint.held else None, self.doing)
         self._keep_up(hold)
         return hold
 
@@ -171,7 +166,7 @@ class _Joint:
 
     def _setpoint(self, number: int) -> Setpoint:
         """Return a setpoint as it was requested."""
-        asked, place = self.asked, self.asked.kept + number
+        asked, place, last = self.asked, self.asked.kept + number, number + 1 == self.count
         segment = asked.segments[place]
         level = asked.level(segment.begin if segment.arrival is None else segment.arrival)
         model = level.model
@@ -180,9 +175,9 @@ class _Joint:
         return Setpoint(
             segment.stretch, asked.segments[place - 1].stretch if number
             else asked.level(segment.begin).stretch,
-            segment.since, segment.arrival, segment.until if number + 1 == self.count
+            segment.since, segment.arrival, segment.until if last
             else asked.segments[place + 1].since, omega, ratio * omega, self.name, number + 1,
-            self.count, possible=stretch_limits(model.material))
+            self.count, possible=stretch_limits(model.material), held=last)
 
 
 class Watch:

@@ -38,8 +38,8 @@ def _judged(run: Run, asked: Requested, tolerances: Tolerances) -> Finding:
     """Judge a setpoint as the planner does while samples and plans come in."""
     joints = run.parameters.get('planner.joints')
     several = isinstance(joints, list) and len(joints) > 1
-    hold = Hold(
-        replace(asked.setpoint, joint=run.joint if several else ''), last=asked.last)
+    hold = Hold(replace(
+        asked.setpoint, joint=run.joint if several else '', held=asked.last))
     moves, sensors = list(asked.moves), list(run.sensors)
     sensor = _SENSOR
     # Beside a planner the clock of the samples is held against the recorder's.
