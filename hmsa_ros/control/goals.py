@@ -69,6 +69,12 @@ class _Goal:
     duration: int = 0  # in ns
     paths: dict[str, Path] = field(default_factory=dict)  # in s from its begin
 
+    def dropped(self, message: str, code: ErrorCode = ErrorCode.INVALID_GOAL) -> Outcome:
+        """Return how it ends where it is not carried out to its end."""
+        if self.canceled:
+            return Outcome('canceled', ErrorCode.SUCCESSFUL, message)
+        return Outcome('aborted', code, message)
+
 
 class Goals:
     """
@@ -141,21 +147,21 @@ class Goals:
             if verdict.code is Code.SUPERSEDED and goal.canceled:
                 return None
             if verdict.severity is Severity.ERROR or verdict.code is Code.SUPERSEDED:
-                return _dropped(goal, ErrorCode.of(verdict.code), verdict.message)
+                return goal.dropped(verdict.message, ErrorCode.of(verdict.code))
             if not goal.canceled:
                 self._begin(name, goal)
             goal.plan = status.plan
         if goal.plan is None:
             # A clock that goes back drops what waits.
             back = verdict.code is Code.CLOCK_JUMPED and state == 'idle'
-            return _dropped(goal, ErrorCode.INVALID_GOAL, verdict.message) if back else None
+            return goal.dropped(verdict.message) if back else None
         if status.plan > goal.plan:
-            return _dropped(goal, ErrorCode.INVALID_GOAL, _REPLACED)
+            return goal.dropped(_REPLACED)
         if goal.canceled:
             rests = state in ('at_rest', 'settling', 'idle')
-            return Outcome('canceled', ErrorCode.SUCCESSFUL, 'came to rest') if rests else None
+            return goal.dropped('came to rest') if rests else None
         if state == 'idle':
-            return _dropped(goal, ErrorCode.INVALID_GOAL, verdict.message)
+            return goal.dropped(verdict.message)
         done = (status.progress.setpoint == status.progress.setpoints
                 and state in ('at_rest', 'settling') and not status.watching)
         return _measured(goal.request, status) if done else None
@@ -164,7 +170,7 @@ class Goals:
         """Take in that a goal has a plan, which replaces that of others."""
         for other, one in list(self._goals.items()):
             if one.plan is not None and other != name:
-                self._end(other, _dropped(one, ErrorCode.INVALID_GOAL, _REPLACED))
+                self._end(other, one.dropped(_REPLACED))
         request = goal.request
         plan = self._plan(goal)
         begin = request.stamp or plan.segments[min(plan.kept, len(plan.segments) - 1)].begin
@@ -265,28 +271,19 @@ def _tolerances(
     return found
 
 
-def _dropped(goal: _Goal, code: ErrorCode, message: str) -> Outcome:
-    if goal.canceled:
-        return Outcome('canceled', ErrorCode.SUCCESSFUL, message)
-    return Outcome('aborted', code, message)
-
-
 def _measured(request: Trajectory, status: StatusChanged) -> Outcome:
     """Return how a goal ended whose motion is over, by what samples have shown."""
-    message = status.unheard or 'nothing was measured'
-    worst = status.worst
-    if worst is not None and worst.verdict is Code.UNOBSERVED:
-        message = f'{worst.message}{status.unheard and "; " + status.unheard}'
-    elif worst is not None:
-        message = _failure(request, worst)
-        # Another request may have been judged, to the same stretch, by other tolerances.
-        for joint in request.joints:
-            message = message or _failure(request, status.findings.get(joint, worst))
-        if not message:
-            return Outcome('succeeded', ErrorCode.SUCCESSFUL, worst.message)
-        return Outcome('aborted', ErrorCode.GOAL_TOLERANCE_VIOLATED, message)
-    return Outcome('aborted', ErrorCode.GOAL_TOLERANCE_VIOLATED, (
-        f'{message}: expected samples on joint_states that show the arrival'))
+    worst, code = status.worst, ErrorCode.GOAL_TOLERANCE_VIOLATED
+    if worst is None or worst.verdict is Code.UNOBSERVED:
+        known = '' if worst is None else worst.message
+        why = '; '.join(filter(None, (known, status.unheard))) or 'nothing was measured'
+        return Outcome(
+            'aborted', code, f'{why}: expected samples on joint_states that show the arrival')
+    # Another request may have been judged, to the same stretch, by other tolerances.
+    for finding in (worst, *(status.findings.get(x, worst) for x in request.joints)):
+        if failure := _failure(request, finding):
+            return Outcome('aborted', code, failure)
+    return Outcome('succeeded', ErrorCode.SUCCESSFUL, worst.message)
 
 
 def _failure(request: Trajectory, finding: Finding) -> str:
