@@ -34,7 +34,6 @@ from hmsa_ros.estimation.words import confounded
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.drafting import Steps
-from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Planner
 from hmsa_ros.planning.timeline import Draft, Model, Plan, PlannedLevel
 
@@ -66,8 +65,8 @@ _SURE, _OFF = 3.0, 1e-4
 class Corrections:
     """Corrects plans where that is expected to leave less."""
 
-    def __init__(self, group: PlannerGroup, feedback: Feedback, clock: Clock) -> None:
-        self._group, self._feedback, self._clock = group, feedback, clock
+    def __init__(self, feedback: Feedback, clock: Clock) -> None:
+        self._feedback, self._clock = feedback, clock
 
     def cautious(self, drafts: Mapping[str, Draft]) -> Mapping[str, Draft]:
         """
@@ -126,7 +125,8 @@ class Corrections:
                 yield self._work(joint, _correct)
 
     def _work(self, joint: Joint, make: Callable[[Joint, int], Steps[Draft | None]]) -> Work:
-        return anew(joint.name, partial(make, joint), self._group, self._clock, corrects=True)
+        return anew(
+            joint.name, joint.planner, partial(make, joint), self._clock, corrects=True)
 
     def _rejoin(self, joint: Joint, now: int) -> Steps[Draft | None]:
         """Plan the rest of a path anew by what is known now, if that stays nearer to it."""

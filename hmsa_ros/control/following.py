@@ -233,7 +233,8 @@ class Following:
 
     def resumption(self, name: str, clock: Clock) -> Work:
         """Return the work of planning a joint's rest anew, where that leaves less."""
-        return anew(name, partial(self._resumed, name), self._group, clock)
+        return anew(
+            name, self._group.planners[name], partial(self._resumed, name), clock)
 
     def _resumed(self, name: str, now: int) -> Steps[Draft | None]:
         planner = self._group.planners[name]

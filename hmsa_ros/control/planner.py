@@ -82,7 +82,7 @@ class PlannerRuntime:
             group, self.following, self._watch, around, self._outputs, self._note,
             lambda: around.unheard() or receipts.words, self._unseen)
         self.planning = Planning(
-            group, self.following, Corrections(group, self.feedback, clock), self._bulletin,
+            group, self.following, Corrections(self.feedback, clock), self._bulletin,
             around, lambda: self.devices.send(clock()))
         self._next_beat = 0  # time in ns of the next sign of life
         self._last_jump: int | None = None

@@ -1,13 +1,15 @@
 """Requests that are planned in slices, so that commands and requests are served in between."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count
 from typing import Any
 
 from hmsa_ros.control.records import Request, Stop, Trajectory
 from hmsa_ros.planning.drafting import Steps
 from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.planner import Planner
 from hmsa_ros.planning.timeline import Draft
 
 #: Tells the time of the stamps in ns.
@@ -50,31 +52,31 @@ class Work:
 
 def work_on(request: Request, group: PlannerGroup, clock: Clock, then: Then) -> Work:
     """Return the work that a request of joints of a group makes; see `in_time`."""
+    names = group.planners if isinstance(request, Stop) else request.joints
+    planners = [group.planners[x] for x in names]
     if isinstance(request, Trajectory):
-        return Work(
-            frozenset(request.joints), _trajectory(request, group, clock, then), request)
-    if isinstance(request, Stop):
-        joints = frozenset(group.planners)
-        return Work(joints, in_time(group.draft_stop, group, joints, clock), request)
-    joints = frozenset(request.joints)
-    return Work(joints, in_time(
-        lambda now: group.draft_setpoint(request.joint, request.stretch, now), group, joints,
-        clock, then=then), request)
+        steps = _trajectory(request, group, planners, clock, then)
+    elif isinstance(request, Stop):
+        steps = in_time(group.draft_stop, planners, clock)
+    else:
+        steps = in_time(
+            partial(group.draft_setpoint, request.joint, request.stretch), planners, clock,
+            then=then)
+    return Work(frozenset(names), steps, request)
 
 
 def anew(
-        name: str, make: Callable[[int], Steps[Draft | None]], group: PlannerGroup, clock: Clock,
-        *, corrects: bool = False) -> Work:
+        name: str, planner: Planner, make: Callable[[int], Steps[Draft | None]], clock: Clock, *,
+        corrects: bool = False) -> Work:
     """Return the work of making a joint's plan anew; without a draft it stays."""
     def steps(now: int) -> Steps[Mapping[str, Draft]]:
         draft = yield from make(now)
         return {} if draft is None else {name: draft}
-    joints = frozenset([name])
-    return Work(joints, in_time(steps, group, joints, clock), corrects=corrects)
+    return Work(frozenset([name]), in_time(steps, [planner], clock), corrects=corrects)
 
 
 def _trajectory(
-        request: Trajectory, group: PlannerGroup, clock: Clock,
+        request: Trajectory, group: PlannerGroup, planners: Sequence[Planner], clock: Clock,
         then: Then) -> Drafting:
     """Read the points, then plan."""
     points: dict[str, list[tuple[Any, int]]] = {name: [] for name in request.joints}
@@ -86,23 +88,21 @@ def _trajectory(
             yield
     return (yield from in_time(
         lambda now: group.draft_request(
-            points, request.stamp, now, raw=request.raw, path=request.path is not None), group,
-        frozenset(request.joints), clock,
+            points, request.stamp, now, raw=request.raw, path=request.path is not None),
+        planners, clock,
         # The work of a path is not in proportion to its points.
         1 if request.path is not None else request.count * len(request.joints), then))
 
 
 def in_time(
-        make: Callable[[int], Steps[Mapping[str, Draft]]], group: PlannerGroup,
-        joints: frozenset[str], clock: Clock, size: int = 1,
-        then: Then = dict) -> Drafting:
+        make: Callable[[int], Steps[Mapping[str, Draft]]], planners: Sequence[Planner],
+        clock: Clock, size: int = 1, then: Then = dict) -> Drafting:
     """
     Return drafts, and the time in ns they are for, which has not come yet when they are ready.
 
     If what is going to happen to the joints changes meanwhile, it begins anew. The size is about
     how many pauses it makes. What is done with drafts `then` belongs to the work.
     """
-    planners = [group.planners[x] for x in sorted(joints)]
     lead = planners[0].options.lead_time
     later = 0
     while True:
