@@ -186,11 +186,25 @@ class Devices:
             'hardware out of reach (/diagnostics), and its coil off; close it (~/interlock of the '
             'driver), then send a new request')
 
-    def check_interlock(self, joints: Iterable[str]) -> None:
-        """Raise `RefusedError` if one of some joints is locked."""
+    def check(self, joints: Iterable[str]) -> None:
+        """
+        Look at devices before joints move.
+
+        Raises
+        ------
+        RefusedError
+            If one is locked, or clocks are so far apart that every command would come too late.
+
+        """
         for joint in joints:
             if joint in self.open:
                 raise self.interlock(joint)
+        offset = self.receipts.offset
+        if offset is not None and offset.ahead - offset.error > max(
+                x.options.lead_time for x in self._planners.values()):
+            raise RefusedError(
+                Code.CLOCKS_DIFFER,
+                f'every command would come too late, since {offset.words}')
 
     def _dropped(self, joint: str, code: Code, words: str) -> Verdict:
         """Plan from a sample next, since a plan was dropped; return the verdict."""
@@ -231,25 +245,6 @@ class Devices:
                 'though the plant or driver is heard: look at the network in the direction from '
                 'the planner to it, and send the request again')
         return True
-
-    # -- clocks --------------------------------------------------------------------------------
-
-    def check_clocks(self) -> None:
-        """
-        Look at the clocks before a move.
-
-        Raises
-        ------
-        RefusedError
-            If they are so far apart that every command would come too late.
-
-        """
-        offset = self.receipts.offset
-        if offset is not None and offset.ahead - offset.error > max(
-                x.options.lead_time for x in self._planners.values()):
-            raise RefusedError(
-                Code.CLOCKS_DIFFER,
-                f'every command would come too late, since {offset.words}')
 
     @property
     def clocks(self) -> str:

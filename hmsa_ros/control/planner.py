@@ -109,8 +109,7 @@ class PlannerRuntime:
             if not isinstance(request, Stop):
                 if self.crowded is not None:
                     raise self.crowded
-                self.devices.check_interlock(request.joints)
-                self.devices.check_clocks()
+                self.devices.check(request.joints)
         except RefusedError as error:
             return self.planning.refuse(error, request)
         if (isinstance(request, Trajectory) and self.settings.trajectory_mode == 'rest'
