@@ -20,7 +20,7 @@ from hmsa_ros.bag import limits
 from hmsa_ros.errors import BagError
 
 if TYPE_CHECKING:  # slow to load, and no use to a node that records nothing
-    from hmsa_ros.bag.topics import Topic
+    from hmsa_ros.bag.metadata import Topic
 
 # Types that are part of the language of .msg files and have no file of their own.
 _BUILTIN = frozenset((

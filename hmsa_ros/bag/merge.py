@@ -1,7 +1,6 @@
 """Messages of several chunks in order of time."""
 
 from array import array
-from collections import Counter
 from collections.abc import Callable, Iterator
 import heapq
 from itertools import islice
@@ -84,11 +83,6 @@ class Cursor:
             yield Message(
                 names[channel] or '', log_time, publish_time, sequence,
                 content[place + head_size:place + prefix_size + length])
-
-    def counts(self) -> Counter[int]:
-        """Return the number of messages by channel."""
-        unpack = records.MESSAGE_HEAD.unpack_from
-        return Counter(unpack(self.content, place)[2] for place in self._places)
 
 
 def merge(cursors: list[Cursor], limit: int) -> Iterator[Message]:

@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from hmsa_ros.bag import limits, qos
-from hmsa_ros.errors import BagError
+from hmsa_ros.errors import BadInputError, BagError
 
 FILE_NAME = 'metadata.yaml'
 VERSION = 9
@@ -21,15 +21,24 @@ _Dumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 
 @dataclass(frozen=True)
-class TopicMetadata:
-    """One recorded topic."""
+class Topic:
+    """A topic of a bag, read or to be written; the metadata say no definition of it."""
 
-    name: str
-    type: str
-    serialization_format: str = 'cdr'
-    profiles: tuple[qos.Qos, ...] = ()  #: what the publishers offered
-    type_hash: str = ''  #: RIHS01 hash, empty if unknown
-    message_count: int = 0
+    name: str  #: for example ``'/joint_states'``
+    type: str  #: for example ``'sensor_msgs/msg/JointState'``; empty if a bag does not have it
+    definition: str = ''  #: with its dependencies; empty if not known
+    definition_encoding: str = 'ros2msg'  #: or ``'ros2idl'``, empty
+    profiles: tuple[qos.Qos, ...] = ()  #: what the publishers offer
+    type_hash: str = ''  #: RIHS01 hash, empty if not known
+    encoding: str = 'cdr'  #: of the messages
+    message_count: int = 0  #: as the metadata say
+
+    def check(self) -> None:
+        """Raise `BadInputError` for a topic that nobody could name or decode."""
+        if not self.name:
+            raise BadInputError('a topic has an empty name: expected a name such as /stretch')
+        if not self.type:
+            raise BadInputError(f'topic {self.name} has an empty type: expected a message type')
 
 
 @dataclass(frozen=True)
@@ -49,15 +58,14 @@ class BagMetadata:
     start_ns: int = NO_TIME  #: first log time; `NO_TIME` without a message
     duration_ns: int = 0
     message_count: int = 0
-    topics: tuple[TopicMetadata, ...] = ()
+    topics: tuple[Topic, ...] = ()
     files: tuple[FileMetadata, ...] = ()  #: in order of writing
     #: What the user and the recorder noted.
     custom_data: Mapping[str, str] = field(default_factory=dict)
     ros_distro: str = 'jazzy'  #: that wrote it
     version: int = VERSION  #: of the file's layout
     storage: str = 'mcap'
-    compression_format: str = ''  #: rosbag2's own, none if empty; not MCAP's of chunks
-    compression_mode: str = ''
+    compression_mode: str = ''  #: of rosbag2 itself, none if empty; not MCAP's of chunks
 
 
 def to_map(metadata: BagMetadata) -> dict[str, Any]:
@@ -72,13 +80,13 @@ def to_map(metadata: BagMetadata) -> dict[str, Any]:
             'topic_metadata': {
                 'name': topic.name,
                 'type': topic.type,
-                'serialization_format': topic.serialization_format,
+                'serialization_format': topic.encoding,
                 'offered_qos_profiles': qos.to_maps(topic.profiles),
                 'type_description_hash': topic.type_hash,
             },
             'message_count': topic.message_count,
         } for topic in metadata.topics],
-        'compression_format': metadata.compression_format,
+        'compression_format': '',
         'compression_mode': metadata.compression_mode,
         'relative_file_paths': [file.path for file in metadata.files],
         'files': [{
@@ -146,7 +154,7 @@ def from_map(content: Any, source: str) -> BagMetadata:
         if version > VERSION:
             raise BagError(
                 f'{source} is of version {version}: expected at most {VERSION}')
-        topics = tuple(_topic(entry) for entry in content['topics_with_message_count'] or ())
+        topics = tuple(map(_topic, content['topics_with_message_count'] or ()))
         start = int(content['starting_time']['nanoseconds_since_epoch'])
         duration = int(content['duration']['nanoseconds'])
         count = int(content['message_count'])
@@ -160,7 +168,6 @@ def from_map(content: Any, source: str) -> BagMetadata:
             start, duration, count, topics, files or tuple(map(FileMetadata, paths)),
             {str(key): str(value) for key, value in (content.get('custom_data') or {}).items()},
             str(content.get('ros_distro') or ''), version, str(content['storage_identifier']),
-            str(content.get('compression_format') or ''),
             str(content.get('compression_mode') or ''))
     except BagError:
         raise
@@ -170,10 +177,11 @@ def from_map(content: Any, source: str) -> BagMetadata:
                        'bag') from error
 
 
-def _topic(entry: Any) -> TopicMetadata:
+def _topic(entry: Any) -> Topic:
     """Read one topic."""
     topic = entry['topic_metadata']
-    return TopicMetadata(
-        str(topic['name']), str(topic['type']), str(topic['serialization_format']),
-        qos.from_stored(topic.get('offered_qos_profiles')),
-        str(topic.get('type_description_hash') or ''), int(entry['message_count']))
+    return Topic(
+        str(topic['name']), str(topic['type']),
+        profiles=qos.from_stored(topic.get('offered_qos_profiles')),
+        type_hash=str(topic.get('type_description_hash') or ''),
+        encoding=str(topic['serialization_format']), message_count=int(entry['message_count']))

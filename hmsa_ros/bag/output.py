@@ -35,8 +35,8 @@ import zstandard
 
 from hmsa_ros import __version__
 from hmsa_ros.bag import metadata, qos
+from hmsa_ros.bag.metadata import Topic
 from hmsa_ros.bag.records import MAGIC, MESSAGE, MESSAGE_FIXED, MESSAGE_HEAD
-from hmsa_ros.bag.topics import Topic
 
 LIBRARY = f'hmsa_ros {__version__}'
 #: Name of the metadata record with the experiment.

@@ -17,7 +17,6 @@ A bag may come from anybody: what it says of sizes is held against `hmsa_ros.bag
 memory is taken, only files in its own folder are read, and nothing in it is ever run.
 """
 
-from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 import os
 from pathlib import Path
@@ -25,14 +24,14 @@ from typing import Any, NamedTuple
 
 from hmsa_ros.bag import limits, metadata
 from hmsa_ros.bag.definitions import make_decoder
-from hmsa_ros.bag.folder import Folder
-from hmsa_ros.bag.intake import Intake, Problems, ScannedFile
+from hmsa_ros.bag.folder import find
 from hmsa_ros.bag.merge import Cursor, merge, Message
+from hmsa_ros.bag.metadata import Topic
 from hmsa_ros.bag.output import EXPERIMENT
 from hmsa_ros.bag.records import Block
-from hmsa_ros.bag.scan import check_data, scan
-from hmsa_ros.bag.topics import Topic, Topics
-from hmsa_ros.errors import BadInputError, BagError
+from hmsa_ros.bag.scan import Intake, ScannedFile
+from hmsa_ros.bag.topics import topics_of
+from hmsa_ros.errors import BadInputError, BagError, HmsaError
 
 __all__ = ['BagReader', 'DecodedMessage', 'Message', 'Topic', 'read_messages']
 # Later than any log time.
@@ -93,22 +92,17 @@ class BagReader:
                 f'largest chunk is {max_chunk_size} bytes: expected at least 1')
         self.path = Path(path)
         self._max_chunk_size = max_chunk_size
-        self._problems = Problems()
-        self.problems = self._problems.sentences
-        intake = Intake(max_chunk_size, self._problems)
-        folder = Folder(self.path, self._problems)
-        paths = folder.find()
-        self.metadata = folder.metadata
+        intake = Intake(max_chunk_size)
+        self.problems = intake.problems
+        paths, self.metadata = find(self.path, intake.problem)
         self._files: list[ScannedFile] = []
         for file_path in paths:
             try:
-                self._files.append(scan(intake, file_path, len(self._files)))
-            except BagError as error:
-                self._problems.add(str(error))
-            except BadInputError as error:
-                if len(paths) == 1:
+                self._files.append(ScannedFile(intake, file_path, len(self._files)))
+            except HmsaError as error:
+                if len(paths) == 1 and isinstance(error, BadInputError):
                     raise
-                self._problems.add(str(error))
+                intake.problem(str(error))
         if not self._files:
             raise BadInputError(f'no file of {self.path} can be read: ' + self.problems[0])
         self.files = tuple(file.path for file in self._files)
@@ -120,18 +114,13 @@ class BagReader:
         self._ended = metadata.NOT_ENDED not in noted
         noted.pop(metadata.NOT_ENDED, None)
         if not self._ended:
-            self._problems.add(f'{self.path} was not closed by its recorder: it was killed, or '
-                               'is still at work')
+            intake.problem(f'{self.path} was not closed by its recorder: it was killed, or '
+                           'is still at work')
         self.custom_data = noted or {
             key: value for key, value in self.records.get(EXPERIMENT, {}).items()
             if key != 'version'}
-        directory = Topics(
-            () if self.metadata is None else self.metadata.topics, self.custom_data,
-            self._problems)
-        for file in self._files:
-            for channel in file.channels.values():
-                directory.add(file, channel)
-        self.topics = directory.by_name
+        described = {} if self.metadata is None else {x.name: x for x in self.metadata.topics}
+        self.topics = topics_of(self._files, described, self.custom_data, intake.problem)
 
     @property
     def complete(self) -> bool:
@@ -220,25 +209,11 @@ class BagReader:
         """Return the messages by topic; counted where statistics and CRC cannot be trusted."""
         result = dict.fromkeys(self.topics, 0)
         for file in self._files:
-            check_data(file)
-            if file.damaged and not file.counted:
-                self._count(file)
-            for number, count in file.counts.items():
+            for number, count in file.counts().items():
                 name = self._topic_of(file, number) or ''
                 if name in result:
                     result[name] += count
         return result
-
-    def _count(self, file: ScannedFile) -> None:
-        """Count what can be read of a damaged file."""
-        said, found = sum(file.counts.values()), Counter[int]()
-        for block in file.blocks:
-            cursor = self._cursor(block)
-            if cursor is not None:
-                found.update(cursor.counts())
-        file.counts, file.counted = dict(found), True
-        if found.total() < said:
-            file.problem(f': {said - found.total()} of {said} messages cannot be read')
 
     def _cursor(
             self, block: Block, topics: Collection[str] | None = None, start: int = 0,

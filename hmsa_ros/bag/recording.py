@@ -14,8 +14,9 @@ import threading
 import time
 from typing import NamedTuple
 
+from hmsa_ros.bag.metadata import Topic
 from hmsa_ros.bag.output import Entry
-from hmsa_ros.bag.topics import number_of, Topic
+from hmsa_ros.bag.topics import number_of
 from hmsa_ros.bag.writer import BagWriter, MIN_FILE_SIZE
 from hmsa_ros.errors import BadInputError, BagError
 

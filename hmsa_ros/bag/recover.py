@@ -1,11 +1,9 @@
 """Making a readable bag out of what a crash, a full disk or a damaged file left."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 import os
 
 from hmsa_ros.bag import limits
-from hmsa_ros.bag.output import Entry
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.bag.writer import BagWriter
 from hmsa_ros.errors import BagError
@@ -27,18 +25,11 @@ def recover(
     reader = BagReader(path, max_chunk_size=max_chunk_size)
     try:
         with BagWriter(out, custom_data=reader.custom_data) as writer:
-            numbers: dict[str, int] = {}
-
-            def entries() -> Iterator[Entry]:
-                for message in reader.stored_messages():
-                    if message.topic not in numbers:
-                        numbers[message.topic] = _add(reader, writer, message.topic)
-                    yield (numbers[message.topic], message.log_time, message.publish_time,
-                           message.sequence, message.data)
-
-            for topic in reader.topics:
-                numbers[topic] = _add(reader, writer, topic)
-            writer.write(entries())
+            numbers = {name: writer.add_topic(replace(topic, type=topic.type or 'unknown'))
+                       for name, topic in reader.topics.items()}
+            writer.write((
+                numbers[x.topic], x.log_time, x.publish_time, x.sequence, x.data)
+                for x in reader.stored_messages())
         expected = writer.topic_counts()
     except OSError as error:
         raise BagError(f'{out} cannot be written: {error.strerror or error}') from error
@@ -52,9 +43,3 @@ def recover(
     # Counted last, when all damage is known.
     reader.counts()
     return Recovered(str(out), sum(found.values()), tuple(reader.problems))
-
-
-def _add(reader: BagReader, writer: BagWriter, name: str) -> int:
-    """Announce a topic of one bag to another."""
-    topic = reader.topics[name]
-    return writer.add_topic(replace(topic, type=topic.type or 'unknown'))

@@ -1,10 +1,13 @@
 """What a file of a bag holds: by its summary, or else record by record."""
 
-from collections.abc import Iterator
+from array import array
+from collections import Counter, defaultdict
+from collections.abc import Mapping
 from dataclasses import replace
 import os
 from pathlib import Path
 import struct
+from typing import Any, TypeVar
 import zlib
 
 from mcap.opcode import Opcode
@@ -21,235 +24,365 @@ from mcap.records import (
 )
 
 from hmsa_ros.bag import limits, records
-from hmsa_ros.bag.intake import Intake, ScannedFile
 from hmsa_ros.bag.records import Block, MAGIC, PREFIX
-from hmsa_ros.errors import BadInputError, BagError
+from hmsa_ros.errors import BadInputError, BagError, printable
 
 # Messages outside chunks are grouped, so that they are handled like chunks.
 _RUN_BYTES = 512 * 1024
+_CRC_BYTES = 2**20
+# What an entry of a map takes besides its texts.
+_ENTRY_BYTES = 100
+_FOOTER_SIZE = PREFIX.size + 20
+_TAIL_SIZE = _FOOTER_SIZE + len(MAGIC)
+_DATA_END_SIZE = PREFIX.size + 4
 # Read by nobody here, but no sign of damage.
 _PASSED_OVER = frozenset(
     (Opcode.ATTACHMENT, Opcode.ATTACHMENT_INDEX, Opcode.SUMMARY_OFFSET))
+_Declared = TypeVar('_Declared', Schema, Channel)
 
 
-def walk(descriptor: int, file: ScannedFile) -> None:
-    """Take in a file record by record, and count its messages."""
-    offset, ended, statistics = len(MAGIC), False, None
-    run: list[int] = []  # offset, start and end of the messages outside chunks in a row
+class Intake:
+    """
+    What is taken in of all files of a bag: within limits, and with the problems that are found.
 
-    def end_run() -> None:
-        if run:
-            length = offset - run[0]
-            file.blocks.append(Block(
-                file.number, run[0], length, length, run[1], run[2]))
-            run.clear()
+    ``problems`` has sentences about what cannot be read, each once and not without end.
+    """
 
-    chunked = False
-    while offset + PREFIX.size <= file.size and not ended:
-        head = os.pread(descriptor, PREFIX.size + records.CHUNK_HEAD_SIZE, offset)
-        opcode, length = PREFIX.unpack_from(head)
-        end = offset + PREFIX.size + length
-        if end > file.size or opcode == 0:
-            break
+    def __init__(self, max_chunk_size: int) -> None:
+        self._max_chunk_size = max_chunk_size
+        self._kept = 0
+        self._known: set[str] = set()
+        self.problems: list[str] = []
+
+    def problem(self, sentence: str) -> None:
+        """Note what cannot be read."""
+        if sentence in self._known or len(self._known) > limits.PROBLEMS:
+            return
+        self._known.add(sentence)
+        self.problems.append(
+            printable(sentence) if len(self._known) <= limits.PROBLEMS
+            else 'further problems are not listed')
+
+    def check_size(self, size: int, what: str) -> None:
+        """Raise `BagError` for what is larger, in bytes, than the memory it may take."""
+        if size > self._max_chunk_size:
+            raise BagError(f'a {what} of {size} bytes is larger than the {self._max_chunk_size} '
+                           'bytes allowed')
+
+    def keep(self, size: int) -> None:
+        """Count what is kept of the small records; raise `BagError` for too much of it."""
+        if self._kept + size > limits.KEPT_SIZE:
+            raise BagError(f'schemas, channels and metadata are larger than '
+                           f'{limits.KEPT_SIZE} bytes')
+        self._kept += size
+
+
+class ScannedFile:
+    """
+    What a file holds; records by their id, metadata records by name.
+
+    ``blocks`` are its parts with messages, in their order; ``complete`` says whether it was closed
+    by its writer. Raises `BadInputError` if it is no MCAP file.
+    """
+
+    def __init__(self, intake: Intake, path: Path, number: int) -> None:
+        self.path = path
+        self.complete = False
+        self._intake = intake
+        self._number = number  # its place in the bag
+        self._damaged = self._counted = False
+        self._data_end = self._data_crc = 0
+        self._clear()
         try:
-            if len(file.blocks) > limits.CHUNKS:
-                file.problem(f' has more than {limits.CHUNKS} chunks: the rest is skipped')
-                break
-            if opcode == Opcode.MESSAGE:
-                if length < records.MESSAGE_FIXED:
-                    raise BagError('a message record ends early')
-                file.intake.check_size(length, 'message')
-                if chunked:
-                    file.problem(' has messages outside its chunks')
-                log_time = records.MESSAGE_HEAD.unpack_from(head)[4]
-                if run and offset - run[0] >= _RUN_BYTES:
-                    end_run()
-                if run:
-                    run[1:] = min(run[1], log_time), max(run[2], log_time)
-                else:
-                    run += offset, log_time, log_time
-            else:
-                end_run()
-                chunked = chunked or opcode == Opcode.CHUNK
-                record = _read_record(descriptor, file, offset, head)
-                statistics = record if isinstance(record, Statistics) else statistics
-                ended = isinstance(record, Footer) and os.pread(
-                    descriptor, len(MAGIC), end) == MAGIC
-        except BagError as error:
-            end_run()
-            file.problem(f': {error}, at byte {offset}: skipped')
-        offset = end
-    end_run()
-    if not ended:
-        file.problem(f' is not complete: it can be read up to byte {offset} of {file.size}')
-    file.complete = ended
-    _count(descriptor, file)
-    found = sum(file.counts.values())
-    if statistics is not None and statistics.message_count != found:
-        file.problem(
-            f' holds {found} messages that can be read: it says {statistics.message_count}')
+            with path.open('rb') as stream:
+                self._descriptor = stream.fileno()  # while it is read
+                self._size = os.fstat(self._descriptor).st_size
+                magic = stream.read(len(MAGIC))
+                if magic != MAGIC:
+                    what = 'is empty' if not magic else (
+                        f'was cut off after {self._size} bytes' if MAGIC.startswith(magic) else
+                        f'is not an MCAP file, as it begins with {magic!r}')
+                    raise BadInputError(f'{path} {what}: expected an MCAP file')
+                if not self._read_summary():
+                    self._clear()
+                    self._walk()
+        except OSError as error:
+            raise BadInputError(
+                f'{path} cannot be read ({error.strerror}): expected an MCAP file') from error
 
+    def problem(self, sentence: str) -> None:
+        """Note that something is damaged."""
+        self._damaged = True
+        self._intake.problem(f'{self.path.name}{sentence}')
 
-def _read_record(
-        descriptor: int, file: ScannedFile, offset: int, head: bytes) -> McapRecord | None:
-    """Take in one record that is no message."""
-    opcode, length = PREFIX.unpack_from(head)
-    content = head[PREFIX.size:]
-    if opcode == Opcode.CHUNK:
-        file.add_block(Block.of_chunk(file.number, offset, content, length), offset)
-    elif opcode == Opcode.MESSAGE_INDEX:
-        if length < 6 or struct.unpack_from('<I', content, 2)[0] != length - 6:
-            raise BagError('a message index record ends early')
-    elif opcode not in _PASSED_OVER:
-        if length > limits.RECORD_SIZE:
-            raise BagError(f'a record of {length} bytes is larger than '
-                           f'{limits.RECORD_SIZE} bytes')
-        record = records.parse_any(
-            opcode, records.read_exactly(descriptor, length, offset + PREFIX.size))
-        if record is None:
-            raise BagError(f'a record is of the unknown kind {opcode:#x}')
-        file.take(record)
-        return record
-    return None
-
-
-def _count(descriptor: int, file: ScannedFile) -> None:
-    """Go through all chunks: for what is declared in them, and for what is true of them."""
-    blocks, file.blocks, file.counted = file.blocks, [], True
-    for block in blocks:
-        times: list[int] = []
+    def counts(self) -> dict[int, int]:
+        """Return the messages by channel; counted where statistics and CRC cannot be trusted."""
         try:
-            for channel, time in _messages(file, block.content(descriptor)):
-                file.counts[channel] = file.counts.get(channel, 0) + 1
-                times[:] = (min(times[0], time), max(times[1], time)) if times else (
-                    time, time)
+            with self.path.open('rb') as stream:
+                self._descriptor = stream.fileno()
+                self._check_data()
+                if self._damaged and not self._counted:
+                    self._count(self._counts.total())
+        except OSError as error:
+            self.problem(f' cannot be read any more: {error.strerror}')
+        return self._counts
+
+    def _clear(self) -> None:
+        """Forget what has been taken in."""
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.blocks: list[Block] = []
+        self.metadata: dict[str, dict[str, str]] = {}
+        self._counts = Counter[int]()
+
+    def _take(self, record: McapRecord) -> None:
+        """Take in a schema, channel or metadata, or raise `BagError` if it is too large."""
+        if isinstance(record, Schema):
+            if self._is_new(self.schemas, record):
+                self._intake.keep(len(record.data))
+                if len(record.data) > limits.DEFINITION_SIZE:
+                    raise BagError(
+                        f'the definition of {record.name} has {len(record.data)} bytes, more '
+                        f'than {limits.DEFINITION_SIZE}')
+                self.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            if self._is_new(self.channels, record):
+                self._intake.keep(sum(map(len, record.metadata.values())) + len(record.topic))
+                self.channels[record.id] = record
+        elif isinstance(record, Metadata):
+            values = self.metadata.setdefault(record.name, {})
+            self._intake.keep(len(record.name) + sum(
+                len(value) + (0 if key in values else len(key) + _ENTRY_BYTES)
+                for key, value in record.metadata.items() if values.get(key) != value))
+            values.update(record.metadata)
+
+    def _is_new(self, known: Mapping[int, _Declared], record: _Declared) -> bool:
+        """Return whether a declaration is to be taken in."""
+        what = type(record).__name__.lower()
+        if record.id in known:
+            if known[record.id] != record:
+                self.problem(f': {what} {record.id} is declared in two ways')
+            return False
+        if len(known) >= limits.CHANNELS:
+            self.problem(f' declares more than {limits.CHANNELS} of {what}: the rest is skipped')
+            return False
+        return True
+
+    def _add_block(self, block: Block, offset: int) -> None:
+        """Take in a chunk that is not too large."""
+        try:
+            self._intake.check_size(max(block.size, block.length), 'chunk')
         except BagError as error:
-            file.problem(f': {error}, at byte {block.offset}: skipped')
-        if times and (block.start, block.end) != tuple(times):
-            file.problem(f': a chunk has other times than it says, at byte {block.offset}')
-        if times:
-            file.blocks.append(replace(block, start=times[0], end=times[1]))
-
-
-def _messages(file: ScannedFile, content: bytes) -> Iterator[tuple[int, int]]:
-    """Return channel and log time of each message, and take in what else is there."""
-    unpack = records.MESSAGE_HEAD.unpack_from
-    for opcode, start, end in records.split(content):
-        if opcode == records.MESSAGE:
-            _, _, channel, _, time, _ = unpack(content, start - PREFIX.size)
-            yield channel, time
+            self.problem(f': {error}, at byte {offset}: skipped')
         else:
+            self.blocks.append(block)
+
+    # -- record by record -----------------------------------------------------------------------
+
+    def _walk(self) -> None:
+        """Take in the file record by record, and count its messages."""
+        offset, chunked, said = len(MAGIC), False, None
+        self.complete = False
+        run: int | None = None  # where messages outside chunks begin
+        while offset + PREFIX.size <= self._size and not self.complete:
+            head = os.pread(self._descriptor, PREFIX.size + records.CHUNK_HEAD_SIZE, offset)
+            opcode, length = PREFIX.unpack_from(head)
+            end = offset + PREFIX.size + length
+            if end > self._size or opcode == 0:
+                break
+            if len(self.blocks) > limits.CHUNKS:
+                self.problem(f' has more than {limits.CHUNKS} chunks: the rest is skipped')
+                break
             try:
-                record = records.parse_any(opcode, content[start:end])
-                if not isinstance(record, (Schema, Channel)):
-                    raise BagError(f'a chunk holds a record of the kind {opcode:#x}')
-                file.take(record)
+                if opcode != Opcode.MESSAGE or run is not None and offset - run >= _RUN_BYTES:
+                    self._end_run(run, offset)
+                    run = None
+                if opcode == Opcode.MESSAGE:
+                    if length < records.MESSAGE_FIXED:
+                        raise BagError('a message record ends early')
+                    self._intake.check_size(length, 'message')
+                    if chunked:
+                        self.problem(' has messages outside its chunks')
+                    run = offset if run is None else run
+                else:
+                    chunked = chunked or opcode == Opcode.CHUNK
+                    record = self._read_record(offset, head)
+                    said = record.message_count if isinstance(record, Statistics) else said
+                    self.complete = isinstance(record, Footer) and os.pread(
+                        self._descriptor, len(MAGIC), end) == MAGIC
             except BagError as error:
-                file.problem(f': {error}: skipped')
+                self._end_run(run, offset)
+                run = None
+                self.problem(f': {error}, at byte {offset}: skipped')
+            offset = end
+        self._end_run(run, offset)
+        if not self.complete:
+            self.problem(
+                f' is not complete: it can be read up to byte {offset} of {self._size}')
+        self._count(said)
 
+    def _end_run(self, begin: int | None, end: int) -> None:
+        """Take in messages outside chunks like a chunk that does not say its times."""
+        if begin is not None:
+            self.blocks.append(Block(self._number, begin, end - begin, end - begin, -1, -1))
 
-_FOOTER_SIZE = PREFIX.size + 20
-_DATA_END_SIZE = PREFIX.size + 4
+    def _read_record(self, offset: int, head: bytes) -> McapRecord | None:
+        """Take in one record that is no message."""
+        opcode, length = PREFIX.unpack_from(head)
+        content = head[PREFIX.size:]
+        if opcode == Opcode.CHUNK:
+            self._add_block(Block.of_chunk(self._number, offset, content, length), offset)
+        elif opcode == Opcode.MESSAGE_INDEX:
+            if length < 6 or struct.unpack_from('<I', content, 2)[0] != length - 6:
+                raise BagError('a message index record ends early')
+        elif opcode not in _PASSED_OVER:
+            if length > limits.RECORD_SIZE:
+                raise BagError(f'a record of {length} bytes is larger than '
+                               f'{limits.RECORD_SIZE} bytes')
+            record = records.parse_any(
+                opcode, records.read_exactly(self._descriptor, length, offset + PREFIX.size))
+            if record is None:
+                raise BagError(f'a record is of the unknown kind {opcode:#x}')
+            self._take(record)
+            return record
+        return None
 
+    def _count(self, said: int | None) -> None:
+        """Go through all blocks: for what is declared in them, and for what is true of them."""
+        blocks, self.blocks, self._counts, self._counted = self.blocks, [], Counter(), True
+        unpack = records.MESSAGE_HEAD.unpack_from
+        for block in blocks:
+            start, end = 2**64, -1
+            channels = array('H')
+            try:
+                content = block.content(self._descriptor)
+                for opcode, begin, until in records.split(content):
+                    if opcode == records.MESSAGE:
+                        _, _, channel, _, time, _ = unpack(content, begin - PREFIX.size)
+                        channels.append(channel)
+                        start, end = min(start, time), max(end, time)
+                        continue
+                    try:
+                        record = records.parse_any(opcode, content[begin:until])
+                        if not isinstance(record, (Schema, Channel)):
+                            raise BagError(f'a chunk holds a record of the kind {opcode:#x}')
+                        self._take(record)
+                    except BagError as error:
+                        self.problem(f': {error}: skipped')
+            except BagError as error:
+                self.problem(f': {error}, at byte {block.offset}: skipped')
+            self._counts.update(channels)
+            if channels:
+                if block.end >= 0 and (block.start, block.end) != (start, end):
+                    self.problem(
+                        f': a chunk has other times than it says, at byte {block.offset}')
+                self.blocks.append(replace(block, start=start, end=end))
+        found = self._counts.total()
+        if said is not None and said != found:
+            self.problem(f': {said - found} of {said} messages cannot be read' if said > found else
+                         f' holds {found} messages that can be read: it says {said}')
 
-def read_summary(descriptor: int, file: ScannedFile) -> bool:
-    """Take in a file by its summary; False if that is missing or not to be trusted."""
-    tail_size = _FOOTER_SIZE + len(MAGIC)
-    tail = os.pread(descriptor, tail_size, max(0, file.size - tail_size))
-    if not (len(tail) == tail_size and tail.endswith(MAGIC)
-            and tail.startswith(PREFIX.pack(Opcode.FOOTER, 20))):
-        return False
-    file.complete = True
-    footer = records.parse(Footer, tail[PREFIX.size:_FOOTER_SIZE])
-    start, end = footer.summary_start, file.size - tail_size
-    if not start:
-        return False
-    try:
-        if not _DATA_END_SIZE < start <= end or end - start > limits.SUMMARY_SIZE:
-            raise BagError('it does not lie where the file says')
-        summary = records.read_exactly(descriptor, end - start, start)
-        if footer.summary_crc not in (0, zlib.crc32(tail[:25], zlib.crc32(summary))):
-            raise BagError('its CRC differs')
-        return _take_summary(descriptor, file, summary, start)
-    except BagError as error:
-        file.problem(
-            f': the summary cannot be used ({error}): the file is read record by record')
-        return False
+    # -- by the summary -------------------------------------------------------------------------
 
+    def _read_summary(self) -> bool:
+        """Take in the file by its summary; False if that is missing or not to be trusted."""
+        tail = os.pread(self._descriptor, _TAIL_SIZE, max(0, self._size - _TAIL_SIZE))
+        if not (tail.endswith(MAGIC) and tail.startswith(PREFIX.pack(Opcode.FOOTER, 20))):
+            return False
+        self.complete = True
+        try:
+            footer = records.parse(Footer, tail[PREFIX.size:_FOOTER_SIZE])
+            start, end = footer.summary_start, self._size - _TAIL_SIZE
+            if not start:
+                return False
+            if not _DATA_END_SIZE < start <= end or end - start > limits.SUMMARY_SIZE:
+                raise BagError('it does not lie where the file says')
+            summary = records.read_exactly(self._descriptor, end - start, start)
+            if footer.summary_crc not in (0, zlib.crc32(tail[:25], zlib.crc32(summary))):
+                raise BagError('its CRC differs')
+            return self._take_summary(summary, start - _DATA_END_SIZE)
+        except BagError as error:
+            self.problem(
+                f': the summary cannot be used ({error}): the file is read record by record')
+            return False
 
-def _take_summary(descriptor: int, file: ScannedFile, summary: bytes, start: int) -> bool:
-    """Take in the records of a summary; False if they are not complete."""
-    chunks: list[ChunkIndex] = []
-    notes: list[MetadataIndex] = []
-    statistics: Statistics | None = None
-    declared = 0
-    for opcode, begin, end in records.split(summary):
-        record = records.parse_any(opcode, summary[begin:end])
-        if isinstance(record, ChunkIndex):
-            chunks.append(record)
-        elif isinstance(record, MetadataIndex):
-            notes.append(record)
-        elif isinstance(record, Statistics):
-            statistics = record
-        elif record is not None:
-            declared += isinstance(record, Channel)
-            file.take(record)
-    if statistics is None or statistics.message_count and not chunks \
-            or statistics.channel_count and not declared:
-        return False
-    _check(statistics, chunks, declared)
-    file.counts = dict(statistics.channel_message_counts)
-    end_record = records.read_exactly(descriptor, _DATA_END_SIZE, start - _DATA_END_SIZE)
-    if not end_record.startswith(PREFIX.pack(Opcode.DATA_END, 4)):
-        file.problem(f' is damaged at byte {start - _DATA_END_SIZE}: no end of data')
-    file.data_end = start - _DATA_END_SIZE
-    file.data_crc = records.parse(DataEnd, end_record[PREFIX.size:]).data_section_crc
-    _find_chunks(descriptor, file, chunks)
-    for entry in notes:
-        _find_metadata(descriptor, file, entry)
-    return True
+    def _take_summary(self, summary: bytes, data_end: int) -> bool:
+        """Take in the records of a summary; False if they are not complete."""
+        found: defaultdict[type[McapRecord] | None, list[Any]] = defaultdict(list)
+        for opcode, begin, end in records.split(summary):
+            record = records.parse_any(opcode, summary[begin:end])
+            found[None if record is None else type(record)].append(record)
+        chunks: list[ChunkIndex] = found[ChunkIndex]
+        if not found[Statistics]:
+            return False
+        statistics: Statistics = found[Statistics][-1]
+        if statistics.message_count and not chunks or (
+                statistics.channel_count and not found[Channel]):
+            return False
+        _check(statistics, chunks, len(found[Channel]))
+        for record in (*found[Schema], *found[Channel]):
+            self._take(record)
+        self._counts = Counter(statistics.channel_message_counts)
+        end_record = records.read_exactly(self._descriptor, _DATA_END_SIZE, data_end)
+        if not end_record.startswith(PREFIX.pack(Opcode.DATA_END, 4)):
+            self.problem(f' is damaged at byte {data_end}: no end of data')
+        self._data_end = data_end
+        self._data_crc = records.parse(DataEnd, end_record[PREFIX.size:]).data_section_crc
+        before = len(MAGIC)
+        for index in sorted(chunks, key=lambda index: index.chunk_start_offset):
+            offset = index.chunk_start_offset
+            if offset < before or offset + index.chunk_length > data_end:
+                raise BagError(f'a chunk at byte {offset} overlaps with something else')
+            before = offset + index.chunk_length
+            self._find_chunk(index)
+        for entry in found[MetadataIndex]:
+            self._find_metadata(entry)
+        return True
 
-
-def _find_chunks(descriptor: int, file: ScannedFile, chunks: list[ChunkIndex]) -> None:
-    """Hold the heads of the chunks against the index."""
-    before = len(MAGIC)
-    for index in sorted(chunks, key=lambda index: index.chunk_start_offset):
-        offset = index.chunk_start_offset
-        after = offset + index.chunk_length
-        if offset < before or after > file.data_end:
-            raise BagError(f'a chunk at byte {offset} overlaps with something else')
-        before = after
-        head = os.pread(descriptor, PREFIX.size + records.CHUNK_HEAD_SIZE, offset)
-        content, length = head[PREFIX.size:], index.chunk_length - PREFIX.size
-        crc = struct.unpack_from('<I', content, 24)[0] if len(content) >= 28 else 0
+    def _find_chunk(self, index: ChunkIndex) -> None:
+        """Take in a chunk that the summary names, and hold its head against that."""
+        offset, length = index.chunk_start_offset, index.chunk_length - PREFIX.size
+        head = os.pread(self._descriptor, PREFIX.size + records.CHUNK_HEAD_SIZE, offset)
+        # What the index does not say is taken from the head in any case.
+        crc, = struct.unpack_from('<I', head, PREFIX.size + 24)
         block = Block(
-            file.number, offset + PREFIX.size + 40 + len(index.compression.encode()),
+            self._number, offset + PREFIX.size + 40 + len(index.compression.encode()),
             index.compressed_size, index.uncompressed_size, index.message_start_time,
             index.message_end_time, index.compression, crc)
         try:
-            found = Block.of_chunk(file.number, offset, content, length)
+            found = Block.of_chunk(self._number, offset, head[PREFIX.size:], length)
         except BagError:
             found = None
         if block != found or not head.startswith(PREFIX.pack(Opcode.CHUNK, length)):
-            file.problem(f' is damaged at byte {offset}: the chunk there is not as the index '
+            self.problem(f' is damaged at byte {offset}: the chunk there is not as the index '
                          'says, and is read as that says')
-        file.add_block(block, offset)
+        self._add_block(block, offset)
 
+    def _find_metadata(self, index: MetadataIndex) -> None:
+        """Take in a metadata record that the summary names."""
+        try:
+            if not PREFIX.size <= index.length <= limits.RECORD_SIZE:
+                raise BagError(f'a metadata record has {index.length} bytes')
+            data = records.read_exactly(self._descriptor, index.length, index.offset)
+            if PREFIX.unpack_from(data) != (Opcode.METADATA, index.length - PREFIX.size):
+                raise BagError('a metadata record is not where the index says')
+            record = records.parse(Metadata, data[PREFIX.size:])
+            if record.name != index.name:
+                raise BagError('a metadata record is not called as the index says')
+            self._take(record)
+        except (BagError, OverflowError) as error:
+            self.problem(f': {error}, at byte {index.offset}: skipped')
 
-def _find_metadata(descriptor: int, file: ScannedFile, index: MetadataIndex) -> None:
-    """Take in a metadata record that the summary names."""
-    try:
-        if not PREFIX.size <= index.length <= limits.RECORD_SIZE:
-            raise BagError(f'a metadata record has {index.length} bytes')
-        data = records.read_exactly(descriptor, index.length, index.offset)
-        if PREFIX.unpack_from(data) != (Opcode.METADATA, index.length - PREFIX.size):
-            raise BagError('a metadata record is not where the index says')
-        record = records.parse(Metadata, data[PREFIX.size:])
-        if record.name != index.name:
-            raise BagError('a metadata record is not called as the index says')
-        file.take(record)
-    except (BagError, OverflowError) as error:
-        file.problem(f': {error}, at byte {index.offset}: skipped')
+    def _check_data(self) -> None:
+        """Hold the data against their CRC, unless that would take long."""
+        if not self._data_crc or self._damaged or self._data_end > limits.CHECKED_SIZE:
+            return
+        crc = 0
+        for offset in range(0, self._data_end, _CRC_BYTES):
+            size = min(_CRC_BYTES, self._data_end - offset)
+            crc = zlib.crc32(os.pread(self._descriptor, size, offset), crc)
+        if crc != self._data_crc:
+            self.problem(' is damaged: the CRC of its data differs')
 
 
 def _check(statistics: Statistics, chunks: list[ChunkIndex], declared: int) -> None:
@@ -266,48 +399,3 @@ def _check(statistics: Statistics, chunks: list[ChunkIndex], declared: int) -> N
                 (x.message_end_time for x in filled), default=statistics.message_end_time))):
         if said != found:
             raise BagError(f'it says {said} {what} and has {found}')
-
-
-_CRC_BYTES = 2**20
-
-
-def scan(intake: Intake, path: Path, number: int) -> ScannedFile:
-    """Find out what a file holds; raise `BadInputError` if it is no MCAP file."""
-    try:
-        with path.open('rb') as stream:
-            size = os.fstat(stream.fileno()).st_size
-            if size == 0:
-                raise BadInputError(f'{path} is empty: expected an MCAP file')
-            magic = stream.read(len(MAGIC))
-            if magic != MAGIC:
-                if MAGIC.startswith(magic):
-                    raise BadInputError(
-                        f'{path} was cut off after {size} bytes: expected an MCAP file')
-                raise BadInputError(f'{path} is not an MCAP file: it begins with '
-                                    f'{magic!r}, expected {MAGIC!r}')
-            descriptor = stream.fileno()
-            file = ScannedFile(path, number, size, intake)
-            if not read_summary(descriptor, file):
-                file = replace(
-                    file, schemas={}, channels={}, blocks=[], metadata={}, counts={})
-                walk(descriptor, file)
-            return file
-    except OSError as error:
-        raise BadInputError(
-            f'{path} cannot be read ({error.strerror}): expected an MCAP file') from error
-
-
-def check_data(file: ScannedFile) -> None:
-    """Hold the data of a file against their CRC, unless that would take long."""
-    crc, offset = 0, 0
-    if not file.data_crc or file.damaged or file.data_end > limits.CHECKED_SIZE:
-        return
-    with file.path.open('rb') as stream:
-        while offset < file.data_end:
-            data = stream.read(min(_CRC_BYTES, file.data_end - offset))
-            if not data:
-                break
-            crc = zlib.crc32(data, crc)
-            offset += len(data)
-    if crc != file.data_crc:
-        file.problem(' is damaged: the CRC of its data differs')

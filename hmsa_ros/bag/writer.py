@@ -9,6 +9,7 @@ half way is undone. Message payloads are stored as given.
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 import contextlib
+from dataclasses import replace
 import itertools
 import operator
 import os
@@ -17,9 +18,10 @@ import re
 
 from hmsa_ros import __version__
 from hmsa_ros.bag import metadata, qos
+from hmsa_ros.bag.metadata import Topic
 from hmsa_ros.bag.output import Entry, OutputFile, PRESETS
 from hmsa_ros.bag.records import MESSAGE_HEAD
-from hmsa_ros.bag.topics import number_of, Topic
+from hmsa_ros.bag.topics import number_of
 from hmsa_ros.errors import BadInputError, BagError
 
 __all__ = ['BagWriter', 'MIN_FILE_SIZE', 'parse_custom_data', 'PRESETS', 'Topic']
@@ -93,10 +95,9 @@ class BagWriter:
         self._preset = preset
         self._chunk_size = chunk_size
         self._fsync = fsync
-        self._waiting: list[Entry]
-        self._start: int  # of the log times that wait
-        self._end: int
-        self._forget_waiting()
+        self._waiting: list[Entry] = []
+        self._waiting_size = 0
+        self._start, self._end = 2**64, 0  # of the log times that wait
         self._file: OutputFile | None = None
         self._next_number = 0
         self._closed = False
@@ -165,8 +166,13 @@ class BagWriter:
     def write(self, entries: Iterable[Entry]) -> None:
         """Add messages in any order of log times (ns); full chunks go to the file."""
         for entry in entries:
-            self._start = min(self._start, entry[1])
-            self._end = max(self._end, entry[1])
+            log_time = entry[1]
+            if not self._waiting:
+                self._start = self._end = log_time
+            elif log_time > self._end:
+                self._end = log_time
+            elif log_time < self._start:
+                self._start = log_time
             self._waiting.append(entry)
             self._waiting_size += MESSAGE_HEAD.size + len(entry[4])
             if self._waiting_size >= self._chunk_size:
@@ -330,9 +336,8 @@ class BagWriter:
         end = max((file.start_ns + file.duration_ns for file in filled), default=start)
         return metadata.BagMetadata(
             start, end - start, sum(file.message_count for file in files),
-            tuple(metadata.TopicMetadata(
-                topic.name, topic.type, 'cdr', topic.profiles, topic.type_hash,
-                counts.get(number, 0)) for number, topic in enumerate(self._topics)),
+            tuple(replace(topic, encoding='cdr', message_count=counts.get(number, 0))
+                  for number, topic in enumerate(self._topics)),
             tuple(files), custom_data, self._ros_distro)
 
 
