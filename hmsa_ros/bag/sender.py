@@ -9,7 +9,7 @@ from itertools import islice
 import time
 
 from hmsa_ros.bag.reader import BagReader, Message
-from hmsa_ros.bag.transport import Transport
+from hmsa_ros.bag.transport import PlayingInterruptedError, Transport
 
 _POLL_SECONDS = 0.02
 # Read ahead at a time, each an equal share of the messages and of the memory.
@@ -45,9 +45,9 @@ class ReadAhead:
             self._ahead.append(self._thread.submit(self._batch))
             yield from batch
 
-    def wait(self, cancelled: Callable[[], bool]) -> None:
+    def wait(self, transport: Transport) -> None:
         """Wait for the first messages, or the end if there are none or nobody waits."""
-        while not (self._ahead[0].done() or cancelled()):
+        while not (self._ahead[0].done() or transport.interrupted):
             wait([self._ahead[0]], _POLL_SECONDS)
 
     def stop(self) -> None:
@@ -119,65 +119,60 @@ class Sender:
             try:
                 self._send_latched(start)
                 # Time runs from when there is something to send.
-                source.wait(self._transport.interrupted)
+                source.wait(self._transport)
                 self._transport.begin(start)
-                outcome = self._send_all(source, start)
+                self._send_all(source, start)
+                return True
+            except PlayingInterruptedError:
+                if self._transport.stopped:
+                    return False
+                start = self._transport.take_seek(self._excerpt.first)
             finally:
                 source.stop()
-            if outcome != 'seek':
-                return not outcome
-            start = self._transport.take_seek(self._excerpt.first)
 
     def _read(self, start: int, cancelled: Callable[[], bool]) -> Iterator[Message]:
         """Return the messages to send from a time on."""
         return self._reader.messages(
             self._out.keys(), start=start, end=self._excerpt.end + 1, cancelled=cancelled)
 
-    def _send_all(self, messages: Iterable[Message], start: int) -> str:
-        """Send messages, each at its time; return why it ended early, or an empty string."""
+    def _send_all(self, messages: Iterable[Message], start: int) -> None:
+        """Send messages, each at its time."""
         tick, clock = start, self._clock
         ticking = clock is not None and clock.frequency > 0.0
         if clock is not None and ticking:
             # Before the first message: in a loop, time jumps back with this.
             clock.send(start)
         for message in messages:
-            outcome, tick = self._tick_until(message.log_time, tick, last=False)
-            if outcome:
-                return outcome
+            tick = self._tick_until(message.log_time, tick, last=False)
             if clock is not None and clock.on_publish:
                 clock.send(message.log_time)
             self._out[message.topic](message.data)
             self.count += 1
             self._transport.sent(message.log_time)
-        outcome, _ = self._tick_until(self._excerpt.end, tick, last=True)
-        if clock is not None and ticking and not outcome:
+        self._tick_until(self._excerpt.end, tick, last=True)
+        if clock is not None and ticking:
             clock.send(self._excerpt.end)
-        return outcome
 
-    def _tick_until(self, when: int, tick: int, *, last: bool) -> tuple[str, int]:
-        """Wait until a time of the bag, with the clock's ticks before it."""
+    def _tick_until(self, when: int, tick: int, *, last: bool) -> int:
+        """Wait until a time of the bag, with the clock's ticks before it; return the next tick."""
         clock = self._clock
         if clock is not None and clock.frequency > 0.0:
             while tick <= when:
-                outcome = self._wait(tick, message=False)
-                if outcome:
-                    return outcome, tick
+                self._wait(tick, message=False)
                 if self._transport.stepping and not last:
                     break
                 clock.send(tick)
                 tick += max(1, round(1e9 * self._transport.rate / clock.frequency))
-        return self._wait(when, message=not last), tick
+        self._wait(when, message=not last)
+        return tick
 
-    def _wait(self, when: int, *, message: bool) -> str:
-        """Wait until a time of the bag; return why it did not come, or an empty string."""
-        while True:
-            outcome = self._transport.wait(
-                when, message=message, timeout=CLOCK_WHILE_WAITING_SECONDS)
-            if outcome != 'paused':
-                return outcome
+    def _wait(self, when: int, *, message: bool) -> None:
+        """Wait until a time of the bag."""
+        while (standing_at := self._transport.wait(
+                when, message=message, timeout=CLOCK_WHILE_WAITING_SECONDS)) is not None:
             if self._clock is not None:
                 # Time stands still, but who comes now is to know it.
-                self._clock.send(self._transport.standing_at)
+                self._clock.send(standing_at)
 
     def _send_latched(self, start: int) -> None:
         """Send what a subscriber of the latched topics would have got at a time."""
@@ -186,7 +181,7 @@ class Sender:
         kept = {name: deque[Message]() for name in self._latched}
         size = 0
         for message in self._reader.messages(
-                self._latched.keys(), end=start, cancelled=self._transport.interrupted):
+                self._latched.keys(), end=start, cancelled=lambda: self._transport.interrupted):
             latest = kept[message.topic]
             latest.append(message)
             size += len(message.data)

@@ -8,6 +8,10 @@ import time
 _FINE_SECONDS = 0.01
 
 
+class PlayingInterruptedError(Exception):
+    """Playing was stopped, or is to go on from another time of the bag."""
+
+
 class Transport:
     """
     The schedule of one run, paused at first: which time of the bag (ns) is due when.
@@ -85,6 +89,7 @@ class Transport:
             self.position = start
             self._anchor = (start, time.monotonic())
 
+    @property
     def interrupted(self) -> bool:
         """Return whether what is going on has been given up."""
         return self.stopped or self._seek is not None
@@ -112,26 +117,27 @@ class Transport:
         with self.change:
             return self.change.wait_for(lambda: self.stopped, max(0.0, seconds))
 
-    def wait(self, when: int, *, message: bool, timeout: float) -> str:
-        """Wait until a time of the bag (ns) is due, while paused at most ``timeout`` s."""
-        # Empty if it is due, otherwise 'stop', 'seek' or 'paused'; a message may be what a step
-        # asks for.
+    def wait(self, when: int, *, message: bool, timeout: float) -> int | None:
+        """
+        Wait until a time of the bag (ns) is due; a message may be what a step asks for.
+
+        Returns None then, or where time stands still after ``timeout`` s of a pause. Raises
+        `PlayingInterruptedError`.
+        """
         while True:
             with self.change:
-                if self.stopped:
-                    return 'stop'
-                if self._seek is not None:
-                    return 'seek'
+                if self.interrupted:
+                    raise PlayingInterruptedError
+                since, began = self._anchor
                 if self.paused:
                     if self._steps:
                         if message:
                             self._steps -= 1
                             self._anchor = (when, time.monotonic())
-                        return ''
+                        return None
                     if not self.change.wait(timeout):
-                        return 'paused'
+                        return since
                     continue
-                since, began = self._anchor
                 delay = began + (when - since) * 1e-9 / self.rate - time.monotonic()
                 if delay > 2 * _FINE_SECONDS:
                     self.change.wait(delay - _FINE_SECONDS)
@@ -140,9 +146,4 @@ class Transport:
                 time.sleep(delay)
             else:
                 self.late = max(self.late, -delay)
-            return ''
-
-    @property
-    def standing_at(self) -> int:
-        """Time of the bag at which it is paused, in ns."""
-        return self._anchor[0]
+            return None
