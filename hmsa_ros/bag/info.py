@@ -16,7 +16,7 @@ _SHOWN = (
     'path', 'files', 'start_ns', 'end_ns', 'duration', 'message_count', 'lost', 'sent_before',
     'topics', 'parameters', 'custom_data', 'complete', 'problems')
 # What custom data count by topic.
-_LOST, _BEFORE = 'lost', 'sent_before'
+_COUNTED = 'lost', 'sent_before'
 
 
 @dataclass(frozen=True)
@@ -62,47 +62,45 @@ class BagSummary:
     @property
     def lost(self) -> int | None:
         """Return the number of lost messages, None if the recorder did not count."""
-        return _sum(topic.lost for topic in self.topics)
+        return self._sum('lost')
 
     @property
     def sent_before(self) -> int | None:
         """Return how many messages were sent before the recorder was matched, None as above."""
-        return _sum(topic.sent_before for topic in self.topics)
+        return self._sum('sent_before')
 
-
-def _sum(counts: Iterable[int | None]) -> int | None:
-    """Return the sum of the counts that there are, None without any."""
-    counted = [x for x in counts if x is not None]
-    return sum(counted) if counted else None
+    def _sum(self, name: str) -> int | None:
+        counted = [x for topic in self.topics if (x := getattr(topic, name)) is not None]
+        return sum(counted) if counted else None
 
 
 def summarize(
-        path: str | os.PathLike[str], *,
+        bag: str | os.PathLike[str] | BagReader, *,
         max_chunk_size: int = limits.CHUNK_SIZE) -> BagSummary:
-    """Read a bag's figures, as `BagReader` does; raise `BadInputError` if there is none."""
-    reader = BagReader(path, max_chunk_size=max_chunk_size)
+    """Return the figures of a bag, or of one that is read; raise `BadInputError` if it is none."""
+    reader = bag if isinstance(bag, BagReader) else BagReader(bag, max_chunk_size=max_chunk_size)
     # First of all: it finds out what is damaged.
     counts = reader.counts()
     start, end = reader.start_time, reader.end_time
     seconds = 0.0 if start is None or end is None else (end - start) * 1e-9
-    lost, before = (missing_messages(reader.custom_data, key) for key in (_LOST, _BEFORE))
+    lost, before = (missing_messages(reader.custom_data, key) for key in _COUNTED)
     topics = tuple(TopicSummary(
-        info.name, info.type, counts[name],
+        name, topic.type, counts[name],
         (counts[name] - 1) / seconds if seconds > 0.0 and counts[name] > 1 else None,
         None if lost is None else lost.get(name, 0),
         None if before is None else before.get(name, 0),
-        '/'.join(sorted({profile.reliability for profile in info.profiles})),
-        '/'.join(sorted({profile.durability for profile in info.profiles})))
-        for name, info in sorted(reader.topics.items()))
+        '/'.join(sorted({x.reliability for x in topic.profiles})),
+        '/'.join(sorted({x.durability for x in topic.profiles})))
+        for name, topic in sorted(reader.topics.items()))
     parameters = {
         parameter_key(node, name): value
         for node, values in node_parameters(reader.custom_data).items()
         for name, value in values.items()}
     return BagSummary(
-        str(path), tuple((file.name, file.stat().st_size) for file in reader.files), start, end,
-        topics, parameters,
+        str(reader.path), tuple((file.name, file.stat().st_size) for file in reader.files), start,
+        end, topics, parameters,
         {key: value for key, value in reader.custom_data.items()
-         if key not in {*parameters, _LOST, _BEFORE} and not key.startswith(qos.LATER)},
+         if key not in {*parameters, *_COUNTED} and not key.startswith(qos.LATER)},
         reader.complete, tuple(reader.problems))
 
 
@@ -133,11 +131,11 @@ def to_json(summary: BagSummary, notes: Sequence[str] = ()) -> str:
 def to_text(
         summary: BagSummary, notes: Sequence[str] = (), *, parameters: bool = False) -> str:
     """Return a summary and what is notable besides in words; with the parameters if asked."""
-    return '\n'.join(map(printable, (
-        *_lines(summary, parameters), *(f'note: {x}' for x in notes))))
+    return '\n'.join(map(printable, _lines(summary, notes, parameters)))
 
 
-def _lines(summary: BagSummary, parameters: bool) -> Iterator[str]:
+def _lines(
+        summary: BagSummary, notes: Iterable[str], parameters: bool) -> Iterator[str]:
     """Return the lines of a summary."""
     yield f'bag       {summary.path}'
     for name, size in summary.files:
@@ -158,12 +156,11 @@ def _lines(summary: BagSummary, parameters: bool) -> Iterator[str]:
             '' if topic.lost is None else str(topic.lost),
             ', '.join(filter(None, (topic.reliability, topic.durability))))
             for topic in summary.topics]
-        widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+        wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
         yield ''
         for row in rows:
-            yield '  '.join(
-                text.rjust(width) if 2 <= i <= 4 else text.ljust(width)
-                for i, (text, width) in enumerate(zip(row, widths, strict=True))).rstrip()
+            yield '  '.join(f'{text:{side}{width}}' for text, side, width in zip(
+                row, '<<>>><', wide, strict=True)).rstrip()
     if summary.parameters and not parameters:
         nodes = ', '.join(dict.fromkeys(x.partition('.')[0] for x in summary.parameters))
         yield ''
@@ -182,8 +179,7 @@ def _lines(summary: BagSummary, parameters: bool) -> Iterator[str]:
                    'recorder was matched')
     if silent := [x.name for x in summary.topics if not x.count]:
         yield f'note: nothing was received of {", ".join(silent)}'
-    for problem in summary.problems:
-        yield f'note: {problem}'
+    yield from (f'note: {x}' for x in (*summary.problems, *notes))
 
 
 def _time(nanoseconds: int) -> str:

@@ -72,9 +72,8 @@ def _info(arguments: argparse.Namespace) -> int:
     from hmsa_ros.recordings.topics import unanswered
 
     with progress('reading'):
-        summary = summarize(arguments.bag, max_chunk_size=arguments.max_chunk_size)
-        notes = tuple(unanswered(
-            BagReader(arguments.bag, max_chunk_size=arguments.max_chunk_size)))
+        reader = BagReader(arguments.bag, max_chunk_size=arguments.max_chunk_size)
+        summary, notes = summarize(reader), tuple(unanswered(reader))
     print(to_json(summary, notes) if arguments.json else to_text(
         summary, notes, parameters=arguments.parameters))
     return 0
