@@ -6,8 +6,9 @@ bag may come from this package's recorder, from rosbag2, from a simulated plant 
 """
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,7 @@ def read_runs(
     reader = BagReader(path, max_chunk_size=max_chunk_size)
     spaces = topics_by_joint(reader)
     collected = _collect(reader, spaces, progress)
-    summary = summarize(path, max_chunk_size=max_chunk_size)
+    summary = summarize(reader)
     label = path.resolve().stem if path.is_file() else path.resolve().name
     runs, reasons = [], []
     for space, by_joint in sorted(spaces.items()):
@@ -123,8 +124,7 @@ def _collect(
         except BagError as error:
             raise BadInputError(f'{reader.path} cannot be evaluated: {error}') from error
     collected = {
-        space: _Collected(SampleReader(
-            decoders[next(iter(by_joint.values()))[roles.JOINT_STATES]]))
+        space: _Collected(decoders[next(iter(by_joint.values()))[roles.JOINT_STATES]])
         for space, by_joint in spaces.items()}
     begin, end = reader.start_time or 0, reader.end_time or 0
     for i, message in enumerate(reader.messages(list(found))):
@@ -142,7 +142,7 @@ def _collect(
 class _Point:
     """A point of a trajectory: time from its start in ns, and values by joint."""
 
-    time: int
+    time: int | None  # None for a setpoint that is held until the next
     positions: tuple[float, ...]
     velocities: tuple[float, ...]
     effort: tuple[float, ...]
@@ -168,27 +168,26 @@ class _Trajectory:
             for x in message.points), message.header.frame_id)
 
 
-@dataclass
 class _Collected:
-    """What has been read of the actuators of one namespace so far."""
+    """What has been read of the actuators of one namespace so far; dictionaries are by joint."""
 
-    samples: SampleReader
-    commands: dict[str, list[Level]] = field(default_factory=dict)
-    applied: dict[str, list[Level]] = field(default_factory=dict)
-    forces: dict[str, list[tuple[int, int, float]]] = field(default_factory=dict)
-    refused: dict[str, int] = field(default_factory=dict)
-    # Of all joints, as they were received; plans and verdicts are known once they are in order.
-    plans: list[_Trajectory] = field(default_factory=list)
-    # Trajectories, and setpoints with the joint in the name of their topic.
-    requests: list[tuple[str | None, _Trajectory | RecordedRequest]] = field(default_factory=list)
-    stops: list[int] = field(default_factory=list)  # when plans without a request were recorded
-    verdicts: list[Verdict] = field(default_factory=list)
-    # Plans and verdicts, and when each was published, by the clock of the planner.
-    published: list[tuple[int, _Trajectory | Verdict]] = field(default_factory=list)
-    # With the joint that each is of.
-    sensors: list[tuple[str, LearntSensor]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    left_out: int = 0
+    def __init__(self, decode: Callable[[bytes], Any]) -> None:
+        self.samples = SampleReader(decode)
+        self.commands: defaultdict[str, list[Level]] = defaultdict(list)
+        self.applied: defaultdict[str, list[Level]] = defaultdict(list)
+        self.forces: defaultdict[str, list[tuple[int, int, float]]] = defaultdict(list)
+        self.refused = Counter[str]()
+        # Of all joints; plans and verdicts are known once they are in order.
+        self.plans: list[_Trajectory] = []
+        self.requests: list[_Trajectory] = []
+        self.stops: list[int] = []  # when plans without a request were recorded
+        self.verdicts: list[Verdict] = []
+        # Plans and verdicts, and when each was published, by the clock of the planner.
+        self.published: list[tuple[int, _Trajectory | Verdict]] = []
+        # With the joint that each is of.
+        self.sensors: list[tuple[str, LearntSensor]] = []
+        self.notes: list[str] = []
+        self.left_out = 0
 
     def take(
             self, role: str, joint: str, message: Message,
@@ -199,41 +198,38 @@ class _Collected:
                 self.samples.take(message.log_time, message.data)
             else:
                 self._take(role, joint, message, decode(message.data))
-        except (AttributeError, TypeError, ValueError, OverflowError) as error:
+        except (AttributeError, TypeError, ValueError, OverflowError, BagError) as error:
             # The bag brings the definition along, and may call anything by that name.
-            self._leave_out(
+            reason = str(error) if isinstance(error, BagError) else (
                 f'a message of topic {message.topic} is not as {roles.TYPES[role]} is defined in '
                 f'ROS 2: {error}')
-        except BagError as error:
-            self._leave_out(str(error))
-
-    def _leave_out(self, reason: str) -> None:
-        self.left_out += 1
-        if len(self.notes) < _MOST_NOTES:
-            self.notes.append(f'{reason}: left out')
+            self.left_out += 1
+            if len(self.notes) < _MOST_NOTES:
+                self.notes.append(f'{reason}: left out')
 
     def _take(self, role: str, joint: str, message: Message, content: Any) -> None:
         sent = message.log_time
         if role in (roles.COMMAND, roles.APPLIED):
             vector = content.magnetic_field
-            kept = self.commands if role == roles.COMMAND else self.applied
             if obeyed(vector.x, vector.y, vector.z):
                 stamp = nanoseconds_of(content.header.stamp)
-                kept.setdefault(joint, []).append(Level(
+                kept = self.commands if role == roles.COMMAND else self.applied
+                kept[joint].append(Level(
                     stamp or (sent if role == roles.COMMAND else 0), float(vector.z), sent))
             else:
-                self.refused[joint] = self.refused.get(joint, 0) + 1
+                self.refused[joint] += 1
         elif role == roles.FORCE:
-            self.forces.setdefault(joint, []).append((
+            self.forces[joint].append((
                 sent, nanoseconds_of(content.header.stamp) or sent,
                 float(content.wrench.force.z)))
         elif role == roles.PLAN:
             self.published.append((message.publish_time, _Trajectory.of(sent, content)))
         elif role == roles.TRAJECTORY:
-            self.requests.append((None, _Trajectory.of(sent, content)))
+            self.requests.append(_Trajectory.of(sent, content))
         elif role == roles.SETPOINT:
-            self.requests.append((
-                joint, RecordedRequest(sent, 0, ((float(content.data), None),))))
+            self.requests.append(_Trajectory(
+                sent, (joint,) if joint else (), 0,
+                (_Point(None, (float(content.data),), (), ()),), ''))
         elif role == roles.ESTIMATE:
             self.sensors += (
                 (x.hardware_id, LearntSensor(sent, Sensor.of({y.key: y.value for y in x.values})))
@@ -289,32 +285,31 @@ class _Collected:
             place = bisect_left(times, verdict.sent)
             return times[place - (place > 0 and times[place - 1] in plans)]
 
-        self.requests.sort(key=lambda x: x[1].sent)
-        found, others = answers.answered([x for _, x in self.requests], self.verdicts)
+        self.requests.sort(key=lambda x: x.sent)
+        found, others = answers.answered(self.requests, self.verdicts)
         self.stops = [announced(x) for x in others]
         unheard = sum(answer is None and not taken for answer, taken in found)
         if unheard:
             self.notes.append(
                 f'{unheard} of {len(found)} requests have no answer of a planner, and are not '
                 'judged: was it running, and is its ~/status recorded?')
-        for i, ((key, request), (answer, taken)) in enumerate(
-                zip(self.requests, found, strict=True)):
+        for i, (request, (answer, taken)) in enumerate(zip(self.requests, found, strict=True)):
             sent = request.sent
             if answer is not None:
                 begun = announced(answer)
                 place = bisect_left(times, begun)
                 before = times[place - 1] if place else sent - 1
                 sent = min(max(sent, before + 1), begun - 1)
-            self.requests[i] = key, replace(request, sent=sent, taken=taken)
+            self.requests[i] = replace(request, sent=sent, taken=taken)
 
-    def _plans(self, joint: str) -> Iterable[tuple[Level, ...]]:
+    def _plans(self, joint: str) -> Iterator[tuple[Level, ...]]:
         """Return the plans of a joint, or of the one that they are of."""
         for plan in self.plans:
             place = _place(plan.joints, joint)
             if place is None:
                 continue
             levels = [
-                Level(plan.stamp + x.time, x.effort[place], plan.sent, x.positions[place],
+                Level(plan.stamp + (x.time or 0), x.effort[place], plan.sent, x.positions[place],
                       x.velocities[place])
                 for x in plan.points
                 if min(len(x.positions), len(x.velocities), len(x.effort)) > place]
@@ -326,13 +321,9 @@ class _Collected:
                           or x.flux_density != levels[i - 1].flux_density]
             yield tuple(levels)
 
-    def _requests(self, joint: str, key: str) -> list[RecordedRequest]:
+    def _requests(self, joint: str) -> Iterator[RecordedRequest]:
         """Return what was asked of a joint, by time."""
-        requests: list[RecordedRequest] = []
-        for of, asked in self.requests:
-            if isinstance(asked, RecordedRequest):
-                requests += [asked] * (of == key)
-                continue
+        for asked in sorted(self.requests, key=lambda x: x.sent):
             place = _place(asked.joints, joint)
             if place is not None:
                 points = tuple(
@@ -340,11 +331,10 @@ class _Collected:
                     if len(x.positions) == max(len(asked.joints), 1))
                 moves = len(points) > 0 and any(any(x.velocities) for x in asked.points)
                 path = points[-1][1] if moves else None
-                requests.append(RecordedRequest(
+                yield RecordedRequest(
                     asked.sent, asked.stamp,
                     points if path is None else ((points[-1][0], None),), path, asked.name,
-                    asked.taken))
-        return sorted(requests, key=lambda x: x.sent)
+                    asked.taken)
 
     def finish(
             self, label: str, reader: BagReader, summary: BagSummary, topics: Mapping[str, str],
@@ -357,15 +347,16 @@ class _Collected:
         named = joint or next(
             (x for x in (*planned, named_joint(parameters), *beside) if x in self.samples.names),
             '')
-        samples = self.samples.columns(f'{reader.path}: {states}', named, required=bool(joint))
+        samples, sample_notes, lost_samples = self.samples.columns(
+            f'{reader.path}: {states}', named, required=bool(joint))
         plant, planner, known, more = actuators(parameters, given, named)
-        refused = self.refused.get(key, 0)
+        refused = self.refused[key]
         notes = [*self.notes, *summary.problems]
         if roles.COMMAND not in topics:
             notes.append(
                 f'The recording has no {roles.COMMAND}: setpoints, unshaped steps and lateness '
                 'are unknown.')
-        elif not self.commands.get(key):
+        elif not self.commands[key]:
             notes.append(
                 f'{topics[roles.COMMAND]} holds no command: there is no setpoint to evaluate.')
         if refused:
@@ -373,16 +364,16 @@ class _Collected:
                 f'{refused} commands are not finite or not along z: left out, as the plant '
                 'does.')
         run = Run(
-            label, named, reader.path, samples.time, samples.logged, samples.stretch, samples.rate,
-            samples.flux_density, tuple(self.commands.get(key, ())),
-            _begun(self.applied.get(key, ()), int(samples.time[0])),
-            tuple(self.forces.get(key, ())), tuple(self._plans(joint)),
-            tuple(self._requests(joint, key)),
-            tuple(self.verdicts), tuple(self.stops),
-            tuple(x for of, x in self.sensors if of == joint or len(
-                {y for y, _ in self.sensors}) == 1), {**parameters, **given},
-            plant, planner, known, self.left_out + refused + samples.left_out,
-            (*notes, *samples.notes, *more), topics, summary)
+            label, named, reader.path, **samples, commands=tuple(self.commands[key]),
+            applied=_begun(self.applied[key], int(samples['time'][0])),
+            forces=tuple(self.forces[key]), plans=tuple(self._plans(joint)),
+            requests=tuple(self._requests(joint)), verdicts=tuple(self.verdicts),
+            stops=tuple(self.stops), sensors=tuple(
+                x for of, x in self.sensors
+                if of == joint or len({y for y, _ in self.sensors}) == 1),
+            parameters={**parameters, **given}, plant=plant, planner=planner,
+            parameters_known=known, left_out=self.left_out + refused + lost_samples,
+            notes=(*notes, *sample_notes, *more), topics=topics, summary=summary)
         if not (lost := run.lost(roles.COMMAND, roles.APPLIED)):
             return run
         return replace(run, notes=(

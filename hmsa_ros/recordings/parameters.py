@@ -146,12 +146,9 @@ def read_parameter_file(
     Raises `BadInputError` if the file cannot be read or sets no parameter of the actuator.
     """
     entries = entries_of(Path(path)) if entries is None else entries
-    found: dict[str, object] = {}
-    for node in (PLANNER, PLANT):
-        # What is meant for all nodes comes first, so that a node's own goes before it.
-        for own in (False, True):
-            found |= {f'{node}.{name}': value for key, name, value in entries
-                      if key == (node if own else '')}
+    # What is meant for all nodes comes first, so that a node's own goes before it.
+    found = {f'{node}.{name}': value for own in (False, True) for node in (PLANNER, PLANT)
+             for key, name, value in entries if key == (node if own else '')}
     if not any(name.partition('.')[2].endswith(x.name) for name in found for x in shared.BLOCK):
         raise BadInputError(
             f'{path} sets no parameter of the actuator: expected some of '

@@ -3,7 +3,6 @@
 from array import array
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
@@ -11,9 +10,7 @@ import numpy as np
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces.parameters import JOINT
-from hmsa_ros.model.equations import Array
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.recordings.record import Times
 
 # Samples may overtake one another on their way; further back goes only a clock, in ns.
 _CLOCK_JUMP = 100_000_000
@@ -21,6 +18,11 @@ _CLOCK_JUMP = 100_000_000
 _FAR = 30 * 86_400 * NANOSECONDS
 # What lies beyond is no motion of a block, and nothing could be drawn beside it; the rate in 1/s.
 _LARGEST_STRETCH, _LARGEST_RATE = 1e6, 1e12
+
+
+#: Of a run, by name, all of shape (n,): see `hmsa_ros.recordings.record.Run`.
+Columns = dict[str, Any]
+_COLUMNS = ('logged', 'time', 'stretch', 'rate', 'flux_density')
 
 
 def nanoseconds_of(stamp: Any) -> int:
@@ -64,11 +66,13 @@ class SampleReader:
         """Joints that the samples name."""
         return {x for shape in self._columns for x in shape[0]}
 
-    def columns(self, where: str, joint: str, *, required: bool) -> 'Samples':
+    def columns(
+            self, where: str, joint: str, *, required: bool) -> tuple[Columns, list[str], int]:
         """
-        Return a joint's samples in order; another joint will do unless ``required``.
+        Return a joint's samples in order, what a reader should know, and how many were left out.
 
-        Raises `BadInputError` if there is no such joint, or none of its samples can be used.
+        Another joint will do unless ``required``. Raises `BadInputError` if there is no such
+        joint, or none of its samples can be used; ``where`` names what is read.
         """
         if not self._columns:
             raise BadInputError(f'{where} holds no message: expected samples of the actuator')
@@ -90,12 +94,12 @@ class SampleReader:
             raise BadInputError(
                 f'{where} holds no position of joint {joint!r}: expected the stretch, '
                 'or the deflection of a beam')
-        logged, stamps, stretch, rate, flux_density = (
-            np.concatenate(x) for x in zip(*parts, strict=True))
-        order = np.argsort(logged, kind='stable')
-        return tidy(
-            where, *(x[order] for x in (stamps, logged, stretch, rate, flux_density)),
-            left_out=total - len(stamps))
+        found = dict(zip(
+            _COLUMNS, map(np.concatenate, zip(*parts, strict=True)), strict=True))
+        left_out = total - len(found['logged'])
+        found, notes, more = _tidy(
+            where, _rows(found, np.argsort(found['logged'], kind='stable')))
+        return found, notes, left_out + more
 
     def _joint(self, where: str, joint: str, required: bool) -> str:
         names = self.names
@@ -113,60 +117,38 @@ class SampleReader:
             '--joint')
 
 
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """Samples of one actuator, all of shape (n,)."""
-
-    time: Times  # stamps in ns, increasing
-    logged: Times  # when they were recorded, in ns
-    stretch: Array  # finite
-    rate: Array  # in 1/s
-    flux_density: Array  # in T, or NaN
-    left_out: int  # how many could not be used
-    notes: tuple[str, ...]  # what a reader should know
+def _rows(columns: Columns, rows: Any) -> Columns:
+    """Return some rows of all columns."""
+    return {name: x[rows] for name, x in columns.items()}
 
 
-def tidy(
-        where: str, stamps: Times, logged: Times, stretch: Array, rate: Array,
-        flux_density: Array, *, left_out: int = 0) -> Samples:
-    """
-    Leave out what cannot be a motion, sort by stamp and complete the rate.
-
-    Arrays of shape (n,) are in the order recorded, stamps in ns, with NaN for what was not;
-    ``left_out`` says how many were left out before, ``where`` names what is read in messages.
-    Raises `BadInputError` if no stretch is a finite number.
-    """
+def _tidy(where: str, columns: Columns) -> tuple[Columns, list[str], int]:
+    """Leave out what cannot be a motion, sort by stamp and complete the rate; see `columns`."""
     notes = []
-    if not stamps.any():
-        stamps = logged.copy()
-        notes.append(
-            'The samples have no timestamps: the receive times are used.')
+    if not columns['time'].any():
+        columns['time'] = columns['logged'].copy()
+        notes.append('The samples have no timestamps: the receive times are used.')
+    stamps = columns['time']
     near = np.abs(stamps - np.sort(stamps)[len(stamps) // 2]) < _FAR
-    if not np.all(near):
+    good = near & (np.abs(columns['stretch']) < _LARGEST_STRETCH)
+    far, odd = len(near) - int(np.count_nonzero(near)), int(np.count_nonzero(near & ~good))
+    if far:
         notes.append(
-            f'{np.count_nonzero(~near)} samples are stamped more than 30 days away from the '
-            'others: left out.')
-        left_out += int(np.count_nonzero(~near))
-    good = np.abs(stretch) < _LARGEST_STRETCH
-    if not np.all(good[near]):
+            f'{far} samples are stamped more than 30 days away from the others: left out.')
+    if odd:
         notes.append(
-            f'{np.count_nonzero(near & ~good)} samples are not finite numbers, or beyond '
-            f'{_LARGEST_STRETCH:g}: left out.')
-        left_out += int(np.count_nonzero(near & ~good))
-    if not np.any(near & good):
+            f'{odd} samples are not finite numbers, or beyond {_LARGEST_STRETCH:g}: left out.')
+    if not np.any(good):
         raise BadInputError(
             f'{where} holds no finite position: expected the stretch as a number')
-    stamps, logged, stretch, rate, flux_density = (
-        x[near & good] for x in (stamps, logged, stretch, rate, flux_density))
-    if np.any(np.diff(stamps) < -_CLOCK_JUMP):
+    columns = _rows(columns, good)
+    if np.any(np.diff(columns['time']) < -_CLOCK_JUMP):
         notes.append(
             'The timestamps of the samples jump back: the samples are sorted by timestamp. Was '
             'the clock reset in the run?')
-    order = np.argsort(stamps, kind='stable')
     # Of samples with one stamp the first counts, so that time increases.
-    order = order[np.append(True, np.diff(stamps[order]) > 0)]
-    stamps, logged, stretch, rate, flux_density = (
-        x[order] for x in (stamps, logged, stretch, rate, flux_density))
+    columns = _rows(columns, np.unique(columns['time'], return_index=True)[1])
+    stamps, stretch, rate = columns['time'], columns['stretch'], columns['rate']
     missing = ~(np.abs(rate) < _LARGEST_RATE)
     if np.any(missing):
         which = 'Stretch rates' if np.all(missing) \
@@ -174,5 +156,5 @@ def tidy(
         notes.append(f'{which} were not recorded: they are differences of the stretch.')
         slope = np.gradient(stretch, (stamps - stamps[0]) / NANOSECONDS) \
             if len(stamps) > 1 else np.zeros_like(stretch)
-        rate = np.where(missing, slope, rate)
-    return Samples(stamps, logged, stretch, rate, flux_density, left_out, tuple(notes))
+        columns['rate'] = np.where(missing, slope, rate)
+    return columns, notes, far + odd

@@ -101,18 +101,12 @@ def _acts(run: Run, levels: Sequence[Level]) -> list[_Act]:
 
 def _begin(run: Run, request: RecordedRequest, levels: Sequence[Level]) -> int:
     """Return from when on a request is carried out."""
+    later = [x for x in levels if x.sent >= request.sent]
     place = next((i for i, x in enumerate(run.plans) if x and x[0].sent >= request.sent), None)
-    begin = None
-    if place is not None:
-        begin = _under_way(run, place, [x for x in levels if x.sent >= request.sent])
-        if begin is None:
-            begin = _new(run, place)
-    if begin is None:
-        begin = next((x.stamp for x in levels if x.sent >= request.sent), None)
-    if begin is None:
-        begin = request.stamp or request.sent + round(
-            run.number('planner.lead_time') * NANOSECONDS)
-    return begin
+    by_plan = () if place is None else (_under_way(run, place, later), _new(run, place))
+    known = (*by_plan, *(x.stamp for x in later[:1]))
+    return next((x for x in known if x is not None), request.stamp or request.sent + round(
+        run.number('planner.lead_time') * NANOSECONDS))
 
 
 def _under_way(run: Run, place: int, levels: Sequence[Level]) -> int | None:

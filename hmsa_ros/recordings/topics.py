@@ -1,10 +1,11 @@
 """Which topics of a bag belong to which actuator: by the ends of their names."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+import contextlib
 import re
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.errors import BadInputError, BagError
+from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces import topics as declared
 
 if TYPE_CHECKING:
@@ -88,10 +89,11 @@ def unanswered(reader: 'BagReader') -> Iterator[str]:
         if found.type != TYPES[TRAJECTORY] or not f'/{topic}'.endswith(f'/{TRAJECTORY}'):
             continue
         status = f'{topic[:-len(TRAJECTORY)]}{STATUS}'
-        verdicts = {'': False, **{_value(x, 'request'): True for x in _messages(reader, status)}}
-        names = [x.header.frame_id for x in _messages(reader, topic)]
         # Whose requests have no names cannot be told.
-        count = sum(bool(x) and x not in verdicts for x in names)
+        answered = {'', *_texts(reader, status, lambda x: next(
+            (y.value for y in x.values if y.key == 'request'), ''))}
+        names = _texts(reader, topic, lambda x: x.header.frame_id)
+        count = sum(x not in answered for x in names)
         if count:
             why = 'no planner took it' if status in reader.topics else (
                 'the planner was not active, or its status was not recorded')
@@ -99,18 +101,12 @@ def unanswered(reader: 'BagReader') -> Iterator[str]:
                    f'{"have" if count > 1 else "has"} no verdict on {status}: {why}')
 
 
-def _messages(reader: 'BagReader', topic: str) -> Iterator[Any]:
-    """Yield what can be decoded of a topic."""
-    if topic not in reader.topics:
-        return
-    try:
+def _texts(reader: 'BagReader', topic: str, text_in: Callable[[Any], str]) -> list[str]:
+    """Return a text of each message of a topic, as far as they can be read."""
+    texts: list[str] = []
+    # Damage is noted elsewhere, and the bag brings the definition along.
+    with contextlib.suppress(HmsaError, AttributeError, TypeError):
         decode = reader.decoder(topic)
         for message in reader.messages([topic]):
-            yield decode(message.data)
-    except BagError:
-        # Damage is noted elsewhere.
-        return
-
-
-def _value(status: Any, key: str) -> str:
-    return next((x.value for x in status.values if x.key == key), '')
+            texts.append(text_in(decode(message.data)))
+    return texts

@@ -82,72 +82,57 @@ def verify_run(run: Run) -> Verification:
         raise BadInputError(
             f'{run.path} does not contain the parameters of the plant: name a parameter file '
             'with --params-file')
-    replay = _Replay(run)
-    replay.run()
+    window = _one_run(run)
+    begin = int(run.time[window.start])
+    notes: list[str] = []
+    creep = creep_of(run.parameters, run.joint)
+    simulation = _start(run, window.start, creep)
+    if creep and not _rests(simulation):
+        notes.append(
+            'the first sample is not one of rest: what the branches of viscoelastic.* hold by '
+            'then is not known and taken as nothing, expected differences that fade')
+    samples = zip(
+        np.maximum.accumulate(run.logged[window]).tolist(), itertools.repeat(_SAMPLE),
+        run.time[window].tolist(), run.stretch[window].tolist(), strict=False)
+    forces = ((sent, _FORCE, stamp, newton) for sent, stamp, newton in run.forces)
+    count = window.stop - window.start
+    late = refused = 0
+    left_out = run.left_out + len(run.time) - count
+    largest, where = 0.0, 0
+    for _, kind, stamp, value in heapq.merge(
+            samples, _commands(run, window.start), forces, key=lambda x: x[:2]):
+        if kind == _SAMPLE:
+            simulation.advance(stamp)
+            difference = abs(simulation.stretch - value)
+            if difference > largest or math.isnan(difference):
+                largest, where = difference, stamp - begin
+            continue
+        try:
+            if kind == _FORCE:
+                simulation.force(stamp, value)
+            elif simulation.command(stamp, value) > 0 and not run.applied:
+                late += 1
+        except BadInputError:
+            left_out += 1
+            refused += kind == _COMMAND
     unapplied = _unapplied(run)
-    left_out = run.left_out + replay.left_out
     return Verification(
-        run.topics.get(JOINT_STATES, str(run.path)), run.topics.get(COMMAND, ''), replay.samples,
-        len(run.commands) - replay.refused, replay.late, replay.largest,
-        replay.where / NANOSECONDS,
-        '; '.join([*replay.notes, *_notes(run, left_out, unapplied)]),
-        left_out, unapplied)
+        run.topics.get(JOINT_STATES, str(run.path)), run.topics.get(COMMAND, ''), count,
+        len(run.commands) - refused, late, largest, where / NANOSECONDS,
+        '; '.join([*notes, *_notes(run, left_out, unapplied)]), left_out, unapplied)
 
 
-class _Replay:
-    """An actuator that is driven anew by what was recorded of it."""
-
-    def __init__(self, run: Run) -> None:
-        self._run = run
-        self._window = _one_run(run)
-        self.samples = self.late = self.refused = 0
-        self.left_out = len(run.time) - (self._window.stop - self._window.start)
-        self.largest, self.where = 0.0, 0
-        self.notes: list[str] = []
-
-    def run(self) -> None:
-        """Integrate from the first sample to the last."""
-        run, first = self._run, self._window.start
-        creep = creep_of(run.parameters, run.joint)
-        simulation = _start(run, first, creep)
-        if creep and not _rests(simulation):
-            self.notes.append(
-                'the first sample is not one of rest: what the branches of viscoelastic.* hold by '
-                'then is not known and taken as nothing, expected differences that fade')
-        samples = zip(
-            np.maximum.accumulate(run.logged[self._window]).tolist(), itertools.repeat(_SAMPLE),
-            run.time[self._window].tolist(), run.stretch[self._window].tolist(), strict=False)
-        forces = ((sent, _FORCE, stamp, newton) for sent, stamp, newton in run.forces)
-        for _, kind, stamp, value in heapq.merge(
-                samples, self._commands(first), forces, key=lambda x: x[:2]):
-            if kind == _SAMPLE:
-                simulation.advance(stamp)
-                difference = abs(simulation.stretch - value)
-                if difference > self.largest or math.isnan(difference):
-                    self.largest, self.where = difference, stamp - int(run.time[first])
-                self.samples += 1
-                continue
-            try:
-                if kind == _FORCE:
-                    simulation.force(stamp, value)
-                elif simulation.command(stamp, value) > 0 and not run.applied:
-                    self.late += 1
-            except BadInputError:
-                self.left_out += 1
-                self.refused += kind == _COMMAND
-
-    def _commands(self, first: int) -> Iterator[tuple[int, int, int, float]]:
-        """Return what took effect, which is known from the begin; or what was commanded."""
-        run = self._run
-        begin = int(run.time[first])
-        if run.applied or not run.commands:
-            for level in run.levels:
-                if level.stamp > begin:
-                    yield int(run.logged[first]) - 1, _COMMAND, level.stamp, level.flux_density
-            return
-        for level in run.commands:
-            if level.sent > run.logged[first] or level.stamp > begin:
-                yield level.sent, _COMMAND, level.stamp, level.flux_density
+def _commands(run: Run, first: int) -> Iterator[tuple[int, int, int, float]]:
+    """Return what took effect, which is known from the begin; or what was commanded."""
+    begin, logged = int(run.time[first]), int(run.logged[first])
+    if run.applied or not run.commands:
+        for level in run.levels:
+            if level.stamp > begin:
+                yield logged - 1, _COMMAND, level.stamp, level.flux_density
+        return
+    for level in run.commands:
+        if level.sent > logged or level.stamp > begin:
+            yield level.sent, _COMMAND, level.stamp, level.flux_density
 
 
 def _one_run(run: Run) -> slice:
