@@ -123,9 +123,7 @@ def _collect(
             decoders[topic] = reader.decoder(topic)
         except BagError as error:
             raise BadInputError(f'{reader.path} cannot be evaluated: {error}') from error
-    collected = {
-        space: _Collected(decoders[next(iter(by_joint.values()))[roles.JOINT_STATES]])
-        for space, by_joint in spaces.items()}
+    collected = {space: _Collected() for space in spaces}
     begin, end = reader.start_time or 0, reader.end_time or 0
     for i, message in enumerate(reader.messages(list(found))):
         if i % _PROGRESS_MESSAGES == 0:
@@ -171,8 +169,8 @@ class _Trajectory:
 class _Collected:
     """What has been read of the actuators of one namespace so far; dictionaries are by joint."""
 
-    def __init__(self, decode: Callable[[bytes], Any]) -> None:
-        self.samples = SampleReader(decode)
+    def __init__(self) -> None:
+        self.samples = SampleReader()
         self.commands: defaultdict[str, list[Level]] = defaultdict(list)
         self.applied: defaultdict[str, list[Level]] = defaultdict(list)
         self.forces: defaultdict[str, list[tuple[int, int, float]]] = defaultdict(list)
@@ -194,10 +192,7 @@ class _Collected:
             decode: Callable[[bytes], Any]) -> None:
         """Take in a message, or count and note it if it is not what its topic is for."""
         try:
-            if role == roles.JOINT_STATES:
-                self.samples.take(message.log_time, message.data)
-            else:
-                self._take(role, joint, message, decode(message.data))
+            self._take(role, joint, message, decode(message.data))
         except (AttributeError, TypeError, ValueError, OverflowError, BagError) as error:
             # The bag brings the definition along, and may call anything by that name.
             reason = str(error) if isinstance(error, BagError) else (
@@ -209,7 +204,9 @@ class _Collected:
 
     def _take(self, role: str, joint: str, message: Message, content: Any) -> None:
         sent = message.log_time
-        if role in (roles.COMMAND, roles.APPLIED):
+        if role == roles.JOINT_STATES:
+            self.samples.take(sent, content)
+        elif role in (roles.COMMAND, roles.APPLIED):
             vector = content.magnetic_field
             if obeyed(vector.x, vector.y, vector.z):
                 stamp = nanoseconds_of(content.header.stamp)

@@ -2,7 +2,6 @@
 
 from array import array
 from collections import defaultdict
-from collections.abc import Callable
 from itertools import chain
 from typing import Any
 
@@ -19,7 +18,6 @@ _FAR = 30 * 86_400 * NANOSECONDS
 # What lies beyond is no motion of a block, and nothing could be drawn beside it; the rate in 1/s.
 _LARGEST_STRETCH, _LARGEST_RATE = 1e6, 1e12
 
-
 #: Of a run, by name, all of shape (n,): see `hmsa_ros.recordings.record.Run`.
 Columns = dict[str, Any]
 _COLUMNS = ('logged', 'time', 'stretch', 'rate', 'flux_density')
@@ -34,32 +32,24 @@ def nanoseconds_of(stamp: Any) -> int:
 _Shape = tuple[tuple[str, ...], int, int, int]
 
 
-class _Columns:
-    """Samples of one shape: log time and stamp, and the numbers, row after row."""
-
-    def __init__(self) -> None:
-        self.times = array('q')
-        self.numbers = array('d')
-
-
 class SampleReader:
     """Reads joint states, of all joints and shapes."""
 
-    def __init__(self, decode: Callable[[bytes], Any]) -> None:
-        self._decode = decode
-        self._columns: defaultdict[_Shape, _Columns] = defaultdict(_Columns)
+    def __init__(self) -> None:
+        # Log time and stamp, and the numbers, row after row.
+        self._columns: defaultdict[_Shape, tuple[array[int], array[float]]] = defaultdict(
+            lambda: (array('q'), array('d')))
 
-    def take(self, logged: int, data: bytes) -> None:
+    def take(self, logged: int, message: Any) -> None:
         """Take in a sample."""
-        message = self._decode(data)
         numbers = [tuple(x) for x in (message.position, message.velocity, message.effort)]
         position, velocity, effort = map(len, numbers)
         # Both are made first: what cannot be kept leaves no half of it behind.
         times = array('q', (logged, nanoseconds_of(message.header.stamp)))
         row = array('d', chain.from_iterable(numbers))
-        columns = self._columns[tuple(message.name), position, velocity, effort]
-        columns.times.extend(times)
-        columns.numbers.extend(row)
+        kept = self._columns[tuple(message.name), position, velocity, effort]
+        kept[0].extend(times)
+        kept[1].extend(row)
 
     @property
     def names(self) -> set[str]:
@@ -79,13 +69,13 @@ class SampleReader:
         joint = self._joint(where, joint, required)
         parts = []
         total = 0
-        for (names, *widths), columns in self._columns.items():
+        for (names, *widths), (stamps, rows) in self._columns.items():
             place = names.index(joint) if joint in names else 0
-            times = np.array(columns.times).reshape(-1, 2)
+            times = np.array(stamps).reshape(-1, 2)
             total += len(times)
             if names and joint not in names or place >= widths[0]:
                 continue
-            numbers = np.array(columns.numbers).reshape(len(times), -1)
+            numbers = np.array(rows).reshape(len(times), -1)
             picked = [
                 numbers[:, sum(widths[:i]) + place] if place < width
                 else np.full(len(times), np.nan) for i, width in enumerate(widths)]

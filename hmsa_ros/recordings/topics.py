@@ -1,6 +1,6 @@
 """Which topics of a bag belong to which actuator: by the ends of their names."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
 import re
 from typing import Any, TYPE_CHECKING
@@ -28,65 +28,60 @@ def topics_by_joint(reader: 'BagReader') -> dict[str, dict[str, dict[str, str]]]
 
     Raises `BadInputError` if there are no joint states, or commands in other namespaces only.
     """
-    names: dict[str, list[tuple[str, str]]] = {role: [] for role in TYPES}
+    found: dict[str, dict[str, str]] = {role: {} for role in TYPES}  # topics by namespace
     for topic in reader.topics.values():
         for role, kind in TYPES.items():
             node, _, last = role.rpartition('/')
             if topic.type != kind:
                 continue
             if f'/{topic.name}'.endswith(f'/{role}'):
-                names[role].append((topic.name[:-len(role)].rstrip('/'), topic.name))
+                found[role].setdefault(topic.name[:-len(role)].rstrip('/'), topic.name)
             elif role == SETPOINT and re.search(rf'/{node}/[^/]+/{last}$', f'/{topic.name}'):
                 # .../planner/JOINT/setpoint goes with .../JOINT/flux_density_command.
                 space, _, joint = topic.name[:-len(last) - 1].rpartition('/')
-                names[role].append((f'{space[:-len(node)]}{joint}', topic.name))
-    if not names[JOINT_STATES]:
+                found[role].setdefault(f'{space[:-len(node)]}{joint}', topic.name)
+    if not found[JOINT_STATES]:
         has = ', '.join(sorted(reader.topics)) or 'none: the bag is empty'
         raise BadInputError(
             f'{reader.path} has no topic .../{JOINT_STATES} ({TYPES[JOINT_STATES]}): expected a '
             f'bag of a run; its topics are {has}')
     spaces: dict[str, dict[str, dict[str, str]]] = {}
-    for space, name in names[JOINT_STATES]:
-        own = _topics_in(names, space, name)
-        if COMMAND in own or not names[COMMAND]:
+    for space in found[JOINT_STATES]:
+        own = _topics_in(found, space)
+        if COMMAND in own or not found[COMMAND]:
             spaces[space] = {'': own}
             continue
         by_joint = {
-            where[len(space) + 1:]: where for where, _ in names[COMMAND]
+            where[len(space) + 1:]: where for where in found[COMMAND]
             if where.startswith(f'{space}/') and '/' not in where[len(space) + 1:]}
         if by_joint:
             spaces[space] = {joint: {
-                **own, **{role: topic for role in _OF_A_JOINT
-                          for at, topic in names[role] if at == where}}
+                **own, **{x: found[x][where] for x in _OF_A_JOINT if where in found[x]}}
                 for joint, where in by_joint.items()}
     if not spaces:
         raise BadInputError(
             f'{reader.path} has joint states and commands in different namespaces: expected '
-            f'{COMMAND} beside one of '
-            + ', '.join(name for _, name in names[JOINT_STATES]))
+            f'{COMMAND} beside one of ' + ', '.join(found[JOINT_STATES].values()))
     return spaces
 
 
-def _topics_in(
-        names: Mapping[str, Sequence[tuple[str, str]]], space: str, states: str
-) -> dict[str, str]:
+def _topics_in(found: Mapping[str, Mapping[str, str]], space: str) -> dict[str, str]:
     """Return the topics of a namespace, by role."""
-    topics = {JOINT_STATES: states}
-    for role in TYPES:
-        same = [x for where, x in names[role] if where == space]
-        if same:
-            topics[role] = same[0]
-        elif len(names[role]) == 1 and len(names[JOINT_STATES]) == 1 and (
-                role not in _OF_A_JOINT or len(names[COMMAND]) == 1):
+    topics = {}
+    for role, topic_in in found.items():
+        if space in topic_in:
+            topics[role] = topic_in[space]
+        elif len(topic_in) == len(found[JOINT_STATES]) == 1 and (
+                role not in _OF_A_JOINT or len(found[COMMAND]) == 1):
             # Planner and plant in namespaces of their own, remapped to each other.
-            topics[role] = names[role][0][1]
+            topics[role], = topic_in.values()
     return topics
 
 
 def unanswered(reader: 'BagReader') -> Iterator[str]:
     """Yield a sentence for each topic of sequences that holds some without a verdict."""
-    for topic, found in sorted(reader.topics.items()):
-        if found.type != TYPES[TRAJECTORY] or not f'/{topic}'.endswith(f'/{TRAJECTORY}'):
+    for topic, known in sorted(reader.topics.items()):
+        if known.type != TYPES[TRAJECTORY] or not f'/{topic}'.endswith(f'/{TRAJECTORY}'):
             continue
         status = f'{topic[:-len(TRAJECTORY)]}{STATUS}'
         # Whose requests have no names cannot be told.
