@@ -235,3 +235,22 @@ def test_a_bag_is_not_complete_before_its_recorder_has_closed_it(tmp_path):
     assert not BagReader(tmp_path / 'bag').complete
     writer.close()
     assert BagReader(tmp_path / 'bag').complete
+
+
+def test_a_split_that_fails_loses_no_message(tmp_path, monkeypatch):
+    writer = BagWriter(tmp_path / 'bag')
+    splits = []
+
+    def split():
+        splits.append(split)
+        if len(splits) == 1:
+            raise OSError('no room')
+        return BagWriter.split(writer)
+
+    monkeypatch.setattr(writer, 'split', split)
+    recording = Recording(writer, Limits(max_size=1024))
+    recording.add_topic(TOPIC)
+    recording.put([message(i) for i in range(100)], 500)
+    recording.close()
+    assert len(splits) > 1
+    assert [item.sequence for item in BagReader(tmp_path / 'bag').messages()] == list(range(100))

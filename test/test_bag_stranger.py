@@ -283,6 +283,15 @@ def test_what_would_take_over_a_terminal_is_shown_as_codes(tmp_path, capsys):
     assert list(read_messages(tmp_path / 'new'))
 
 
+def test_requests_of_a_foreign_definition_are_passed_over(tmp_path, capsys):
+    path = tmp_path / 'bag.mcap'
+    path.write_bytes(BEGIN + schema(
+        1, 'trajectory_msgs/msg/JointTrajectory', b'float64 data\n') + channel(
+        1, 1, '/planner/joint_trajectory') + message() + END)
+    assert main(['bag', 'info', str(path)]) == 0
+    assert '/planner/joint_trajectory' in capsys.readouterr().out
+
+
 def test_a_type_name_imports_nothing_but_interfaces():
     from hmsa_ros.nodes.endpoints import interface_class
     assert interface_class(FLOAT).__name__ == 'Float64'
