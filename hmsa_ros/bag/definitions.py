@@ -5,7 +5,7 @@ A bag holds the text of each message type with all it depends on, so that a read
 ROS. The text is taken from the ``share`` folders of the environment, without rclpy.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 import contextlib
 from functools import cache
 import io
@@ -63,42 +63,33 @@ def _find(type_name: str, suffix: str) -> Path | None:
 
 
 def _dependencies(type_name: str, text: str) -> list[str]:
-    """Return the types that a definition uses, as it names them, sorted."""
+    """Return the types that a definition uses, as pkg/Name, sorted."""
     package, _ = _split(type_name)
     names = set()
     for line in text.splitlines():
         match = _FIELD.match(line.split('#', 1)[0].strip())
         if match and match[1] not in _BUILTIN:
-            name = match[1]
-            if name == 'Header':
-                name = 'std_msgs/Header'
-            names.add(name if '/' in name else f'{package}/{name}')
+            name = 'std_msgs/Header' if match[1] == 'Header' else match[1]
+            names.add('/'.join(_split(name if '/' in name else f'{package}/{name}')))
     return sorted(names)
 
 
 @cache
 def message_definition(type_name: str) -> tuple[str, str]:
     """Return ``'ros2msg'`` and the text of a type and all it needs, or raise `BagError`."""
-    seen = {'/'.join(_split(type_name))}
-
-    def sections(name: str) -> Iterator[str]:
+    sections: list[str] = []
+    names = ['/'.join(_split(type_name))]
+    for name in names:
         path = _find(name, '.msg')
         if path is None:
             raise BagError(
-                f'no definition of message type {name} found under '
+                f'no definition of message type {name if sections else type_name} found under '
                 + ', '.join(map(str, share_folders()))
                 + ': expected an installed interface package; source its workspace')
         text = path.read_text(encoding='utf-8')
-        yield text
-        for dependency in _dependencies(name, text):
-            key = '/'.join(_split(dependency))
-            if key not in seen:
-                seen.add(key)
-                inner = sections(dependency)
-                yield f'{_SEPARATOR}{dependency}\n{next(inner)}'
-                yield from inner
-
-    return 'ros2msg', ''.join(sections(type_name))
+        sections.append(f'{_SEPARATOR}{name}\n{text}' if sections else text)
+        names += [x for x in _dependencies(name, text) if x not in names]
+    return 'ros2msg', ''.join(sections)
 
 
 @cache
