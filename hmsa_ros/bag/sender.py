@@ -19,12 +19,11 @@ READ_AHEAD_BYTES = 64 * 2**20
 
 
 class ReadAhead:
-    """Reads so many messages ahead in a thread; ``read`` learns whether nobody wants more."""
+    """Reads so many messages ahead in a thread; ``read`` is asked for them with ``cancelled``."""
 
-    def __init__(
-            self, read: Callable[[Callable[[], bool]], Iterator[Message]], size: int) -> None:
+    def __init__(self, read: Callable[..., Iterator[Message]], size: int) -> None:
         self._ended = False
-        self._messages = read(lambda: self._ended)
+        self._messages = read(cancelled=lambda: self._ended)
         self._most = -(-size // _BATCHES)
         # One thread: the batches come in order.
         self._thread = ThreadPoolExecutor(1, 'read ahead')
@@ -99,7 +98,7 @@ class Sender:
         self._latched = latched
         self._transport = transport
         self._excerpt = excerpt
-        self._clock = clock
+        self._clock = clock or ClockOut(lambda when: None)
         self.count = 0
 
     def run(self) -> None:
@@ -115,7 +114,9 @@ class Sender:
     def _play(self, start: int) -> bool:
         """Play from a time on; return whether the end was reached."""
         while True:
-            source = ReadAhead(partial(self._read, start), self._excerpt.read_ahead)
+            source = ReadAhead(partial(
+                self._reader.messages, self._out.keys(), start=start, end=self._excerpt.end + 1),
+                self._excerpt.read_ahead)
             try:
                 self._send_latched(start)
                 # Time runs from when there is something to send.
@@ -130,39 +131,32 @@ class Sender:
             finally:
                 source.stop()
 
-    def _read(self, start: int, cancelled: Callable[[], bool]) -> Iterator[Message]:
-        """Return the messages to send from a time on."""
-        return self._reader.messages(
-            self._out.keys(), start=start, end=self._excerpt.end + 1, cancelled=cancelled)
-
     def _send_all(self, messages: Iterable[Message], start: int) -> None:
         """Send messages, each at its time."""
         tick, clock = start, self._clock
-        ticking = clock is not None and clock.frequency > 0.0
-        if clock is not None and ticking:
+        if clock.frequency > 0.0:
             # Before the first message: in a loop, time jumps back with this.
             clock.send(start)
         for message in messages:
             tick = self._tick_until(message.log_time, tick, last=False)
-            if clock is not None and clock.on_publish:
+            if clock.on_publish:
                 clock.send(message.log_time)
             self._out[message.topic](message.data)
             self.count += 1
             self._transport.sent(message.log_time)
         self._tick_until(self._excerpt.end, tick, last=True)
-        if clock is not None and ticking:
+        if clock.frequency > 0.0:
             clock.send(self._excerpt.end)
 
     def _tick_until(self, when: int, tick: int, *, last: bool) -> int:
         """Wait until a time of the bag, with the clock's ticks before it; return the next tick."""
         clock = self._clock
-        if clock is not None and clock.frequency > 0.0:
-            while tick <= when:
-                self._wait(tick, message=False)
-                if self._transport.stepping and not last:
-                    break
-                clock.send(tick)
-                tick += max(1, round(1e9 * self._transport.rate / clock.frequency))
+        while clock.frequency > 0.0 and tick <= when:
+            self._wait(tick, message=False)
+            if self._transport.stepping and not last:
+                break
+            clock.send(tick)
+            tick += max(1, round(1e9 * self._transport.rate / clock.frequency))
         self._wait(when, message=not last)
         return tick
 
@@ -170,9 +164,8 @@ class Sender:
         """Wait until a time of the bag."""
         while (standing_at := self._transport.wait(
                 when, message=message, timeout=CLOCK_WHILE_WAITING_SECONDS)) is not None:
-            if self._clock is not None:
-                # Time stands still, but who comes now is to know it.
-                self._clock.send(standing_at)
+            # Time stands still, but who comes now is to know it.
+            self._clock.send(standing_at)
 
     def _send_latched(self, start: int) -> None:
         """Send what a subscriber of the latched topics would have got at a time."""
