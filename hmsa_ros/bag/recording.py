@@ -266,19 +266,19 @@ class Recording:
                     max(0.0, next_flush - time.monotonic()))
                 closing = self._closing
             try:
-                if self._error:
-                    self._retry(now=False)
+                if self._error and time.monotonic() >= self._next_retry:
+                    self._retry()
                 if not self._error:
                     self._take_items()
-                if time.monotonic() >= next_flush and not self._error:
-                    self._writer.flush()
+                    if time.monotonic() >= next_flush:
+                        self._writer.flush()
             except OSError as error:
                 self._fail(error)
             if time.monotonic() >= next_flush:
                 next_flush = time.monotonic() + period
             if closing and self._error:
                 # One last try; it may be the file alone that cannot grow any more.
-                self._retry(now=True)
+                self._retry()
             if closing and (self._error or self._is_late() or not self._items):
                 self._give_up()
                 return
@@ -342,27 +342,25 @@ class Recording:
         return time.monotonic() > self._deadline
 
     def _fail(self, error: OSError) -> None:
-        """Take note that writing is not possible."""
+        """Take note that writing is not possible; it is tried again later."""
+        known = self._error
         self._error = f'cannot write to {self._writer.folder}: {_reason(error)}'
-        self._report(
-            f'{self._error}; recording resumes in a new file when possible, up to '
-            f'{self._limits.cache_size} bytes are buffered until then', True)
+        if not known:
+            self._report(
+                f'{self._error}; recording resumes in a new file when possible, up to '
+                f'{self._limits.cache_size} bytes are buffered until then', True)
         self._writer.abandon()
         self._next_retry = time.monotonic() + RETRY_SECONDS
 
-    def _retry(self, *, now: bool) -> None:
+    def _retry(self) -> None:
         """Try to go on in a new file."""
-        if not now and time.monotonic() < self._next_retry:
-            return
-        self._next_retry = time.monotonic() + RETRY_SECONDS
         try:
             name = self._writer.reopen()
         except OSError as error:
-            self._error = f'cannot write to {self._writer.folder}: {_reason(error)}'
-            self._writer.abandon()
-            return
-        self._error = ''
-        self._report(f'recording continues in {name}', False)
+            self._fail(error)
+        else:
+            self._error = ''
+            self._report(f'recording continues in {name}', False)
 
     def _give_up(self) -> None:
         """Count what is left in the queue as lost, and answer who waits."""
