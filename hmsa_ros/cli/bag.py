@@ -14,7 +14,7 @@ import sys
 from typing import Any
 
 from hmsa_ros.bag.limits import CHUNK_SIZE, MEBIBYTE
-from hmsa_ros.cli.options import add_command, add_options, JSON
+from hmsa_ros.cli.options import add_command, JSON
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError, printable
 from hmsa_ros.files import json_text
@@ -41,10 +41,10 @@ def add_parser(subparsers: Any) -> None:
     for function, options in (
             (_info, [('--parameters', 'also print the parameters of the recorded nodes'), JSON]),
             (_recover, [out]), (_verify, [tolerance, params_file, JSON])):
-        action = add_command(actions, function.__name__.strip('_'), function.__doc__)
-        action.add_argument('bag', metavar='BAG', help='folder of a bag, or an .mcap file')
-        add_options(action, *options, max_chunk)
-        action.set_defaults(action=function)
+        add_command(
+            actions, function.__name__.strip('_'), function.__doc__,
+            ('bag', 'BAG', str, 'folder of a bag, or an .mcap file'), *options, max_chunk,
+        ).set_defaults(action=function)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.check_driver import setting
-from hmsa_ros.cli.options import add_command, add_options, JSON, Row
-from hmsa_ros.cli.pictures import add_picture_options, paper_of
+from hmsa_ros.cli.options import add_command, JSON, Row
+from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.quantities import number_of
 from hmsa_ros.errors import BadInputError, HmsaError
@@ -41,20 +41,22 @@ _SETTLED = 0.01
 _SET: Row = ('--set', 'KEY=VALUE', str, 'a setting of the hardware, as hardware.KEY of hmsa '
              'driver; may be given several times', {'action': 'append', 'default': []})
 _LIMIT: Row = ('--limit', 'T', float, 'maximum flux density (default 0.01 T)', {'default': 0.01})
+_SOURCE: tuple[Row, ...] = (
+    ('source', 'MODULE:NAME', str,
+     'hardware as in the parameter hardware of hmsa driver, with a sensor', {'nargs': '?'}),
+    ('--simulate', 'calibrate a simulated bench with delays and noise'), _SET, _LIMIT)
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the command and its kinds."""
     parser = add_command(subparsers, __name__, __doc__)
     kinds = parser.add_subparsers(metavar='PART', required=True)
-    coil = _add_kind(kinds, 'coil', _coil)
-    coil.add_argument(
-        'source', metavar='MODULE:NAME|CSV',
-        help='hardware as in the parameter hardware of hmsa driver, with a coil constant that is '
-             'roughly right; or readings with the columns current (A) and flux_density (T), in '
-             'the order taken')
-    add_options(
-        coil,
+    _add_kind(
+        kinds, _coil,
+        ('source', 'MODULE:NAME|CSV', str,
+         'hardware as in the parameter hardware of hmsa driver, with a coil constant that is '
+         'roughly right; or readings with the columns current (A) and flux_density (T), in the '
+         'order taken'),
         _SET, _LIMIT,
         ('--steps', 'N', int, 'levels on each quarter of the loop (default 5)', {'default': 5}),
         ('--settle', 'S', float, 'time at each level before it is read (default 1 s)',
@@ -67,12 +69,9 @@ def add_parser(subparsers: Any) -> None:
          'demagnetise the core at the end'),
         ('--out', 'YAML', Path,
          'parameter file of the driver to write; a table is written beside it as CSV'),
-        JSON)
-    add_picture_options(coil, named='readings and model to draw')
-    latency = _add_kind(kinds, 'latency', _latency)
-    _add_source(latency)
-    add_options(
-        latency,
+        JSON, *picture_options('readings and model to draw'))
+    _add_kind(
+        kinds, _latency, *_SOURCE,
         ('--steps', 'N', int, 'number of levels (default 24)', {'default': 24}),
         ('--params-file', 'YAML', Path,
          'parameter file with the sizes of the actuator, and rough values (default: none)'),
@@ -81,12 +80,9 @@ def add_parser(subparsers: Any) -> None:
          'returns a flux density in T, or a list of (flux density, NaN, time in ns)'),
         ('--lag', 'S', float, 'known time constant of the coil, where there is no probe'),
         ('--out', 'YAML', Path, 'parameter file of driver and planner to write'),
-        JSON)
-    add_picture_options(latency, named='response of the field to draw, or of the stretch')
-    static = _add_kind(kinds, 'static', _static)
-    _add_source(static)
-    add_options(
-        static,
+        JSON, *picture_options('response of the field to draw, or of the stretch'))
+    _add_kind(
+        kinds, _static, *_SOURCE,
         ('--steps', 'N', int, 'levels on each quarter of the staircase (default 5)',
          {'default': 5}),
         ('--settle', 'S', float,
@@ -96,22 +92,12 @@ def add_parser(subparsers: Any) -> None:
          'length of the actuator in the unit of its rest length'),
         ('--out', 'YAML', Path,
          'parameter file of driver and planner to write; the table is written beside it as CSV'),
-        JSON)
-    add_picture_options(static, named='staircase to draw')
+        JSON, *picture_options('staircase to draw'))
 
 
-def _add_kind(kinds: Any, name: str, run: 'Callable[[argparse.Namespace], int]') -> Any:
-    parser = add_command(kinds, name, run.__doc__)
+def _add_kind(kinds: Any, run: 'Callable[[argparse.Namespace], int]', *rows: Row) -> None:
+    parser = add_command(kinds, run.__name__.strip('_'), run.__doc__, *rows)
     parser.set_defaults(run=run, parser=parser)
-    return parser
-
-
-def _add_source(parser: Any) -> None:
-    parser.add_argument(
-        'source', nargs='?', metavar='MODULE:NAME',
-        help='hardware as in the parameter hardware of hmsa driver, with a sensor')
-    add_options(
-        parser, ('--simulate', 'calibrate a simulated bench with delays and noise'), _SET, _LIMIT)
 
 
 def _checked(arguments: argparse.Namespace) -> str:

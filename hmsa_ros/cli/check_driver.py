@@ -13,7 +13,7 @@ from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, add_options, JSON
+from hmsa_ros.cli.options import add_command, JSON
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import check_targets, json_text, write_text
@@ -24,12 +24,10 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    parser.add_argument(
-        'hardware', metavar='MODULE:NAME',
-        help='as in the parameter hardware of hmsa driver, such as serial_board')
-    add_options(
-        parser,
+    add_command(
+        subparsers, __name__, __doc__,
+        ('hardware', 'MODULE:NAME', str,
+         'as in the parameter hardware of hmsa driver, such as serial_board'),
         ('--joint', 'NAME', str, 'name of the joint (default actuator)', {'default': 'actuator'}),
         ('--set', 'KEY=VALUE', str, 'a setting of the class, as hardware.KEY of hmsa driver; may '
          'be given several times', {'action': 'append', 'default': []}),

@@ -14,8 +14,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_bags, add_command, add_options, JSON
-from hmsa_ros.cli.pictures import add_picture_options, paper_of
+from hmsa_ros.cli.options import add_command, bags, JSON
+from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
@@ -26,13 +26,11 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    add_bags(parser, 'runs')
-    add_options(
-        parser,
+    add_command(
+        subparsers, __name__, __doc__,
+        bags('runs'),
         ('--joint', 'NAME', str, 'joint to compare, if the bags have several', {'default': ''}),
-        JSON)
-    add_picture_options(parser, named='pictures of all runs to write')
+        JSON, *picture_options('pictures of all runs to write'))
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -52,8 +52,9 @@ class Command:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    parser.add_argument('shell', choices=('bash', 'zsh', 'fish'), help='the shell')
+    add_command(
+        subparsers, __name__, __doc__,
+        ('shell', None, str, 'the shell', {'choices': ('bash', 'zsh', 'fish')}))
 
 
 def run(arguments: argparse.Namespace) -> int:

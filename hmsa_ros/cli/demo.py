@@ -14,7 +14,7 @@ import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, add_options
+from hmsa_ros.cli.options import add_command
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.ending import ENDING
 from hmsa_ros.files import json_text
@@ -26,9 +26,8 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    add_options(
-        parser,
+    add_command(
+        subparsers, __name__, __doc__,
         ('--out', 'DIR', Path, 'output folder (default hmsa_demo/ plus date and time)'),
         ('--json', 'print the result as JSON'))
 

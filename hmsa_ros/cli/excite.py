@@ -13,7 +13,7 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, add_options, JSON
+from hmsa_ros.cli.options import add_command, JSON
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.files import json_text, write_text
 
@@ -24,9 +24,8 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    add_options(
-        parser,
+    add_command(
+        subparsers, __name__, __doc__,
         ('--params-file', 'YAML', Path,
          'parameter file with estimates of the block, flux_density_min, flux_density_max and '
          'slew_limit (default: the defaults of the nodes)'),

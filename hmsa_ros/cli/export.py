@@ -12,17 +12,15 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from hmsa_ros.cli.options import add_command, add_options
+from hmsa_ros.cli.options import add_command
 from hmsa_ros.cli.progress import progress
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    parser.add_argument(
-        'run_path', type=Path, metavar='RUN', help='folder of a bag, or an .mcap file')
-    add_options(
-        parser,
+    add_command(
+        subparsers, __name__, __doc__,
+        ('run_path', 'RUN', Path, 'folder of a bag, or an .mcap file'),
         ('--out', 'FILE', Path,
          'file to write, ending in .csv, .parquet or .mat; an existing file is replaced',
          {'required': True}),

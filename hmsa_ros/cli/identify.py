@@ -14,7 +14,7 @@ from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, add_options, JSON
+from hmsa_ros.cli.options import add_command, JSON
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.quantities import number_of
 from hmsa_ros.errors import BadInputError
@@ -27,11 +27,9 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    parser.add_argument(
-        'recording', type=Path, metavar='RUN', help='a bag, or a CSV of samples')
-    add_options(
-        parser,
+    add_command(
+        subparsers, __name__, __doc__,
+        ('recording', 'RUN', Path, 'a bag, or a CSV of samples'),
         ('--commands', 'CSV', Path,
          'CSV of time, flux_density: the level in force from that time on'),
         ('--params-file', 'YAML', Path,

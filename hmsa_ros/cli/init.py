@@ -18,7 +18,7 @@ from pathlib import Path
 import sys
 from typing import Any, cast, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, add_options, JSON, law_of, LAW_OPTION, Row
+from hmsa_ros.cli.options import add_command, JSON, law_of, LAW_OPTION, Row
 from hmsa_ros.cli.quantities import (
     BY_KEY,
     DAMPING,
@@ -62,9 +62,8 @@ _HARDLY = 0.01
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    add_options(
-        parser,
+    add_command(
+        subparsers, __name__, __doc__,
         ('--beam',
          'a beam that is clamped at one end, magnetised along its length, in a field across it; '
          'its setpoints are deflections of the tip over the length'),

@@ -14,17 +14,16 @@ import math
 from pathlib import Path
 from typing import Any
 
-from hmsa_ros.cli.options import add_bags, add_command, add_options, JSON
+from hmsa_ros.cli.options import add_command, bags, JSON
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.files import check_targets, json_text, write_text
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    add_bags(parser, 'runs')
-    add_options(
-        parser,
+    add_command(
+        subparsers, __name__, __doc__,
+        bags('runs'),
         ('--joint', 'NAME', str, 'joint to learn for, if the bags have several', {'default': ''}),
         ('--out', 'YAML', Path, 'file for the next levels'),
         JSON)

@@ -7,12 +7,17 @@ from typing import Any
 
 from hmsa_ros.errors import BadInputError, excerpt
 
-#: Name, metavar, type, help and, where there are any, other settings of argparse; of a flag name
-#: and help.
+#: Names, metavar, type, help and, where there are any, other settings of argparse; of a flag name
+#: and help, of a group its title and a list of its rows.
 Row = tuple[Any, ...]
 
 JSON: Row = ('--json', 'print one JSON object')
 NAMESPACE: Row = ('--namespace', 'NS', str, 'namespace of the planner', {'default': ''})
+JOINTS: Row = (
+    '--joint', 'NAMES', str, 'joint, or several separated by commas (default actuator)',
+    {'default': 'actuator'})
+EXAMPLE: Row = (
+    '--params-file', 'YAML', Path, 'parameter file of the actuator (default: the example block)')
 TIMEOUT: Row = (
     '--timeout', 'S', float, 'seconds to wait for a reply (default 10 s)', {'default': 10.0})
 #: Dimensionless parameters of a block: option, metavar and meaning.
@@ -80,9 +85,9 @@ def timeout_of(arguments: argparse.Namespace) -> float:
     return timeout
 
 
-def add_command(subparsers: Any, name: str, text: str | None) -> Any:
+def add_command(subparsers: Any, name: str, text: str | None, *rows: Row) -> Any:
     """
-    Add a command that a docstring describes, and return its parser.
+    Add a command with arguments that a docstring describes, and return its parser.
 
     The first line of the docstring is the help among other commands, and its last paragraph, which
     begins with ``example:``, is left as it is written. The end of a module's name will do as name.
@@ -90,23 +95,26 @@ def add_command(subparsers: Any, name: str, text: str | None) -> Any:
     what, _, rest = inspect.cleandoc(text or '').partition('\n\n')
     description, _, example = rest.rpartition('example: ')
     what = what.rstrip('.')
-    return subparsers.add_parser(
+    parser = subparsers.add_parser(
         name.rpartition('.')[2].replace('_', '-'), help=what[:1].lower() + what[1:],
         description=description or f'{what}.', epilog=f'example: {example}')
+    add_options(parser, *rows)
+    return parser
 
 
-def add_bags(parser: Any, name: str) -> None:
-    """Add one or more bags as arguments of a name."""
-    parser.add_argument(
-        name, nargs='+', type=Path, metavar='BAG', help='folder of a bag, or an .mcap file')
+def bags(name: str) -> Row:
+    """Return the arguments that are one or more bags."""
+    return name, 'BAG', Path, 'folder of a bag, or an .mcap file', {'nargs': '+'}
 
 
 def add_options(parser: Any, *rows: Row) -> None:
-    """Add options in the order of the help."""
-    for name, *texts in rows:
-        if len(texts) == 1:
-            parser.add_argument(name, action='store_true', help=texts[0])
+    """Add arguments in the order of the help."""
+    for names, *texts in rows:
+        if isinstance(texts[0], list):
+            add_options(parser.add_argument_group(names), *texts[0])
+        elif len(texts) == 1:
+            parser.add_argument(names, action='store_true', help=texts[0])
         else:
             metavar, kind, text, *settings = texts
             parser.add_argument(
-                name, metavar=metavar, type=kind, help=text, **(settings[0] if settings else {}))
+                *names.split(), metavar=metavar, type=kind, help=text, **dict(*settings))

@@ -13,7 +13,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from hmsa_ros.cli.options import add_command, add_options, NAMESPACE
+from hmsa_ros.cli.options import add_command, JOINTS, NAMESPACE
 from hmsa_ros.cli.setpoints import setpoint_of_joints
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
@@ -21,13 +21,11 @@ from hmsa_ros.errors import BadInputError
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    add_options(
-        parser,
+    parser = add_command(
+        subparsers, __name__, __doc__,
         ('--port', 'N', int, 'port on 127.0.0.1 (default 0: a free one)', {'default': 0}),
         NAMESPACE,
-        ('--joint', 'NAMES', str, 'joint, or several separated by commas (default actuator)',
-         {'default': 'actuator'}),
+        JOINTS,
         ('--span', 'S', float, 'time shown in the charts (default 10 s)', {'default': 10.0}),
         ('--out', 'DIR', Path, 'folder of the recordings (default hmsa_panel)',
          {'default': Path('hmsa_panel')}))

@@ -9,7 +9,7 @@ example: hmsa param set planner shaper robust
 import argparse
 from typing import Any
 
-from hmsa_ros.cli.options import add_command, add_options, JSON, NAMESPACE, TIMEOUT, timeout_of
+from hmsa_ros.cli.options import add_command, JSON, NAMESPACE, TIMEOUT, timeout_of
 from hmsa_ros.ending import ENDING
 from hmsa_ros.files import json_text, yaml_text
 
@@ -18,16 +18,16 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = add_command(subparsers, __name__, __doc__)
     actions = parser.add_subparsers(metavar='ACTION', required=True)
-    get = add_command(actions, 'get', _get.__doc__)
-    set_ = add_command(actions, 'set', _set.__doc__)
-    for action in (get, set_):
-        action.add_argument('node', metavar='NODE', help='name of the node, such as planner')
-    get.add_argument('names', nargs='*', metavar='NAME', help='parameters (default all)')
-    set_.add_argument('name', metavar='NAME', help='the parameter')
-    set_.add_argument('value', metavar='VALUE', help='the value, as in YAML: 0.5, robust, [1, 2]')
-    for action, function in ((get, _get), (set_, _set)):
-        add_options(action, NAMESPACE, TIMEOUT, *([JSON] if action is get else []))
-        action.set_defaults(action=function)
+    node = ('node', 'NODE', str, 'name of the node, such as planner')
+    add_command(
+        actions, 'get', _get.__doc__,
+        node, ('names', 'NAME', str, 'parameters (default all)', {'nargs': '*'}),
+        NAMESPACE, TIMEOUT, JSON).set_defaults(action=_get)
+    add_command(
+        actions, 'set', _set.__doc__,
+        node, ('name', 'NAME', str, 'the parameter'),
+        ('value', 'VALUE', str, 'the value, as in YAML: 0.5, robust, [1, 2]'),
+        NAMESPACE, TIMEOUT).set_defaults(action=_set)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -2,43 +2,33 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-from hmsa_ros.cli.options import add_options
+from hmsa_ros.cli.options import Row
 from hmsa_ros.report.paper import kind_of, KINDS, kinds_in, Paper
 
 _ENDS = f'{", ".join(f".{x}" for x in KINDS[:-1])} or .{KINDS[-1]}'
 
 
-def add_picture_options(
-        parser: Any, *, named: str = '', folder: bool = False, data: bool = True) -> None:
+def picture_options(
+        named: str = '', *, formats: str = '', data: bool = True) -> tuple[Row, ...]:
     """
-    Add the options of pictures.
+    Return the options of pictures.
 
     Parameters
     ----------
-    parser : argparse.ArgumentParser
-        Of a command.
     named : str
         What ``--picture`` is said to draw; without it there is no such option.
-    folder : bool
-        Whether the pictures go into a folder, so that ``--format`` names their formats.
+    formats : str
+        Formats by default of pictures that go into a folder; without them there is no option.
     data : bool
         Whether there is ``--data``; a command that always writes it needs none.
 
     """
-    if named:
-        add_options(parser, (
-            '--picture', 'FILE', Path, f'{named}; each name ends in {_ENDS}',
-            {'nargs': '+', 'default': []}))
-    group = parser.add_argument_group('pictures')
-    if folder:
-        add_options(group, (
-            '--format', 'NAME,...', str,
-            f'formats, of {", ".join(KINDS)} (default %(default)s)', {'default': 'png,pdf'}))
     standard = Paper()
-    add_options(
-        group,
+    rows: list[Row] = [
+        ('--format', 'NAME,...', str, f'formats, of {", ".join(KINDS)} (default %(default)s)',
+         {'default': formats})] if formats else []
+    rows += [
         ('--width', 'MM', float,
          'width in mm: 85 for a column, 120, or 183 for two (default %(default)g); panels that '
          'do not fit side by side are stacked',
@@ -46,9 +36,13 @@ def add_picture_options(
         ('--font-size', 'PT', float, 'font size in pt (default %(default)g)',
          {'default': standard.letters}),
         ('--dpi', 'N', float, 'dots per inch of PNG (default %(default)g)',
-         {'default': standard.dpi}),
-        *([('--data', 'also write the plotted values as CSV, under the same name')]
-          if data else []))
+         {'default': standard.dpi})]
+    if data:
+        rows.append(('--data', 'also write the plotted values as CSV, under the same name'))
+    files: tuple[Row, ...] = (
+        ('--picture', 'FILE', Path, f'{named}; each name ends in {_ENDS}',
+         {'nargs': '+', 'default': []}),) if named else ()
+    return *files, ('pictures', rows)
 
 
 def paper_of(arguments: argparse.Namespace) -> Paper:

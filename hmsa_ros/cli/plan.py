@@ -13,7 +13,7 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, add_options, law_of, LAW_OPTION, MATERIAL, of_unit
+from hmsa_ros.cli.options import add_command, law_of, LAW_OPTION, MATERIAL, of_unit
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import setpoint
 from hmsa_ros.errors import BadInputError
@@ -39,12 +39,11 @@ _WINDING = ('inductance', 'resistance', 'tesla_per_ampere')
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    parser.add_argument(
-        'setpoints', nargs='*', type=setpoint, metavar='STRETCH:DURATION',
-        help='target stretch, or deflection of a beam, and duration (move plus hold)')
-    add_options(
-        parser,
+    add_command(
+        subparsers, __name__, __doc__,
+        ('setpoints', 'STRETCH:DURATION', setpoint,
+         'target stretch, or deflection of a beam, and duration (move plus hold)',
+         {'nargs': '*'}),
         ('--path', 'CSV', Path,
          'instead of setpoints, with --params-file: a path to follow from rest to rest, with the '
          'columns time (s) and stretch; the smoothest curve through them'),

@@ -12,8 +12,8 @@ import argparse
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_bags, add_command, add_options
-from hmsa_ros.cli.pictures import add_picture_options, paper_of
+from hmsa_ros.cli.options import add_command, bags
+from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import check_targets, json_text, write_text
@@ -24,32 +24,29 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    add_bags(parser, 'bags')
-    add_options(
-        parser,
+    add_command(
+        subparsers, __name__, __doc__,
+        bags('bags'),
         ('--out', 'FILE', Path,
          'page to write; an existing file is replaced (default: NAME_report.html in this folder, '
          'NAME being the first bag)'),
-        ('--json', 'print the results of each setpoint, and the files, as JSON'))
-    parser.add_argument(
-        '--params-file', '--params', dest='params', type=Path, metavar='YAML',
-        help='parameter file (YAML) of the actuator (default: the parameters in the bag)')
-    parser.add_argument(
-        '--joint', default='', metavar='NAME',
-        help='joint to show, or several separated by commas (default: those with commands)')
-    add_picture_options(parser, named='figures to write in addition')
+        ('--json', 'print the results of each setpoint, and the files, as JSON'),
+        ('--params-file --params', 'YAML', Path,
+         'parameter file (YAML) of the actuator (default: the parameters in the bag)'),
+        ('--joint', 'NAME', str,
+         'joint to show, or several separated by commas (default: those with commands)',
+         {'default': ''}),
+        *picture_options('figures to write in addition'))
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Read, evaluate and write."""
-    bags: list[Path] = arguments.bags
-    out = arguments.out or Path(f'{bags[0].resolve().stem}_report.html')
+    out = arguments.out or Path(f'{arguments.bags[0].resolve().stem}_report.html')
     pictures: list[Path] = arguments.picture
     paper = paper_of(arguments)
     targets = [out, *pictures, *(
         dict.fromkeys(x.with_suffix('.csv') for x in pictures) if paper.data else ())]
-    _check_targets(targets, bags)
+    _check_targets(targets, arguments.bags)
 
     from hmsa_ros.recordings.bags import read_runs
     from hmsa_ros.recordings.parameters import read_parameter_file
@@ -57,10 +54,11 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.report.page import page
 
     joints = [x for x in arguments.joint.split(',') if x]
-    parameters = None if arguments.params is None else read_parameter_file(arguments.params)
+    parameters = None if arguments.params_file is None else read_parameter_file(
+        arguments.params_file)
     with progress() as update:
         runs: list[Run] = []
-        for bag in bags:
+        for bag in arguments.bags:
             runs += read_runs(
                 bag, parameters=parameters, joints=joints, progress=update)
         update('evaluating', None)

@@ -18,9 +18,9 @@ import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, add_options, NAMESPACE
+from hmsa_ros.cli.options import add_command, JOINTS, NAMESPACE
 from hmsa_ros.cli.progress import progress
-from hmsa_ros.cli.setpoints import add_sequence, levels_of, path_of
+from hmsa_ros.cli.setpoints import levels_of, path_of, SEQUENCE
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
@@ -41,10 +41,9 @@ _MOST_REPEATS = 10_000
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    add_sequence(parser)
-    add_options(
-        parser,
+    add_command(
+        subparsers, __name__, __doc__,
+        *SEQUENCE,
         ('--simulate',
          'start a planner and a plant for this run, in simulated time'),
         ('--params-file', 'YAML', Path,
@@ -64,8 +63,7 @@ def add_parser(subparsers: Any) -> None:
         ('--out', 'DIR', Path, 'folder for the output (default hmsa_run/ plus date and time)'),
         ('--json', 'print the result as JSON'),
         NAMESPACE,
-        ('--joint', 'NAMES', str, 'joint, or several separated by commas (default actuator)',
-         {'default': 'actuator'}))
+        JOINTS)
 
 
 def run(arguments: argparse.Namespace) -> int:

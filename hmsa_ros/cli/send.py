@@ -11,25 +11,23 @@ import argparse
 import sys
 from typing import Any
 
-from hmsa_ros.cli.options import add_command, add_options, NAMESPACE, timeout_of
-from hmsa_ros.cli.setpoints import add_sequence, levels_of, path_of
+from hmsa_ros.cli.options import add_command, JOINTS, NAMESPACE, timeout_of
+from hmsa_ros.cli.setpoints import levels_of, path_of, SEQUENCE
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import HmsaError
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    add_sequence(parser)
-    add_options(
-        parser,
+    add_command(
+        subparsers, __name__, __doc__,
+        *SEQUENCE,
         ('--wait',
          'report progress until the end of the sequence, and fail unless the samples show that '
          'all setpoints were reached, or there are no samples'),
         ('--recorded', 'wait until a recorder has subscribed, then send'),
         NAMESPACE,
-        ('--joint', 'NAMES', str, 'joint, or several separated by commas (default actuator)',
-         {'default': 'actuator'}),
+        JOINTS,
         ('--timeout', 'S', float,
          'time to wait for a reply, and beyond the end of the sequence (default 10 s)',
          {'default': 10.0}))

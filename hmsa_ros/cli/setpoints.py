@@ -4,28 +4,9 @@ import argparse
 import math
 from pathlib import Path
 
+from hmsa_ros.cli.options import Row
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.planning.setpoint import Setpoint
-
-
-def add_sequence(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that say what to send: setpoints, or a file of levels."""
-    parser.add_argument(
-        'setpoints', nargs='*', type=setpoint_of_joints, metavar='STRETCH:SECONDS',
-        help='target stretch, or deflection of a beam, and its duration in s (move plus hold); '
-             'with several joints, one stretch for all or one per joint, as in 1.10,1.20:2')
-    parser.add_argument(
-        '--levels', type=Path, metavar='CSV',
-        help='instead of setpoints: CSV with the columns time and flux_density, as hmsa excite '
-             'writes it, or YAML of hmsa learn. The levels are sent unchanged if they respect the '
-             'limits of coil and block; levels that do not end at rest are followed by a shaped '
-             'move to rest')
-
-    parser.add_argument(
-        '--path', type=Path, metavar='CSV',
-        help='instead of setpoints: CSV with the columns time and stretch, as hmsa wave --path '
-             'writes it, followed from rest to rest by a planner whose trajectory_mode is path; '
-             'with feedback: adapt it is corrected on the way')
 
 
 def path_of(arguments: argparse.Namespace) -> list[list[float]]:
@@ -92,3 +73,18 @@ def setpoint_of_joints(text: str) -> tuple[tuple[float, ...], float]:
 def _no_setpoint(text: str) -> argparse.ArgumentTypeError:
     return argparse.ArgumentTypeError(
         f'{text!r}: expected STRETCH:DURATION, two numbers such as 1.10:10')
+
+
+#: What says what to send: setpoints, or a file of levels or of a path.
+SEQUENCE: tuple[Row, ...] = (
+    ('setpoints', 'STRETCH:SECONDS', setpoint_of_joints,
+     'target stretch, or deflection of a beam, and its duration in s (move plus hold); with '
+     'several joints, one stretch for all or one per joint, as in 1.10,1.20:2', {'nargs': '*'}),
+    ('--levels', 'CSV', Path,
+     'instead of setpoints: CSV with the columns time and flux_density, as hmsa excite writes it, '
+     'or YAML of hmsa learn. The levels are sent unchanged if they respect the limits of coil and '
+     'block; levels that do not end at rest are followed by a shaped move to rest'),
+    ('--path', 'CSV', Path,
+     'instead of setpoints: CSV with the columns time and stretch, as hmsa wave --path writes it, '
+     'followed from rest to rest by a planner whose trajectory_mode is path; with feedback: adapt '
+     'it is corrected on the way'))

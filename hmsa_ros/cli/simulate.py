@@ -13,21 +13,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from hmsa_ros.cli.options import add_command, add_options, JSON
-from hmsa_ros.cli.pictures import add_picture_options, paper_of
+from hmsa_ros.cli.options import add_command, EXAMPLE, JSON
+from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.files import json_text
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    parser.add_argument(
-        'levels', type=Path, metavar='LEVELS.csv', help='CSV of time, flux_density')
-    add_options(
-        parser,
-        ('--params-file', 'YAML', Path,
-         'parameter file of the actuator (default: the example block)'),
+    add_command(
+        subparsers, __name__, __doc__,
+        ('levels', 'LEVELS.csv', Path, 'CSV of time, flux_density'),
+        EXAMPLE,
         ('--until', 'S', float, 'end in s (default: when the last level has settled)'),
         ('--start', 'X', float, 'initial stretch, at rest (default 1; 0 for a beam)'),
         ('--rate', 'HZ', float,
@@ -37,8 +34,7 @@ def add_parser(subparsers: Any) -> None:
         ('--seed', 'N', int, 'of the noise (default 0)', {'default': 0}),
         ('--out', 'FILE', Path,
          'samples to write, ending in .csv, .parquet or .mat; an existing file is replaced'),
-        JSON)
-    add_picture_options(parser, named='pictures to write')
+        JSON, *picture_options('pictures to write'))
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -10,15 +10,14 @@ example: hmsa stop
 import argparse
 from typing import Any
 
-from hmsa_ros.cli.options import add_command, add_options, NAMESPACE, TIMEOUT, timeout_of
+from hmsa_ros.cli.options import add_command, NAMESPACE, TIMEOUT, timeout_of
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import HmsaError
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    add_options(parser, NAMESPACE, TIMEOUT)
+    add_command(subparsers, __name__, __doc__, NAMESPACE, TIMEOUT)
 
 
 def run(arguments: argparse.Namespace) -> int:

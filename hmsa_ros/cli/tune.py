@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.identify import known_of
-from hmsa_ros.cli.options import add_command, add_options, NAMESPACE
+from hmsa_ros.cli.options import add_command, NAMESPACE
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import setpoint_of_joints
 from hmsa_ros.ending import ENDING
@@ -34,12 +34,11 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    parser.add_argument(
-        'setpoints', nargs='+', type=setpoint_of_joints, metavar='STRETCH:SECONDS',
-        help='moves to tune for: target stretch, or deflection of a beam, and duration in s')
-    add_options(
-        parser,
+    add_command(
+        subparsers, __name__, __doc__,
+        ('setpoints', 'STRETCH:SECONDS', setpoint_of_joints,
+         'moves to tune for: target stretch, or deflection of a beam, and duration in s',
+         {'nargs': '+'}),
         ('--simulate', 'start a planner and a plant for each run, in simulated time'),
         ('--params-file', 'YAML', Path,
          'parameter file with known values (default: the parameters of the running planner, or '

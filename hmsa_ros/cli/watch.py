@@ -17,7 +17,7 @@ import sys
 from time import monotonic
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, add_options
+from hmsa_ros.cli.options import add_command
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
 
@@ -34,9 +34,8 @@ _LOOK_SECONDS = 0.1
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    add_options(
-        parser,
+    add_command(
+        subparsers, __name__, __doc__,
         ('--namespace', 'NS', str, 'namespace of planner and plant', {'default': ''}),
         ('--joint', 'NAME', str, 'joint to show, or several separated by commas (default all)',
          {'default': ''}),

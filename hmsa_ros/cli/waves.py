@@ -13,7 +13,7 @@ import argparse
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, add_options, JSON
+from hmsa_ros.cli.options import add_command, EXAMPLE, JSON
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
 
@@ -23,22 +23,17 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, 'wave', __doc__)
-    parser.add_argument(
-        'shape', metavar='SHAPE', help='sine, triangle, square, sweep or CSV')
-    parser.add_argument(
-        '--offset', '--mean', metavar='STRETCH', type=float,
-        help='mean stretch (default: that without a field)')
-    add_options(
-        parser,
+    add_command(
+        subparsers, 'wave', __doc__,
+        ('shape', 'SHAPE', str, 'sine, triangle, square, sweep or CSV'),
+        ('--offset --mean', 'STRETCH', float, 'mean stretch (default: that without a field)'),
         ('--frequency', 'HZ', float, 'frequency', {'required': True}),
         ('--amplitude', 'STRETCH', float, 'amplitude of the stretch', {'required': True}),
         ('--cycles', 'N', float,
          'cycles at full amplitude, besides those in which the wave fades in and out (default 10)',
          {'default': 10.0}),
         ('--to', 'HZ', float, 'last frequency of a sweep'),
-        ('--params-file', 'YAML', Path,
-         'parameter file of the actuator (default: the example block)'),
+        EXAMPLE,
         ('--out', 'FILE', Path,
          'levels to write, ending in .csv, .parquet or .mat; an existing file is replaced'),
         ('--path', 'CSV', Path,

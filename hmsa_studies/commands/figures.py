@@ -12,19 +12,18 @@ from pathlib import Path
 from typing import Any
 
 from hmsa_ros.cli.options import add_command
-from hmsa_ros.cli.pictures import add_picture_options, formats_of, paper_of
+from hmsa_ros.cli.pictures import formats_of, paper_of, picture_options
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.files import make_folder
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    parser.add_argument(
-        '--out', type=Path, default=Path('figures'), metavar='DIR',
-        help='output folder, created if missing (default figures)')
-    add_picture_options(parser, folder=True, data=False)
-    parser.set_defaults(format='png')
+    add_command(
+        subparsers, __name__, __doc__,
+        ('--out', 'DIR', Path, 'output folder, created if missing (default figures)',
+         {'default': Path('figures')}),
+        *picture_options(formats='png', data=False))
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -18,8 +18,8 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, add_options, MATERIAL
-from hmsa_ros.cli.pictures import add_picture_options, formats_of, paper_of
+from hmsa_ros.cli.options import add_command, MATERIAL
+from hmsa_ros.cli.pictures import formats_of, paper_of, picture_options
 from hmsa_ros.cli.plan import nominal
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, make_folder
@@ -46,9 +46,8 @@ def _move(text: str) -> tuple[float, float]:
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    add_options(
-        parser,
+    add_command(
+        subparsers, __name__, __doc__,
         ('--move', 'START:TARGET', _move,
          'moves from one stretch at rest to another (default 1.0:1.1 1.0:1.4 1.0:0.7; of a beam '
          '0:0.1 0:0.4)', {'nargs': '+'}),
@@ -71,8 +70,8 @@ def add_parser(subparsers: Any) -> None:
         ('--seeds', 'N', int, 'runs with different noise for --feedback (default 10)',
          {'default': 10}),
         *chunked.options('processes (default 1)'),
-        ('--json', 'print JSON in full precision'))
-    add_picture_options(parser, folder=True)
+        ('--json', 'print JSON in full precision'),
+        *picture_options(formats='png,pdf'))
 
 
 def run(arguments: argparse.Namespace) -> int:

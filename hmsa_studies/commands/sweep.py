@@ -18,8 +18,8 @@ from pathlib import Path
 import shutil
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, add_options, MATERIAL
-from hmsa_ros.cli.pictures import add_picture_options, formats_of, paper_of
+from hmsa_ros.cli.options import add_command, MATERIAL
+from hmsa_ros.cli.pictures import formats_of, paper_of, picture_options
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.report.paper import kind_of, named, Paper
 from hmsa_studies.commands import chunked
@@ -45,9 +45,8 @@ _AXES = (
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = add_command(subparsers, __name__, __doc__)
-    add_options(
-        parser,
+    add_command(
+        subparsers, __name__, __doc__,
         *((option, 'GRID', str, text) for option, text in _AXES),
         ('--vary', 'NAME=GRID', str,
          'another column: load_min, load_max, period, slew, lag or a constant of the law '
@@ -82,12 +81,11 @@ def add_parser(subparsers: Any) -> None:
         ('--show', 'COLUMN,...', str,
          'columns to draw (default: duration and first level, or residual and offset)'),
         *chunked.options(
-            'processes; 1 computes in this one (default: one a core for large sweeps)'))
-    add_picture_options(
-        parser, folder=True,
-        named='also draw the results: curves over one numeric column, a map with contours over '
-              'two, bands of quantiles for samples; hatched without a plan. A folder as --out '
-              'always gets figures, named table')
+            'processes; 1 computes in this one (default: one a core for large sweeps)'),
+        *picture_options(
+            'also draw the results: curves over one numeric column, a map with contours over two, '
+            'bands of quantiles for samples; hatched without a plan. A folder as --out always '
+            'gets figures, named table', formats='png,pdf'))
 
 
 def run(arguments: argparse.Namespace) -> int:
