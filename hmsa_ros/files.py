@@ -48,10 +48,10 @@ def write_text(path: Path, text: str) -> None:
         beside.write_bytes(text.encode('utf-8', 'replace'))
 
 
-def check_targets(targets: Iterable[Path], sources: Iterable[Path] = ()) -> None:
+def check_targets(*targets: Path | None, sources: Iterable[Path | None] = ()) -> None:
     """Refuse by `BadInputError` what cannot be written, or is read, before a command begins."""
-    read = [x.resolve() for x in sources]
-    for target in targets:
+    read = [x.resolve() for x in sources if x is not None]
+    for target in filter(None, targets):
         why = ('it is a folder; expected a file' if target.is_dir() else
                f'{target.parent} is no folder; expected one that exists'
                if not target.resolve().parent.is_dir() else
@@ -71,7 +71,7 @@ def make_folder(folder: Path) -> None:
 
 
 def json_text(document: object) -> str:
-    """Return a document as JSON, with null for each number that is not finite."""
+    """Return a document as JSON: paths as texts, null for each number that is not finite."""
     return json.dumps(finite(document), indent=2, allow_nan=False)
 
 
@@ -81,6 +81,9 @@ def finite(value: Any) -> Any:
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
         return {key: finite(x) for key, x in value.items()}
+    if isinstance(value, Path):
+        return str(value)
+    value = value.tolist() if hasattr(value, 'tolist') else value  # of NumPy
     return [finite(x) for x in value] if isinstance(value, (list, tuple)) else value
 
 

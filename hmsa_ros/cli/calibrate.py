@@ -8,26 +8,24 @@ example: hmsa calibrate coil readings.csv --out coil.yaml
 
 import argparse
 from contextlib import nullcontext
+from dataclasses import asdict
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.check_driver import setting
-from hmsa_ros.cli.options import add_command, JSON, Row
+from hmsa_ros.cli.options import add_command, JSON, Row, show
 from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.quantities import number_of
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.files import check_targets, json_text, write_text, yaml_text
+from hmsa_ros.files import check_targets, write_text, yaml_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from hmsa_ros.device.assembly import SensorScale
     from hmsa_ros.device.bench import Bench
-    from hmsa_ros.device.calibration import CoilCalibration
-    from hmsa_ros.device.iron_core import IronCore
-    from hmsa_ros.identification.delays import Interval
     from hmsa_ros.model.equations import Array
 
 # Readings of a probe that are averaged.
@@ -100,33 +98,6 @@ def _add_kind(kinds: Any, run: 'Callable[[argparse.Namespace], int]', *rows: Row
     parser.set_defaults(run=run, parser=parser)
 
 
-def _checked(arguments: argparse.Namespace) -> str:
-    """Return the name of what is to be calibrated, of valid options."""
-    check_targets([] if arguments.out is None else [arguments.out])
-    if arguments.simulate is (arguments.source is not None):
-        raise BadInputError('expected either MODULE:NAME of hardware or --simulate')
-    if arguments.steps < 2:
-        raise BadInputError(f'--steps is {arguments.steps}: expected at least 2')
-    if not 0.0 < arguments.limit < math.inf:
-        raise BadInputError(f'--limit is {arguments.limit:g} T: expected a number above 0')
-    return f'{_SIMULATED}SimulatedBench' if arguments.simulate else str(arguments.source)
-
-
-def _bench(name: str, arguments: argparse.Namespace, rate: float = 1000.0) -> 'Bench':
-    """Return hardware in force, whose sensor is read at a rate in Hz."""
-    from hmsa_ros.device.bench import Bench
-
-    return Bench(name, dict(setting(x) for x in arguments.set), arguments.limit, rate)
-
-
-def _scale(bench: 'Bench') -> 'SensorScale | None':
-    """Return what the readings of a sensor mean; None where it does not say."""
-    from hmsa_ros.device.assembly import SensorScale
-
-    found = getattr(bench.coil.instrument.hardware, 'scale', None)
-    return found if isinstance(found, SensorScale) else None
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate the part named; the kinds have their own."""
     status: int = arguments.run(arguments)
@@ -147,7 +118,7 @@ def _coil(arguments: argparse.Namespace) -> int:
     from hmsa_ros.device.calibration import calibrate_coil
     from hmsa_ros.device.iron_core import fit_core
 
-    check_targets([] if arguments.out is None else [arguments.out])
+    check_targets(arguments.out)
     if not (arguments.limit > 0.0 and arguments.settle >= 0.0 and arguments.steps >= 2):
         raise BadInputError(
             f'--limit {arguments.limit:g}, --settle {arguments.settle:g} or --steps '
@@ -165,41 +136,47 @@ def _coil(arguments: argparse.Namespace) -> int:
         from hmsa_ros.report.calibration import draw_coil
 
         draw_coil(arguments.picture, current, flux, found, paper)
-    table = ''
+    low, high = found.interval
+    constant = f'{found.tesla_per_ampere:.6g} T/A, 95 % interval {low:.6g} to {high:.6g}'
+    table = None
     if arguments.out is not None:
-        table = str(_write(arguments.out, found, core if arguments.hysteresis else None))
-    if arguments.json:
-        print(json_text({
+        if found.model == 'table':
+            table = _write_table(arguments.out, {
+                'current': found.current, 'flux_density': found.flux_density})
+        settings = found.settings(str(table and table.resolve()))
+        if core is not None and arguments.hysteresis:
+            settings |= {'hardware.coil.play_widths': list(core.widths),
+                         'hardware.coil.play_weights': list(core.weights)}
+        _write_parameters(
+            arguments.out, f'{constant}, by hmsa calibrate coil', {'driver': settings})
+    hysteresis = 'unknown: no current was approached from both sides'
+    if not math.isnan(found.hysteresis):
+        hysteresis = f'{100.0 * found.hysteresis:.2g} % of the range'
+        if core is not None and found.hysteresis >= _NO_HYSTERESIS:
+            hysteresis += f', {100.0 * left:.2g} % from the model' + (
+                '' if arguments.hysteresis else ' that --hysteresis writes')
+    return show(
+        arguments, {
             **{x: getattr(found, x) for x in (
                 'tesla_per_ampere', 'std', 'interval', 'saturation', 'offset', 'misses',
                 'hysteresis', 'model')},
-            'compensated': left,
-            'current': found.current.tolist(), 'flux_density': found.flux_density.tolist(),
-            'file': None if arguments.out is None else str(arguments.out)}))
-        return 0
-    low, high = found.interval
-    print(f'{"coil constant":<16}{found.tesla_per_ampere:.6g} T/A, 95 % interval {low:.6g} to '
-          f'{high:.6g}')
-    for label, text in (
-            ('saturation', f'{found.saturation:.4g} T' if math.isfinite(found.saturation)
-             else 'does not show'),
-            ('hysteresis', 'unknown: no current was approached from both sides' if math.isnan(
-                found.hysteresis) else f'{100.0 * found.hysteresis:.2g} % of the range' + (
-                '' if core is None or found.hysteresis < _NO_HYSTERESIS else
-                f', {100.0 * left:.2g} % from the model' + (
-                    '' if arguments.hysteresis else ' that --hysteresis writes'))),
-            ('probe offset', f'{found.offset:.3g} T'),
-            ('model', f'{found.model}, off by at most {100.0 * found.misses:.2g} % of the range')):
-        print(f'{label:<16}{text}')
-    if arguments.out is not None:
-        print(f'{arguments.out} written{f", and {table}" if found.model == "table" else ""}')
-    return 0
+            'compensated': left, 'current': found.current, 'flux_density': found.flux_density,
+            'file': arguments.out},
+        f'coil constant   {constant}',
+        'saturation      ' + (f'{found.saturation:.4g} T' if math.isfinite(found.saturation)
+                              else 'does not show'),
+        f'hysteresis      {hysteresis}', f'probe offset    {found.offset:.3g} T',
+        f'model           {found.model}, off by at most {100.0 * found.misses:.2g} % of the range',
+        written=(arguments.out, table))
 
 
 def _readings(arguments: argparse.Namespace) -> 'tuple[Array, Array]':
     """Return currents in A and flux densities in T, from a file or from the coil."""
+    from hmsa_ros.device.hardware import SHIPPED
+
     path = Path(arguments.source)
-    if path.suffix.lower() in ('.csv', '.txt', '.tsv'):
+    if path.suffix.lower() in ('.csv', '.txt', '.tsv') or (
+            path.is_dir() and arguments.source not in SHIPPED):
         from hmsa_ros.columns import read_table
 
         columns = read_table(path, ('current', 'flux_density')).columns
@@ -276,20 +253,12 @@ def _made(name: str, option: str) -> Any:
     return found
 
 
-def _write(out: Path, found: 'CoilCalibration', core: 'IronCore | None') -> Path:
-    """Write the driver's parameters, and a table beside them; return the path of that."""
+def _write_table(out: Path, columns: 'dict[str, Array]') -> Path:
+    """Write columns beside a parameter file; return where."""
+    from hmsa_ros.recordings.tables import write_table
+
     table = out.with_suffix('.csv')
-    if found.model == 'table':
-        rows = zip(found.current.tolist(), found.flux_density.tolist(), strict=True)
-        write_text(table, '\n'.join(
-            ['current,flux_density', *(f'{x!r},{y!r}' for x, y in rows)]) + '\n')
-    low, high = found.interval
-    _write_parameters(
-        out, f'{found.tesla_per_ampere:.6g} T/A, 95 % interval {low:.6g} to {high:.6g}, by hmsa '
-        'calibrate coil', {'driver': found.settings(str(table.resolve())) | (
-            {} if core is None else {
-                'hardware.coil.play_widths': list(core.widths),
-                'hardware.coil.play_weights': list(core.weights)})})
+    write_table(table, columns)
     return table
 
 
@@ -301,6 +270,33 @@ def _write_parameters(out: Path, words: str, nodes: 'dict[str, dict[str, Any]]')
             lines += [f'/**/{node}:', '  ros__parameters:', *(
                 f'    {key}: {yaml_text(value)}' for key, value in values.items())]
     write_text(out, '\n'.join(lines) + '\n')
+
+
+def _checked(arguments: argparse.Namespace, least: int) -> str:
+    """Return the name of what is to be calibrated, of valid options, in so many steps at least."""
+    check_targets(arguments.out)
+    if arguments.simulate is (arguments.source is not None):
+        raise BadInputError('expected either MODULE:NAME of hardware or --simulate')
+    if arguments.steps < least:
+        raise BadInputError(f'--steps is {arguments.steps}: expected at least {least}')
+    if not 0.0 < arguments.limit < math.inf:
+        raise BadInputError(f'--limit is {arguments.limit:g} T: expected a number above 0')
+    return f'{_SIMULATED}SimulatedBench' if arguments.simulate else str(arguments.source)
+
+
+def _bench(name: str, arguments: argparse.Namespace, rate: float = 1000.0) -> 'Bench':
+    """Return hardware in force, whose sensor is read at a rate in Hz."""
+    from hmsa_ros.device.bench import Bench
+
+    return Bench(name, dict(setting(x) for x in arguments.set), arguments.limit, rate)
+
+
+def _scale(bench: 'Bench') -> 'SensorScale | None':
+    """Return what the readings of a sensor mean; None where it does not say."""
+    from hmsa_ros.device.assembly import SensorScale
+
+    found = getattr(bench.coil.instrument.hardware, 'scale', None)
+    return found if isinstance(found, SensorScale) else None
 
 
 def _latency(arguments: argparse.Namespace) -> int:
@@ -315,11 +311,13 @@ def _latency(arguments: argparse.Namespace) -> int:
 
     example: hmsa calibrate latency my_lab:Bench --probe my_lab:Hall --limit 0.05 --out delays.yaml
     """
-    paper, name = paper_of(arguments), _checked(arguments)
-    if arguments.lag is not None and not 0.0 <= arguments.lag < 1.0:
-        raise BadInputError(f'--lag is {arguments.lag:g} s: expected 0 to 1 s')
-    if arguments.lag is not None and (arguments.probe is not None or arguments.simulate):
-        raise BadInputError('--lag is given with a probe, which measures it: expected one of both')
+    paper, name = paper_of(arguments), _checked(arguments, 2)
+    if arguments.lag is not None:
+        if not 0.0 <= arguments.lag < 1.0:
+            raise BadInputError(f'--lag is {arguments.lag:g} s: expected 0 to 1 s')
+        if arguments.probe is not None or arguments.simulate:
+            raise BadInputError(
+                '--lag is given with a probe, which measures it: expected one of both')
     from hmsa_ros.identification.files import read_belief
     from hmsa_ros.lab.calibrating import measure_delays, steps_of
 
@@ -335,38 +333,27 @@ def _latency(arguments: argparse.Namespace) -> int:
         from hmsa_ros.report.calibration import draw_delays
 
         draw_delays(arguments.picture, found, paper)
-    shown = {'transport': found.transport, 'lag': found.lag, 'latency': found.latency}
+    delays = {'transport': found.transport, 'lag': found.lag, 'latency': found.latency}
     notes = list(found.notes)
     if arguments.out is not None:
-        nodes: dict[str, dict[str, Any]] = {'driver': {}, 'planner': {}}
-        if scale is not None:
-            nodes['driver'] = {'hardware.sensor.latency': scale.latency + found.setting.value}
-        else:
+        if scale is None:
             notes.append(f'{name} has no setting sensor.latency: take '
                          f'{found.setting.value:.6g} s off the timestamps of its samples')
-        if math.isfinite(found.lag.value):
-            nodes['planner'] = {'coil_time_constant': max(found.lag.value, 0.0)}
-        _write_parameters(arguments.out, 'by hmsa calibrate latency; times in s', nodes)
-    if arguments.json:
-        print(json_text({
-            **{x: {'value': y.value, 'low': y.low, 'high': y.high} for x, y in shown.items()},
-            'jitter': found.jitter, 'setting': found.setting.value,
-            'verdict': found.motion.verdict, 'notes': notes,
-            'file': None if arguments.out is None else str(arguments.out)}))
-        return 0
-    for name, value in shown.items():
-        print(f'{name:<16}{_interval(value)}')
-    print(f'{"jitter":<16}{1e3 * found.jitter:.3g} ms, of what the device reports')
-    for line in (*(f'note: {x}' for x in notes),
-                 *([] if arguments.out is None else [f'{arguments.out} written'])):
-        print(line)
-    return 0
-
-
-def _interval(found: 'Interval') -> str:
-    return 'unknown' if math.isnan(found.value) else (
-        f'{1e3 * found.value:.4g} ms, 95 % interval {1e3 * found.low:.4g} to '
-        f'{1e3 * found.high:.4g}')
+        _write_parameters(arguments.out, 'by hmsa calibrate latency; times in s', {
+            'driver': {} if scale is None else {
+                'hardware.sensor.latency': scale.latency + found.setting.value},
+            'planner': {'coil_time_constant': max(found.lag.value, 0.0)} if math.isfinite(
+                found.lag.value) else {}})
+    return show(
+        arguments, {
+            **{x: asdict(y) for x, y in delays.items()}, 'jitter': found.jitter,
+            'setting': found.setting.value, 'verdict': found.motion.verdict, 'notes': notes,
+            'file': arguments.out},
+        *(f'{x:<16}' + ('unknown' if math.isnan(y.value) else (
+            f'{1e3 * y.value:.4g} ms, 95 % interval {1e3 * y.low:.4g} to {1e3 * y.high:.4g}'))
+          for x, y in delays.items()),
+        f'jitter          {1e3 * found.jitter:.3g} ms, of what the device reports',
+        *(f'note: {x}' for x in notes), written=[arguments.out])
 
 
 def _static(arguments: argparse.Namespace) -> int:
@@ -380,10 +367,8 @@ def _static(arguments: argparse.Namespace) -> int:
 
     example: hmsa calibrate static my_lab:Bench --limit 0.05 --settle 5 --out static.yaml
     """
-    paper, name = paper_of(arguments), _checked(arguments)
-    if arguments.steps < 3:
-        raise BadInputError(
-            f'--steps is {arguments.steps}: expected at least 3, since a table needs six levels')
+    # A table needs six levels.
+    paper, name = paper_of(arguments), _checked(arguments, 3)
     if not 0.1 <= arguments.settle < math.inf:
         raise BadInputError(f'--settle is {arguments.settle:g} s: expected at least 0.1 s')
     from hmsa_ros.device.statics import scale_at_rest, scale_by_gauge, statics
@@ -411,34 +396,22 @@ def _static(arguments: argparse.Namespace) -> int:
         from hmsa_ros.report.calibration import draw_statics
 
         draw_statics(arguments.picture, level, stretch, found, paper)
-    table = None if arguments.out is None else arguments.out.with_suffix('.csv')
-    if table is not None:
-        write_text(table, '\n'.join(['stretch,flux_density', *(
-            f'{x!r},{y!r}' for x, y in zip(
-                found.stretch.tolist(), found.level.tolist(), strict=True))]) + '\n')
-        _write_parameters(arguments.out, 'by hmsa calibrate static', {
-            'driver': _scale_settings(scale),
-            'planner': {'law.name': 'table', 'law.file': str(table.resolve())}})
-    if arguments.json:
-        print(json_text({
-            'level': found.level.tolist(), 'stretch': found.stretch.tolist(), 'rest': found.rest,
-            'apart': found.apart, 'drift': drift, 'scale': _scale_settings(scale),
-            'misses': misses, 'notes': notes,
-            'file': None if arguments.out is None else str(arguments.out)}))
-        return 0
-    print(f'{"stretch":<16}{found.stretch[0]:.4f} to {found.stretch[-1]:.4f}, '
-          f'{len(found.level)} levels of {found.level[0]:.4g} to {found.level[-1]:.4g} T')
-    print(f'{"branches":<16}apart by {100.0 * found.apart:.2g} % of the range')
-    print(f'{"without a field":<16}{found.rest:.6g} as the sensor shows it')
-    for key, value in _scale_settings(scale).items():
-        print(f'{key.removeprefix("hardware."):<20}{value:.6g}')
-    for line in (*(f'note: {x}' for x in notes),
-                 *([] if table is None else [f'{arguments.out} and {table} written'])):
-        print(line)
-    return 0
-
-
-def _scale_settings(scale: 'SensorScale | None') -> 'dict[str, float]':
-    """Return the settings of a driver for a scale, none without one."""
-    return {} if scale is None else {
+    sensor = {} if scale is None else {
         f'hardware.sensor.{x}': getattr(scale, x) for x in ('gain', 'offset', 'rest_length')}
+    table = None
+    if arguments.out is not None:
+        table = _write_table(
+            arguments.out, {'stretch': found.stretch, 'flux_density': found.level})
+        _write_parameters(arguments.out, 'by hmsa calibrate static', {
+            'driver': sensor, 'planner': {'law.name': 'table', 'law.file': str(table.resolve())}})
+    return show(
+        arguments, {
+            'level': found.level, 'stretch': found.stretch, 'rest': found.rest,
+            'apart': found.apart, 'drift': drift, 'scale': sensor, 'misses': misses,
+            'notes': notes, 'file': arguments.out},
+        f'stretch         {found.stretch[0]:.4f} to {found.stretch[-1]:.4f}, {len(found.level)} '
+        f'levels of {found.level[0]:.4g} to {found.level[-1]:.4g} T',
+        f'branches        apart by {100.0 * found.apart:.2g} % of the range',
+        f'without a field {found.rest:.6g} as the sensor shows it',
+        *(f'{x.removeprefix("hardware."):<20}{y:.6g}' for x, y in sensor.items()),
+        *(f'note: {x}' for x in notes), written=(arguments.out, table))

@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.device.conformance import Trial
 
     out: Path | None = arguments.report
-    check_targets(filter(None, [out]))
+    check_targets(out)
     settings = dict(setting(x) for x in arguments.set)
     with progress() as update:
         found = Trial(

@@ -14,11 +14,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, bags, JSON
+from hmsa_ros.cli.options import add_command, bags, JSON, show
 from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import json_text
 
 if TYPE_CHECKING:
     from hmsa_ros.report.paper import Paper
@@ -52,15 +51,9 @@ def run(arguments: argparse.Namespace) -> int:
         found = compare(
             *(read(x, joint=arguments.joint) for x in arguments.runs),
             picture=arguments.picture or None, **asdict(paper))
-    if arguments.json:
-        print(json_text({
-            'runs': [str(x) for x in arguments.runs], 'setpoints': found.records(),
-            'files': [str(x) for x in arguments.picture]}))
-        return 0
-    print(found)
-    for picture in arguments.picture:
-        print(picture)
-    return 0
+    return show(arguments, {
+        'runs': arguments.runs, 'setpoints': found.records(), 'files': arguments.picture,
+    }, found, *arguments.picture)
 
 
 def _compare_repeats(
@@ -79,16 +72,11 @@ def _compare_repeats(
                  for label, group in zip(labels, groups, strict=True)}
         found = {label: statistics([x.evaluation.findings for x in group])
                  for label, group in parts.items()}
-        table = statistics_table(found)
         if arguments.picture:
             from hmsa_ros.report.bands import draw_bands
             draw_bands(arguments.picture, parts, paper)
-    if arguments.json:
-        print(json_text({
-            'runs': list(found), 'setpoints': [
-                {'run': label, **x} for label, group in found.items() for x in group],
-            'files': [str(x) for x in arguments.picture]}))
-        return 0
-    for line in (table, *arguments.picture):
-        print(line)
-    return 0
+    return show(arguments, {
+        'runs': list(found), 'setpoints': [
+            {'run': label, **x} for label, group in found.items() for x in group],
+        'files': arguments.picture,
+    }, statistics_table(found), *arguments.picture)

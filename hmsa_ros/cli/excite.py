@@ -13,9 +13,9 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, JSON
+from hmsa_ros.cli.options import add_command, JSON, show
 from hmsa_ros.cli.progress import progress
-from hmsa_ros.files import json_text, write_text
+from hmsa_ros.files import write_text
 
 if TYPE_CHECKING:
     from hmsa_ros.identification.excitation import Excitation, Program
@@ -64,23 +64,16 @@ def run(arguments: argparse.Namespace) -> int:
         rows = zip(found.best.level_times, found.best.levels, strict=True)
         lines = ['time,flux_density', *(f'{x:.9f},{y:.9g}' for x, y in rows)]
         write_text(arguments.out, '\n'.join(lines) + '\n')
-    if arguments.json:
-        print(json_text({
-            'duration': found.duration, **_record(found.best), 'improvement': found.improvement,
-            'plain': _record(found.plain), 'paper': _record(found.paper)}))
-        return 0
-    for line in table(found, belief.actuator):
-        print(line)
-    if arguments.out is not None:
-        print(f'{arguments.out} written')
-    return 0
+    return show(arguments, {
+        'duration': found.duration, **_record(found.best), 'improvement': found.improvement,
+        'plain': _record(found.plain), 'paper': _record(found.paper),
+    }, *table(found, belief.actuator), written=[arguments.out])
 
 
 def _record(program: 'Program') -> dict[str, Any]:
     """Return a sequence as JSON."""
     return {
-        'levels': [[x, y] for x, y in zip(
-            program.level_times.tolist(), program.levels.tolist(), strict=True)],
+        'levels': list(zip(program.level_times, program.levels, strict=True)),
         'std': program.std, 'stretch_min': program.reach[0],
         'stretch_max': program.reach[1], 'ends_at_rest': program.ends_at_rest}
 

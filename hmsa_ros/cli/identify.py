@@ -70,8 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     """
     check_targets(
-        filter(None, (arguments.out, arguments.report)),
-        filter(None, (arguments.recording, arguments.commands)))
+        arguments.out, arguments.report, sources=(arguments.recording, arguments.commands))
 
     from hmsa_ros.identification.files import file_text, read_belief
     from hmsa_ros.identification.identify import identify

@@ -18,7 +18,7 @@ from pathlib import Path
 import sys
 from typing import Any, cast, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, JSON, law_of, LAW_OPTION, Row
+from hmsa_ros.cli.options import add_command, JSON, law_of, LAW_OPTION, Row, show
 from hmsa_ros.cli.quantities import (
     BY_KEY,
     DAMPING,
@@ -31,7 +31,7 @@ from hmsa_ros.cli.quantities import (
     Quantity,
 )
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import check_targets, json_text, write_text, yaml_text
+from hmsa_ros.files import check_targets, write_text, yaml_text
 from hmsa_ros.interfaces.parameters import LAW, LAW_NAME, PUBLISH_RATE
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
     path: Path = arguments.out
     if not arguments.force and path.exists():
         raise BadInputError(f'{path} exists: name another file with --out, or add --force')
-    check_targets([path])
+    check_targets(path)
     asked = _asked(arguments)
     given = _given(arguments, asked)
     joints = joint_names(arguments.joint)
@@ -136,17 +136,12 @@ def run(arguments: argparse.Namespace) -> int:
     write_text(path, file_text(path, made, joints))
     for doubt in doubts:
         print(f'hmsa: warning: {doubt}', file=sys.stderr)
-    if arguments.json:
-        print(json_text({
-            'file': str(path), 'joints': joints, 'parameters': _parameters(made),
-            'scales': asdict(found), 'warnings': doubts}))
-        return 0
-    for line in table(found, actuator):
-        print(line)
-    print(f'\n{path} written; to use it:')
-    for node in ('plant', 'planner'):
-        print(f'  hmsa {node} --ros-args --params-file {path}')
-    return 0
+    return show(
+        arguments, {
+            'file': path, 'joints': joints, 'parameters': _parameters(made),
+            'scales': asdict(found), 'warnings': doubts},
+        *table(found, actuator), f'\n{path} written; to use it:',
+        *(f'  hmsa {x} --ros-args --params-file {path}' for x in ('plant', 'planner')))
 
 
 def _asked(arguments: argparse.Namespace) -> tuple[Quantity, ...]:

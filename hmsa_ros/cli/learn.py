@@ -14,9 +14,9 @@ import math
 from pathlib import Path
 from typing import Any
 
-from hmsa_ros.cli.options import add_command, bags, JSON
+from hmsa_ros.cli.options import add_command, bags, JSON, show
 from hmsa_ros.cli.progress import progress
-from hmsa_ros.files import check_targets, json_text, write_text
+from hmsa_ros.files import check_targets, write_text
 
 
 def add_parser(subparsers: Any) -> None:
@@ -31,7 +31,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read, learn and print."""
-    check_targets([] if arguments.out is None else [arguments.out])
+    check_targets(arguments.out)
     from hmsa_ros.identification.sequences import learn_from, sequence_text
     from hmsa_ros.recordings.bags import read_run
     from hmsa_ros.table import Column, Table
@@ -40,31 +40,26 @@ def run(arguments: argparse.Namespace) -> int:
         found, targets = learn_from([read_run(x, joint=arguments.joint) for x in arguments.runs])
     if arguments.out is not None:
         write_text(arguments.out, sequence_text(found, targets, arguments.runs))
-    if arguments.json:
-        print(json_text({
-            'runs': [{'run': str(x), 'setpoints': [
-                {'stretch': z.stretch, 'vibration': y.vibration, 'offset': y.offset}
-                for y, z in zip(left, targets, strict=True)]}
-                for x, left in zip(arguments.runs, found.left, strict=True)],
-            'best': str(arguments.runs[found.best]),
-            'second_mode': found.frequency if math.isfinite(found.frequency) else None,
-            'levels': [[x, y] for x, y in zip(
-                found.level_times.tolist(), found.levels.tolist(), strict=True)],
-            'file': None if arguments.out is None else str(arguments.out)}))
-        return 0
-    print(Table(
+    rows = [(run, target.stretch, left.vibration, left.offset)
+            for run, each in zip(arguments.runs, found.left, strict=True)
+            for left, target in zip(each, targets, strict=True)]
+    best = arguments.runs[found.best]
+    lines: list[object] = [Table(
         (Column('run'), Column('setpoint'), Column('vibration', '%', '%'),
          Column('offset', '%', '+%')),
-        tuple((str(x), f'{z.stretch:g}', 100.0 * y.vibration, 100.0 * y.offset)
-              for x, left in zip(arguments.runs, found.left, strict=True)
-              for y, z in zip(left, targets, strict=True)),
+        tuple((str(x), f'{y:g}', 100.0 * vibration, 100.0 * offset)
+              for x, y, vibration, offset in rows),
         'vibration: peak to peak in the first period after the move; offset: mean less the '
-        'setpoint; in % of the step'))
+        'setpoint; in % of the step')]
     if math.isfinite(found.frequency):
-        print(f'second mode at {found.frequency:.4g} Hz')
+        lines.append(f'second mode at {found.frequency:.4g} Hz')
     if found.best != len(arguments.runs) - 1:
-        print(f'note: {arguments.runs[found.best]} left less than later runs: the next levels '
-              'start from it, with smaller changes')
-    if arguments.out is not None:
-        print(f'{arguments.out} written')
-    return 0
+        lines.append(f'note: {best} left less than later runs: the next levels start from it, '
+                     'with smaller changes')
+    return show(arguments, {
+        'runs': [{'run': x, 'setpoints': [
+            dict(zip(('stretch', 'vibration', 'offset'), y[1:], strict=True))
+            for y in rows if y[0] is x]} for x in arguments.runs],
+        'best': best, 'second_mode': found.frequency,
+        'levels': list(zip(found.level_times, found.levels, strict=True)),
+        'file': arguments.out}, *lines, written=[arguments.out])

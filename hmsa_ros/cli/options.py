@@ -1,11 +1,13 @@
 """Options of commands, as rows of tables."""
 
 import argparse
+from collections.abc import Iterable
 import inspect
 from pathlib import Path
 from typing import Any
 
 from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.files import json_text
 
 #: Names, metavar, type, help and, where there are any, other settings of argparse; of a flag name
 #: and help, of a group its title and a list of its rows.
@@ -118,3 +120,13 @@ def add_options(parser: Any, *rows: Row) -> None:
             metavar, kind, text, *settings = texts
             parser.add_argument(
                 *names.split(), metavar=metavar, type=kind, help=text, **dict(*settings))
+
+
+def show(
+        arguments: argparse.Namespace, record: dict[str, Any], *lines: object,
+        written: Iterable[Path | None] = ()) -> int:
+    """Print a result, its record with --json, else lines and the files written; return 0."""
+    for line in [json_text(record)] if arguments.json else [
+            *lines, *(f'{x} written' for x in written if x is not None)]:
+        print(line)
+    return 0

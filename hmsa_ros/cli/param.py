@@ -9,9 +9,9 @@ example: hmsa param set planner shaper robust
 import argparse
 from typing import Any
 
-from hmsa_ros.cli.options import add_command, JSON, NAMESPACE, TIMEOUT, timeout_of
+from hmsa_ros.cli.options import add_command, JSON, NAMESPACE, show, TIMEOUT, timeout_of
 from hmsa_ros.ending import ENDING
-from hmsa_ros.files import json_text, yaml_text
+from hmsa_ros.files import yaml_text
 
 
 def add_parser(subparsers: Any) -> None:
@@ -48,13 +48,7 @@ def _get(arguments: argparse.Namespace) -> int:
 
     with RemoteNode(arguments.node, arguments.namespace, arguments.timeout) as node:
         found = node.get(arguments.names)
-    if arguments.json:
-        print(json_text(found))
-        return 0
-
-    for name, value in found.items():
-        print(f'{name}: {yaml_text(value)}')
-    return 0
+    return show(arguments, found, *(f'{x}: {yaml_text(y)}' for x, y in found.items()))
 
 
 def _set(arguments: argparse.Namespace) -> int:

@@ -12,11 +12,11 @@ import argparse
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, bags
+from hmsa_ros.cli.options import add_command, bags, show
 from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import check_targets, json_text, write_text
+from hmsa_ros.files import check_targets, write_text
 
 if TYPE_CHECKING:
     from hmsa_ros.recordings.record import Run
@@ -46,7 +46,13 @@ def run(arguments: argparse.Namespace) -> int:
     paper = paper_of(arguments)
     targets = [out, *pictures, *(
         dict.fromkeys(x.with_suffix('.csv') for x in pictures) if paper.data else ())]
-    _check_targets(targets, arguments.bags)
+    if len({x.resolve() for x in targets}) < len(targets):
+        raise BadInputError(
+            'two of --out and --picture name the same file: expected different files')
+    if part := next((x for x in targets if x.suffix in ('.mcap', '.yaml')), None):
+        raise BadInputError(
+            f'cannot write {part}: it may be part of a bag; expected a name such as report.html')
+    check_targets(*targets, sources=arguments.bags)
 
     from hmsa_ros.recordings.bags import read_runs
     from hmsa_ros.recordings.parameters import read_parameter_file
@@ -68,26 +74,8 @@ def run(arguments: argparse.Namespace) -> int:
         if pictures:
             from hmsa_ros.report.picture import draw
             draw(pictures, parts, paper)
-    if arguments.json:
-        print(json_text({
-            'runs': [{
-                'run': x.run.label, 'bag': str(x.run.path), 'joint': x.run.joint,
-                'setpoints': [y.to_dict() for y in x.evaluation.findings]} for x in parts],
-            'files': [str(x) for x in targets]}))
-        return 0
-    for target in targets:
-        print(target)
-    return 0
-
-
-def _check_targets(targets: list[Path], bags: list[Path]) -> None:
-    """Refuse what cannot be written before the bags are read."""
-    if len({x.resolve() for x in targets}) < len(targets):
-        raise BadInputError(
-            'two of --out and --picture name the same file: expected different files')
-    for target in targets:
-        if target.suffix in ('.mcap', '.yaml'):
-            raise BadInputError(
-                f'cannot write {target}: it may be part of a bag; expected a name such as '
-                'report.html')
-    check_targets(targets, bags)
+    return show(arguments, {
+        'runs': [{
+            'run': x.run.label, 'bag': x.run.path, 'joint': x.run.joint,
+            'setpoints': [y.to_dict() for y in x.evaluation.findings]} for x in parts],
+        'files': targets}, *targets)

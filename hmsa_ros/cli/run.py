@@ -106,8 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
         records.append({
             'verdict': verdict, 'reason': reason, 'setpoints': [x.to_dict() for x in findings],
             **({'levels': [asdict(x) for x in _levels(parts)]} if experiment.levels else {}),
-            'notes': done.notes, 'exits': done.exits, 'bag': str(experiment.bag),
-            'report': None if report is None else str(report)})
+            'notes': done.notes, 'exits': done.exits, 'bag': experiment.bag, 'report': report})
         if not arguments.json:
             _print(experiment, parts, reason, done, report)
     from hmsa_ros.report.repeats import statistics, statistics_table

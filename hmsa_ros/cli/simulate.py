@@ -13,10 +13,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from hmsa_ros.cli.options import add_command, EXAMPLE, JSON
+from hmsa_ros.cli.options import add_command, EXAMPLE, JSON, show
 from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
-from hmsa_ros.files import json_text
 
 
 def add_parser(subparsers: Any) -> None:
@@ -50,13 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         written = [] if arguments.out is None else motion.save(arguments.out)
         if arguments.picture:
             motion.plot(arguments.picture, **asdict(paper))
-    report = motion.report()
-    if arguments.json:
-        print(json_text({
-            'samples': len(motion.times), 'duration': float(motion.times[-1]),
-            'rows': report.records(), 'files': [str(x) for x in (*written, *arguments.picture)]}))
-        return 0
-    print(report)
-    for path in (*written, *arguments.picture):
-        print(path)
-    return 0
+    report, files = motion.report(), [*written, *arguments.picture]
+    return show(arguments, {
+        'samples': len(motion.times), 'duration': motion.times[-1], 'rows': report.records(),
+        'files': files}, report, *files)

@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
             'setpoints name several joints: expected one stretch each; tune one joint at a time, '
             'with a planner of its own')
     folder = arguments.folder or Path('hmsa_tune') / datetime.now().strftime('%Y-%m-%d_%H-%M-%S')
-    check_targets(filter(None, (arguments.out, arguments.report)))
+    check_targets(arguments.out, arguments.report)
     known, uncertain = known_of(arguments.known)
     if arguments.simulate:
         from hmsa_ros.lab.processes import local_environment
@@ -105,8 +105,7 @@ def run(arguments: argparse.Namespace) -> int:
             'verdict': verdict, 'reason': reason, 'identified': found.identified.record(),
             'shapers': [asdict(x) for x in found.shapers], 'shaper': found.shaper,
             **{x.run.label: [y.to_dict() for y in x.evaluation.findings] for x in found.parts},
-            'file': None if found.file is None else str(found.file), 'folder': str(folder),
-            'report': None if arguments.report is None else str(arguments.report)}))
+            'file': found.file, 'folder': folder, 'report': arguments.report}))
     else:
         _print(found, folder, arguments.report)
     return 0 if verdict == 'tuned' else 1

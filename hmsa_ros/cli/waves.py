@@ -13,9 +13,8 @@ import argparse
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, EXAMPLE, JSON
+from hmsa_ros.cli.options import add_command, EXAMPLE, JSON, show
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import json_text
 
 if TYPE_CHECKING:
     from hmsa_ros.api.actuator import Actuator
@@ -45,7 +44,7 @@ def add_parser(subparsers: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print what can be reached, plan and write; what is no wave is a `BadInputError`."""
     from hmsa_ros.api.actuator import Actuator
-    from hmsa_ros.api.paths import read_path
+    from hmsa_ros.api.paths import read_path, SHAPES
 
     if (arguments.shape == 'sweep') != (arguments.to is not None):
         raise BadInputError(
@@ -54,7 +53,8 @@ def run(arguments: argparse.Namespace) -> int:
     actuator = Actuator() if arguments.params_file is None else Actuator.from_yaml(
         arguments.params_file)
     shape: Any = arguments.shape
-    if shape.lower().endswith('.csv'):
+    if shape.lower().endswith('.csv') or (
+            shape not in (*SHAPES, 'square', 'sweep') and Path(shape).is_dir()):
         times, stretches = read_path(Path(shape))
         shape = {'time': times, 'stretch': stretches}
     elif shape == 'sweep':
@@ -72,19 +72,13 @@ def run(arguments: argparse.Namespace) -> int:
         plan.save(arguments.out)
     duration = float(sum(x for x in plan.setpoints[:-1, 1]) + plan.move_times[-1])
     notes = [y for x in plan.segments for y in x.notes()]
-    if arguments.json:
-        print(json_text({
-            'bands': bands.tolist(), 'duration': duration, 'levels': plan.levels.tolist(),
-            'notes': notes}))
-        return 0
-    units = actuator.model.units
-    print(f'{len(plan.levels)} levels of {plan.flux_densities.min():.4g} to '
-          f'{plan.flux_densities.max():.4g}{units.load_name}, at rest after {duration:.4g} s')
-    for note in notes:
-        print(f'note: {note}')
-    for file in filter(None, (arguments.out, arguments.path)):
-        print(f'{file} written')
-    return 0
+    return show(
+        arguments, {
+            'bands': bands, 'duration': duration, 'levels': plan.levels, 'notes': notes},
+        f'{len(plan.levels)} levels of {plan.flux_densities.min():.4g} to '
+        f'{plan.flux_densities.max():.4g}{actuator.model.units.load_name}, at rest after '
+        f'{duration:.4g} s', *(f'note: {x}' for x in notes),
+        written=(arguments.out, arguments.path))
 
 
 def _write_path(arguments: argparse.Namespace, actuator: 'Actuator', shape: Any) -> None:

@@ -138,7 +138,7 @@ def _show(
     if as_json:
         print(json_text({
             'moves': [_record(case, results, unit) for case, results in studies],
-            'files': [str(path) for path in files]}))
+            'files': files}))
         return 0
     for case, results in studies:
         _print_table(case, results, unit)
@@ -298,7 +298,7 @@ def _show_matrix(
     """Print rows as they are worked out."""
     if as_json:
         found = {'seeds': seeds, 'rows': [asdict(x) for x in rows]}
-        print(json_text(found if table is None else {**found, 'files': [str(table)]}))
+        print(json_text(found if table is None else {**found, 'files': [table]}))
         return 0
     print('peak-to-peak vibration (offset) in % of the step, root mean square: after the first '
           'move\n(0.4 from rest), a cycle and two cycles later, after the next move (to 0.1); what'
