@@ -394,7 +394,7 @@ def run(lab: Laboratory) -> Outcome:
     entries = [(PLANNER, f'actuator.{x}', getattr(lab.bench.given, x)) for x in (
         'half_length', 'half_thickness', 'damping_coefficient')]
     tuning = Tuning(
-        Path(), tuple(((x,), hold) for x in lab.bench.targets), Path(), entries, lambda _: (),
+        Path(), tuple(((x,), hold) for x in lab.bench.targets), Path(), entries,
         accept=True)
     belief = read_belief(None, entries)
     trial = Trial(Driver(Board(lab), sheet), planner_of(belief.actuator))

@@ -70,7 +70,7 @@ def test_a_model_that_lacks_something_is_planned_with_smoothly():
     time, (switches, levels) = np.arange(0.0, 0.4, 1e-3), steps((1.3, 1.0, 1.2), 0.1)
     seen = simulate(time, switches, levels) + np.random.default_rng(0).normal(0.0, 1e-3, 400)
     found = identify(Recording(time, seen, switches, levels))
-    tuning = Tuning(Path(), tuple(((x,), y) for x, y in MOVES), Path(), [], lambda _: ())
+    tuning = Tuning(Path(), tuple(((x,), y) for x, y in MOVES), Path(), [])
     belief = read_belief(None, [])
     chosen_for = [chosen(tuning, belief, x)[1]['shaper'] for x in (
         found, replace(found, verdict='model_rejected'))]

@@ -9,7 +9,6 @@ example: hmsa demo --out my_first_run
 """
 
 import argparse
-from datetime import datetime
 import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -36,11 +35,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the demo."""
     from rich.console import Console
 
-    from hmsa_ros.lab.processes import local_environment
+    from hmsa_ros.lab.processes import dated, stay_local
 
-    folder = arguments.out or Path('hmsa_demo') / datetime.now().strftime('%Y-%m-%d_%H-%M-%S')
-    # Set before anything of ROS is imported: this process joins the nodes' domain.
-    os.environ.update(local_environment())
+    folder = arguments.out or dated('hmsa_demo')
+    stay_local()
     from hmsa_ros.lab.demo import run_demo
     from hmsa_ros.lab.experiment import prepare
 
@@ -51,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         f'ROS_DOMAIN_ID {os.environ["ROS_DOMAIN_ID"]}, output in {folder}', highlight=False)
     try:
         with progress() as update:
-            result = run_demo(folder, dict(os.environ), update)
+            result = run_demo(folder, update)
             ENDING.check()
     except KeyboardInterrupt:
         console.print(f'interrupted; the bag so far: {folder / "run"}', highlight=False)

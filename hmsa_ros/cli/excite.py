@@ -52,14 +52,11 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.identification.quantities import free_of
 
     belief = read_belief(arguments.params_file)
-    bounds = Bounds(
-        belief.number('flux_density_min', -0.5), belief.number('flux_density_max', 0.5),
-        belief.number('slew_limit', 0.0) or math.inf, arguments.stretch_min,
-        arguments.stretch_max)
     with progress('designing the sequence'):
         found = excite(
-            belief.actuator, bounds, duration=arguments.duration, rate=arguments.rate,
-            noise=arguments.noise, free=free_of(arguments.free, belief.actuator.law))
+            belief.actuator, Bounds.of(belief, arguments.stretch_min, arguments.stretch_max),
+            duration=arguments.duration, rate=arguments.rate, noise=arguments.noise,
+            free=free_of(arguments.free, belief.actuator.law))
     if arguments.out is not None:
         rows = zip(found.best.level_times, found.best.levels, strict=True)
         lines = ['time,flux_density', *(f'{x:.9f},{y:.9g}' for x, y in rows)]

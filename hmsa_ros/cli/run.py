@@ -10,11 +10,9 @@ example: hmsa run 1.10:0.2 1.20:0.2 1.00:0.2 --simulate
 
 import argparse
 from dataclasses import asdict
-from datetime import datetime
 from functools import partial
 from importlib import import_module
 import math
-import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -74,11 +72,11 @@ def run(arguments: argparse.Namespace) -> int:
     if not 1 <= arguments.repeat <= _MOST_REPEATS:
         raise BadInputError(
             f'--repeat is {arguments.repeat}: expected 1 to {_MOST_REPEATS}')
-    folder = arguments.out or Path('hmsa_run') / datetime.now().strftime('%Y-%m-%d_%H-%M-%S')
+    from hmsa_ros.lab.processes import dated, stay_local
+
+    folder = arguments.out or dated('hmsa_run')
     if arguments.simulate:
-        from hmsa_ros.lab.processes import local_environment
-        # Set before anything of ROS is imported: this process joins the nodes' domain.
-        os.environ.update(local_environment())
+        stay_local()
     from hmsa_ros.lab.experiment import prepare
 
     # Each repeat has a folder of its own.
@@ -125,7 +123,7 @@ def _carried_out(
     from hmsa_ros.lab.experiment import conduct
 
     with progress() as update:
-        done = conduct(experiment, dict(os.environ), partial(_tell, update))
+        done = conduct(experiment, partial(_tell, update))
         ENDING.check()
         update('evaluating the bag', None)
         parts = _measure(experiment, tolerances) if done.measured else []
@@ -160,7 +158,7 @@ def _tolerances(arguments: argparse.Namespace) -> 'Tolerances | None':
 
 
 def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
-    from hmsa_ros.lab.experiment import Experiment, simulated_nodes
+    from hmsa_ros.lab.experiment import Experiment, simulated_node
     from hmsa_ros.recordings.parameters import read_parameter_file
 
     expected = {} if arguments.params_file is None else dict(read_parameter_file(
@@ -169,8 +167,8 @@ def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
         expected['planner.feedback'] = arguments.feedback
     if arguments.path is not None:
         expected['planner.trajectory_mode'] = 'path'
-    nodes = simulated_nodes(
-        expected, str(arguments.params_file or ''), arguments.namespace
+    nodes = (simulated_node(
+        expected, str(arguments.params_file or ''), arguments.namespace),
     ) if arguments.simulate else ()
     return Experiment(
         folder, tuple(arguments.setpoints), nodes, arguments.namespace,

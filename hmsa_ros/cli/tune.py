@@ -10,9 +10,7 @@ example: hmsa tune 1.10:0.5 1.00:0.5 --simulate --params-file actuator.yaml
 """
 
 import argparse
-from dataclasses import asdict, replace
-from datetime import datetime
-import os
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -25,10 +23,8 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import check_targets, json_text, write_text
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from hmsa_ros.lab.processes import NodeProcess
-    from hmsa_ros.lab.tuning import Nodes, Tuned
+    from hmsa_ros.lab.tuning import Tuned
     from hmsa_ros.recordings.parameters import Entries
 
 
@@ -73,26 +69,26 @@ def run(arguments: argparse.Namespace) -> int:
         raise BadInputError(
             'setpoints name several joints: expected one stretch each; tune one joint at a time, '
             'with a planner of its own')
-    folder = arguments.folder or Path('hmsa_tune') / datetime.now().strftime('%Y-%m-%d_%H-%M-%S')
     check_targets(arguments.out, arguments.report)
     known, uncertain = known_of(arguments.known)
+    from hmsa_ros.lab.processes import dated, stay_local
+
+    folder = arguments.folder or dated('hmsa_tune')
     if arguments.simulate:
-        from hmsa_ros.lab.processes import local_environment
-        # Set before anything of ROS is imported: this process joins the nodes' domain.
-        os.environ.update(local_environment())
+        stay_local()
     from hmsa_ros.lab.experiment import prepare
     from hmsa_ros.lab.tuning import tune, Tuning
 
     prepare(folder)
     ENDING.note()
-    entries, nodes = _nodes(arguments)
+    entries, node = _nodes(arguments)
     tuning = Tuning(
         folder, tuple(arguments.setpoints), arguments.out or folder / 'actuator.yaml', entries,
-        nodes, arguments.namespace, arguments.duration, arguments.stretch_min,
+        node, arguments.namespace, arguments.duration, arguments.stretch_min,
         arguments.stretch_max, arguments.free, known, uncertain, arguments.accept)
     try:
         with progress() as update:
-            found = tune(tuning, dict(os.environ), update)
+            found = tune(tuning, update)
     except KeyboardInterrupt:
         return ENDING.status
     if arguments.report is not None:
@@ -111,26 +107,19 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if verdict == 'tuned' else 1
 
 
-def _nodes(arguments: argparse.Namespace) -> 'tuple[Entries, Nodes]':
-    """Return what is known, and what starts nodes with parameters of the planner."""
+def _nodes(arguments: argparse.Namespace) -> 'tuple[Entries, NodeProcess | None]':
+    """Return what is known, and planner and plant to start where that is asked for."""
+    from hmsa_ros.lab.experiment import simulated_node
     from hmsa_ros.lab.tuning import known_to
     from hmsa_ros.recordings.parameters import entries_of, read_parameter_file
 
     path: Path | None = arguments.params_file
+    entries = [] if path is None else entries_of(path)
     if not arguments.simulate:
-        return (known_to(arguments.namespace) if path is None else entries_of(path)), (
-            lambda settings: ())
-    from hmsa_ros.interfaces.topics import PLANNER
-    from hmsa_ros.lab.experiment import simulated_nodes
-
-    expected = {} if path is None else dict(read_parameter_file(path))
-    node, = simulated_nodes(expected, str(path or ''), arguments.namespace)
-
-    def nodes(settings: 'Mapping[str, object]') -> 'tuple[NodeProcess, ...]':
-        return replace(node, parameters={
-            **node.parameters, **{f'{PLANNER}:{x}': y for x, y in settings.items()}}),
-
-    return ([] if path is None else [x for x in entries_of(path) if x[0] != 'plant']), nodes
+        return known_to(arguments.namespace) if path is None else entries, None
+    # What the plant really is the tuning does not know.
+    return [x for x in entries if x[0] != 'plant'], simulated_node(
+        {} if path is None else read_parameter_file(path), str(path or ''), arguments.namespace)
 
 
 def _print(found: 'Tuned', folder: Path, report: Path | None) -> None:

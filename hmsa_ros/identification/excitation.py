@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,6 +28,9 @@ from hmsa_ros.model.status import RefusedError
 from hmsa_ros.planning.sequence import plan_sequence
 from hmsa_ros.planning.setpoint import Setpoint
 from hmsa_ros.planning.shapers.request import Request
+
+if TYPE_CHECKING:
+    from hmsa_ros.identification.files import Belief
 
 _PATTERN = 5  # levels in the pattern that is repeated
 # Tries to find the largest pattern inside the limits, what they aim at, and what is large enough.
@@ -65,6 +69,15 @@ class Bounds:
         if not self.slew_limit > 0.0:
             raise BadInputError(
                 f'slew limit is {self.slew_limit:g} T/s: expected a number above 0')
+
+    @classmethod
+    def of(
+            cls, belief: 'Belief', stretch_min: float | None,
+            stretch_max: float | None) -> 'Bounds':
+        """Return the limits of the coil in a parameter file, with those of the motion."""
+        return cls(
+            belief.number('flux_density_min', -0.5), belief.number('flux_density_max', 0.5),
+            belief.number('slew_limit', 0.0) or math.inf, stretch_min, stretch_max)
 
     def of_motion(self, actuator: ActuatorParameters) -> tuple[float, float]:
         """Return the range of an actuator's motion; `BadInputError` if it lacks rest."""

@@ -74,7 +74,8 @@ class PlannerClient(Visitor):
         self._namespace = namespace
         #: What the planner said last.
         self.verdict: Verdict = _SILENCE
-        self._requested = ''
+        #: The request that was sent last.
+        self.requested = ''
         endpoints.subscribe(self.node, topics.STATUS, self._on_status, topics.PLANNER)
         self._publisher = endpoints.publisher(
             self.node, topics.JOINT_TRAJECTORY, topics.PLANNER)
@@ -94,12 +95,12 @@ class PlannerClient(Visitor):
                     and self._publisher.get_subscription_count() > 0)
 
         # One whose node is there but does not listen yet is still starting.
-        self.spin_until(lambda: found() or self._planner_starts(), failure, each)
+        self.spin_until(lambda: found() or self._is_there(topics.PLANNER), failure, each)
         state = ServiceCall(
             self.node, GetState, f'{topics.PLANNER}/get_state', GetState.Request())
 
         def settled() -> bool:
-            if found() or not self._planner_starts():
+            if found() or not self._is_there(topics.PLANNER):
                 return True
             # It answers as soon as it is not busy with its start.
             answer = state.answer()
@@ -116,8 +117,8 @@ class PlannerClient(Visitor):
         state.close()
         self.spin_until(found, failure, each)
 
-    def _planner_starts(self) -> bool:
-        return (topics.PLANNER, f'/{self._namespace.strip("/")}') in (
+    def _is_there(self, name: str) -> bool:
+        return (name, f'/{self._namespace.strip("/")}') in (
             self.node.get_node_names_and_namespaces())
 
     def check_alone(self, *, own: bool = False) -> None:
@@ -254,10 +255,10 @@ class PlannerClient(Visitor):
             if end >= 2**31:
                 raise BadInputError(f'the sequence lasts {end:g} s: expected less than 2^31 s')
             points.append((stretch, round(end * NANOSECONDS)))
-        self._requested = uuid4().hex
+        self.requested = uuid4().hex
         self._publisher.publish(to_trajectory(
-            points, self._joints, frame=self._requested, raw=bool(levels), path=bool(path)))
-        return self._requested
+            points, self._joints, frame=self.requested, raw=bool(levels), path=bool(path)))
+        return self.requested
 
     @property
     def listened(self) -> bool:
@@ -332,7 +333,7 @@ class PlannerClient(Visitor):
             self._executor.spin_once(timeout_sec=SLICE_SECONDS)
             # What was sent last may be on its way: the stop must come after it.
             patient = monotonic() - begin < _GONE_SECONDS
-            if answer is None and (self.verdict.request == self._requested or not patient):
+            if answer is None and (self.verdict.request == self.requested or not patient):
                 answer = stop.answer()
                 if answer is None and not patient and not stop.ready:
                     return False

@@ -71,13 +71,11 @@ class DemoResult:
             'adapting': self.adapting.as_json()}
 
 
-def run_demo(
-        folder: Path, environment: dict[str, str],
-        progress: Callable[[str, float], None]) -> DemoResult:
+def run_demo(folder: Path, progress: Callable[[str, float], None]) -> DemoResult:
     """Run the paper's sequence in a prepared folder and read the result back from the bag."""
     experiment = Experiment(folder, [
         ((stretch,), span * paper_actuator().time_unit) for stretch, span in SEQUENCE], _NODES)
-    exits = conduct(experiment, environment, progress).exits
+    exits = conduct(experiment, progress).exits
     progress('evaluating the bag', 1.0)
     results = _evaluate(experiment.bag, folder / 'run.png')
     progress('a plant that is not as planned', 1.0)

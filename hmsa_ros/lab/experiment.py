@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from itertools import pairwise
+import math
 from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING
@@ -131,8 +132,7 @@ def prepare(folder: Path) -> None:
             'permission (--out)') from error
 
 
-def conduct(
-        experiment: Experiment, environment: Mapping[str, str], progress: Tell) -> Conducted:
+def conduct(experiment: Experiment, progress: Tell) -> Conducted:
     """
     Carry out an experiment.
 
@@ -140,8 +140,6 @@ def conduct(
     ----------
     experiment : Experiment
         In a prepared folder.
-    environment : mapping of str to str
-        Of the processes; this process must live in the same ROS domain.
     progress : callable
         Called with what is going on and the share of the sequence that is done.
 
@@ -160,53 +158,42 @@ def conduct(
 
     """
     times = [monotonic()]
-    with Session(experiment.folder, environment) as session:
+    with Session(experiment.folder) as session:
         progress('starting the nodes' if experiment.nodes else 'looking for the nodes', 0.0)
         if experiment.nodes:
             for node in (*experiment.nodes, recorder_of(experiment, True)):
                 ENDING.check()
                 session.start(node)
-        return _conduct(experiment, session, progress, times)
+        # ROS is imported here, while the nodes do the same.
+        from hmsa_ros.lab.watch import Watch
 
-
-def _conduct(
-        experiment: Experiment, session: Session, progress: Tell,
-        times: list[float]) -> Conducted:
-    """Carry out an experiment whose nodes, if it has any, have been started."""
-    # ROS is imported here, while the nodes do the same.
-    from hmsa_ros.lab.client import PlannerClient
-    from hmsa_ros.lab.watch import Watch
-
-    with PlannerClient(
-            namespace=experiment.namespace, joints=experiment.joints,
-            timeout=START_SECONDS) as client:
-        watch = Watch(client, experiment, session.check)
-        try:
-            _begin(experiment, session, watch)
-            times.append(monotonic())
-            begin = watch.now
-            verdict = _carry_out(experiment, watch, progress)
-            times.append(monotonic())
-            pace = (watch.now - begin) / (times[-1] - times[-2])
-            measured = watch.measured
-            watch.wait_for_parameters()
-        except BaseException as error:
-            resting = True
-            if watch.sent:
-                progress('coming to rest', 1.0)
-                resting = client.stop()
-            session.stop()
-            if resting:
-                raise
-            raise HmsaError(
-                f'{str(error) or "interrupted"}; the planner does not say that the actuator '
-                'rests: look after the coil') from error
-        progress('closing the bag', 1.0)
-        exits = session.stop()
-        for name, status in exits.items():
-            if status:
+        with Watch(experiment, session.check) as watch:
+            try:
+                _begin(experiment, session, watch)
+                times.append(monotonic())
+                begin = watch.now
+                verdict = _carry_out(experiment, watch, progress)
+                times.append(monotonic())
+                pace = (watch.now - begin) / (times[-1] - times[-2])
+                measured = watch.measured
+                watch.wait_for_parameters()
+            except BaseException as error:
+                resting = True
+                if watch.requested:
+                    progress('coming to rest', 1.0)
+                    resting = watch.stop()
+                session.stop()
+                if resting:
+                    raise
                 raise HmsaError(
-                    f'the {name} ended with status {status}: {session.last_words(name)}')
+                    f'{str(error) or "interrupted"}; the planner does not say that the actuator '
+                    'rests: look after the coil') from error
+            progress('closing the bag', 1.0)
+            exits = session.stop()
+            for name, status in exits.items():
+                if status:
+                    raise HmsaError(
+                        f'the {name} ended with status {status}: {session.last_words(name)}')
     times.append(monotonic())
     seconds = dict(zip(
         ('start', 'sequence', 'end'), (y - x for x, y in pairwise(times)), strict=True))
@@ -215,17 +202,17 @@ def _conduct(
 
 def _begin(experiment: Experiment, session: Session, watch: 'Watch') -> None:
     """Check what runs, and wait for the recorder."""
-    watch.client.find_planner(session.check)
+    watch.find_planner(session.check)
     watch.read_parameters()
     if not experiment.nodes:
-        watch.client.check_alone()
+        watch.check_alone()
         watch.check()
         session.start(recorder_of(experiment, bool(watch.parameter('planner.use_sim_time'))))
-    watch.client.spin_until(
+    watch.spin_until(
         lambda: watch.recorder_ready,
         f'the recorder is not ready: {session.last_words(topics.RECORDER)}', session.check)
     if experiment.nodes:
-        watch.client.check_alone(own=True)
+        watch.check_alone(own=True)
         watch.unpause()
 
 
@@ -238,8 +225,7 @@ def recorder_of(experiment: Experiment, simulated: bool) -> NodeProcess:
 
 def _carry_out(experiment: Experiment, watch: 'Watch', progress: Tell) -> Verdict:
     """Send the sequence, and wait until the last setpoint has been watched for its span."""
-    watch.sent = True
-    verdict = watch.client.send(experiment.setpoints, experiment.levels, experiment.path)
+    verdict = watch.send(experiment.setpoints, experiment.levels, experiment.path)
     begin = watch.now
     lead = watch.parameter('planner.lead_time')
     total = experiment.duration + (
@@ -249,13 +235,13 @@ def _carry_out(experiment: Experiment, watch: 'Watch', progress: Tell) -> Verdic
     slow = f' at {factor:.2g} of real time' if isinstance(factor, float) and (
         0.0 < factor < 1.0) else ''
 
-    def report() -> None:
+    def report(*_: object) -> None:
         watch.look(begin + total)
         progress(f'running the sequence{slow}', min((watch.now - begin) / total, 1.0))
 
-    verdict = watch.client.follow(verdict, each=lambda _: report(), timeout=float('inf'))
-    watch.client.spin_until(
-        lambda: watch.now - begin > total, 'time does not advance', report, float('inf'))
+    verdict = watch.follow(verdict, each=report, timeout=math.inf)
+    watch.spin_until(
+        lambda: watch.now - begin > total, 'time does not advance', report, math.inf)
     return verdict
 
 
@@ -265,13 +251,12 @@ _SAMPLES_A_PERIOD = 25.0
 _SAMPLES_A_SECOND = 4000.0
 
 
-def simulated_nodes(
-        settings: Mapping[str, object], params_file: str,
-        namespace: str) -> tuple[NodeProcess]:
+def simulated_node(
+        settings: Mapping[str, object], params_file: str, namespace: str) -> NodeProcess:
     """
     Return a planner and a paused plant that leads its time.
 
-    They are one process: time waits for the planner, however busy the machine is.
+    They are one process, since time waits for the planner, however busy the machine is.
     """
     # What the parameter file sets goes before what is chosen here.
     block = actuator_from(values_of(settings, PLANT, BLOCK))
@@ -284,7 +269,7 @@ def simulated_nodes(
         f'{PLANT}:real_time_factor': factor, f'{PLANNER}:use_sim_time': True,
         f'{PLANNER}:feedback': settings.get(f'{PLANNER}.feedback', 'off'),
         f'{PLANNER}:trajectory_mode': settings.get(f'{PLANNER}.trajectory_mode', 'rest')},
-        namespace, params_file),
+        namespace, params_file)
 
 
 def _number(settings: Mapping[str, object], name: str, default: float) -> float:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 import ctypes
 from dataclasses import dataclass
+from datetime import datetime
 import os
 from pathlib import Path
 import signal
@@ -50,11 +51,14 @@ class NodeProcess:
 
 
 class Session:
-    """Node processes, each with its log in a folder; a context manager that ends them."""
+    """
+    Node processes, each with its log in a folder; a context manager that ends them.
 
-    def __init__(self, folder: Path, environment: Mapping[str, str]) -> None:
+    Their environment is that of this process, which must live in the same ROS domain.
+    """
+
+    def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._environment = dict(environment)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def __enter__(self) -> 'Session':
@@ -69,8 +73,8 @@ class Session:
             # A session of its own: Ctrl-C in the terminal reaches only us, and we end the
             # nodes in order. Should we be killed, the kernel ends them.
             self._processes[node.name] = subprocess.Popen(
-                node.command(), env=self._environment, stdin=subprocess.DEVNULL, stdout=log,
-                stderr=log, start_new_session=True,
+                node.command(), stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                start_new_session=True,
                 preexec_fn=_die_with_parent)  # noqa: PLW1509 - only calls the kernel
 
     def log(self, name: str) -> Path:
@@ -123,12 +127,15 @@ def _die_with_parent() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
 
 
-def local_environment() -> dict[str, str]:
-    """Return a copy of our environment in which nodes talk to this host only."""
+def stay_local() -> None:
+    """Have this process and its nodes talk to this host only; before anything of ROS is there."""
     # The ROS domain is the caller's where ROS_DOMAIN_ID is set, and otherwise one that other runs
     # on this host are unlikely to use.
-    environment = dict(os.environ)
-    environment[RANGE] = 'LOCALHOST'
+    os.environ[RANGE] = 'LOCALHOST'
     # Domains above 101 collide with the ephemeral ports of Linux.
-    environment.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 101))
-    return environment
+    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 101))
+
+
+def dated(base: Path | str) -> Path:
+    """Return a folder in another one, named by date and time."""
+    return Path(base) / datetime.now().strftime('%Y-%m-%d_%H-%M-%S')

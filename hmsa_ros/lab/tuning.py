@@ -5,7 +5,7 @@ Moves as they are, an excitation, an identification, a choice among the shapers,
 and the same moves again.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -43,8 +43,6 @@ _DELAYS = ('coil_time_constant', 'sensor_latency')
 # How far beyond the setpoints the excitation goes, as a share of their range.
 _BEYOND = 0.5
 
-Nodes = Callable[[Mapping[str, object]], 'tuple[NodeProcess, ...]']
-
 
 @dataclass(frozen=True)
 class Tuning:
@@ -54,8 +52,7 @@ class Tuning:
     setpoints: tuple[tuple[tuple[float, ...], float], ...]  #: stretch and duration in s
     out: Path  #: parameter file to write
     entries: Entries  #: what is known, as in a parameter file
-    #: nodes to start with parameters of the planner; none where nodes run
-    nodes: Nodes
+    node: 'NodeProcess | None' = None  #: planner and plant to start; none where nodes run
     namespace: str = ''
     duration: float | None = None  #: of the excitation in s
     stretch_min: float | None = None  #: of the excitation; default somewhat below the setpoints
@@ -103,7 +100,7 @@ class Tuned:
             'hmsa run --feedback adapt')
 
 
-def tune(tuning: Tuning, environment: Mapping[str, str], progress: Tell) -> Tuned:
+def tune(tuning: Tuning, progress: Tell) -> Tuned:
     """
     Carry it out.
 
@@ -111,8 +108,6 @@ def tune(tuning: Tuning, environment: Mapping[str, str], progress: Tell) -> Tune
     ----------
     tuning : Tuning
         In a folder that can be made.
-    environment : mapping of str to str
-        Of the processes; this process must live in the same ROS domain.
     progress : callable
         Called with what is going on and the share of it that is done.
 
@@ -128,13 +123,13 @@ def tune(tuning: Tuning, environment: Mapping[str, str], progress: Tell) -> Tune
 
     """
     belief = read_belief(None, tuning.entries)
-    before = _moves(tuning, 'before', {}, environment, progress)
+    before = _moves(tuning, 'before', {}, progress)
     progress('designing the excitation', 0.0)
     time = before.run.time
     levels = excitation(tuning, belief, 1e9 * (len(time) - 1) / float(time[-1] - time[0]))
     excited = _conducted(Experiment(
-        tuning.folder / 'excitation', (), tuning.nodes({}), tuning.namespace, levels=levels),
-        environment, progress)
+        tuning.folder / 'excitation', (), _nodes(tuning, {}), tuning.namespace, levels=levels),
+        progress)
     progress('identifying', 0.0)
     recording, block, coil = recording_of(read_run(excited), belief.actuator)
     found = identified(tuning, belief, recording, block, coil)
@@ -147,9 +142,9 @@ def tune(tuning: Tuning, environment: Mapping[str, str], progress: Tell) -> Tune
     write_text(tuning.out, file_text(
         found, replace(belief, settings={**belief.settings, 'shaper': shaper}), str(excited),
         now))
-    if not tuning.nodes({}):
+    if tuning.node is None:
         _apply(tuning, settings)
-    after = _moves(tuning, 'after', settings, environment, progress)
+    after = _moves(tuning, 'after', settings, progress)
     return Tuned(before, found, tuple(shapers), shaper, tuning.out, after)
 
 
@@ -184,12 +179,17 @@ def _of_planner(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {x: y for x, y in settings.items() if x in own}
 
 
-def _conducted(
-        experiment: Experiment, environment: Mapping[str, str], progress: Tell) -> Path:
+def _nodes(tuning: Tuning, settings: Mapping[str, object]) -> 'tuple[NodeProcess, ...]':
+    """Return the nodes to start with parameters of the planner."""
+    return () if tuning.node is None else (replace(tuning.node, parameters={
+        **tuning.node.parameters, **{f'{PLANNER}:{x}': y for x, y in settings.items()}}),)
+
+
+def _conducted(experiment: Experiment, progress: Tell) -> Path:
     """Carry out an experiment in its folder, which names it; return its bag."""
     prepare(experiment.folder)
-    done = conduct(experiment, environment, lambda text, share: progress(
-        f'{experiment.folder.name}: {text}', share))
+    done = conduct(
+        experiment, lambda text, share: progress(f'{experiment.folder.name}: {text}', share))
     if not done.measured:
         raise HmsaError(
             'no node publishes joint_states: expected a plant, or a driver with a sensor')
@@ -200,12 +200,11 @@ def _conducted(
 
 
 def _moves(
-        tuning: Tuning, name: str, settings: Mapping[str, object],
-        environment: Mapping[str, str], progress: Tell) -> Part:
+        tuning: Tuning, name: str, settings: Mapping[str, object], progress: Tell) -> Part:
     """Make the moves; return what was measured of them."""
     bag = _conducted(Experiment(
-        tuning.folder / name, tuning.setpoints, tuning.nodes(_of_planner(settings)),
-        tuning.namespace), environment, progress)
+        tuning.folder / name, tuning.setpoints, _nodes(tuning, _of_planner(settings)),
+        tuning.namespace), progress)
     return Part.of(replace(read_run(bag), label=name))
 
 
@@ -215,9 +214,8 @@ def excitation(tuning: Tuning, belief: Belief, rate: float) -> list[tuple[float,
     stretches = [rest, *(x[0] for x, _ in tuning.setpoints)]
     beyond = _BEYOND * (max(stretches) - min(stretches))
     found = excite(
-        belief.actuator, Bounds(
-            belief.number('flux_density_min', -0.5), belief.number('flux_density_max', 0.5),
-            belief.number('slew_limit', 0.0) or float('inf'),
+        belief.actuator, Bounds.of(
+            belief,
             min(stretches) - beyond if tuning.stretch_min is None else tuning.stretch_min,
             max(stretches) + beyond if tuning.stretch_max is None else tuning.stretch_max),
         duration=tuning.duration, rate=rate,

@@ -1,10 +1,9 @@
 """What an experiment looks at: who is there, the recorder's readiness, and the time."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
-import json
 from time import monotonic, time
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rosgraph_msgs.msg import Clock
@@ -16,11 +15,11 @@ from hmsa_ros.interfaces.parameters import BLOCK, WORDS
 from hmsa_ros.interfaces.status import whole
 from hmsa_ros.lab.client import PlannerClient
 from hmsa_ros.lab.experiment import Experiment, START_SECONDS
+from hmsa_ros.lab.remote import parameters_of
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.capture import decode
 from hmsa_ros.nodes.conversions import from_time
-from hmsa_ros.nodes.service_call import RemoteParameters
 
 # How long the end of a sequence may keep us waiting after its time is over.
 _GRACE_SECONDS = 20.0
@@ -31,17 +30,18 @@ _LOOK_SECONDS = 0.5
 _SAME = 1e-9
 
 
-class Watch:
-    """Looks at the nodes of an experiment through a client; ``check`` raises if one has ended."""
+class Watch(PlannerClient):
+    """
+    A client of the planner that looks at the nodes of an experiment as well.
 
-    def __init__(
-            self, client: PlannerClient, experiment: Experiment,
-            check: Callable[[], None]) -> None:
-        self.client = client
-        self._check = check
-        self.sent = False
+    ``check_nodes`` raises if one of those that were started has ended.
+    """
+
+    def __init__(self, experiment: Experiment, check_nodes: Callable[[], None]) -> None:
+        super().__init__(
+            namespace=experiment.namespace, joints=experiment.joints, timeout=START_SECONDS)
+        self._experiment, self._check_nodes = experiment, check_nodes
         self.notes: list[str] = []
-        self._experiment = experiment
         # Topics of which the recorder has found a publisher, by what it says.
         self._matched = 0
         # Nodes whose parameters are in the bag.
@@ -51,11 +51,10 @@ class Watch:
         # The time, and when it last went on.
         self._seen = 0.0, monotonic()
         self._over: float | None = None
-        self._parameters: dict[str, str] = {}
-        node = client.node
-        endpoints.subscribe(node, topics.DIAGNOSTICS, self._on_diagnostics)
+        self._parameters: dict[str, Any] = {}
+        endpoints.subscribe(self.node, topics.DIAGNOSTICS, self._on_diagnostics)
         # Only the newest counts: the executor would call for each of thousands a second.
-        self._clock = endpoints.listen(node, topics.CLOCK_TOPIC)
+        self._clock = endpoints.listen(self.node, topics.CLOCK_TOPIC)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -78,15 +77,15 @@ class Watch:
     @property
     def recorder_ready(self) -> bool:
         """Whether the recorder hears everything that somebody sends."""
-        sent = [x for x in self._experiment.topics() if self.client.node.count_publishers(x)]
+        sent = [x for x in self._experiment.topics() if self.node.count_publishers(x)]
         return self._matched >= len(sent)
 
     def wait_for_parameters(self) -> None:
         """Wait until parameters of planner and plant are in the bag, or note that they are not."""
-        count = sum(self._known(x) for x in (topics.PLANNER, topics.PLANT))
+        count = len({x.partition('.')[0] for x in self._parameters})
         try:
-            self.client.spin_until(
-                lambda: self._stored >= count, 'no parameters', self._check, _STORED_SECONDS)
+            self.spin_until(
+                lambda: self._stored >= count, 'no parameters', self._check_nodes, _STORED_SECONDS)
         except HmsaError:
             self.notes.append(
                 'the recorder has not read all parameters of planner and plant: they are not in '
@@ -95,7 +94,7 @@ class Watch:
     @property
     def measured(self) -> bool:
         """Whether somebody publishes samples."""
-        return bool(self.client.node.count_publishers(topics.JOINT_STATES.name))
+        return bool(self.node.count_publishers(topics.JOINT_STATES.name))
 
     # -- checks --------------------------------------------------------------------------------
 
@@ -105,34 +104,14 @@ class Watch:
 
         Nodes that were started answer when they have created all that they publish.
         """
-        space = f'/{self._experiment.namespace.strip("/")}'.rstrip('/')
-        asked = {x: RemoteParameters(self.client.node, f'{space}/{x}')
-                 for x in (topics.PLANNER, topics.PLANT)}
-
-        def poll() -> None:
-            self._check()
-            for node, remote in asked.items():
-                if not self._known(node):
-                    remote.poll(partial(self._note, node))
-
-        def known() -> bool:
-            there = {x for x, own in self.client.node.get_node_names_and_namespaces()
-                     if own == (space or '/')}
-            return all(
-                self._known(node) for node in asked
-                if node == topics.PLANNER or node in there or self._experiment.nodes)
-
-        self.client.spin_until(known, 'the nodes do not give their parameters', poll)
-
-    def _known(self, node: str) -> bool:
-        return any(x.startswith(f'{node}.') for x in self._parameters)
-
-    def _note(self, node: str, found: Mapping[str, str]) -> None:
-        self._parameters |= {f'{node}.{x.partition(f"{node}.")[2]}': found[x] for x in found}
+        for name in (topics.PLANNER, topics.PLANT):
+            if name == topics.PLANNER or self._experiment.nodes or self._is_there(name):
+                self._parameters |= {f'{name}.{x}': y for x, y in parameters_of(
+                    self, name, each=self._check_nodes).items()}
 
     def parameter(self, name: str) -> object:
         """Return a parameter of a node by ``'node.name'``; None if it has none."""
-        return json.loads(self._parameters.get(name, 'null'))
+        return self._parameters.get(name)
 
     def check(self) -> None:
         """
@@ -160,13 +139,13 @@ class Watch:
             if own is not None and not _same(own, other):
                 self.notes.append(
                     f'{spec.name} is {other} for the planner and {own} for the plant')
-        self.client.spin_until(
-            lambda: not self.client.unheard(),
+        self.spin_until(
+            lambda: not self.unheard(),
             'no node receives the commands on '
-            f'{", ".join(self.client.unheard()) or "their topics"}: '
+            f'{", ".join(self.unheard()) or "their topics"}: '
             'expected a plant or a driver of the coil (hmsa plant)')
         joints = self._experiment.joints
-        if not self.client.node.count_publishers(
+        if not self.node.count_publishers(
                 topics.of_joint(topics.FLUX_DENSITY_APPLIED, joints[0], joints).name):
             self.notes.append(
                 'no node reports the applied levels (flux_density_applied)')
@@ -185,7 +164,7 @@ class Watch:
             If something has gone.
 
         """
-        self._check()
+        self._check_nodes()
         moment, now = monotonic(), self.now
         if moment - self._looked < _LOOK_SECONDS:
             return
@@ -194,10 +173,10 @@ class Watch:
             self._seen = now, moment
         elif moment - self._seen[1] > START_SECONDS:
             raise HmsaError(f'time does not advance beyond {now:g} s: expected messages on /clock')
-        if not self.client.node.count_publishers(
+        if not self.node.count_publishers(
                 topics.from_outside(topics.STATUS.name, topics.PLANNER)):
             raise HmsaError('the planner has gone: expected it to run until the end')
-        if unheard := self.client.unheard():
+        if unheard := self.unheard():
             raise HmsaError(
                 f'no node receives the commands on {", ".join(unheard)} any more: expected plant '
                 'or driver to run until the end')
@@ -210,12 +189,12 @@ class Watch:
     def unpause(self) -> None:
         """Let simulated time run."""
         call = endpoints.call(
-            self.client.node, topics.SET_PAUSED, topics.PLANT, SetBool.Request(data=False))
+            self.node, topics.SET_PAUSED, topics.PLANT, SetBool.Request(data=False))
         for condition, failure in (
                 (lambda: call.ready, 'the plant offers no service to unpause it'),
                 (lambda: call.answer() is not None, 'the plant did not answer'),
                 (lambda: self.now > 0.0, 'time does not begin to advance')):
-            self.client.spin_until(condition, failure, self._check)
+            self.spin_until(condition, failure, self._check_nodes)
 
 
 def _same(own: object, other: object) -> bool:

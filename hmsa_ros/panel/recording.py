@@ -1,7 +1,5 @@
 """A recording that is switched on and off, and its report."""
 
-from datetime import datetime
-import os
 from pathlib import Path
 import subprocess
 import sys
@@ -11,7 +9,7 @@ from time import monotonic
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.interfaces.topics import RECORDER
 from hmsa_ros.lab.experiment import Experiment, prepare, recorder_of
-from hmsa_ros.lab.processes import Session
+from hmsa_ros.lab.processes import dated, Session
 
 
 class Recording:
@@ -36,11 +34,11 @@ class Recording:
         """Begin, in simulated time if so; raise `HmsaError` if it cannot."""
         if self.state != 'off':
             raise HmsaError(f'the recording is {self.state}: expected none')
-        folder = (self._base / datetime.now().strftime('%Y-%m-%d_%H-%M-%S')).resolve()
+        folder = dated(self._base).resolve()
         prepare(folder)
         experiment = Experiment(
             folder, (), namespace=self._namespace, joints=self._joints)
-        self._session = Session(folder, dict(os.environ))
+        self._session = Session(folder)
         self._session.start(recorder_of(experiment, simulated))
         self.state, self.bag, self.since = 'on', experiment.bag, monotonic()
         self.trouble, self.report = '', None
