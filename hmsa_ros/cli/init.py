@@ -11,16 +11,23 @@ example: hmsa init --half-length 5mm --half-thickness 5mm --density 1.9g/cm3 \
 """
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 import math
 from pathlib import Path
 import sys
 from typing import Any, cast, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, JSON, law_of, LAW_OPTION, Row, show
+from hmsa_ros.cli.options import (
+    add_command,
+    argument,
+    JSON,
+    law_of,
+    LAW_OPTION,
+    Row,
+    show,
+)
 from hmsa_ros.cli.quantities import (
-    BY_KEY,
     DAMPING,
     default_of,
     EVERY,
@@ -44,7 +51,7 @@ _JOINT = 'actuator'
 _COIL = ('flux_max', 'flux_min', 'slew_limit')
 # Those of which nothing but a form of its own has sizes and constants.
 _OF_THEIR_OWN = ('beam', 'dielectric')
-_ARGUMENTS = {'j_lim': 'chain_limit'}
+_ARGUMENTS = {'j_lim': 'chain_limit', 'damping': 'damping_coefficient'}
 # In place of which the damping coefficient may be given.
 _DAMPED = ('zeta', 'damping_ratio')
 _FILE = Path('actuator.yaml')
@@ -70,8 +77,8 @@ def add_parser(subparsers: Any) -> None:
         ('--dielectric',
          'a dielectric elastomer, one layer or a stack, driven by a voltage; its setpoints are '
          'capacitances over that at rest'),
-        *(_option(x) for x in (
-            *QUANTITIES, *(x for x in EVERY if x.key not in BY_KEY), DAMPING)), LAW_OPTION,
+        *map(_option, (*QUANTITIES, *(x for x in EVERY if x not in QUANTITIES), DAMPING)),
+        LAW_OPTION,
         ('--joint', 'NAME', str,
          f'joint name (default {_JOINT}), or several separated by commas for identical actuators',
          {'default': ''}),
@@ -83,20 +90,14 @@ def add_parser(subparsers: Any) -> None:
 
 def _option(quantity: Quantity) -> Row:
     """Return the option of a quantity."""
-    def read(text: str) -> float:
-        try:
-            return quantity.parse(text)
-        except BadInputError as error:
-            raise argparse.ArgumentTypeError(str(error)) from error
-
     note = ', in place of --zeta; with --beam of its tip, in place of --damping-ratio'
     if quantity is not DAMPING:
-        default = _FOLLOWS.get(quantity.key) or f'{quantity.default:g}'
-        with_ = ' or '.join(f'--{x}' for x in _OF_THEIR_OWN if quantity in FORMS[x] or (
-            quantity.key == 'damping_ratio'))
-        note = f' (default {default}){"" if quantity.key in BY_KEY else f", with {with_}"}'
+        note = f' (default {_FOLLOWS.get(quantity.key) or format(quantity.default, "g")})'
+        if quantity not in QUANTITIES:
+            note += ', with ' + ' or '.join(
+                f'--{x}' for x in _OF_THEIR_OWN if quantity.key in {y.key for y in FORMS[x]})
     unit = f' [{quantity.unit}]' if quantity.unit else ''
-    return quantity.option, 'X', read, f'{quantity.text}{unit}{note}'
+    return quantity.option, 'X', argument(quantity.parse), f'{quantity.text}{unit}{note}'
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -105,50 +106,61 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.force and path.exists():
         raise BadInputError(f'{path} exists: name another file with --out, or add --force')
     check_targets(path)
-    asked = _asked(arguments)
-    given = _given(arguments, asked)
+    form, asked = _asked(arguments)
+    given = _given(arguments, form, asked)
     joints = joint_names(arguments.joint)
-    by_key = {x.key: x for x in asked}
-    missing = [key for key in by_key if key not in OPTIONAL and not _known(key, given)]
+    missing = [x for x in asked if x.key not in OPTIONAL and not _known(x.key, given)]
+    guessed = [x for x in missing if x.key in _GUESSES] if arguments.yes else []
     if missing and not arguments.yes:
         if not sys.stdin.isatty():
             raise BadInputError(
                 'standard input is not a terminal, and '
-                f'{", ".join(by_key[x].option for x in missing)} '
+                f'{", ".join(x.option for x in missing)} '
                 f'{"is" if len(missing) == 1 else "are"} not given: give them, or add --yes for '
                 'the defaults')
-        given, joints = _ask(asked, given, joints)
-    guessed = [key for key in _GUESSES if key in missing and arguments.yes]
-    for key, quantity in by_key.items():
-        if not _known(key, given):
-            given[key] = default_of(quantity, given)
+        joints = _ask(asked, given, joints)
+    for quantity in asked:
+        if not _known(quantity.key, given):
+            given[quantity.key] = default_of(quantity, given)
+    from hmsa_ros.api.facts import facts
 
-    made = _actuator(arguments, given)
-    actuator, found = made.block, made.scales
-    given.setdefault('shear_modulus', actuator.shear_modulus)
-    doubts = _doubts(_form(arguments), given, found)
+    made = _actuator(form, given, arguments.law)
+    found = made.scales
+    given.setdefault('shear_modulus', made.block.shear_modulus)
+    doubts = _doubts(form, given, found)
     if guessed:
         doubts.append(
-            f'{" and ".join(f"{by_key[x].words} {given[x]:g}" for x in guessed)} '
+            f'{" and ".join(f"{x.words} {given[x.key]:g}" for x in guessed)} '
             f'{"is a guess" if len(guessed) == 1 else "are guesses"}: a plan is only as exact '
             'as its parameters; measure them and pass the values')
     joints = joints or [_JOINT]
-    write_text(path, file_text(path, made, joints))
+    parameters = _parameters(made)
+    table = [f'{name:<26} {value}' for name, value in facts(found, made.block)]
+    write_text(path, '\n'.join([
+        '# Parameters of an actuator for planner and plant, written by hmsa init:',
+        f'#   hmsa plant --ros-args --params-file {path.name}',
+        f'#   hmsa planner --ros-args --params-file {path.name}',
+        '#', '# What follows from them (computed by hmsa init when it wrote this file):',
+        *(f'#   {line}' for line in table), '/**:', '  ros__parameters:',
+        *_lines(form, parameters), *_joints(joints, made.block), *_sampling(made.block)]) + '\n')
     for doubt in doubts:
         print(f'hmsa: warning: {doubt}', file=sys.stderr)
     return show(
         arguments, {
-            'file': path, 'joints': joints, 'parameters': _parameters(made),
+            'file': path, 'joints': joints, 'parameters': parameters,
             'scales': asdict(found), 'warnings': doubts},
-        *table(found, actuator), f'\n{path} written; to use it:',
+        *table, f'\n{path} written; to use it:',
         *(f'  hmsa {x} --ros-args --params-file {path}' for x in ('plant', 'planner')))
 
 
-def _asked(arguments: argparse.Namespace) -> tuple[Quantity, ...]:
-    """Return what is to be given; a law has a modulus and a limit of its own."""
-    form = _form(arguments)
+def _asked(arguments: argparse.Namespace) -> tuple[str, tuple[Quantity, ...]]:
+    """Return what the actuator is and what is to be given; a law has constants of its own."""
+    forms = [x for x in _OF_THEIR_OWN if getattr(arguments, x)]
+    if len(forms) > 1:
+        raise BadInputError('both --beam and --dielectric are given: expected one of them')
+    form = forms[0] if forms else 'block'
     if arguments.law is None:
-        return FORMS[form]
+        return form, FORMS[form]
     from hmsa_ros.model.laws import LAWS
 
     law = LAWS[law_of(arguments.law)[0]]
@@ -158,20 +170,13 @@ def _asked(arguments: argparse.Namespace) -> tuple[Quantity, ...]:
             f'--law {law.name} is given{"" if form == "block" else f" with --{form}"}: expected '
             f'--{own} for a {own}, which has a law of its own, and --law for a block')
     none = ('shear_modulus', 'j_lim') if law.scaled else ('j_lim',) if law.endless else ()
-    return tuple(x for x in QUANTITIES if x.key not in none)
+    return form, tuple(x for x in QUANTITIES if x.key not in none)
 
 
-def _form(arguments: argparse.Namespace) -> str:
-    """Return what the actuator is, by an option of that name."""
-    forms = [x for x in _OF_THEIR_OWN if getattr(arguments, x)]
-    if len(forms) > 1:
-        raise BadInputError('both --beam and --dielectric are given: expected one of them')
-    return forms[0] if forms else 'block'
-
-
-def _given(arguments: argparse.Namespace, asked: Sequence[Quantity]) -> dict[str, float]:
+def _given(
+        arguments: argparse.Namespace, form: str,
+        asked: Sequence[Quantity]) -> dict[str, float]:
     """Return the values of the options, checked against each other."""
-    form = _form(arguments)
     given = {x.key: value for x in (*EVERY, DAMPING)
              if (value := getattr(arguments, x.key)) is not None}
     for key in _DAMPED:
@@ -184,18 +189,14 @@ def _given(arguments: argparse.Namespace, asked: Sequence[Quantity]) -> dict[str
                 'both --shear-modulus and --youngs-modulus are given: expected one of them, '
                 'since E is 3 G')
         given['youngs_modulus'] = 3.0 * given.pop('shear_modulus')
-    others = given.keys() - {x.key for x in asked} - {DAMPING.key}
-    if others:
+    if others := given.keys() - {x.key for x in asked} - {DAMPING.key}:
+        own = [x for x in _OF_THEIR_OWN if others <= {y.key for y in FORMS[x]}]
         raise BadInputError(
             f'{", ".join(sorted("--" + x.replace("_", "-") for x in others))} is given: expected '
-            + ('sizes of a beam, --length, --thickness and --width, and no --zeta or --j-lim'
-               if form == 'beam'
-               else f'of a dielectric elastomer {", ".join(x.option for x in asked)}'
-               if form == 'dielectric'
-               else f'constants of --law {arguments.law.partition(":")[0]} in its place'
+            + (f'constants of --law {arguments.law.partition(":")[0]} in its place'
                if arguments.law is not None and others <= {x.key for x in QUANTITIES}
-               else next((f'--{x} with it' for x in _OF_THEIR_OWN
-                          if others <= {y.key for y in FORMS[x]}), '--beam or --dielectric')))
+               else f'--{own[0]} with it' if form == 'block' and own
+               else f'sizes of a {form}, or others of {", ".join(x.option for x in asked)}'))
     return given
 
 
@@ -205,19 +206,17 @@ def _known(key: str, given: Mapping[str, float]) -> bool:
 
 
 def _ask(
-        asked: Sequence[Quantity], given: Mapping[str, float],
-        joints: list[str]) -> tuple[dict[str, float], list[str]]:
-    """Ask for what is not given."""
-    answers = dict(given)
+        asked: Sequence[Quantity], answers: dict[str, float], joints: list[str]) -> list[str]:
+    """Add answers to what is given, and return the joints."""
     print(
         'Numbers are in the unit shown unless another unit follows: 10 mm, 50 kPa. Press Enter '
         'for the value in brackets.', file=sys.stderr)
     for quantity in asked:
         key = quantity.key
-        if _known(key, answers):
-            continue
-        default = default_of(quantity, answers)
-        while True:
+        default = None
+        while not _known(key, answers):
+            if default is None:
+                default = default_of(quantity, answers)
             words = quantity.text + (
                 ', or c in N s/m with its unit' if key in _DAMPED else '')
             text = _answer(f'{words} [{quantity.show(default)}]: ')
@@ -234,16 +233,15 @@ def _ask(
                 # Once more, with the number as it is for what Enter takes.
                 print(f'  {doubt}', file=sys.stderr)
                 default = value
-                continue
-            answers[key] = value
-            break
+            else:
+                answers[key] = value
     while not joints:
         text = _answer(f'joint name, or several separated by commas [{_JOINT}]: ')
         try:
             joints = joint_names(text) or [_JOINT]
         except BadInputError as error:
             print(f'  {error}', file=sys.stderr)
-    return answers, joints
+    return joints
 
 
 def _answer(question: str) -> str:
@@ -256,25 +254,24 @@ def _answer(question: str) -> str:
     return line.strip()
 
 
-def _actuator(
-        arguments: argparse.Namespace, given: Mapping[str, float]) -> 'Actuator':
+def _actuator(form: str, given: Mapping[str, float], law: str | None) -> 'Actuator':
     """Return the actuator with its coil."""
     from hmsa_ros.api.actuator import Actuator
 
-    form = _form(arguments)
-    values: dict[str, Any] = {} if form == 'dielectric' else {
-        'flux_density_limits': (given['flux_min'], given['flux_max']),
-        'slew_limit': given['slew_limit'] or math.inf}
-    sizes = [x.key for x in FORMS[form] if x.key not in _COIL]
-    values |= {_ARGUMENTS.get(x, x): given[x] for x in sizes if x in given}
-    if DAMPING.key in given:
-        values = {x: y for x, y in values.items() if x not in _DAMPED} | {
-            'damping_coefficient': given[DAMPING.key]}
-    if arguments.law is not None:
-        values['law'], values['constants'] = law_of(arguments.law)
-    if form == 'dielectric':
-        return Actuator.dielectric(**values)
-    return Actuator.beam(**values) if form == 'beam' else Actuator(**values)
+    # Either of them, as it is given.
+    damping = (DAMPING.key,) if DAMPING.key in given else _DAMPED
+    values: dict[str, Any] = {
+        _ARGUMENTS.get(x, x): given[x]
+        for x in (*(y.key for y in FORMS[form] if y.key not in (*_COIL, *_DAMPED)), *damping)
+        if x in given}
+    if form != 'dielectric':
+        values |= {'flux_density_limits': (given['flux_min'], given['flux_max']),
+                   'slew_limit': given['slew_limit'] or math.inf}
+    if law is not None:
+        values['law'], values['constants'] = law_of(law)
+    makers: dict[str, Callable[..., Actuator]] = {
+        'block': Actuator, 'beam': Actuator.beam, 'dielectric': Actuator.dielectric}
+    return makers[form](**values)
 
 
 def _doubts(form: str, given: Mapping[str, float], found: 'Scales') -> list[str]:
@@ -303,62 +300,47 @@ def _doubts(form: str, given: Mapping[str, float], found: 'Scales') -> list[str]
             doubts.append(
                 f'lying, the beam sags by {sag:.2g} of its length under its own weight, which the '
                 'model does not know: clamp it so that it bends in a horizontal plane')
-        return doubts
-    if form == 'dielectric':
-        return doubts
-    ratio = given['half_thickness'] / given['half_length']
-    if not 0.05 <= ratio <= 20.0:
-        doubts.append(
-            f'half thickness over half length is {ratio:.3g}: the model describes a block with '
-            'sides of similar length; a thin film or a long rod bends instead')
+    if form == 'block':
+        ratio = given['half_thickness'] / given['half_length']
+        if not 0.05 <= ratio <= 20.0:
+            doubts.append(
+                f'half thickness over half length is {ratio:.3g}: the model describes a block '
+                'with sides of similar length; a thin film or a long rod bends instead')
     return doubts
 
 
-def table(found: 'Scales', actuator: 'ActuatorParameters') -> list[str]:
-    """Return what follows from the parameters, aligned, a line each."""
-    from hmsa_ros.api.facts import facts
-
-    return [f'{name:<26} {value}' for name, value in facts(found, actuator)]
-
-
-def file_text(path: Path, made: 'Actuator', joints: list[str]) -> str:
-    """Return the parameter file in ROS 2's YAML; its name and the scales go into comments."""
-    actuator, found = made.block, made.scales
-    lines = [
-        '# Parameters of an actuator for planner and plant, written by hmsa init:',
-        f'#   hmsa plant --ros-args --params-file {path.name}',
-        f'#   hmsa planner --ros-args --params-file {path.name}',
-        '#', '# What follows from them (computed by hmsa init when it wrote this file):',
-        *(f'#   {line}' for line in table(found, actuator)),
-        '/**:', '  ros__parameters:']
+def _lines(form: str, parameters: Mapping[str, Any]) -> list[str]:
+    """Return the nodes' parameters in YAML, each below what it is."""
     texts = {x.name: (x.description.rstrip('.'), x.unit) for x in LAW} | {
         x.parameter: (x.text, x.unit) for x in (*QUANTITIES, DAMPING)}
-    if not actuator.rest:
+    if form == 'beam':
         texts |= {
             x.parameter: (('half of the ' if 'half_' in x.parameter else '') + x.text, x.unit)
             for x in FORMS['beam']} | {
             LAW_NAME.name: ('a beam: positions are deflections of the tip over the length', ''),
             DAMPING.parameter: ('damping coefficient of the tip', DAMPING.unit)}
-    if made.law == 'dielectric':
-        texts |= {x.parameter: (x.text, x.unit) for x in FORMS['dielectric'] if x.parameter} | {
+    if form == 'dielectric':
+        texts |= {x.parameter: (x.text, x.unit) for x in FORMS['dielectric']} | {
             LAW_NAME.name: (
                 'driven by a voltage: positions are capacitances over that at rest', ''),
             'flux_density_min': ("amplifier's minimum voltage", 'V')}
-    for name, value in _parameters(made).items():
+    lines = []
+    for name, value in parameters.items():
         text, unit = texts[name]
         lines += [f'    # {text[0].upper()}{text[1:]}{f" [{unit}]" if unit else ""}.',
                   f'    {name}: {yaml_text(value)}']
+    return lines
+
+
+def _joints(joints: list[str], block: 'ActuatorParameters') -> list[str]:
+    """Return the lines of the joints' names."""
     if len(joints) == 1:
-        lines += ['    # Name of the joint in trajectories and joint states.',
-                  f"    joint: '{joints[0]}'"]
-    else:
-        names = ', '.join(f"'{x}'" for x in joints)
-        lines += [
-            '    # Names of the joints; all are identical except for what is set for one, such '
-            'as',
-            f'    # {joints[0]}.actuator.remanence: {yaml_text(actuator.remanence)}',
-            f'    joints: [{names}]']
-    return '\n'.join(lines + _sampling(actuator)) + '\n'
+        return ['    # Name of the joint in trajectories and joint states.',
+                f'    joint: {yaml_text(joints[0])}']
+    return [
+        '    # Names of the joints; all are identical except for what is set for one, such as',
+        f'    # {joints[0]}.actuator.remanence: {yaml_text(block.remanence)}',
+        f'    joints: {yaml_text(joints)}']
 
 
 def _sampling(actuator: 'ActuatorParameters') -> list[str]:

@@ -1,14 +1,15 @@
 """Options of commands, as rows of tables."""
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 import inspect
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.files import json_text
 
+T = TypeVar('T')
 #: Names, metavar, type, help and, where there are any, other settings of argparse; of a flag name
 #: and help, of a group its title and a list of its rows.
 Row = tuple[Any, ...]
@@ -63,20 +64,28 @@ def law_of(text: str) -> tuple[str, dict[str, Any]]:
     return name, constants
 
 
-def of_unit(option: str, unit: str, text: str) -> Row:
-    """Return an option that is a number above 0 in an SI unit or with a unit of its own."""
-    from hmsa_ros.cli.quantities import number_of
-
-    def read(words: str) -> float:
+def argument(read: Callable[[str], T]) -> Callable[[str], T]:
+    """Return what reads an argument, so that argparse shows its `BadInputError` as it is."""
+    def read_argument(text: str) -> T:
         try:
-            value = number_of(words, unit, option)
+            return read(text)
         except BadInputError as error:
             raise argparse.ArgumentTypeError(str(error)) from error
+
+    return read_argument
+
+
+def of_unit(option: str, unit: str, text: str) -> Row:
+    """Return an option that is a number above 0 in an SI unit or with a unit of its own."""
+    def read(words: str) -> float:
+        from hmsa_ros.cli.quantities import number_of
+
+        value = number_of(words, unit, option)
         if not value > 0.0:
-            raise argparse.ArgumentTypeError(f'{value:g} {unit}: expected more than 0 {unit}')
+            raise BadInputError(f'{value:g} {unit}: expected more than 0 {unit}')
         return value
 
-    return option, 'X', read, f'{text} [{unit}]'
+    return option, 'X', argument(read), f'{text} [{unit}]'
 
 
 def timeout_of(arguments: argparse.Namespace) -> float:

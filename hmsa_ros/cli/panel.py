@@ -52,16 +52,8 @@ def run(arguments: argparse.Namespace) -> int:
     ENDING.note()
     with Server(arguments.port) as server:
         desk = Desk(
-            server, _setpoint, arguments.out, arguments.namespace,
+            server, setpoint_of_joints, arguments.out, arguments.namespace,
             tuple(arguments.joint.split(',')), span, stop_on_close=arguments.stop_on_close)
         print(f'panel: {server.address}', flush=True)
         desk.run()
     return 0
-
-
-def _setpoint(text: str) -> tuple[tuple[float, ...], float]:
-    """Return stretches and seconds of one setpoint, or raise `BadInputError`."""
-    try:
-        return setpoint_of_joints(text)
-    except argparse.ArgumentTypeError as error:
-        raise BadInputError(str(error)) from error

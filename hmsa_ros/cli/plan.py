@@ -13,7 +13,14 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, law_of, LAW_OPTION, MATERIAL, of_unit
+from hmsa_ros.cli.options import (
+    add_command,
+    argument,
+    law_of,
+    LAW_OPTION,
+    MATERIAL,
+    of_unit,
+)
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import setpoint
 from hmsa_ros.errors import BadInputError
@@ -41,7 +48,7 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     add_command(
         subparsers, __name__, __doc__,
-        ('setpoints', 'STRETCH:DURATION', setpoint,
+        ('setpoints', 'STRETCH:DURATION', argument(setpoint),
          'target stretch, or deflection of a beam, and duration (move plus hold)',
          {'nargs': '*'}),
         ('--path', 'CSV', Path,

@@ -4,7 +4,7 @@ import argparse
 import math
 from pathlib import Path
 
-from hmsa_ros.cli.options import Row
+from hmsa_ros.cli.options import argument, Row
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.planning.setpoint import Setpoint
 
@@ -47,7 +47,7 @@ def levels_of(arguments: argparse.Namespace) -> list[tuple[float, float]]:
 
 
 def setpoint(text: str) -> tuple[float, float]:
-    """Read stretch and time from ``'1.10:10'``; raise `ArgumentTypeError` for anything else."""
+    """Read stretch and time from ``'1.10:10'``; raise `BadInputError` for anything else."""
     stretches, span = setpoint_of_joints(text)
     if len(stretches) > 1:
         raise _no_setpoint(text)
@@ -55,29 +55,26 @@ def setpoint(text: str) -> tuple[float, float]:
 
 
 def setpoint_of_joints(text: str) -> tuple[tuple[float, ...], float]:
-    """Read stretches and time from ``'1.10,1.20:10'``, or raise `ArgumentTypeError`."""
-    stretches, colon, span = text.partition(':')
+    """Read stretches and time from ``'1.10,1.20:10'``, or raise `BadInputError`."""
+    stretches, _, span = text.partition(':')
     try:
-        if not colon:
-            raise ValueError(text)
         found = [Setpoint(float(stretch), float(span)) for stretch in stretches.split(',')]
         if math.isinf(found[0].span):
             raise BadInputError('duration is inf: expected a finite number')
     except BadInputError as error:
-        raise argparse.ArgumentTypeError(f'{text!r}: {error}') from error
+        raise BadInputError(f'{text!r}: {error}') from error
     except ValueError:
         raise _no_setpoint(text) from None
     return tuple(x.stretch for x in found), found[0].span
 
 
-def _no_setpoint(text: str) -> argparse.ArgumentTypeError:
-    return argparse.ArgumentTypeError(
-        f'{text!r}: expected STRETCH:DURATION, two numbers such as 1.10:10')
+def _no_setpoint(text: str) -> BadInputError:
+    return BadInputError(f'{text!r}: expected STRETCH:DURATION, two numbers such as 1.10:10')
 
 
 #: What says what to send: setpoints, or a file of levels or of a path.
 SEQUENCE: tuple[Row, ...] = (
-    ('setpoints', 'STRETCH:SECONDS', setpoint_of_joints,
+    ('setpoints', 'STRETCH:SECONDS', argument(setpoint_of_joints),
      'target stretch, or deflection of a beam, and its duration in s (move plus hold); with '
      'several joints, one stretch for all or one per joint, as in 1.10,1.20:2', {'nargs': '*'}),
     ('--levels', 'CSV', Path,

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.identify import known_of
-from hmsa_ros.cli.options import add_command, NAMESPACE
+from hmsa_ros.cli.options import add_command, argument, NAMESPACE
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import setpoint_of_joints
 from hmsa_ros.ending import ENDING
@@ -32,7 +32,7 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     add_command(
         subparsers, __name__, __doc__,
-        ('setpoints', 'STRETCH:SECONDS', setpoint_of_joints,
+        ('setpoints', 'STRETCH:SECONDS', argument(setpoint_of_joints),
          'moves to tune for: target stretch, or deflection of a beam, and duration in s',
          {'nargs': '+'}),
         ('--simulate', 'start a planner and a plant for each run, in simulated time'),
