@@ -20,11 +20,11 @@ from hmsa_ros.cli.options import (
     LAW_OPTION,
     MATERIAL,
     of_unit,
+    show,
 )
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import setpoint
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import json_text
 from hmsa_ros.table import Column
 
 if TYPE_CHECKING:
@@ -96,70 +96,99 @@ def run(arguments: argparse.Namespace) -> int:
     if bool(arguments.setpoints) == (arguments.path is not None) or arguments.path and not si:
         raise BadInputError(
             'expected STRETCH:DURATION such as 1.10:10, or --path CSV with --params-file')
+    return _in_units(arguments) if si else _without_dimension(arguments)
+
+
+def _in_units(arguments: argparse.Namespace) -> int:
+    """Plan in seconds and tesla, or volts."""
+    from hmsa_ros.api.plan import table_of
+
+    actuator = _actuator(arguments)
+    shaper = arguments.shaper or 'two_step'
+    plan = _along(actuator, arguments) if arguments.path else actuator.plan(
+        arguments.setpoints, shaper, **_more(arguments))
+    if arguments.out is not None:
+        plan.save(arguments.out)
+    group, units, per_ampere = (
+        actuator.model.material, actuator.model.units, arguments.tesla_per_ampere)
+    if units.drive.squared and per_ampere is not None:
+        raise BadInputError(
+            f'--tesla-per-ampere is {per_ampere:g} T/A: expected it with a coil alone, the '
+            'actuator of the file is driven by a voltage')
+    record: dict[str, Any] = {
+        'c1': group.c1, 'zeta': group.zeta, 'j_lim': group.j_lim, 'time_unit': units.time,
+        'flux_density_unit': units.load,
+        'segments': [_si_row(x, units, per_ampere) for x in plan.segments]}
+    amplifiers = []
+    if arguments.amplifier:
+        with progress('planning for amplifiers'):
+            amplifiers.append(actuator.amplifiers(
+                arguments.setpoints, shaper=shaper, **_more(arguments),
+                **{x: getattr(arguments, x) for x in _WINDING}))
+        record['amplifiers'] = amplifiers[0].records()
+    unit, word = units.load_name.strip(), units.drive.name.replace(' ', '_')
+    shown = [
+        Column('span', 's', head='duration'),
+        Column('flux_density_p', unit, head=f'{word}_p'), Column('time_p', 's'),
+        Column('flux_density_1', unit, head=f'{word}_1')]
+    if per_ampere is not None:
+        shown += [Column('current_p', 'A'), Column('current_1', 'A')]
+    return show(
+        arguments, record, table_of(
+            plan.segments, (Column(group.coordinate.name), *shown),
+            [(x['stretch'], *(x[y.name] for y in shown)) for x in record['segments']],
+            Column('between', f'{unit} at s'), units.time, units.level,
+            f'c1 {group.c1:.6g}, zeta {group.zeta:.6g}, time unit L sqrt(rho/G) '
+            f'{units.time:.6g} s'),
+        *([f'{arguments.out} written'] if arguments.out is not None else []),
+        *(f'\n{x}' for x in amplifiers))
+
+
+def _without_dimension(arguments: argparse.Namespace) -> int:
+    """Plan in the units of the paper."""
     from hmsa_ros.api.plan import table_of
     from hmsa_ros.model.equations import signed_root
+    from hmsa_ros.model.moves import State
+    from hmsa_ros.model.status import Code, RefusedError
+    from hmsa_ros.model.units import Units
+    from hmsa_ros.planning.sequence import plan_sequence
+    from hmsa_ros.planning.setpoint import impossible, Setpoint
+    from hmsa_ros.planning.shapers.pace import Pace
+    from hmsa_ros.planning.shapers.request import as_errors, ERRORS, Request
 
-    facts, amplifiers = {}, None
-    if si:
-        actuator = _actuator(arguments)
-        plan = _along(actuator, arguments) if arguments.path else actuator.plan(
-            arguments.setpoints, arguments.shaper or 'two_step', **_more(arguments))
-        segments = plan.segments
-        if arguments.out is not None:
-            plan.save(arguments.out)
-        group, units = actuator.model.material, actuator.model.units
-        named, word = units.load_name.strip(), units.drive.name.replace(' ', '_')
-        if units.drive.squared and arguments.tesla_per_ampere is not None:
-            raise BadInputError(
-                f'--tesla-per-ampere is {arguments.tesla_per_ampere:g} T/A: expected it with a '
-                'coil alone, the actuator of the file is driven by a voltage')
-        facts = {'c1': group.c1, 'zeta': group.zeta, 'j_lim': group.j_lim,
-                 'time_unit': units.time, 'flux_density_unit': units.load}
-        rows = [_si_row(x, units, arguments.tesla_per_ampere) for x in segments]
-        if arguments.amplifier:
-            with progress('planning for amplifiers'):
-                amplifiers = actuator.amplifiers(
-                    arguments.setpoints, shaper=arguments.shaper or 'two_step',
-                    **_more(arguments), **{x: getattr(arguments, x) for x in _WINDING})
-        shown = [
-            Column('span', 's', head='duration'),
-            Column('flux_density_p', named, head=f'{word}_p'), Column('time_p', 's'),
-            Column('flux_density_1', named, head=f'{word}_1')]
-        if arguments.tesla_per_ampere is not None:
-            shown += [Column('current_p', 'A'), Column('current_1', 'A')]
-        unit, middle, level = units.time, Column('between', f'{named} at s'), units.level
-        caption = (f'c1 {group.c1:.6g}, zeta {group.zeta:.6g}, time unit L sqrt(rho/G) '
-                   f'{units.time:.6g} s')
-    else:
-        if arguments.out is not None:
-            raise BadInputError(
-                '--out is given: expected --params-file with it, since the file has seconds and '
-                'tesla')
-        group = _group(arguments)
-        segments = _nondimensional(arguments, group)
-        rows = [_row(x) for x in segments]
-        shown = [
-            Column('span', _TIME, head='duration'), Column('b_p'), Column('tau_p', _TIME),
-            Column('b_1')]
-        unit, middle = 1.0, Column('between', 'b at tau')
-
-        def level(load: float) -> float:
-            return float(signed_root(load))
-
-        caption = 'nondimensional as in the paper, b = sqrt(Br B/(mu0 G)); in seconds and tesla ' \
-                  'with --params-file'
-    if arguments.json:
-        print(json_text({**facts, 'segments': rows, **(
-            {} if amplifiers is None else {'amplifiers': amplifiers.records()})}))
-        return 0
-    print(table_of(
-        segments, (Column(group.coordinate.name), *shown),
-        [(x['stretch'], *(x[y.name] for y in shown)) for x in rows], middle, unit, level, caption))
     if arguments.out is not None:
-        print(f'{arguments.out} written')
-    if amplifiers is not None:
-        print(f'\n{amplifiers}')
-    return 0
+        raise BadInputError(
+            '--out is given: expected --params-file with it, since the file has seconds and '
+            'tesla')
+    group = _group(arguments)
+    for stretch, _ in arguments.setpoints:
+        if reason := impossible(stretch, group.rest):
+            raise BadInputError(reason)
+    errors = _errors(arguments)
+    try:
+        segments = plan_sequence(
+            [Setpoint(*x) for x in arguments.setpoints],
+            Request.of(
+                group, State(group.rest if arguments.start is None else arguments.start),
+                units=Units(time_name=f' {_TIME}', load_name=f' {_LOAD}'), order=arguments.order,
+                errors=ERRORS if errors is None else as_errors(errors),
+                pace=Pace(arguments.periods, arguments.max_rate)),
+            arguments.shaper or 'two_step')
+    except RefusedError as error:
+        if error.code is not Code.SPELL_TOO_SHORT:
+            raise
+        raise RefusedError(
+            error.code, f'{error}; if seconds were meant, name the actuator with '
+            '--params-file') from error
+    rows = [_row(x) for x in segments]
+    return show(arguments, {'segments': rows}, table_of(
+        segments, (
+            Column(group.coordinate.name), Column('duration', _TIME), Column('b_p'),
+            Column('tau_p', _TIME), Column('b_1')),
+        [[x[y] for y in ('stretch', 'span', 'b_p', 'tau_p', 'b_1')] for x in rows],
+        Column('between', 'b at tau'), 1.0, lambda load: float(signed_root(load)),
+        'nondimensional as in the paper, b = sqrt(Br B/(mu0 G)); in seconds and tesla with '
+        '--params-file'))
 
 
 def nominal(arguments: argparse.Namespace) -> 'Nominal':
@@ -229,39 +258,6 @@ def _group(arguments: argparse.Namespace) -> 'NondimensionalParameters':
     return NondimensionalParameters(**given)
 
 
-def _nondimensional(
-        arguments: argparse.Namespace,
-        group: 'NondimensionalParameters') -> tuple['Segment', ...]:
-    """Plan in the units of the paper."""
-    from hmsa_ros.model.moves import State
-    from hmsa_ros.model.status import Code, RefusedError
-    from hmsa_ros.model.units import Units
-    from hmsa_ros.planning.sequence import plan_sequence
-    from hmsa_ros.planning.setpoint import impossible, Setpoint
-    from hmsa_ros.planning.shapers.pace import Pace
-    from hmsa_ros.planning.shapers.request import as_errors, ERRORS, Request
-
-    for stretch, _ in arguments.setpoints:
-        if reason := impossible(stretch, group.rest):
-            raise BadInputError(reason)
-    errors = _errors(arguments)
-    try:
-        return plan_sequence(
-            [Setpoint(*x) for x in arguments.setpoints],
-            Request.of(
-                group, State(group.rest if arguments.start is None else arguments.start),
-                units=Units(time_name=f' {_TIME}', load_name=f' {_LOAD}'), order=arguments.order,
-                errors=ERRORS if errors is None else as_errors(errors),
-                pace=Pace(arguments.periods, arguments.max_rate)),
-            arguments.shaper or 'two_step')
-    except RefusedError as error:
-        if error.code is not Code.SPELL_TOO_SHORT:
-            raise
-        raise RefusedError(
-            error.code, f'{error}; if seconds were meant, name the actuator with '
-            '--params-file') from error
-
-
 def _errors(arguments: argparse.Namespace) -> list[float] | None:
     """Return the errors for which minimax plans, if they are given."""
     if arguments.errors is None:
@@ -278,16 +274,16 @@ def _si_row(
         segment: 'Segment', units: 'Units', per_ampere: float | None) -> dict[str, Any]:
     """Return a segment with its times in s, its flux densities in T and currents in A as well."""
     row: dict[str, Any] = _row(segment)
-    first: float | None = None if row['beta_p'] is None else units.level(row['beta_p'])
-    last: float = units.level(row['beta_1'])
-    return row | {
+    levels = [[x.time * units.time, units.level(x.load)] for x in segment.move.levels]
+    first, last = levels[0][1] if segment.shaped else None, units.level(segment.held)
+    row |= {
         'span': row['span'] * units.time,
         'time_p': None if row['tau_p'] is None else row['tau_p'] * units.time,
-        'flux_density_p': first, 'flux_density_1': last,
-        'levels': [[x.time * units.time, units.level(x.load)] for x in segment.move.levels]} | (
-            {} if not per_ampere else {
-                'current_p': None if first is None else first / per_ampere,
-                'current_1': last / per_ampere})
+        'flux_density_p': first, 'flux_density_1': last, 'levels': levels}
+    if per_ampere is not None:
+        row |= {'current_p': None if first is None else first / per_ampere,
+                'current_1': last / per_ampere}
+    return row
 
 
 def _row(segment: 'Segment') -> dict[str, float | str | None]:
