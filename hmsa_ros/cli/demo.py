@@ -11,6 +11,7 @@ example: hmsa demo --out my_first_run
 import argparse
 import os
 from pathlib import Path
+import sys
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_command
@@ -33,8 +34,6 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo."""
-    from rich.console import Console
-
     from hmsa_ros.lab.processes import dated, stay_local
 
     folder = arguments.out or dated('hmsa_demo')
@@ -44,15 +43,13 @@ def run(arguments: argparse.Namespace) -> int:
 
     prepare(folder)
     ENDING.note()
-    console = Console(stderr=True)
-    console.print(
-        f'ROS_DOMAIN_ID {os.environ["ROS_DOMAIN_ID"]}, output in {folder}', highlight=False)
+    print(f'ROS_DOMAIN_ID {os.environ["ROS_DOMAIN_ID"]}, output in {folder}', file=sys.stderr)
     try:
         with progress() as update:
             result = run_demo(folder, update)
             ENDING.check()
     except KeyboardInterrupt:
-        console.print(f'interrupted; the bag so far: {folder / "run"}', highlight=False)
+        print(f'interrupted; the bag so far: {folder / "run"}', file=sys.stderr)
         return ENDING.status
     if arguments.json:
         print(json_text(result.as_json()))

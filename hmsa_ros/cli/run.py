@@ -14,6 +14,7 @@ from functools import partial
 from importlib import import_module
 import math
 from pathlib import Path
+import sys
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_command, JOINTS, NAMESPACE
@@ -21,7 +22,7 @@ from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import levels_of, path_of, SEQUENCE
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import json_text
+from hmsa_ros.files import json_text, write_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -66,8 +67,6 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Carry out the experiment as often as asked for; a bad number is a `BadInputError`."""
-    from rich.console import Console
-
     tolerances = _tolerances(arguments)
     if not 1 <= arguments.repeat <= _MOST_REPEATS:
         raise BadInputError(
@@ -86,49 +85,60 @@ def run(arguments: argparse.Namespace) -> int:
     for x in folders:
         prepare(x)
     ENDING.note()
-    console = Console(stderr=True)
-    records, each, verdicts = [], [], []
+    records, each = [], []
     for experiment in experiments:
         try:
-            done, parts, report = _carried_out(arguments, experiment, tolerances)
+            with progress() as update:
+                done, parts, report = _carried_out(arguments, experiment, tolerances, update)
         except KeyboardInterrupt:
-            console.print(
-                f'interrupted; the bag so far: {experiment.bag}' if experiment.bag.exists()
-                else 'interrupted', highlight=False, soft_wrap=True)
+            so_far = f'; the bag so far: {experiment.bag}' if experiment.bag.exists() else ''
+            print(f'interrupted{so_far}', file=sys.stderr)
             return ENDING.status
-        judged = parts if experiment.setpoints else []
-        findings = [y for x in judged for y in x.evaluation.findings]
+        from hmsa_ros.report.outcome import level_results
+
+        levels = [y for x in parts for y in level_results(x.run)] if experiment.levels else []
+        findings = [y for x in parts for y in x.evaluation.findings] if (
+            experiment.setpoints) else []
         verdict, reason = _verdict(experiment, findings, done)
-        verdicts.append(verdict)
         each.append(findings)
         records.append({
             'verdict': verdict, 'reason': reason, 'setpoints': [x.to_dict() for x in findings],
-            **({'levels': [asdict(x) for x in _levels(parts)]} if experiment.levels else {}),
+            **({'levels': [asdict(x) for x in levels]} if experiment.levels else {}),
             'notes': done.notes, 'exits': done.exits, 'bag': experiment.bag, 'report': report})
         if not arguments.json:
-            _print(experiment, parts, reason, done, report)
+            _print(experiment, parts, levels, reason, done, report)
     from hmsa_ros.report.repeats import statistics, statistics_table
     if arguments.json:
         print(json_text(records[0] if arguments.repeat == 1 else {
             'repeats': records, 'statistics': statistics(each)}))
     elif arguments.repeat > 1 and any(each):
         print(statistics_table({'': statistics(each)}))
-    return 0 if all(x in ('arrived', NOT_MEASURED) for x in verdicts) else 1
+    return 0 if all(x['verdict'] in ('arrived', NOT_MEASURED) for x in records) else 1
 
 
 def _carried_out(
-        arguments: argparse.Namespace, experiment: 'Experiment', tolerances: 'Tolerances | None'
+        arguments: argparse.Namespace, experiment: 'Experiment', tolerances: 'Tolerances | None',
+        update: 'Callable[[str, float | None], None]'
 ) -> 'tuple[Conducted, list[Part], Path | None]':
-    """Conduct an experiment and evaluate its bag."""
+    """Conduct an experiment, and judge the setpoints of each joint by its bag."""
     from hmsa_ros.lab.experiment import conduct
 
-    with progress() as update:
-        done = conduct(experiment, partial(_tell, update))
-        ENDING.check()
-        update('evaluating the bag', None)
-        parts = _measure(experiment, tolerances) if done.measured else []
-        report = _report(
-            parts, experiment.folder / 'report.html') if arguments.report and parts else None
+    done = conduct(experiment, partial(_tell, update))
+    ENDING.check()
+    if not done.measured:
+        return done, [], None
+    update('evaluating the bag', None)
+    from hmsa_ros.recordings.bags import read_runs
+    from hmsa_ros.report.arrivals import Part
+
+    parts = [Part.of(x, tolerances=tolerances) for x in read_runs(
+        experiment.bag, joints=experiment.joints if len(experiment.joints) > 1 else ())]
+    if not arguments.report or not parts:
+        return done, parts, None
+    from hmsa_ros.report.page import page
+
+    report = experiment.folder / 'report.html'
+    write_text(report, page(parts))
     return done, parts, report
 
 
@@ -175,30 +185,6 @@ def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
         tuple(arguments.joint.split(',')), expected, levels_of(arguments), path_of(arguments))
 
 
-def _measure(experiment: 'Experiment', tolerances: 'Tolerances | None') -> 'list[Part]':
-    """Read the bag and judge the setpoints of each joint."""
-    from hmsa_ros.recordings.bags import read_runs
-    from hmsa_ros.report.arrivals import Part
-
-    return [Part.of(x, tolerances=tolerances) for x in read_runs(
-        experiment.bag, joints=experiment.joints if len(experiment.joints) > 1 else ())]
-
-
-def _levels(parts: 'list[Part]') -> 'list[LevelResult]':
-    """Return what was measured of the levels."""
-    from hmsa_ros.report.outcome import level_results
-
-    return [level for x in parts for level in level_results(x.run)]
-
-
-def _report(parts: 'list[Part]', path: Path) -> Path:
-    from hmsa_ros.files import write_text
-    from hmsa_ros.report.page import page
-
-    write_text(path, page(parts))
-    return path
-
-
 def _verdict(
         experiment: 'Experiment', findings: 'list[Finding]', done: 'Conducted') -> tuple[str, str]:
     """Return the verdict on all setpoints, or on the end of levels, and why."""
@@ -225,12 +211,11 @@ def _verdict(
 
 
 def _print(
-        experiment: 'Experiment', parts: 'list[Part]', reason: str, done: 'Conducted',
-        report: Path | None) -> None:
+        experiment: 'Experiment', parts: 'list[Part]', levels: 'list[LevelResult]', reason: str,
+        done: 'Conducted', report: Path | None) -> None:
     from hmsa_ros.report.comparison import setpoints
     from hmsa_ros.report.outcome import level_table
 
-    levels = _levels(parts) if experiment.levels else []
     if levels:
         print(level_table(levels, parts[0].run.plant.coordinate.drive))
     elif not experiment.path and any(x.evaluation.findings for x in parts):
