@@ -2,9 +2,9 @@
 The ``hmsa`` command.
 
 Each command is a module with ``add_parser(subparsers)`` and ``run(arguments)``, listed in
-`COMMANDS`: of this package or, for studies, of another one. Its docstring is the help. Modules
-import what is slow (rclpy, SciPy, matplotlib) inside ``run``, so that ``hmsa --help`` answers at
-once.
+`COMMANDS`: of this package or, for studies, of another one. Its docstring is the help. One with
+commands below it has a function each instead of ``run``. Modules import what is slow (rclpy,
+SciPy, matplotlib) inside these, so that ``hmsa --help`` answers at once.
 """
 
 import argparse
@@ -69,7 +69,7 @@ def build_parser(commands: Sequence[str] = COMMANDS) -> Parser:
         module.add_parser(subparsers)
         for added in subparsers.choices.keys() - before:
             command = subparsers.choices[added]
-            command.set_defaults(parser=command, run=module.run)
+            command.set_defaults(parser=command, run=getattr(module, 'run', None))
     return parser
 
 

@@ -14,10 +14,9 @@ import sys
 from typing import Any
 
 from hmsa_ros.bag.limits import CHUNK_SIZE, MEBIBYTE
-from hmsa_ros.cli.options import add_command, JSON
+from hmsa_ros.cli.options import add_command, JSON, show
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError, printable
-from hmsa_ros.files import json_text
 
 _LARGEST_CHUNK = 65536
 
@@ -44,18 +43,16 @@ def add_parser(subparsers: Any) -> None:
         add_command(
             actions, function.__name__.strip('_'), function.__doc__,
             ('bag', 'BAG', str, 'folder of a bag, or an .mcap file'), *options, max_chunk,
-        ).set_defaults(action=function)
+            run=function)
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Carry out one action; raise `BadInputError` if the largest chunk is out of range."""
+def _chunk_size(arguments: argparse.Namespace) -> int:
+    """Return the size in bytes of the largest chunk to read."""
     if not 0.0 < arguments.max_chunk <= _LARGEST_CHUNK:
         raise BadInputError(
             f'largest chunk is {arguments.max_chunk:g} MiB: expected more than 0 and at most '
             f'{_LARGEST_CHUNK} MiB')
-    arguments.max_chunk_size = max(1, round(arguments.max_chunk * MEBIBYTE))
-    status: int = arguments.action(arguments)
-    return status
+    return max(1, round(arguments.max_chunk * MEBIBYTE))
 
 
 def _info(arguments: argparse.Namespace) -> int:
@@ -72,7 +69,7 @@ def _info(arguments: argparse.Namespace) -> int:
     from hmsa_ros.recordings.topics import unanswered
 
     with progress('reading'):
-        reader = BagReader(arguments.bag, max_chunk_size=arguments.max_chunk_size)
+        reader = BagReader(arguments.bag, max_chunk_size=_chunk_size(arguments))
         summary, notes = summarize(reader), tuple(unanswered(reader))
     print(to_json(summary, notes) if arguments.json else to_text(
         summary, notes, parameters=arguments.parameters))
@@ -99,7 +96,7 @@ def _verify(arguments: argparse.Namespace) -> int:
     parameters = read_parameter_file(arguments.params_file) if arguments.params_file else None
     with progress('verifying'):
         runs = read_runs(
-            arguments.bag, parameters=parameters, max_chunk_size=arguments.max_chunk_size)
+            arguments.bag, parameters=parameters, max_chunk_size=_chunk_size(arguments))
         results = [verify_run(x) for x in runs]
     problems = list(runs[0].summary.problems) if runs[0].summary else []
     for problem in problems:
@@ -107,18 +104,15 @@ def _verify(arguments: argparse.Namespace) -> int:
     # What cannot be read whole is not verified, and a command that nobody applied is a loss.
     passed = not problems and all(
         x.largest_difference <= arguments.tolerance and not x.unapplied_count for x in results)
-    if arguments.json:
-        print(json_text({
+    show(
+        arguments, {
             'passed': passed, 'tolerance': arguments.tolerance, 'problems': problems,
-            'actuators': [asdict(result) for result in results]}))
-    else:
-        for recorded, result in zip(runs, results, strict=True):
-            print(printable(
-                f'{result.states}: {result.sample_count} samples, {result.command_count} '
-                f'commands of {result.commands} ({result.late_count} late), largest difference '
-                f'of the {recorded.plant.coordinate.name} {result.largest_difference:.3g} at '
-                f'{result.where:.6f} s'
-                + (f'; {result.note}' if result.note else '')))
+            'actuators': [asdict(x) for x in results]},
+        *(printable(
+            f'{x.states}: {x.sample_count} samples, {x.command_count} commands of {x.commands} '
+            f'({x.late_count} late), largest difference of the {run.plant.coordinate.name} '
+            f'{x.largest_difference:.3g} at {x.where:.6f} s' + (f'; {x.note}' if x.note else ''))
+          for run, x in zip(runs, results, strict=True)))
     return 0 if passed else 1
 
 
@@ -133,7 +127,7 @@ def _recover(arguments: argparse.Namespace) -> int:
     from hmsa_ros.bag.recover import recover
     with progress('recovering'):
         result = recover(
-            arguments.bag, arguments.out, max_chunk_size=arguments.max_chunk_size)
+            arguments.bag, arguments.out, max_chunk_size=_chunk_size(arguments))
     for problem in result.problems:
         print(f'hmsa: note: {problem}', file=sys.stderr)
     print(printable(f'{result.message_count} messages recovered to {result.folder}'))

@@ -49,8 +49,8 @@ def add_parser(subparsers: Any) -> None:
     """Add the command and its kinds."""
     parser = add_command(subparsers, __name__, __doc__)
     kinds = parser.add_subparsers(metavar='PART', required=True)
-    _add_kind(
-        kinds, _coil,
+    add_command(
+        kinds, 'coil', _coil.__doc__,
         ('source', 'MODULE:NAME|CSV', str,
          'hardware as in the parameter hardware of hmsa driver, with a coil constant that is '
          'roughly right; or readings with the columns current (A) and flux_density (T), in the '
@@ -67,9 +67,9 @@ def add_parser(subparsers: Any) -> None:
          'demagnetise the core at the end'),
         ('--out', 'YAML', Path,
          'parameter file of the driver to write; a table is written beside it as CSV'),
-        JSON, *picture_options('readings and model to draw'))
-    _add_kind(
-        kinds, _latency, *_SOURCE,
+        JSON, *picture_options('readings and model to draw'), run=_coil)
+    add_command(
+        kinds, 'latency', _latency.__doc__, *_SOURCE,
         ('--steps', 'N', int, 'number of levels (default 24)', {'default': 24}),
         ('--params-file', 'YAML', Path,
          'parameter file with the sizes of the actuator, and rough values (default: none)'),
@@ -78,9 +78,9 @@ def add_parser(subparsers: Any) -> None:
          'returns a flux density in T, or a list of (flux density, NaN, time in ns)'),
         ('--lag', 'S', float, 'known time constant of the coil, where there is no probe'),
         ('--out', 'YAML', Path, 'parameter file of driver and planner to write'),
-        JSON, *picture_options('response of the field to draw, or of the stretch'))
-    _add_kind(
-        kinds, _static, *_SOURCE,
+        JSON, *picture_options('response of the field to draw, or of the stretch'), run=_latency)
+    add_command(
+        kinds, 'static', _static.__doc__, *_SOURCE,
         ('--steps', 'N', int, 'levels on each quarter of the staircase (default 5)',
          {'default': 5}),
         ('--settle', 'S', float,
@@ -90,18 +90,7 @@ def add_parser(subparsers: Any) -> None:
          'length of the actuator in the unit of its rest length'),
         ('--out', 'YAML', Path,
          'parameter file of driver and planner to write; the table is written beside it as CSV'),
-        JSON, *picture_options('staircase to draw'))
-
-
-def _add_kind(kinds: Any, run: 'Callable[[argparse.Namespace], int]', *rows: Row) -> None:
-    parser = add_command(kinds, run.__name__.strip('_'), run.__doc__, *rows)
-    parser.set_defaults(run=run, parser=parser)
-
-
-def run(arguments: argparse.Namespace) -> int:
-    """Calibrate the part named; the kinds have their own."""
-    status: int = arguments.run(arguments)
-    return status
+        JSON, *picture_options('staircase to draw'), run=_static)
 
 
 def _coil(arguments: argparse.Namespace) -> int:

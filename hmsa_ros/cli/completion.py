@@ -10,9 +10,8 @@ example: hmsa completion bash
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-import re
 from typing import Any
 
 from hmsa_ros.cli.options import add_command
@@ -38,11 +37,10 @@ class Command:
     """A command, or the program itself."""
 
     path: str  # its words without the program's name, with spaces between
-    text: str
     options: tuple[Option, ...]
     # Commands or choices that its positional arguments may be, and what they mean.
-    words: dict[str, str] = field(default_factory=dict)
-    files: bool = False  # whether positional arguments are files
+    words: dict[str, str]
+    files: bool  # whether positional arguments are files
 
     @property
     def offered(self) -> dict[str, str]:
@@ -73,19 +71,16 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def commands_of(parser: argparse.ArgumentParser, path: str = '', text: str = '') \
-        -> Iterator[Command]:
+def commands_of(parser: argparse.ArgumentParser, path: str = '') -> Iterator[Command]:
     """Yield a parser and its subparsers as commands, the outer ones first."""
     options: list[Option] = []
     words: dict[str, str] = {}
+    inner: dict[str, argparse.ArgumentParser] = {}
     files = False
-    inner: list[tuple[argparse.ArgumentParser, str, str]] = []
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
-            texts = {x.dest: x.help or '' for x in action._choices_actions}
-            for name, each in action.choices.items():
-                words[name] = texts.get(name, '')
-                inner.append((each, f'{path} {name}'.strip(), words[name]))
+            words |= {x.dest: x.help or '' for x in action._choices_actions}
+            inner |= action.choices
         elif action.option_strings:
             options.append(_option(action))
         else:
@@ -93,24 +88,22 @@ def commands_of(parser: argparse.ArgumentParser, path: str = '', text: str = '')
             words |= {str(x): '' for x in action.choices or ()}
     if parser.usage and '--ros-args' in parser.usage:
         options.append(Option(('--ros-args',), 'what follows is for ROS'))
-    yield Command(path, text, tuple(options), words, files)
-    for arguments in inner:
-        yield from commands_of(*arguments)
+    yield Command(path, tuple(options), words, files)
+    for name, each in inner.items():
+        yield from commands_of(each, f'{path} {name}'.strip())
 
 
 def _option(action: argparse.Action) -> Option:
     names = tuple(action.option_strings)
-    text = re.sub(r'\s+', ' ', (action.help or '') % vars(action)) if action.help else ''
-    if action.nargs == 0:
-        return Option(names, text)
+    text = ' '.join(((action.help or '') % vars(action)).split())
     choices = tuple(map(str, action.choices or ()))
     if names[-1] in _OF_SHAPERS:
         from hmsa_ros.planning.shapers import SHAPERS  # imports NumPy, which not all commands need
 
         choices = tuple(SHAPERS)
-    kind = ('one' if choices else 'file' if action.metavar in _FILES
-            else 'folder' if action.metavar in _FOLDERS else 'any')
-    return Option(names, text, kind, choices)
+    return Option(names, text, (
+        '' if action.nargs == 0 else 'one' if choices else 'file' if action.metavar in _FILES
+        else 'folder' if action.metavar in _FOLDERS else 'any'), choices)
 
 
 def _quote(text: str) -> str:

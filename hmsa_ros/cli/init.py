@@ -110,7 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
     given = _given(arguments, form, asked)
     joints = joint_names(arguments.joint)
     missing = [x for x in asked if x.key not in OPTIONAL and not _known(x.key, given)]
-    guessed = [x for x in missing if x.key in _GUESSES] if arguments.yes else []
+    guessed = [x for key in _GUESSES for x in missing if x.key == key and arguments.yes]
     if missing and not arguments.yes:
         if not sys.stdin.isatty():
             raise BadInputError(

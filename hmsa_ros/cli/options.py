@@ -96,9 +96,13 @@ def timeout_of(arguments: argparse.Namespace) -> float:
     return timeout
 
 
-def add_command(subparsers: Any, name: str, text: str | None, *rows: Row) -> Any:
+def add_command(
+        subparsers: Any, name: str, text: str | None, *rows: Row,
+        run: Callable[[argparse.Namespace], int] | None = None) -> Any:
     """
     Add a command with arguments that a docstring describes, and return its parser.
+
+    ``run`` carries out one below a command; that of a module is its function of this name.
 
     The first line of the docstring is the help among other commands, and its last paragraph, which
     begins with ``example:``, is left as it is written. The end of a module's name will do as name.
@@ -110,6 +114,8 @@ def add_command(subparsers: Any, name: str, text: str | None, *rows: Row) -> Any
         name.rpartition('.')[2].replace('_', '-'), help=what[:1].lower() + what[1:],
         description=description or f'{what}.', epilog=f'example: {example}')
     add_options(parser, *rows)
+    if run is not None:
+        parser.set_defaults(parser=parser, run=run)
     return parser
 
 

@@ -7,11 +7,14 @@ example: hmsa param set planner shaper robust
 """
 
 import argparse
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_command, JSON, NAMESPACE, show, TIMEOUT, timeout_of
 from hmsa_ros.ending import ENDING
 from hmsa_ros.files import yaml_text
+
+if TYPE_CHECKING:
+    from hmsa_ros.lab.remote import RemoteNode
 
 
 def add_parser(subparsers: Any) -> None:
@@ -22,20 +25,12 @@ def add_parser(subparsers: Any) -> None:
     add_command(
         actions, 'get', _get.__doc__,
         node, ('names', 'NAME', str, 'parameters (default all)', {'nargs': '*'}),
-        NAMESPACE, TIMEOUT, JSON).set_defaults(action=_get)
+        NAMESPACE, TIMEOUT, JSON, run=_get)
     add_command(
         actions, 'set', _set.__doc__,
         node, ('name', 'NAME', str, 'the parameter'),
         ('value', 'VALUE', str, 'the value, as in YAML: 0.5, robust, [1, 2]'),
-        NAMESPACE, TIMEOUT).set_defaults(action=_set)
-
-
-def run(arguments: argparse.Namespace) -> int:
-    """Carry out one action."""
-    arguments.timeout = timeout_of(arguments)
-    ENDING.note()
-    status: int = arguments.action(arguments)
-    return status
+        NAMESPACE, TIMEOUT, run=_set)
 
 
 def _get(arguments: argparse.Namespace) -> int:
@@ -44,9 +39,7 @@ def _get(arguments: argparse.Namespace) -> int:
 
     example: hmsa param get planner shaper
     """
-    from hmsa_ros.lab.remote import RemoteNode
-
-    with RemoteNode(arguments.node, arguments.namespace, arguments.timeout) as node:
+    with _node(arguments) as node:
         found = node.get(arguments.names)
     return show(arguments, found, *(f'{x}: {yaml_text(y)}' for x, y in found.items()))
 
@@ -59,9 +52,15 @@ def _set(arguments: argparse.Namespace) -> int:
 
     example: hmsa param set planner shaper robust
     """
-    from hmsa_ros.lab.remote import RemoteNode
-
-    with RemoteNode(arguments.node, arguments.namespace, arguments.timeout) as node:
+    with _node(arguments) as node:
         before, after = node.set(arguments.name, arguments.value)
     print(f'{arguments.name}: {after} (was {before})')
     return 0
+
+
+def _node(arguments: argparse.Namespace) -> 'RemoteNode':
+    timeout = timeout_of(arguments)
+    from hmsa_ros.lab.remote import RemoteNode
+
+    ENDING.note()
+    return RemoteNode(arguments.node, arguments.namespace, timeout)
