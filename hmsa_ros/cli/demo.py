@@ -12,16 +12,12 @@ import argparse
 import os
 from pathlib import Path
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
-from hmsa_ros.cli.options import add_command
+from hmsa_ros.cli.options import add_command, show
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.ending import ENDING
-from hmsa_ros.files import json_text
 from hmsa_ros.table import Column, Table
-
-if TYPE_CHECKING:
-    from hmsa_ros.lab.demo import DemoResult
 
 
 def add_parser(subparsers: Any) -> None:
@@ -51,32 +47,25 @@ def run(arguments: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         print(f'interrupted; the bag so far: {folder / "run"}', file=sys.stderr)
         return ENDING.status
-    if arguments.json:
-        print(json_text(result.as_json()))
-    else:
-        _print_table(result)
+    show(
+        arguments, result.as_json(), Table((
+            Column('target'), Column('b_p', '', '.5f'), Column('tau_p', '', '.5f'),
+            Column('b_1', '', '.5f'), Column('arrival', 'ms', '.3f'),
+            Column('residual', '%', '%'), Column('unshaped', '%', '%'), Column('verdict')),
+            tuple((
+                x.stretch, x.b_p, x.tau_p, x.b_1, x.arrival * 1e3, 100.0 * x.residual,
+                100.0 * x.residual_unshaped, str(x.finding['verdict']).replace('_', ' '))
+                for x in result.setpoints),
+            'b and tau nondimensional as in the paper; arrival from the start of the move; '
+            'residual: peak-to-peak stretch after arrival, in % of the step; unshaped: simulated '
+            'on the same plant'),
+        Table((
+            Column('feedback'), Column('target'), Column('arrival', 'ms', '.1f'),
+            Column('vibration', '%', '.2f'), Column('offset', '%', '+.2f')),
+            tuple((x.feedback, x.stretch, x.arrival * 1e3, 100.0 * x.vibration, 100.0 * x.offset)
+                  for x in result.adapting),
+            'a larger block, simulated in this process, whose shear modulus is 20 % above that '
+            'planned with; vibration after the arrival and rest beside the target, in % of the '
+            'step'),
+        f'bag      {result.bag}', f'picture  {result.picture}', f'         {result.second}')
     return 0 if result.succeeded else 1
-
-
-def _print_table(result: 'DemoResult') -> None:
-    print(Table((
-        Column('target'), Column('b_p', '', '.5f'), Column('tau_p', '', '.5f'),
-        Column('b_1', '', '.5f'), Column('arrival', 'ms', '.3f'), Column('residual', '%', '%'),
-        Column('unshaped', '%', '%'), Column('verdict')), tuple((
-            x.stretch, x.b_p, x.tau_p, x.b_1, x.arrival * 1e3, 100.0 * x.residual,
-            100.0 * x.residual_unshaped, str(x.finding['verdict']).replace('_', ' '))
-            for x in result.setpoints),
-        'b and tau nondimensional as in the paper; arrival from the start of the move; residual: '
-        'peak-to-peak stretch after arrival, in % of the step; unshaped: simulated on the same '
-        'plant'))
-    print(Table((
-        Column('feedback'), Column('target'), Column('arrival', 'ms', '.1f'),
-        Column('vibration', '%', '.2f'), Column('offset', '%', '+.2f')), tuple((
-            x.feedback, x.stretch, x.arrival * 1e3, 100.0 * x.vibration, 100.0 * x.offset)
-            for x in result.adapting.results),
-        'a larger block, simulated in this process, whose shear modulus is 20 % above that '
-        'planned with; vibration after the arrival and rest beside the target, in % of the step'))
-    for line in (
-            f'bag      {result.bag}', f'picture  {result.picture}',
-            f'         {result.adapting.picture}'):
-        print(line)

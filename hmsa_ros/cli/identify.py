@@ -10,15 +10,17 @@ example: hmsa identify camera.csv --commands levels.csv --out actuator.yaml
 
 import argparse
 from dataclasses import replace
+from datetime import datetime
+import math
 from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, JSON
+from hmsa_ros.cli.options import add_command, JSON, show
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.quantities import number_of
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import check_targets, json_text, write_text
+from hmsa_ros.files import check_targets, write_text
 
 if TYPE_CHECKING:
     from hmsa_ros.identification.files import Belief
@@ -90,33 +92,22 @@ def run(arguments: argparse.Namespace) -> int:
             recording, free=free_of(arguments.free, belief.actuator.law, known),
             actuator=belief.actuator, known=belief.others, uncertain=uncertain)
         curve = profile(found, arguments.profile) if arguments.profile else []
-    good = found.verdict == 'identified' or arguments.accept and found.acceptable
-    written = []
+    identified = found.verdict == 'identified'
+    good = identified or arguments.accept and found.acceptable
     if arguments.out is not None and good:
-        from datetime import datetime
-
         now = datetime.now().astimezone()
         write_text(arguments.out, file_text(found, belief, str(arguments.recording), now))
-        written.append(arguments.out)
     if arguments.report is not None:
         from hmsa_ros.report.identified import page
 
         write_text(arguments.report, page(found))
-        written.append(arguments.report)
-    if arguments.json:
-        record = found.record()
-        if curve:
-            record['profile'] = {'name': arguments.profile, 'points': curve}
-        print(json_text(record))
-    else:
-        print(found.report())
-        if found.verdict == 'identified':
-            print(f'identified: {found.reason}')
-        for value, deviance in curve:
-            print(f'profile {arguments.profile} {value:.8g} deviance {deviance:.4g}')
-        for path in written:
-            print(f'{path} written')
-    if found.verdict == 'identified':
+    show(
+        arguments, found.record() | ({'profile': {
+            'name': arguments.profile, 'points': curve}} if curve else {}),
+        found.report(), *([f'identified: {found.reason}'] if identified else []),
+        *(f'profile {arguments.profile} {x:.8g} deviance {y:.4g}' for x, y in curve),
+        written=(arguments.out if good else None, arguments.report))
+    if identified:
         return 0
     note = ''
     if good:
@@ -154,8 +145,6 @@ def known_of(text: str) -> tuple[dict[str, float], dict[str, float]]:
 def _read(
         arguments: argparse.Namespace, belief: 'Belief') -> 'tuple[Recording, Belief]':
     """Return the recording, and what is known with what the bag says of it."""
-    import math
-
     path: Path = arguments.recording
     if path.is_dir() or path.suffix == '.mcap':
         from hmsa_ros.identification.runs import read_bag

@@ -15,16 +15,15 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.identify import known_of
-from hmsa_ros.cli.options import add_command, argument, NAMESPACE
+from hmsa_ros.cli.options import add_command, argument, NAMESPACE, show
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import setpoint_of_joints
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import check_targets, json_text, write_text
+from hmsa_ros.files import check_targets, write_text
 
 if TYPE_CHECKING:
     from hmsa_ros.lab.processes import NodeProcess
-    from hmsa_ros.lab.tuning import Tuned
     from hmsa_ros.recordings.parameters import Entries
 
 
@@ -91,19 +90,29 @@ def run(arguments: argparse.Namespace) -> int:
             found = tune(tuning, update)
     except KeyboardInterrupt:
         return ENDING.status
+    from hmsa_ros.report.comparison import comparison
+
     if arguments.report is not None:
         from hmsa_ros.report.page import page
 
         write_text(arguments.report, page(found.parts))
     verdict, reason = found.verdict
-    if arguments.json:
-        print(json_text({
+    show(
+        arguments, {
             'verdict': verdict, 'reason': reason, 'identified': found.identified.record(),
             'shapers': [asdict(x) for x in found.shapers], 'shaper': found.shaper,
             **{x.run.label: [y.to_dict() for y in x.evaluation.findings] for x in found.parts},
-            'file': found.file, 'folder': folder, 'report': arguments.report}))
-    else:
-        _print(found, folder, arguments.report)
+            'file': found.file, 'folder': folder, 'report': arguments.report},
+        found.identified.report(),
+        *(f'shaper   {x.shaper:<12}' + (
+            f'not possible: {x.reason}' if x.reason else
+            f'vibration at most {100.0 * x.vibration:.2g} % of the step, moves take up to '
+            f'{1e3 * x.move_time:.4g} ms') + ('  (chosen)' if x.shaper == found.shaper else '')
+          for x in found.shapers),
+        *([comparison(found.parts)] if found.parts[0].evaluation.findings else []),
+        f'verdict  {verdict}: {reason}',
+        *([] if found.file is None else [f'file     {found.file}']), f'runs     {folder}',
+        *([] if arguments.report is None else [f'report   {arguments.report}']))
     return 0 if verdict == 'tuned' else 1
 
 
@@ -120,22 +129,3 @@ def _nodes(arguments: argparse.Namespace) -> 'tuple[Entries, NodeProcess | None]
     # What the plant really is the tuning does not know.
     return [x for x in entries if x[0] != 'plant'], simulated_node(
         {} if path is None else read_parameter_file(path), str(path or ''), arguments.namespace)
-
-
-def _print(found: 'Tuned', folder: Path, report: Path | None) -> None:
-    from hmsa_ros.report.comparison import comparison
-
-    print(found.identified.report())
-    for each in found.shapers:
-        print(f'shaper   {each.shaper:<12}' + (
-            f'not possible: {each.reason}' if each.reason else
-            f'vibration at most {100.0 * each.vibration:.2g} % of the step, moves take up to '
-            f'{1e3 * each.move_time:.4g} ms') + ('  (chosen)' if each.shaper == found.shaper
-                                                 else ''))
-    if found.parts[0].evaluation.findings:
-        print(comparison(found.parts))
-    for line in (
-            f'verdict  {found.verdict[0]}: {found.verdict[1]}',
-            *([] if found.file is None else [f'file     {found.file}']), f'runs     {folder}',
-            *([] if report is None else [f'report   {report}'])):
-        print(line)

@@ -14,7 +14,7 @@ import json
 import os
 import select
 import sys
-from time import monotonic
+from time import monotonic, sleep
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_command
@@ -22,7 +22,10 @@ from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rich.console import Console
+    from rich.text import Text
 
     from hmsa_ros.watch.listener import Listener
     from hmsa_ros.watch.scene import Scene
@@ -73,21 +76,21 @@ def run(arguments: argparse.Namespace) -> int:
 def _once(
         listener: 'Listener', console: 'Console', arguments: argparse.Namespace) -> int:
     """Print one view as soon as everything is there, or when the time is over."""
+    from hmsa_ros.watch.screen import as_json
+
     end = monotonic() + arguments.timeout
     scene = listener.look()
     # Two looks, so that the samples' rate can be told.
     while not (scene.joints and scene.request and scene.sample_rate > 0.0):
         if monotonic() >= end or ENDING.asked:
             break
-        _wait(_LOOK_SECONDS)
+        sleep(_LOOK_SECONDS)
         scene = listener.look()
     if arguments.json:
-        from hmsa_ros.watch.screen import as_json
         print(json.dumps(as_json(scene)))
     else:
-        for line in _screen(console, arguments.span).lines(
-                scene, console.width, console.height):
-            console.print(line)
+        for text in _screen(console, arguments.span)(scene):
+            console.print(text)
     return 0 if scene.joints or scene.request else 1
 
 
@@ -97,7 +100,7 @@ def _lines(listener: 'Listener', as_objects: bool) -> int:
 
     due = monotonic() + _LINE_SECONDS
     while not ENDING.asked:
-        _wait(min(_LOOK_SECONDS, max(due - monotonic(), 0.0)))
+        sleep(min(_LOOK_SECONDS, max(due - monotonic(), 0.0)))
         scene = listener.look()
         if monotonic() >= due:
             due += _LINE_SECONDS
@@ -105,45 +108,32 @@ def _lines(listener: 'Listener', as_objects: bool) -> int:
     return 0
 
 
-def _wait(seconds: float) -> None:
-    """Let time pass."""
-    select.select([], [], [], seconds)
-
-
-def _screen(console: 'Console', span: float) -> Any:
+def _screen(console: 'Console', span: float) -> 'Callable[[Scene], list[Text]]':
+    """Return what lays a scene out for the size that the terminal has by then."""
     from hmsa_ros.watch.screen import Screen
-    return Screen(span, unicode=console.encoding.lower().startswith('utf'))
+
+    screen = Screen(span, unicode=console.encoding.lower().startswith('utf'))
+    return lambda scene: screen.lines(scene, console.width, console.height)
 
 
 def _live(
         listener: 'Listener', console: 'Console', arguments: argparse.Namespace) -> int:
     """Show the view until a key or a signal ends it."""
-    from rich.console import Console, ConsoleOptions
+    from rich.console import Group
     from rich.live import Live
-    from rich.segment import Segment
 
-    screen = _screen(console, arguments.span)
-    now: list[Scene] = [listener.look()]
-
-    class View:
-        """The scene, laid out anew for the size that the terminal has by now."""
-
-        def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Any]:
-            height = options.height or console.height
-            for i, line in enumerate(screen.lines(now[0], options.max_width, height)):
-                if i:
-                    yield Segment.line()
-                yield from line.render(console)
-
+    lines = _screen(console, arguments.span)
+    scene = listener.look()
     with _keys() as key_pressed, Live(
-            View(), console=console, screen=True, auto_refresh=False) as live:
+            get_renderable=lambda: Group(*lines(scene)), console=console, screen=True,
+            auto_refresh=False) as live:
         due = monotonic()
         while not ENDING.asked:
             due = max(due + 1.0 / arguments.rate, monotonic())
             while monotonic() < due:
                 if key_pressed(min(_LOOK_SECONDS, max(due - monotonic(), 0.0))) in ('q', 'Q'):
                     return 0
-                now[0] = listener.look()
+                scene = listener.look()
             live.refresh()
     return 0
 
@@ -152,10 +142,7 @@ def _live(
 def _keys() -> Iterator[Any]:
     """Give keys as they are pressed, without showing them; the terminal is left as it was."""
     if not sys.stdin.isatty():
-        def none(seconds: float) -> str:
-            _wait(seconds)
-            return ''
-        yield none
+        yield sleep
         return
     import termios
 

@@ -6,7 +6,7 @@ simulated time. The block is ten times as long as that of the first act, so that
 first move.
 """
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -42,19 +42,6 @@ class AdaptingResult:
     offset: float
 
 
-@dataclass(frozen=True, eq=False)
-class SecondAct:
-    """Results of both modes, and the picture."""
-
-    results: tuple[AdaptingResult, ...]
-    picture: Path
-
-    def as_json(self) -> dict[str, object]:
-        """Return it for JSON."""
-        return {'shear_modulus_factor': FACTOR, 'picture': str(self.picture),
-                'moves': [asdict(x) for x in self.results]}
-
-
 def _carry_out(
         block: ActuatorParameters, feedback: str) -> tuple[Array, list[AdaptingResult]]:
     """Make the moves; return time in s with true stretch, and what is left of each."""
@@ -85,7 +72,7 @@ def _carry_out(
     return track, results
 
 
-def second_act(picture: Path) -> SecondAct:
+def second_act(picture: Path) -> tuple[AdaptingResult, ...]:
     """Run it with feedback off and adapt, and draw both."""
     from hmsa_ros.report import style
     from hmsa_ros.report.paper import SCREEN
@@ -109,4 +96,4 @@ def second_act(picture: Path) -> SecondAct:
             f'shear modulus {100.0 * FACTOR - 100.0:+.0f} %, unknown to the planner')
         style.finish(axes, style.axis('time', 't', 'ms'), style.axis('stretch', r'\lambda'))
         axes.legend(loc='upper right')
-    return SecondAct(tuple(results), picture)
+    return tuple(results)

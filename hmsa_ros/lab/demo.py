@@ -12,7 +12,7 @@ from pathlib import Path
 
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.judge.records import Tolerances
-from hmsa_ros.lab.adapting import second_act, SecondAct
+from hmsa_ros.lab.adapting import AdaptingResult, FACTOR, second_act
 from hmsa_ros.lab.experiment import conduct, Experiment
 from hmsa_ros.lab.processes import NodeProcess
 from hmsa_ros.model.parameters import paper_actuator
@@ -56,7 +56,8 @@ class DemoResult:
     exits: dict[str, int]
     bag: Path
     picture: Path
-    adapting: SecondAct
+    adapting: tuple[AdaptingResult, ...]
+    second: Path  #: picture of these
 
     @property
     def succeeded(self) -> bool:
@@ -67,8 +68,9 @@ class DemoResult:
         """Return the result for JSON."""
         return {
             'succeeded': self.succeeded, 'setpoints': [asdict(x) for x in self.setpoints],
-            'exits': self.exits, 'bag': str(self.bag), 'picture': str(self.picture),
-            'adapting': self.adapting.as_json()}
+            'exits': self.exits, 'bag': self.bag, 'picture': self.picture, 'adapting': {
+                'shear_modulus_factor': FACTOR, 'picture': self.second,
+                'moves': [asdict(x) for x in self.adapting]}}
 
 
 def run_demo(folder: Path, progress: Callable[[str, float], None]) -> DemoResult:
@@ -77,10 +79,10 @@ def run_demo(folder: Path, progress: Callable[[str, float], None]) -> DemoResult
         ((stretch,), span * paper_actuator().time_unit) for stretch, span in SEQUENCE], _NODES)
     exits = conduct(experiment, progress).exits
     progress('evaluating the bag', 1.0)
-    results = _evaluate(experiment.bag, folder / 'run.png')
+    picture, second = folder / 'run.png', folder / 'adapting.png'
+    results = _evaluate(experiment.bag, picture)
     progress('a plant that is not as planned', 1.0)
-    return DemoResult(
-        results, exits, experiment.bag, folder / 'run.png', second_act(folder / 'adapting.png'))
+    return DemoResult(results, exits, experiment.bag, picture, second_act(second), second)
 
 
 def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
