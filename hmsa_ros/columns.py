@@ -17,11 +17,12 @@ Array = NDArray[np.float64]
 
 _SEPARATORS = (';', '\t', ',', '|')
 _LARGEST_FILE = 512 * 1024 * 1024
+# The first unit of each is that where the header has none.
 _UNITS = {
     'time': {'s': 1.0, 'sec': 1.0, 'seconds': 1.0, 'ms': 1e-3, 'us': 1e-6, 'µs': 1e-6,
              'ns': 1e-9},
     'current': {'a': 1.0, 'amperes': 1.0, 'ma': 1e-3, 'v': 1.0},
-    'stretch': {'1': 1.0, '-': 1.0, '': 1.0},
+    'stretch': {'': 1.0, '1': 1.0, '-': 1.0},
     'flux_density': {'t': 1.0, 'tesla': 1.0, 'mt': 1e-3, 'g': 1e-4, 'gauss': 1e-4},
 }
 _ALIASES = {
@@ -51,8 +52,7 @@ class Table:
 
 def _text(path: Path, kind: str) -> str:
     try:
-        content = read_at_most(path, _LARGEST_FILE, 'a smaller CSV')
-        return io.TextIOWrapper(io.BytesIO(content), encoding=_encoding(content)).read()
+        return _decoded(read_at_most(path, _LARGEST_FILE, 'a smaller CSV'))
     except UnicodeDecodeError as error:
         raise BadInputError(
             f'{path} is no text: expected {kind}; save a spreadsheet as CSV') from error
@@ -61,15 +61,16 @@ def _text(path: Path, kind: str) -> str:
             f'{path} cannot be read ({error.strerror or error}): expected {kind}') from error
 
 
-def _encoding(content: bytes) -> str:
-    """Return how a spreadsheet wrote text: by its mark, or in the code page of western Windows."""
+def _decoded(content: bytes) -> str:
+    """Return text as a spreadsheet wrote it: by its mark, or in western Windows' code page."""
     if content.startswith((b'\xff\xfe', b'\xfe\xff')):
-        return 'utf-16'
+        return content.decode('utf-16')
     try:
-        content.decode('utf-8-sig')
+        return content.decode('utf-8-sig')
     except UnicodeDecodeError:
-        return 'ascii' if _NO_TEXT.search(content) else 'cp1252'
-    return 'utf-8-sig'
+        if _NO_TEXT.search(content):
+            raise
+        return content.decode('cp1252')
 
 
 def read_table(path: Path, wanted: tuple[str, ...], *, kind: str = 'a CSV') -> Table:
@@ -168,13 +169,13 @@ def _places(
         if name in places:
             continue
         known = _UNITS[name]
-        default = {'time': 's', 'current': 'a', 'stretch': '', 'flux_density': 't'}[name]
-        if (unit or default) not in known:
+        unit = unit or next(iter(known))
+        if unit not in known:
             raise BadInputError(
                 f'{path} gives {name} in {unit}: expected '
                 + ('no unit: divide a length by the length at rest, percent by 100'
                    if name == 'stretch' else ', '.join(known)))
-        factor = known[unit or default]
+        factor = known[unit]
         if factor != 1.0:
             notes.append(f'{name} was converted from {unit} as the header says')
         places[name] = place, factor
