@@ -5,10 +5,11 @@ What the launch files start: processes and their arguments, decided without ``la
 `hmsa_ros.lab.ros_launch`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+import signal
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.lab.processes import NodeProcess
@@ -182,11 +183,8 @@ REPLAY = LaunchFile((
 
 def failure(name: str, status: int, ending: bool) -> str:
     """Return a sentence about a process that failed, else none; signals are fine while all end."""
-    if not status or (ending and status in _SIGNALS):
+    # A process that had to be killed has failed.
+    if not status or (ending and status in (-signal.SIGINT, -signal.SIGTERM)):
         return ''
     return (f'the {name} ended with status {status}: expected 0; the reason is in its output '
             'above')
-
-
-# SIGINT and SIGTERM; a process that had to be killed has failed.
-_SIGNALS: Sequence[int] = (-2, -15)
