@@ -16,6 +16,7 @@ from typing import Any, TYPE_CHECKING
 from hmsa_ros.cli.options import add_command, JSON, show
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.files import write_text
+from hmsa_ros.table import Column, Table
 
 if TYPE_CHECKING:
     from hmsa_ros.identification.excitation import Excitation, Program
@@ -64,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     return show(arguments, {
         'duration': found.duration, **_record(found.best), 'improvement': found.improvement,
         'plain': _record(found.plain), 'paper': _record(found.paper),
-    }, *table(found, belief.actuator), written=[arguments.out])
+    }, *_lines(found, belief.actuator), written=[arguments.out])
 
 
 def _record(program: 'Program') -> dict[str, Any]:
@@ -75,26 +76,26 @@ def _record(program: 'Program') -> dict[str, Any]:
         'stretch_max': program.reach[1], 'ends_at_rest': program.ends_at_rest}
 
 
-def table(found: 'Excitation', actuator: 'ActuatorParameters') -> list[str]:
-    """Return the information in the sequences, aligned, a line each."""
+def _lines(found: 'Excitation', actuator: 'ActuatorParameters') -> tuple[str, Table]:
+    """Return what the sequence is, and what it tells compared with others."""
     from hmsa_ros.identification.quantities import modulus_of
 
-    programs = (found.best, found.plain, found.paper)
+    best, gains = found.best, found.gains
     labels = {'shear_modulus': modulus_of(actuator.law)[0]}
-    lines = [
-        f'{len(found.best.levels)} levels in {found.duration:.4g} s, {actuator.coordinate.name} '
-        f'{found.best.reach[0]:.3f} to {found.best.reach[1]:.3f}, '
-        + ('at rest at the end' if found.best.ends_at_rest else 'still moving at the end'),
-        f'{"standard deviation":<22}{"this":>12}{"unshaped steps":>16}{"paper":>12}{"gain":>8}']
-    gains = found.gains
-    for name in found.best.std:
-        cells = [_share(name, x.std[name]) for x in programs]
-        gain = f'{gains[name]:.1f}' if name in gains else ''
-        lines.append(
-            f'{labels.get(name, name):<22}{cells[0]:>12}{cells[1]:>16}{cells[2]:>12}{gain:>8}')
     least = min(gains, key=lambda x: gains[x])
-    return [*lines, f'gain: unshaped steps over this; the minimum, {gains[least]:.1f}, is that of '
-            f'{labels.get(least, least)}']
+    return (
+        f'{len(best.levels)} levels in {found.duration:.4g} s, {actuator.coordinate.name} '
+        f'{best.reach[0]:.3f} to {best.reach[1]:.3f}, '
+        + ('at rest at the end' if best.ends_at_rest else 'still moving at the end'),
+        Table(
+            tuple(Column(x, '', '.1f') for x in (
+                'standard deviation', 'this', 'unshaped steps', 'paper', 'gain')),
+            tuple((
+                labels.get(name, name),
+                *(_share(name, x.std[name]) for x in (best, found.plain, found.paper)),
+                gains.get(name)) for name in best.std),
+            f'gain: unshaped steps over this; the minimum, {gains[least]:.1f}, is that of '
+            f'{labels.get(least, least)}'))
 
 
 def _share(name: str, value: float) -> str:
