@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import accumulate
 import math
 from time import monotonic, sleep
 from typing import Any
@@ -22,7 +23,7 @@ from hmsa_ros.lab.experiment import check_stretches
 from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
-from hmsa_ros.nodes.capture import decode
+from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
 from hmsa_ros.nodes.presence import LATELY_SECONDS, Presence
 from hmsa_ros.nodes.service_call import ServiceCall
@@ -245,19 +246,17 @@ class PlannerClient(Visitor):
             If the stretches are not as many as the joints, or the sequence is too long.
 
         """
-        points: list[tuple[Any, int]] = [
-            (level, round(time * NANOSECONDS)) for time, level in levels]
-        points += [(point, round(time * NANOSECONDS)) for time, *point in path]
-        end = 0.0
         check_stretches(setpoints, self._joints)
-        for stretch, span in setpoints:
-            end += span
-            if end >= 2**31:
-                raise BadInputError(f'the sequence lasts {end:g} s: expected less than 2^31 s')
-            points.append((stretch, round(end * NANOSECONDS)))
+        points: list[tuple[float, Any]] = [
+            *levels, *((time, point) for time, *point in path),
+            *zip(accumulate(x for _, x in setpoints), (x for x, _ in setpoints), strict=True)]
+        if points and points[-1][0] >= 2**31:
+            raise BadInputError(
+                f'the sequence lasts {points[-1][0]:g} s: expected less than 2^31 s')
         self.requested = uuid4().hex
         self._publisher.publish(to_trajectory(
-            points, self._joints, frame=self.requested, raw=bool(levels), path=bool(path)))
+            [(x, round(time * NANOSECONDS)) for time, x in points], self._joints,
+            frame=self.requested, raw=bool(levels), path=bool(path)))
         return self.requested
 
     @property
@@ -342,6 +341,14 @@ class PlannerClient(Visitor):
         return False
 
 
+def newest_time(clock: RawSubscription) -> float | None:
+    """Return the newest simulated time in s that has come on /clock; None without a new one."""
+    for taken in clock.take()[-1:]:
+        with suppress(BadInputError):
+            return from_time(decode(taken.data, Clock).clock) / NANOSECONDS
+    return None
+
+
 @contextmanager
 def _slower_time(node: Node, timeout: float) -> Iterator[Callable[[], float]]:
     """Give a clock in s of simulated time that is no faster than the wall's; silence counts."""
@@ -353,13 +360,11 @@ def _slower_time(node: Node, timeout: float) -> Iterator[Callable[[], float]]:
 
     def time() -> float:
         nonlocal passed, heard, before
-        now = monotonic()
-        for taken in clock.take()[-1:]:
-            with suppress(BadInputError):
-                seconds = from_time(decode(taken.data, Clock).clock) / NANOSECONDS
-                if seconds > before:
-                    passed += min(seconds - before, now - heard)
-                heard, before = now, seconds
+        now, seconds = monotonic(), newest_time(clock)
+        if seconds is not None:
+            if seconds > before:
+                passed += min(seconds - before, now - heard)
+            heard, before = now, seconds
         # Where nobody publishes it any more the wall's counts.
         return passed + max(now - heard - timeout, 0.0)
 

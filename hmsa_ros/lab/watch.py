@@ -1,25 +1,20 @@
 """What an experiment looks at: who is there, the recorder's readiness, and the time."""
 
 from collections.abc import Callable
-from contextlib import suppress
 from time import monotonic, time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.parameters import BLOCK, WORDS
 from hmsa_ros.interfaces.status import whole
-from hmsa_ros.lab.client import PlannerClient
+from hmsa_ros.lab.client import newest_time, PlannerClient
 from hmsa_ros.lab.experiment import Experiment, START_SECONDS
 from hmsa_ros.lab.remote import parameters_of
-from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
-from hmsa_ros.nodes.capture import decode
-from hmsa_ros.nodes.conversions import from_time
 
 # How long the end of a sequence may keep us waiting after its time is over.
 _GRACE_SECONDS = 20.0
@@ -69,9 +64,8 @@ class Watch(PlannerClient):
         """Time of the nodes in s."""
         if not self._experiment.nodes and not self.parameter('planner.use_sim_time'):
             return time()
-        for taken in self._clock.take()[-1:]:
-            with suppress(BadInputError):
-                self._time = from_time(decode(taken.data, Clock).clock) / NANOSECONDS
+        seconds = newest_time(self._clock)
+        self._time = self._time if seconds is None else seconds
         return self._time
 
     @property
