@@ -48,11 +48,12 @@ def add_parser(subparsers: Any) -> None:
 
 def _chunk_size(arguments: argparse.Namespace) -> int:
     """Return the size in bytes of the largest chunk to read."""
-    if not 0.0 < arguments.max_chunk <= _LARGEST_CHUNK:
+    most: float = arguments.max_chunk
+    if not 0.0 < most <= _LARGEST_CHUNK:
         raise BadInputError(
-            f'largest chunk is {arguments.max_chunk:g} MiB: expected more than 0 and at most '
+            f'largest chunk is {most:g} MiB: expected more than 0 and at most '
             f'{_LARGEST_CHUNK} MiB')
-    return max(1, round(arguments.max_chunk * MEBIBYTE))
+    return max(1, round(most * MEBIBYTE))
 
 
 def _info(arguments: argparse.Namespace) -> int:

@@ -19,7 +19,7 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_command, JOINTS, NAMESPACE
 from hmsa_ros.cli.progress import progress
-from hmsa_ros.cli.setpoints import levels_of, path_of, SEQUENCE
+from hmsa_ros.cli.setpoints import SEQUENCE, sequence_of
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, write_text
@@ -182,7 +182,7 @@ def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
     ) if arguments.simulate else ()
     return Experiment(
         folder, tuple(arguments.setpoints), nodes, arguments.namespace,
-        tuple(arguments.joint.split(',')), expected, levels_of(arguments), path_of(arguments))
+        tuple(arguments.joint.split(',')), expected, *sequence_of(arguments))
 
 
 def _verdict(

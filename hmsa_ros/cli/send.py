@@ -12,7 +12,7 @@ import sys
 from typing import Any
 
 from hmsa_ros.cli.options import add_command, JOINTS, NAMESPACE, timeout_of
-from hmsa_ros.cli.setpoints import levels_of, path_of, SEQUENCE
+from hmsa_ros.cli.setpoints import SEQUENCE, sequence_of
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import HmsaError
 
@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.lab.client import PlannerClient
 
     timeout = timeout_of(arguments)
-    levels, path = levels_of(arguments), path_of(arguments)
+    levels, path = sequence_of(arguments)
     ENDING.note()
     with PlannerClient(
             namespace=arguments.namespace, joints=arguments.joint.split(','),

@@ -9,22 +9,14 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.planning.setpoint import Setpoint
 
 
-def path_of(arguments: argparse.Namespace) -> list[list[float]]:
+def sequence_of(
+        arguments: argparse.Namespace) -> tuple[list[tuple[float, float]], list[list[float]]]:
     """
-    Return time in s, stretch, rate and acceleration of the points of --path, if any.
+    Return times in s and flux densities in T of --levels, and the points of --path.
 
-    What is no path is a `BadInputError`.
+    A point is a time in s, stretch, rate and acceleration. Unless exactly one of setpoints, levels
+    and a path is given, and can be used, it is a `BadInputError`.
     """
-    if arguments.path is None:
-        return []
-    from hmsa_ros.api.paths import read_path, smooth_points
-
-    found: list[list[float]] = smooth_points(*read_path(arguments.path)).tolist()
-    return found
-
-
-def levels_of(arguments: argparse.Namespace) -> list[tuple[float, float]]:
-    """Return times in s and flux densities in T of --levels, if any, or raise `BadInputError`."""
     given = [x for x, y in (
         ('setpoints', arguments.setpoints), ('--levels', arguments.levels),
         ('--path', arguments.path)) if y]
@@ -33,17 +25,22 @@ def levels_of(arguments: argparse.Namespace) -> list[tuple[float, float]]:
             (f'both {" and ".join(given[:2])} are given' if given
              else 'neither setpoints nor --levels nor --path are given')
             + ': expected STRETCH:SECONDS ..., or --levels CSV, or --path CSV')
+    if arguments.path is not None:
+        from hmsa_ros.api.paths import read_path, smooth_points
+
+        return [], smooth_points(*read_path(arguments.path)).tolist()
     if arguments.levels is None:
-        return []
+        return [], []
     if arguments.levels.suffix.lower() in ('.yaml', '.yml'):
         from hmsa_ros.identification.sequences import levels_in
 
         rows = levels_in(arguments.levels)
-        return [(x - rows[0][0], y) for x, y in rows]
-    from hmsa_ros.identification.tables import read_levels
+    else:
+        from hmsa_ros.identification.tables import read_levels
 
-    times, levels, _ = read_levels(arguments.levels)
-    return list(zip((times - times[0]).tolist(), levels.tolist(), strict=True))
+        times, levels, _ = read_levels(arguments.levels)
+        rows = list(zip(times.tolist(), levels.tolist(), strict=True))
+    return [(x - rows[0][0], y) for x, y in rows], []
 
 
 def setpoint(text: str) -> tuple[float, float]:
