@@ -13,7 +13,7 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.check_driver import setting
+from hmsa_ros.cli.check_driver import settings_of
 from hmsa_ros.cli.options import add_command, JSON, Row, show
 from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
@@ -277,7 +277,7 @@ def _bench(name: str, arguments: argparse.Namespace, rate: float = 1000.0) -> 'B
     """Return hardware in force, whose sensor is read at a rate in Hz."""
     from hmsa_ros.device.bench import Bench
 
-    return Bench(name, dict(setting(x) for x in arguments.set), arguments.limit, rate)
+    return Bench(name, settings_of(arguments), arguments.limit, rate)
 
 
 def _scale(bench: 'Bench') -> 'SensorScale | None':

@@ -11,15 +11,12 @@ example: hmsa check-driver my_lab:Coil --set port=/dev/ttyACM0
 import argparse
 from pathlib import Path
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
-from hmsa_ros.cli.options import add_command, JSON
+from hmsa_ros.cli.options import add_command, JSON, show
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import check_targets, json_text, write_text
-
-if TYPE_CHECKING:
-    from hmsa_ros.device.conformance import Conformance
+from hmsa_ros.files import check_targets, write_text
 
 
 def add_parser(subparsers: Any) -> None:
@@ -51,45 +48,38 @@ def run(arguments: argparse.Namespace) -> int:
     """
     from hmsa_ros.device.conformance import Trial
 
-    out: Path | None = arguments.report
-    check_targets(out)
-    settings = dict(setting(x) for x in arguments.set)
+    check_targets(arguments.report)
     with progress() as update:
         found = Trial(
-            arguments.hardware, arguments.joint, settings, level=arguments.limit,
+            arguments.hardware, arguments.joint, settings_of(arguments), level=arguments.limit,
             rate=arguments.rate).run(update)
-    if out is not None:
+    if arguments.report is not None:
         from hmsa_ros.report.conformance import page
 
-        write_text(out, page(found))
-    if arguments.json:
-        print(json_text(found.as_json()))
-    else:
-        _show(found)
-        if out is not None:
-            print(f'{out} written')
+        write_text(arguments.report, page(found))
+    show(
+        arguments, found.as_json(),
+        *(f'{"ok" if x.passed else "FAILED":<7}{x.name:<18}{x.sentence}' for x in found.checks),
+        *(f'-      not tried: {x}' for x in found.untried), written=[arguments.report])
+    failed = [x.name for x in found.checks if not x.passed]
+    if not arguments.json:
+        print(f'{found.name}: ' + (
+            f'{len(failed)} of {len(found.checks)} checks failed: {", ".join(failed)}' if failed
+            else f'{len(found.checks)} checks passed'), file=sys.stderr)
     return 0 if found.passed else 1
 
 
-def setting(text: str) -> tuple[str, Any]:
-    """Return a keyword argument, its value read as in YAML; what is none is a `BadInputError`."""
+def settings_of(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return keyword arguments, each value read as in YAML; what is none is a `BadInputError`."""
     import yaml
 
-    key, given, value = text.partition('=')
-    if not given or not all(x.isidentifier() for x in key.split('.')):
-        raise BadInputError(f'--set {text}: expected KEY=VALUE, as in --set port=/dev/ttyACM0')
-    try:
-        return key, yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise BadInputError(f'--set {text}: expected a value as in YAML') from error
-
-
-def _show(found: 'Conformance') -> None:
-    for x in found.checks:
-        print(f'{"ok" if x.passed else "FAILED":<7}{x.name:<18}{x.sentence}')
-    for text in found.untried:
-        print(f'{"-":<7}not tried: {text}')
-    failed = [x.name for x in found.checks if not x.passed]
-    print(f'{found.name}: ' + (
-        f'{len(failed)} of {len(found.checks)} checks failed: {", ".join(failed)}' if failed
-        else f'{len(found.checks)} checks passed'), file=sys.stderr)
+    found = {}
+    for text in arguments.set:
+        key, given, value = text.partition('=')
+        if not given or not all(x.isidentifier() for x in key.split('.')):
+            raise BadInputError(f'--set {text}: expected KEY=VALUE, as in --set port=/dev/ttyACM0')
+        try:
+            found[key] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise BadInputError(f'--set {text}: expected a value as in YAML') from error
+    return found
