@@ -64,9 +64,12 @@ def make_folder(folder: Path) -> None:
     """Make the folder that a command writes to, unless it exists, or raise `BadInputError`."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / '.writable'
+        probe.touch()
+        probe.unlink(missing_ok=True)
     except OSError as error:
         raise BadInputError(
-            f'cannot create the folder {folder}: {error.strerror or error}; expected a folder '
+            f'cannot write to the folder {folder}: {error.strerror or error}; expected a folder '
             'with write permission (--out)') from error
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.files import make_folder
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.actuator import actuator_from
 from hmsa_ros.interfaces.parameters import BLOCK
@@ -121,15 +122,7 @@ def prepare(folder: Path) -> None:
         raise BadInputError(
             f'{folder} holds an earlier run: expected another folder (--out), or this one '
             'removed')
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / '.writable'
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise BadInputError(
-            f'cannot write to {folder}: {error.strerror}; expected a folder with write '
-            'permission (--out)') from error
+    make_folder(folder)
 
 
 def conduct(experiment: Experiment, progress: Tell) -> Conducted:
