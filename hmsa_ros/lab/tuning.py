@@ -5,7 +5,7 @@ Moves as they are, an excitation, an identification, a choice among the shapers,
 and the same moves again.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -29,6 +29,7 @@ from hmsa_ros.lab.experiment import conduct, Experiment, prepare, Tell
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.recordings.bags import read_run
 from hmsa_ros.recordings.parameters import Entries
+from hmsa_ros.recordings.record import Run
 from hmsa_ros.report.arrivals import Part
 from hmsa_ros.report.looks import RUNS
 
@@ -123,15 +124,13 @@ def tune(tuning: Tuning, progress: Tell) -> Tuned:
 
     """
     belief = read_belief(None, tuning.entries)
-    before = _moves(tuning, 'before', {}, progress)
+    before = Part.of(_run(tuning, 'before', progress, {}))
     progress('designing the excitation', 0.0)
     time = before.run.time
     levels = excitation(tuning, belief, 1e9 * (len(time) - 1) / float(time[-1] - time[0]))
-    excited = _conducted(Experiment(
-        tuning.folder / 'excitation', (), _nodes(tuning, {}), tuning.namespace, levels=levels),
-        progress)
+    excited = _run(tuning, 'excitation', progress, {}, levels)
     progress('identifying', 0.0)
-    recording, block, coil = recording_of(read_run(excited), belief.actuator)
+    recording, block, coil = recording_of(excited, belief.actuator)
     found = identified(tuning, belief, recording, block, coil)
     if found.verdict != 'identified' and not (tuning.accept and found.acceptable):
         return Tuned(before, found)
@@ -140,12 +139,12 @@ def tune(tuning: Tuning, progress: Tell) -> Tuned:
     shapers, settings = chosen(tuning, belief, found)
     shaper = settings['shaper']
     write_text(tuning.out, file_text(
-        found, replace(belief, settings={**belief.settings, 'shaper': shaper}), str(excited),
+        found, replace(belief, settings={**belief.settings, 'shaper': shaper}), str(excited.path),
         now))
     if tuning.node is None:
         _apply(tuning, settings)
-    after = _moves(tuning, 'after', settings, progress)
-    return Tuned(before, found, tuple(shapers), shaper, tuning.out, after)
+    after = _run(tuning, 'after', progress, settings)
+    return Tuned(before, found, tuple(shapers), shaper, tuning.out, Part.of(after))
 
 
 def known_to(namespace: str) -> Entries:
@@ -179,33 +178,25 @@ def _of_planner(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {x: y for x, y in settings.items() if x in own}
 
 
-def _nodes(tuning: Tuning, settings: Mapping[str, object]) -> 'tuple[NodeProcess, ...]':
-    """Return the nodes to start with parameters of the planner."""
-    return () if tuning.node is None else (replace(tuning.node, parameters={
-        **tuning.node.parameters, **{f'{PLANNER}:{x}': y for x, y in settings.items()}}),)
-
-
-def _conducted(experiment: Experiment, progress: Tell) -> Path:
-    """Carry out an experiment in its folder, which names it; return its bag."""
+def _run(
+        tuning: Tuning, name: str, progress: Tell, settings: Mapping[str, Any],
+        levels: Sequence[tuple[float, float]] = ()) -> Run:
+    """Carry out setpoints, or levels, with settings of the planner where one is started."""
+    parameters = {f'{PLANNER}:{x}': y for x, y in _of_planner(settings).items()}
+    experiment = Experiment(
+        tuning.folder / name, () if levels else tuning.setpoints,
+        () if tuning.node is None else (
+            replace(tuning.node, parameters={**tuning.node.parameters, **parameters}),),
+        tuning.namespace, levels=levels)
     prepare(experiment.folder)
-    done = conduct(
-        experiment, lambda text, share: progress(f'{experiment.folder.name}: {text}', share))
+    done = conduct(experiment, lambda text, share: progress(f'{name}: {text}', share))
     if not done.measured:
         raise HmsaError(
             'no node publishes joint_states: expected a plant, or a driver with a sensor')
     # That an unknown actuator does not come to rest where predicted is no failure.
-    if experiment.levels and done.verdict.failure and not done.verdict.measured:
+    if levels and done.verdict.failure and not done.verdict.measured:
         raise HmsaError(f'the excitation failed: {done.verdict.failure}')
-    return experiment.bag
-
-
-def _moves(
-        tuning: Tuning, name: str, settings: Mapping[str, object], progress: Tell) -> Part:
-    """Make the moves; return what was measured of them."""
-    bag = _conducted(Experiment(
-        tuning.folder / name, tuning.setpoints, _nodes(tuning, _of_planner(settings)),
-        tuning.namespace), progress)
-    return Part.of(replace(read_run(bag), label=name))
+    return replace(read_run(experiment.bag), label=name)
 
 
 def excitation(tuning: Tuning, belief: Belief, rate: float) -> list[tuple[float, float]]:
