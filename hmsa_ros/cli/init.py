@@ -44,7 +44,6 @@ from hmsa_ros.interfaces.parameters import LAW, LAW_NAME, PUBLISH_RATE
 if TYPE_CHECKING:
     from hmsa_ros.api.actuator import Actuator
     from hmsa_ros.model.parameters import ActuatorParameters
-    from hmsa_ros.planning.scales import Scales
 
 _JOINT = 'actuator'
 # What is of the coil, and what the actuator takes by another name.
@@ -127,7 +126,7 @@ def run(arguments: argparse.Namespace) -> int:
     made = _actuator(form, given, arguments.law)
     found = made.scales
     given.setdefault('shear_modulus', made.block.shear_modulus)
-    doubts = _doubts(form, given, found)
+    doubts = _doubts(form, given, made)
     if guessed:
         doubts.append(
             f'{" and ".join(f"{x.words} {given[x.key]:g}" for x in guessed)} '
@@ -274,8 +273,9 @@ def _actuator(form: str, given: Mapping[str, float], law: str | None) -> 'Actuat
     return makers[form](**values)
 
 
-def _doubts(form: str, given: Mapping[str, float], found: 'Scales') -> list[str]:
+def _doubts(form: str, given: Mapping[str, float], made: 'Actuator') -> list[str]:
     """Return what is implausible, a sentence each."""
+    found = made.scales
     values = {**given, 'zeta': found.zeta, 'damping_ratio': found.zeta / found.critical_zeta}
     doubts = [x for quantity in FORMS[form]
               if quantity.key in values and (x := quantity.doubt(values[quantity.key]))]
@@ -284,14 +284,13 @@ def _doubts(form: str, given: Mapping[str, float], found: 'Scales') -> list[str]
             f'zeta {found.zeta:g} is above the critical {found.critical_zeta:g}: small motion '
             'about rest does not oscillate, and there is no two-step command for it')
     if found.held[1] - found.held[0] < 2.0 * _HARDLY:
-        drive, words, what, level = {
-            'beam': ('coil', 'deflections', 'deflection of 0.1', '{:.3g} T'),
-            'dielectric': ('amplifier', 'capacitance ratios', 'ratio of 1.1', '{:.3g} V'),
-            'block': ('coil', 'stretches', 'stretch of 1.1 or 0.9', '{:.3g} T')}[form]
+        drive = made.block.coordinate.drive
+        move = {'beam': 'deflection of 0.1', 'dielectric': 'ratio of 1.1',
+                'block': 'stretch of 1.1 or 0.9'}[form]
         doubts.append(
-            f'the {drive} only reaches {words} from '
-            f'{found.held[0]:.6g} to {found.held[1]:.6g}: a {what} needs about '
-            f'{level.format(0.3 * found.flux_density_unit)}')
+            f'the {"amplifier" if drive.squared else "coil"} only reaches '
+            f'{made.block.coordinate.plural} from {found.held[0]:.6g} to {found.held[1]:.6g}: a '
+            f'{move} needs about {0.3 * found.flux_density_unit:.3g} {drive.unit}')
     if form == 'beam':
         # q L^4/(8 E I) of an even load, over L.
         sag = 1.5 * given['density'] * _GRAVITY * given['length'] ** 3 / (

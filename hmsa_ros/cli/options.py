@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hmsa_ros.errors import BadInputError, excerpt
-from hmsa_ros.files import json_text
 
 T = TypeVar('T')
 #: Names, metavar, type, help and, where there are any, other settings of argparse; of a flag name
@@ -141,6 +140,8 @@ def show(
         arguments: argparse.Namespace, record: dict[str, Any], *lines: object,
         written: Iterable[Path | None] = ()) -> int:
     """Print a result, its record with --json, else lines and the files written; return 0."""
+    from hmsa_ros.files import json_text
+
     for line in [json_text(record)] if arguments.json else [
             *lines, *(f'{x} written' for x in written if x is not None)]:
         print(line)
