@@ -142,7 +142,8 @@ def test_an_interrupt_leaves_the_coil_off(monkeypatch):
     (('bench_under_test:Supply',), 'no coil of currents'),
     (('bench_under_test:nothing',), 'cannot be loaded'),
     (('bench_under_test:coil', '--probe', 'bench_under_test:nothing'), '--probe'),
-    (('bench_under_test:coil', '--limit', '0'), '--limit'), (('missing.csv',), 'missing.csv')])
+    (('bench_under_test:coil', '--limit', '0'), '--limit'), (('missing.csv',), 'missing.csv'),
+    (('.',), 'cannot be read (Is a directory)')])
 def test_what_cannot_be_calibrated_is_refused(words, what, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, 'bench_under_test', sys.modules[__name__])
     assert main(['calibrate', 'coil', *words]) == 2

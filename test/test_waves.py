@@ -137,6 +137,8 @@ def test_the_command_tells_the_reach_first_and_writes_levels(tmp_path, capsys):
     assert np.all(np.diff(times) > 0.0)
     assert main(['wave', 'square', *wave[2:], '--path', str(out)]) == 2
     assert 'a square wave is no path: expected' in capsys.readouterr().err
+    assert main(['wave', str(tmp_path), *wave[2:]]) == 2
+    assert 'cannot be read (Is a directory): expected a CSV' in capsys.readouterr().err
     for extra, words in ((['--to', '40'], 'expected --to HZ with sweep'),
                          (['--amplitude', '3'], 'an extreme of the wave is -2'),
                          (['--frequency', '900'], 'Hz: expected 0.08')):
