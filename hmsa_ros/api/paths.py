@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from hmsa_ros.api.plan import Plan
 
 # Shapes of waves; a square one is a sequence of moves between its extremes.
-_SHAPES: dict[str, Shape] = {'square': sine, 'sine': sine, 'triangle': triangle}
+SHAPES: dict[str, Shape] = {'square': sine, 'sine': sine, 'triangle': triangle}
 # Points between two breaks of a wave.
 _OF_EACH = 8
 # Frequencies at which a sweep is held against the limits.
@@ -89,11 +89,11 @@ def wave_of(
     mean = number(rest if offset is None else offset, 'offset')
     size = number(amplitude, 'amplitude', above=0.0)
     if isinstance(shape, str):
-        if shape not in _SHAPES:
+        if shape not in SHAPES:
             raise BadInputError(
-                f'shape is {excerpt(shape)}: expected one of {", ".join(_SHAPES)}, or one '
+                f'shape is {excerpt(shape)}: expected one of {", ".join(SHAPES)}, or one '
                 'period of times and stretches')
-        form = _SHAPES[shape]
+        form = SHAPES[shape]
     else:
         times, stretches = columns_of(shape, ('time', 'stretch'), 'samples of a wave')
         form = sampled_shape(times, stretches)

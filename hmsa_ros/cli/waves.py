@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.params_file)
     shape: Any = arguments.shape
     if shape.lower().endswith('.csv') or (
-            shape not in (*SHAPES, 'square', 'sweep') and Path(shape).is_dir()):
+            shape not in (*SHAPES, 'sweep') and Path(shape).is_dir()):
         times, stretches = read_path(Path(shape))
         shape = {'time': times, 'stretch': stretches}
     elif shape == 'sweep':
