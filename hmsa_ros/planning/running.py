@@ -65,10 +65,10 @@ class RunningPlan:
 
     def _begin_with(self, level: PlannedLevel, *, keep: bool = False) -> None:
         """Begin anew from a level; if its setpoints are kept, so is what was not sent yet."""
-        old, ahead = self.plan, self.plan.levels[self._history.sent:] if keep else ()
-        self._history = History(Plan(
-            old.number, (level, *ahead), old.segments if keep else (), old.kept if keep else 0),
-            stale=1 if ahead else None)
+        old = self.plan if keep else Plan(self.plan.number, (), ())
+        ahead = old.levels[self._history.sent:]
+        self._history = History(
+            replace(old, levels=(level, *ahead)), stale=1 if ahead else None)
         self.revision += 1
 
     def take_over(
