@@ -15,7 +15,6 @@ from hmsa_ros.model.moves import Level, Move, State
 from hmsa_ros.model.parameters import NondimensionalParameters
 from hmsa_ros.model.simulation import check_stretch, follow, longest_motion, sampled
 from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.model.units import Units
 from hmsa_ros.motion import STRETCH
 from hmsa_ros.planning.setpoint import Setpoint
 from hmsa_ros.planning.shapers import creeping, get_shaper
@@ -97,12 +96,17 @@ def plan_sequence(
     """
     if not setpoints:
         raise RefusedError(Code.BAD_INPUT, 'no setpoint given: expected at least one')
-    if short_spell not in SHORT_SPELL:
-        raise BadInputError(
-            f'short_spell is {excerpt(short_spell)}: expected one of {", ".join(SHORT_SPELL)}')
+    check_short_spell(short_spell)
     begin = frame if isinstance(frame, Request) else Request.of(frame)
     shape = get_shaper(shaper) if isinstance(shaper, str) else shaper
     return tuple(segments(begin, setpoints, shape, short_spell))
+
+
+def check_short_spell(value: str) -> None:
+    """Refuse what is none of `SHORT_SPELL` with `BadInputError`."""
+    if value not in SHORT_SPELL:
+        raise BadInputError(
+            f'short_spell is {excerpt(value)}: expected one of {", ".join(SHORT_SPELL)}')
 
 
 def segments(
@@ -115,8 +119,8 @@ def segments(
     `RefusedError` where a setpoint cannot be had, `BadInputError` for another argument.
     """
     shape = first or shaper
-    material, delivery, units, state = frame.material, frame.delivery, frame.units, frame.state
-    check_stretch(state.stretch, material, 'start stretch')
+    units, state = frame.units, frame.state
+    check_stretch(state.stretch, frame.material, 'start stretch')
     begin = 0.0
     upcoming = iter(setpoints)
     setpoint = next(upcoming, None)
@@ -124,7 +128,7 @@ def segments(
         following = next(upcoming, None)
         request = replace(frame, state=state, target=setpoint.stretch, work=Work())
         move = creeping.held(
-            request, _rounded(shape(request), delivery),
+            request, _rounded(shape(request), frame.delivery),
             math.inf if following is None else setpoint.span)
         # Both are rounded: a span that the move fills exactly is long enough.
         if setpoint.span * (1.0 + 1e-12) < move.duration < math.inf:
@@ -135,27 +139,27 @@ def segments(
                     f'{setpoint.stretch:g} takes {units.time_text(move.duration)}, its setpoint '
                     f'lasts {units.time_text(setpoint.span)}: expected a duration at least as '
                     'long as the move')
-            move = _cut(move, setpoint, units, last=following is None)
-        end = _follow(state, move, setpoint, material, delivery)
+            move = _cut(request, move, setpoint.span, last=following is None)
+        end = _follow(request, move, setpoint.span)
         if following is not None and move.tail:
             move = move.until(setpoint.span)
         yield Segment(
             setpoint, begin, state, end, move,
-            float(elastic_force(setpoint.stretch, material)))
+            float(elastic_force(setpoint.stretch, frame.material)))
         begin += setpoint.span
         state = end
         setpoint = following
         shape = shaper
 
 
-def _cut(move: Move, setpoint: Setpoint, units: Units, *, last: bool) -> Move:
+def _cut(request: Request, move: Move, span: float, *, last: bool) -> Move:
     """Return a move that its setpoint leaves no time for; the last one is finished."""
+    units = request.units
     return replace(
-        move if last else move.until(setpoint.span), code=Code.SPELL_TOO_SHORT,
+        move if last else move.until(span), code=Code.SPELL_TOO_SHORT,
         duration=move.duration if last else math.inf,
-        reason=f'the duration {units.time_text(setpoint.span)} ends before '
-        f'{units.coordinate} {setpoint.stretch:g} is reached, which takes '
-        f'{units.time_text(move.duration)}')
+        reason=f'the duration {units.time_text(span)} ends before {request.named_target} is '
+        f'reached, which takes {units.time_text(move.duration)}')
 
 
 def _rounded(move: Move, delivery: Delivery) -> Move:
@@ -165,52 +169,40 @@ def _rounded(move: Move, delivery: Delivery) -> Move:
         delivery.rounded(move.duration), move.reason)
 
 
-def _follow(
-        state: State, move: Move, setpoint: Setpoint, material: NondimensionalParameters,
-        delivery: Delivery) -> State:
-    """Return the state at the end of the span, or where the last ramp ends."""
+def _follow(request: Request, move: Move, span: float) -> State:
+    """Return the state at the end of a span, or where the last ramp ends."""
+    material, delivery = request.material, request.delivery
     end = move.levels[-1].time if math.isinf(move.duration) else move.duration
-    if math.isfinite(setpoint.span):
-        end = max(end, setpoint.span)
-    if math.isnan(state.load):
-        state = replace(state, load=float(elastic_force(state.stretch, material)))
+    if math.isfinite(span):
+        end = max(end, span)
     if move.tail:
-        return _follow_tail(state, move, end, setpoint.stretch, material, delivery)
-    parts, last = ramps(move.levels, state.ramps_from, end, delivery.slew)
+        # What branches do after the arrival is known.
+        if move.duration > 0.0:
+            _check_known(request, move.until(move.duration).levels, (move.duration,) * 2)
+        place = bisect_right(move.levels, end, key=lambda x: x.time) - 1
+        level = move.levels[place]
+        return follow(
+            (replace(level, time=0.0),), move.tail[place - len(move.levels)], end - level.time,
+            material, delivery)
+    parts, last = ramps(move.levels, request.load, end, delivery.slew)
     ramped = max(parts[-1][0], 0.0)
-    settled = longest_motion(last, material) + delivery.settling(0.0)
     if not material.creep:
-        end = min(end, ramped + settled)
-    _check_known(state, move.levels, (ramped, end), setpoint.stretch, material, delivery)
-    return follow(move.levels, state, end, material, delivery)
+        end = min(end, ramped + longest_motion(last, material) + delivery.settling(0.0))
+    _check_known(request, move.levels, (ramped, end))
+    return follow(move.levels, request.start, end, material, delivery)
 
 
-def _follow_tail(
-        state: State, move: Move, end: float, target: float, material: NondimensionalParameters,
-        delivery: Delivery) -> State:
-    """Return the state at a time after the arrival, where what branches do is known."""
-    if move.duration > 0.0:
-        _check_known(
-            state, move.until(move.duration).levels, (move.duration,) * 2, target, material,
-            delivery)
-    place = bisect_right(move.levels, end, key=lambda x: x.time) - 1
-    level = move.levels[place]
-    return follow(
-        (replace(level, time=0.0),), move.tail[place - len(move.levels)], end - level.time,
-        material, delivery)
-
-
-def _check_known(
-        state: State, levels: Sequence[Level], ends: tuple[float, float], target: float,
-        material: NondimensionalParameters, delivery: Delivery) -> None:
+def _check_known(request: Request, levels: Sequence[Level], ends: tuple[float, float]) -> None:
     """
     Refuse a move that swings to where nothing is known of the elastic force, or pulls in.
 
     Ends are those of the last ramp and of what is looked at.
     """
+    material, target = request.material, request.target
     elastic = material.law
     if elastic is None or elastic.limits == ENDLESS:
         return
+    where = f'{material.coordinate.name} {request.state.stretch:.6g}'
     # The first swing about the last level is the widest.
     swing = 2.0 * math.pi / float(natural_frequency(target, material))
     if elastic.volts:
@@ -219,7 +211,8 @@ def _check_known(
     times = np.linspace(
         levels[0].time, min(ends[1], ends[0] + swing), _LOOK, dtype=np.float64)
     try:
-        stretch = sampled(levels, state, times, material, delivery, _LOOK_RTOL)[STRETCH]
+        stretch = sampled(
+            levels, request.start, times, material, request.delivery, _LOOK_RTOL)[STRETCH]
         # A voltage wins over the elastic force where that falls.
         over = stretch[stretch > stretch_limits(material)[1]]
         pulled = elastic.volts and np.any(elastic_force(over, material) < levels[-1].load)
@@ -231,7 +224,7 @@ def _check_known(
     if pulled:
         raise RefusedError(
             Code.OUT_OF_RANGE,
-            f'the move from {material.coordinate.name} {state.stretch:.6g} to {target:g} '
+            f'the move from {where} to {target:g} '
             f'overshoots and pulls in: expected a target of less, or a shaper that does not '
             'overshoot, such as two_step')
     for widest, beyond in ((np.min(stretch), -1.0), (np.max(stretch), 1.0)):
@@ -239,7 +232,7 @@ def _check_known(
         if beyond * (widest - limit) > 0.0:
             raise RefusedError(
                 Code.OUT_OF_RANGE,
-                f'the move from {material.coordinate.name} {state.stretch:.6g} to {target:g} '
+                f'the move from {where} to {target:g} '
                 f'swings to {widest:.4f}: expected a motion between the limits '
                 f'{elastic.limits[0]:.4f} and {elastic.limits[1]:.4f} of law {elastic.law}, '
                 'beyond which nothing is known')

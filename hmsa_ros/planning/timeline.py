@@ -25,7 +25,7 @@ from hmsa_ros.model.simulation import follow, longest_motion, sampled
 from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS, Units
 from hmsa_ros.planning.path import Path
-from hmsa_ros.planning.sequence import SHORT_SPELL
+from hmsa_ros.planning.sequence import check_short_spell
 from hmsa_ros.planning.shapers import creeping, get_shaper
 from hmsa_ros.planning.shapers.pace import PACE, Pace
 from hmsa_ros.planning.shapers.request import as_errors, ERRORS
@@ -79,10 +79,7 @@ class Model:
         actuator, options = self.actuator, self.options
         get_shaper(options.shaper)
         as_errors(options.errors)
-        if options.short_spell not in SHORT_SPELL:
-            raise BadInputError(
-                f'short_spell is {options.short_spell!r}: expected one of '
-                + ', '.join(SHORT_SPELL))
+        check_short_spell(options.short_spell)
         if options.lead_time < 0:
             raise BadInputError(
                 f'lead_time is {options.lead_time / NANOSECONDS:g} s: expected at least 0 s')
