@@ -25,7 +25,7 @@ from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.flat import held_along, loads_for
 from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.shapers.two_step import two_step
-from hmsa_ros.planning.shooting import Attempt, solve, Template
+from hmsa_ros.planning.shooting import Attempt, kept, solve, Template
 
 #: Stretch, rate and acceleration, shape (n,) each, at times from the start on.
 Course = Callable[[Array], tuple[Array, Array, Array]]
@@ -261,7 +261,7 @@ class _Follower:
             if free.stop is not None:
                 # The field is that which holds the end, whatever it is just before.
                 slope = once[-1, -1] - self._lack[0] - gained[-1] + lag * (
-                    self._holding() - values[-1, -1])
+                    self._request.balance(self._followed) - values[-1, -1])
                 coefficients[-2:] = wanted[-1, -1] - 0.5 * inner[-1, 0] * slope, wanted[-1, -1]
             coefficients[free] = 0.0
             coefficients[free] = spsolve(normal, design[:, free].T @ (
@@ -335,8 +335,8 @@ class _Follower:
         begin = int(np.searchsorted(edges, end - _ENDING * 2.0 * math.pi / request.frequency))
         begin = max(min(begin, len(edges) - 1 - _FEWEST // 2), len(edges) - 1 - _LAST, 0)
         rest = replace(request, state=self._states[begin])
-        found = self._ended(rest, begin)
-        if found is None or not request.keeps(found[0]):
+        found = kept(self._ended(rest, begin), request)
+        if found is None:
             # Beside the path at its end: a move of its own to rest.
             begin = len(edges) - 1
             last = two_step(replace(request, state=self._states[-1]))
@@ -369,14 +369,8 @@ class _Follower:
         d_loads = np.zeros((len(edges), len(changes)))
         d_loads[:-1] = np.array(changes).T
         rounded = np.array([delivery.rounded(x) for x in edges.tolist()])
-        levels = np.append(levels, self._holding())
+        levels = np.append(levels, self._request.balance(self._followed))
         return solve(Template(rounded, levels, np.zeros_like(d_loads), d_loads), request)
-
-    def _holding(self) -> float:
-        """Return the load that keeps the end of the path at rest at first."""
-        request = self._request
-        return request.balance(self._followed) if request.material.creep else (
-            request.holding_load())
 
     def _words(self, largest: float, when: float) -> str:
         """Return the largest deviation in words, if it is more than levels may leave."""

@@ -103,13 +103,14 @@ def solve(
     return levels, duration
 
 
+def kept(found: Attempt, request: 'Request') -> Attempt:
+    """Return a command that keeps the load limits, None in place of another."""
+    return found if found is not None and request.keeps(found[0]) else None
+
+
 def first_kept(guesses: Iterable[Template], request: 'Request') -> Attempt:
     """Return the first solution of some guesses that keeps the load limits, if there is one."""
-    for guess in guesses:
-        found = solve(guess, request)
-        if found is not None and request.keeps(found[0]):
-            return found
-    return None
+    return next(filter(None, (kept(solve(x, request), request) for x in guesses)), None)
 
 
 def soonest_kept(guesses: Iterable[tuple[float, Template]], request: 'Request') -> Attempt:
@@ -122,9 +123,8 @@ def soonest_kept(guesses: Iterable[tuple[float, Template]], request: 'Request') 
     for duration, guess in sorted(guesses, key=itemgetter(0)):
         if best is not None and duration >= best[1]:
             break
-        found = solve(guess, request)
-        if found is not None and request.keeps(found[0]) and (
-                best is None or found[1] < best[1]):
+        found = kept(solve(guess, request), request)
+        if found is not None and (best is None or found[1] < best[1]):
             best = found
     return best
 

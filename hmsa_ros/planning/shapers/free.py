@@ -125,15 +125,14 @@ def _swings(request: Request) -> Iterator[tuple[float, Template]]:
 
 def _refusal(request: Request) -> tuple[Code, str]:
     units, delivery, limits = request.units, request.delivery, request.limits
-    within = (f'{units.drive.plural} of {units.load_text(limits.minimum)} to '
-              f'{units.load_text(limits.maximum)}')
+    slow, ramps = delivery.slew < math.inf, f'ramps of {units.slew_text(delivery.slew)}'
     if delivery.lag > 0.0:
-        text = (f'no command for a coil time constant of {units.time_text(delivery.lag)} brings '
-                f'{request.named_target} and the field to rest together within ')
-        if not math.isinf(delivery.slew):
-            return Code.SLEW_LIMIT, (
-                f'{text}ramps of {units.slew_text(delivery.slew)} and {within}')
-        return Code.FLUX_LIMIT, text + within
+        return Code.SLEW_LIMIT if slow else Code.FLUX_LIMIT, (
+            f'no command for a coil time constant of {units.time_text(delivery.lag)} brings '
+            f'{request.named_target} and the field to rest together within '
+            + (f'{ramps} and ' if slow else '')
+            + f'{units.drive.plural} of {units.load_text(limits.minimum)} to '
+            f'{units.load_text(limits.maximum)}')
     if request.material.creep:
         return Code.NO_TWO_STEP, (
             f'no two flux densities within the limits bring {request.named_target} of this '
@@ -143,6 +142,4 @@ def _refusal(request: Request) -> tuple[Code, str]:
         return Code.NO_TWO_STEP, (
             f'no command on a grid of {units.time_text(delivery.period)} within the limits '
             f'brings {request.named_target} to rest')
-    return Code.SLEW_LIMIT, (
-        f'no command through ramps of {units.slew_text(delivery.slew)} brings '
-        f'{request.named_target} to rest')
+    return Code.SLEW_LIMIT, f'no command through {ramps} brings {request.named_target} to rest'

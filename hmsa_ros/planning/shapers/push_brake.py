@@ -18,6 +18,7 @@ from hmsa_ros.planning.shooting import (
     Attempt,
     first_kept,
     heights,
+    kept,
     on_time,
     solve,
     Template,
@@ -90,8 +91,7 @@ def _attempt(request: Request, low: float, high: float) -> Attempt:
         replace(delivery, lag=0.0))
     if found is not None and (request.material.creep or delivery.lag > 0.0):
         found = _carried(request, found[0])
-    found = on_time(found, request)
-    return found if found is not None and request.keeps(found[0]) else None
+    return kept(on_time(found, request), request)
 
 
 def _carried(request: Request, plain: tuple[Level, ...]) -> Attempt:

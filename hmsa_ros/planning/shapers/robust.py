@@ -46,14 +46,10 @@ def robust(request: Request) -> Move:
             for x in chain.levels[:-1]]
         chain = _chain(ideal, [*waypoints, request.target])
         if chain.code is not Code.ROBUST:
-            return _single(move, request, chain)
-    if request.material.creep or not request.delivery.ideal:
+            break
+    if chain.code is Code.ROBUST and (request.material.creep or not request.delivery.ideal):
         chain = _chain(request, [*waypoints, request.target])
-    return chain if chain.code is Code.ROBUST else _single(move, request, chain)
-
-
-def _single(move: Move, request: Request, chain: Move) -> Move:
-    return replace(move, reason=(
+    return chain if chain.code is Code.ROBUST else replace(move, reason=(
         f'no chain of order {request.order} leads to {request.named_target} ({chain.code}): '
         'a single two-step command is used'))
 

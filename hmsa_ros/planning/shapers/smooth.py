@@ -25,7 +25,7 @@ from hmsa_ros.planning.flat import fade, held_along, loads_for
 from hmsa_ros.planning.shapers.free import at_rest
 from hmsa_ros.planning.shapers.pace import MOST_PERIODS
 from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.planning.shooting import Attempt, solve, Template
+from hmsa_ros.planning.shooting import Attempt, kept, solve, Template
 
 # Points of a path, levels of a natural period, and how many there are at least and at most.
 _POINTS = 129
@@ -59,8 +59,8 @@ def smooth(request: Request) -> Move:
     for _ in range(_RETRIES):
         if path is None:
             break
-        found = _delivered(request, path, holding, period)
-        if found is not None and request.keeps(found[0]):
+        found = kept(_delivered(request, path, holding, period), request)
+        if found is not None:
             return Move(Code.SMOOTH, *found)
         path = _path(request, holding, _RETRY * path.duration)
     units, limits, slew = request.units, request.limits, request.delivery.slew

@@ -19,6 +19,7 @@ from hmsa_ros.planning.shooting import (
     Attempt,
     first_kept,
     heights,
+    kept,
     solve,
     soonest_kept,
     Template,
@@ -66,8 +67,9 @@ def two_step(request: Request) -> Move:
     if code in _WITHOUT and not (lags and code is Code.HOLD):
         return _without(request, code, holding)
     if code is Code.TWO_STEP:
-        found = (levels, levels[-1].time) if at_once else _delivered(request, levels)
-        if found is not None and request.keeps(found[0]):
+        found = kept((levels, levels[-1].time) if at_once else _delivered(
+            request, levels), request)
+        if found is not None:
             sooner = _sooner(request, found[1]) if lags or creeps else None
             return sooner or Move(Code.TWO_STEP, *found)
     if request.still and not lags and (code is Code.TWO_STEP or not creeps):
@@ -200,12 +202,11 @@ def _ramped(request: Request, ideal: tuple[Level, ...]) -> Attempt:
         ideal = (Level(0.0, start + change / (1.0 + decay ** half_periods)),
                  Level(half_periods * last.time, last.load))
     tried = [approach(ideal, slower, _SHORTEST_STRIDE)]
-    if request.still and (
-            half_periods > 1 or tried[0] is None or not request.keeps(tried[0][0])):
+    if request.still and (half_periods > 1 or kept(tried[0], request) is None):
         tried.append(soonest_kept(_held(bare), bare))
     for found in sorted(filter(None, tried), key=itemgetter(1)):
-        late = approach(found[0], later, _SHORTEST_STRIDE) if lag > 0.0 else found
-        if late is not None and request.keeps(late[0]):
+        late = kept(approach(found[0], later, _SHORTEST_STRIDE) if lag > 0.0 else found, request)
+        if late is not None:
             return late
     return None
 
