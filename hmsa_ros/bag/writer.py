@@ -202,7 +202,7 @@ class BagWriter:
         return self._open()
 
     def reopen(self) -> str:
-        """Give up the file after an `OSError`, as `abandon` does, and go on in a new one."""
+        """Give up the file after an `OSError`, as `abandon` does; write what waits to the next."""
         self.abandon()
         self.folder.mkdir(parents=True, exist_ok=True)
         name = self._open()
