@@ -85,8 +85,16 @@ _LEAST_POINT = 24
 # More joints than any planner has.
 _MOST_JOINTS = 1000
 _FIELDS = ('positions', 'velocities', 'accelerations', 'effort')
-# What is read of a point of a path: the first three.
-_PATH = 'path'
+# What is read of points: the fields that all have to have, and what is expected of the others.
+_WANTED = {
+    'positions': (
+        ('positions',),
+        'none, the actuator comes to rest at each setpoint (with the parameter trajectory_mode '
+        'set to path, it follows velocities)'),
+    'effort': (('effort',), 'none, the levels of the field are all there is'),
+    'path': (
+        ('positions', 'velocities'), 'accelerations of all joints or none, and no effort'),
+}
 
 
 def read_trajectory(data: bytes) -> Trajectory:
@@ -114,12 +122,17 @@ def read_trajectory(data: bytes) -> Trajectory:
     points = _Points(cursor, names, count, 'effort' if raw else 'positions')
     return Trajectory(
         names, points, count, stamp or None, name, raw,
-        replace(points, wanted=_PATH) if sizes[:2] == [many, many] else None)
+        replace(points, wanted='path') if sizes[:2] == [many, many] else None)
 
 
 @dataclass(frozen=True)
 class _Points:
-    """Points behind a cursor, read anew each time that they are asked for."""
+    """
+    Points behind a cursor, read anew each time that they are asked for.
+
+    Each is stretches, or levels in T, and time from the start in ns. Of a path, each joint has
+    stretch, rate and acceleration, the latter NaN if it is not given.
+    """
 
     cursor: Cursor
     names: Sequence[str]
@@ -127,7 +140,31 @@ class _Points:
     wanted: str
 
     def __iter__(self) -> Iterator[tuple[Sequence[Any], int]]:
-        return _points(copy(self.cursor), self.names, self.count, self.wanted)
+        many = len(self.names)
+        cursor, rest = copy(self.cursor), (0.0,) * many
+        needed, expected = _WANTED[self.wanted]
+        for number in range(self.count):
+            found = []
+            for field in _FIELDS:
+                values = cursor.take('d', cursor.count())
+                if field in needed:
+                    if len(values) != many:
+                        raise RefusedError(
+                            Code.BAD_INPUT,
+                            f'point {number} has {len(values)} {field}: expected {many}, one for '
+                            'each of joint_names')
+                    found.append(values)
+                elif self.wanted == 'path' and field == 'accelerations' and len(values) == many:
+                    found.append(values)
+                elif values not in ((), rest):
+                    raise RefusedError(
+                        Code.BAD_INPUT,
+                        f'point {number} has {field} {excerpt(list(values))}: expected {expected}')
+            if self.wanted == 'path':
+                yield list(zip(*found[:2], *found[2:] or [(math.nan,) * many], strict=True)), (
+                    cursor.time())
+            else:
+                yield found[0], cursor.time()
 
 
 def _sizes(cursor: Cursor) -> list[int]:
@@ -137,49 +174,3 @@ def _sizes(cursor: Cursor) -> list[int]:
         return [len(ahead.take('d', ahead.count())) for _ in _FIELDS]
     except BadInputError:
         return []
-
-
-def _points(
-        cursor: Cursor, names: Sequence[str], count: int,
-        wanted: str) -> Iterator[tuple[Sequence[Any], int]]:
-    """
-    Yield stretches, or levels in T, and time from the start in ns of each point.
-
-    Of a path, each joint has stretch, rate and acceleration, the latter NaN if it is not given.
-    """
-    rest = (0.0,) * len(names)
-    for number in range(count):
-        if wanted == _PATH:
-            rows = [cursor.take('d', cursor.count()) for _ in _FIELDS]
-            for field, row in zip(_FIELDS[:2], rows, strict=False):
-                if len(row) != len(names):
-                    raise RefusedError(
-                        Code.BAD_INPUT,
-                        f'point {number} has {len(row)} {field}: expected {len(names)}, one for '
-                        'each of joint_names in every point of a path')
-            if len(rows[2]) not in (0, len(names)) or rows[3] not in ((), rest):
-                raise RefusedError(
-                    Code.BAD_INPUT,
-                    f'point {number} has accelerations {excerpt(list(rows[2]))} and effort '
-                    f'{excerpt(list(rows[3]))}: expected accelerations of all joints or none, '
-                    'and no effort')
-            yield list(zip(*rows[:2], rows[2] or (math.nan,) * len(names), strict=True)), (
-                cursor.time())
-            continue
-        for field in _FIELDS:
-            values = cursor.take('d', cursor.count())
-            if field == wanted:
-                found = values
-                if len(found) != len(names):
-                    raise RefusedError(
-                        Code.BAD_INPUT,
-                        f'point {number} has {len(found)} {wanted}: expected {len(names)}, '
-                        'one for each of joint_names')
-            elif values not in ((), rest):
-                raise RefusedError(
-                    Code.BAD_INPUT,
-                    f'point {number} has {field} {excerpt(list(values))}: expected none, '
-                    + ('the actuator comes to rest at each setpoint (with the parameter '
-                       'trajectory_mode set to path, it follows velocities)'
-                       if wanted == 'positions' else 'the levels of the field are all there is'))
-        yield found, cursor.time()
