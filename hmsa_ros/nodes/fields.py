@@ -1,6 +1,5 @@
 """Fields of messages by their paths, such as ``pose.position.z`` or ``data[2]``."""
 
-from collections.abc import Sequence
 import re
 from typing import Any
 
@@ -29,37 +28,32 @@ AXES = ('x', 'y', 'z')
 _STEP = re.compile(r'([a-z]\w*)((?:\[\d+\])*)$')
 
 
-def steps(path: str) -> list[str | int]:
+def located(type_name: str, message: Any, path: str) -> tuple[str, list[str | int], Any]:
     """
-    Return the names and indices of a path.
+    Return a path, or the usual one for an empty one, its steps, and what is at their end.
+
+    That is what an empty message of the type has there, or the array before an index.
 
     Raises
     ------
     BadInputError
-        If it is no path.
+        If it is no path, or the message does not have it, as far as an empty one shows that.
 
     """
-    found: list[str | int] = []
+    path = path or USUAL.get(type_name, '')
+    if not path:
+        raise BadInputError(
+            f'parameter field is empty: expected that of a {type_name} to use, such as '
+            'pose.position.z or data[0]')
+    way: list[str | int] = []
     for word in path.split('.'):
         match = _STEP.match(word)
         if match is None:
             raise BadInputError(
                 f'parameter field is {path!r}: expected names of fields with dots between them, '
                 'such as pose.position.z or data[2]')
-        found += [match[1], *map(int, re.findall(r'\d+', match[2]))]
-    return found
-
-
-def end(type_name: str, value: Any, way: Sequence[str | int], path: str) -> Any:
-    """
-    Return what an empty message has at the steps of a path, or the array before an index.
-
-    Raises
-    ------
-    BadInputError
-        If the message does not have them, as far as an empty one shows that.
-
-    """
+        way += [match[1], *map(int, re.findall(r'\d+', match[2]))]
+    value = message
     for step in way:
         if isinstance(step, int):
             # An empty message may have none of them.
@@ -71,7 +65,7 @@ def end(type_name: str, value: Any, way: Sequence[str | int], path: str) -> Any:
                 f'one of {", ".join(names)}' if names else
                 f'parameter field is {path!r}: expected nothing after a number')
         value = getattr(value, step)
-    return value
+    return path, way, value
 
 
 def is_point(value: Any) -> bool:

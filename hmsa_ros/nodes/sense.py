@@ -54,18 +54,13 @@ def reader(type_name: str, kind: type[Any], path: str, element: str) -> Callable
         If there is no such field, it is no number, or an element is needed or not.
 
     """
-    path = path or fields.USUAL.get(type_name, '')
-    if not path:
-        raise BadInputError(
-            f'parameter field is empty: expected the field of {type_name} to read, such as '
-            'pose.position.z')
     find = _FIND.get(type_name)
+    path, steps, end = fields.located(
+        type_name, TransformStamped() if find is _of_frame else kind(), path)
     if (find is None) is bool(element):
         raise BadInputError(f'parameter element is {element!r}: expected ' + (
             f'none, since a {type_name} has one reading' if element else
             f'the name of the joint or frame to read in a {type_name}'))
-    steps = fields.steps(path)
-    end = fields.end(type_name, TransformStamped() if find is _of_frame else kind(), steps, path)
     if isinstance(end, (bool, str)) or not (
             isinstance(end, (int, float)) or hasattr(end, '__len__') or fields.is_point(end)):
         raise BadInputError(

@@ -5,8 +5,6 @@ The joints of a driver may share a message. Vectors that share a field add up.
 """
 
 from array import array
-from collections.abc import Sequence
-from dataclasses import dataclass
 import math
 from time import monotonic, sleep
 from typing import Any
@@ -33,32 +31,6 @@ class TopicError(HmsaError):
     """A topic that no node subscribes to."""
 
 
-@dataclass
-class _Part:
-    """A level, and where it is in a message: as a number, or along a direction."""
-
-    way: Sequence[str | int]
-    direction: Sequence[float]  # empty for a number
-    size: int
-    level: float = 0.0
-
-    def put(self, message: Any) -> None:
-        """Add the level to a message."""
-        *inner, last = self.way
-        holder = message
-        for step in inner:
-            holder = getattr(holder, str(step))
-        if isinstance(last, int):
-            if isinstance(holder, array):
-                holder.extend([0.0] * (max(self.size, last + 1) - len(holder)))
-            holder[last] += self.level
-            return
-        point = getattr(holder, last) if self.direction else holder
-        for name, x in zip(
-                fields.AXES if self.direction else [last], self.direction or [1.0], strict=True):
-            setattr(point, name, getattr(point, name) + self.level * x)
-
-
 class _Topic:
     """A topic whose subscriber is waited for, and what the joints put into its message."""
 
@@ -68,7 +40,7 @@ class _Topic:
         self._node = visit(
             own, '', start_parameter_services=False, enable_rosout=False,
             cli_args=['--ros-args', '-r', f'__node:={own}'])
-        self.parts: dict[str, _Part] = {}
+        self.fields: dict[str, Field] = {}
         self._publisher: Any = None
         try:
             self.name = self._node.resolve_topic_name(name)
@@ -104,8 +76,8 @@ class _Topic:
         """Publish what all joints have put in, at a time in ns."""
         self._require_subscriber()
         message = self.kind()
-        for part in self.parts.values():
-            part.put(message)
+        for field in self.fields.values():
+            field.put(message)
         if hasattr(message, 'header'):
             message.header.stamp = to_time(now)
         self._publisher.publish(message)
@@ -159,27 +131,23 @@ class Field:
             raise BadInputError(
                 f'hardware.size is {excerpt(size)}: expected a whole number, 0 to {_LONGEST}')
         self._joint, self._key = joint, (topic, type_name)
+        self._level, self._size = 0.0, int(size)
         shared = _SHARED.get(self._key)
         self._topic = _Topic(topic, type_name) if shared is None else shared
         try:
-            self._part = self._made(path, direction, int(size))
+            self._find(path, direction)
         except BaseException:
             if shared is None:
                 self._topic.close()
             raise
         _SHARED[self._key] = self._topic
-        self._topic.parts[joint] = self._part
-        self.description = f'{path or self._path} of {self._topic.name} ({self._topic.type})'
+        self._topic.fields[joint] = self
 
-    def _made(self, path: str, direction: Any, size: int) -> _Part:
-        type_name, kind = self._topic.type, self._topic.kind
-        self._path = path or fields.USUAL.get(type_name, '')
-        if not self._path:
-            raise BadInputError(
-                f'hardware.field is empty: expected the field of {type_name} to set, such as '
-                'data[0]')
-        way = fields.steps(self._path)
-        end, last = fields.end(type_name, kind(), way, self._path), way[-1]
+    def _find(self, path: str, direction: Any) -> None:
+        """Find the field, a number or a vector, in messages on the topic."""
+        type_name = self._topic.type
+        path, way, end = fields.located(type_name, self._topic.kind(), path)
+        self.way, last = way, way[-1]
         number = isinstance(end, float) or (
             isinstance(last, int) and last < _LONGEST and not any(
                 isinstance(x, int) for x in way[:-1])
@@ -187,23 +155,41 @@ class Field:
                 end, np.ndarray) and end.dtype.kind == 'f' and last < len(end)))
         if not number and not fields.is_point(end):
             raise BadInputError(
-                f'hardware.field is {self._path!r}, of a {type_name} no field that takes a level: '
+                f'hardware.field is {path!r}, of a {type_name} no field that takes a level: '
                 'expected a floating-point number, an element of an array of those, or a vector')
         if number and (other := next(
-                (x for x, part in self._topic.parts.items() if part.way == way), None)):
+                (x for x, field in self._topic.fields.items() if field.way == way), None)):
             raise BadInputError(
-                f'hardware.field is {self._path!r} for joints {other} and {self._joint}: expected '
+                f'hardware.field is {path!r} for joints {other} and {self._joint}: expected '
                 f'a field for each, as in {self._joint}.hardware.field')
-        return _Part(way, _unit(direction, number=number), size)
+        # Empty for a number.
+        self._direction = _unit(direction, number=number)
+        self.description = f'{path} of {self._topic.name} ({type_name})'
+
+    def put(self, message: Any) -> None:
+        """Add the level to a message."""
+        *inner, last = self.way
+        holder = message
+        for step in inner:
+            holder = getattr(holder, str(step))
+        if isinstance(last, int):
+            if isinstance(holder, array):
+                holder.extend([0.0] * (max(self._size, last + 1) - len(holder)))
+            holder[last] += self._level
+            return
+        point = getattr(holder, last) if self._direction else holder
+        for name, x in zip(
+                fields.AXES if self._direction else [last], self._direction or [1.0], strict=True):
+            setattr(point, name, getattr(point, name) + self._level * x)
 
     def write(self, level: float, now: int) -> None:
         """Publish a level in the unit of the topic, with other joints', at a time in ns."""
-        self._part.level = level
+        self._level = level
         self._topic.publish(now)
 
     def close(self) -> None:
         """Leave the topic."""
-        if self._topic.parts.pop(self._joint, None) is not None and not self._topic.parts:
+        if self._topic.fields.pop(self._joint, None) is not None and not self._topic.fields:
             del _SHARED[self._key]
             self._topic.close()
 
