@@ -8,7 +8,7 @@ from rclpy.parameter import Parameter
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.parameters import ACTUATOR, INITIAL_STRETCH, JOINT, ParameterSpec
-from hmsa_ros.nodes.parameters import declare_joints, joint_names, JOINTS
+from hmsa_ros.nodes.parameters import checked, declare_joints, joint_names, JOINTS
 
 OWN = (*ACTUATOR, INITIAL_STRETCH)
 SPECS = (*OWN, JOINT, JOINTS, ParameterSpec('other', 1, 'Not for one joint.', '', 0, 9))
@@ -45,23 +45,23 @@ def test_joint_has_its_own_value_or_that_of_all(make_ros):
     assert list(left) == list(right) == [x.name for x in SPECS]
     assert (left['actuator.remanence'], right['actuator.remanence']) == (0.2, 0.1)
     assert left['initial_stretch'] == right['initial_stretch'] == values['initial_stretch'] == 1.1
-    changed = values.changed([
+    changed = values.changed(checked(node, [
         Parameter('actuator.remanence', value=0.3), Parameter('right.initial_stretch', value=0.9),
-        Parameter('use_sim_time', value=True)])
+        Parameter('use_sim_time', value=True)]))
     assert (changed.of('left')['actuator.remanence'], changed.of('left')['initial_stretch']) == (
         0.2, 1.1)
     assert (changed.of('right')['actuator.remanence'], changed.of('right')['initial_stretch']) == (
         0.3, 0.9)
     assert values.of('right') == right
     with pytest.raises(BadInputError, match='parameter left.actuator.remanence is -1'):
-        values.changed([Parameter('left.actuator.remanence', value=-1.0)])
+        checked(node, [Parameter('left.actuator.remanence', value=-1.0)])
 
 
 @pytest.mark.ros
 def test_one_joint_by_name_alone_declares_nothing_more(make_ros):
     node, values = declared(make_ros, 'joint:=knee')
     assert values.names == ('knee',)
-    assert list(values.of('knee')) == list(values.specs) == [x.name for x in SPECS]
+    assert list(values.of('knee')) == list(values.values) == [x.name for x in SPECS]
 
 
 @pytest.mark.ros

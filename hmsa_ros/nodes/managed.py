@@ -5,7 +5,8 @@ The states and services are those of ROS 2 (``ros2 lifecycle``, launch). With th
 ``autostart``, which is true by default, a node configures and activates itself when it starts.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from time import time_ns
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -31,7 +32,7 @@ from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import to_diagnostics
 from hmsa_ros.nodes.newest_clock import NewestClock
 from hmsa_ros.nodes.outlet import Outlet
-from hmsa_ros.nodes.parameters import check_former_names, check_names, declare
+from hmsa_ros.nodes.parameters import check_former_names, check_names, checked, declare
 
 AUTOSTART = ParameterSpec(
     'autostart', True,
@@ -112,11 +113,11 @@ class ManagedNode(LifecycleNode):
         self.every(1.0, publish)
         return publish
 
-    def on_change(self, take: Callable[[Sequence[Parameter]], None]) -> None:
-        """Have parameters that are set taken together, or refused by `BadInputError`."""
+    def on_change(self, take: Callable[[Mapping[str, Any]], None]) -> None:
+        """Have values that are set, by name, taken together, or refused by `BadInputError`."""
         def change(parameters: Sequence[Parameter]) -> SetParametersResult:
             try:
-                take(parameters)
+                take(checked(self, parameters))
             except BadInputError as error:
                 return SetParametersResult(successful=False, reason=str(error))
             return SetParametersResult(successful=True)

@@ -69,8 +69,7 @@ def declare(node: Node, specs: Iterable[ParameterSpec]) -> Mapping[str, Any]:
             continue
         if filled is None and spec.name in FIXED:
             filled = from_files(node, values)
-        values[spec.name] = spec.taken(
-            declare_one(node, spec, (filled or {}).get(spec.name, spec.default)))
+        values[spec.name] = declare_one(node, spec, (filled or {}).get(spec.name, spec.default))
     return values
 
 
@@ -107,34 +106,33 @@ def declare_one(node: Node, spec: ParameterSpec, default: Any = None) -> Any:
     Raises
     ------
     BadInputError
-        If a value from the command line or a file has the wrong type.
+        If a value from the command line or a file has the wrong type or is out of range.
 
     """
-    specs, overrides = _declared(node), node._parameter_overrides
-    specs[spec.name] = spec
+    _declared(node)[spec.name] = spec
+    overrides, kind = node._parameter_overrides, type_of(spec)
     if spec.name in overrides:
         overrides[spec.name] = typed(spec, overrides[spec.name])
     if isinstance(spec.default, list):
-        node.declare_parameter(
-            spec.name, type_of(spec), descriptor(spec), ignore_override=True)
+        node.declare_parameter(spec.name, kind, descriptor(spec), ignore_override=True)
         value = overrides[spec.name].value if spec.name in overrides else default
-        if value is None:
-            return None
-        # rclpy would take an empty list for one of bytes.
-        node._parameters[spec.name] = Parameter(spec.name, type_of(spec), spec.taken(value))
+        if value is not None:
+            value = spec.taken(value)
+            # rclpy would take an empty list for one of bytes.
+            node._parameters[spec.name] = Parameter(spec.name, kind, value)
         return value
     try:
-        # The range is checked by `ParameterSpec`, whose message names what was expected; rclpy's
-        # does not.
-        return node.declare_parameter(
-            spec.name, type_of(spec) if default is None else default, descriptor(spec)).value
+        value = node.declare_parameter(
+            spec.name, kind if default is None else default, descriptor(spec)).value
     except ParameterException as error:
-        override = overrides.get(spec.name)
-        got = 'a value of another kind' if override is None else repr(override.value)
+        # rclpy's message does not name what was expected.
         expected = type(spec.default).__name__
         if spec.minimum is not None or spec.maximum is not None:
             expected += f', {spec.range_text()}'
-        raise BadInputError(f'parameter {spec.name} is {got}: expected {expected}') from error
+        raise BadInputError(
+            f'parameter {spec.name} is {overrides[spec.name].value!r}: expected {expected}'
+        ) from error
+    return None if value is None else spec.taken(value)
 
 
 def _declared(node: Node) -> dict[str, ParameterSpec]:
@@ -144,6 +142,20 @@ def _declared(node: Node) -> dict[str, ParameterSpec]:
         node.add_pre_set_parameters_callback(lambda given: [
             typed(specs[x.name], x) if x.name in specs else x for x in given])
     return _DECLARED[node]
+
+
+def checked(node: Node, given: Iterable[Parameter]) -> dict[str, Any]:
+    """
+    Return what is set of a node's declared parameters, by name, as the node uses it.
+
+    Raises
+    ------
+    BadInputError
+        If a value is of another type, out of range or not one of the choices.
+
+    """
+    specs = _declared(node)
+    return {x.name: specs[x.name].taken(x.value) for x in given if x.name in specs}
 
 
 def from_files(node: Node, values: Mapping[str, Any], joint: str = '') -> Mapping[str, Any]:
@@ -216,20 +228,17 @@ def joint_names(values: Mapping[str, Any]) -> tuple[str, ...]:
         If a name cannot be a part of a topic's name, or is there twice.
 
     """
-    names = tuple(values[JOINTS.name]) or (str(values[JOINT.name]),)
-    if not values[JOINTS.name]:
-        return names
+    names = tuple(values[JOINTS.name])
     for name in names:
         if not _TOKEN.fullmatch(name) or '__' in name or name.endswith('_'):
             raise BadInputError(
                 f'parameter joints names {name!r}: expected letters, digits and single '
                 'underscores, starting with a letter')
-    for name in names:
         if names.count(name) > 1:
             raise BadInputError(
                 f'parameter joints names {name!r} {names.count(name)} times: expected each '
                 'joint once')
-    return names
+    return names or (str(values[JOINT.name]),)
 
 
 @dataclass(frozen=True)
@@ -237,10 +246,7 @@ class JointParameters:
     """Values of a node's parameters, for all joints and for each."""
 
     names: tuple[str, ...]  #: the joints
-    #: what is declared, and set: an override that is not is missing; by full name
-    specs: Mapping[str, ParameterSpec]
-    values: Mapping[str, Any]
-    own: frozenset[str]  #: parameters that a joint may have a value of its own for
+    values: Mapping[str, Any]  #: by full name; an override that is not set is missing
 
     def __getitem__(self, name: str) -> Any:
         """Return the value for all joints."""
@@ -248,11 +254,12 @@ class JointParameters:
 
     def of(self, joint: str) -> dict[str, Any]:
         """Return the values of one joint by name, its own before those for all."""
-        return {
-            name: self.values.get(f'{joint}.{name}', self.values[name])
-            if name in self.own else self.values[name]
-            for name in self.specs if name in self.values
-            and (name in self.own or not self._is_override(name))}
+        found = {}
+        for name, value in self.values.items():
+            of, _, rest = name.partition('.')
+            if of not in self.names or rest not in self.values:
+                found[name] = self.values.get(f'{joint}.{name}', value)
+        return found
 
     def each(self, make: Callable[[str, dict[str, Any]], Any]) -> dict[str, Any]:
         """
@@ -274,17 +281,9 @@ class JointParameters:
                 raise BadInputError(f'joint {name}: {error}') from error
         return found
 
-    def _is_override(self, name: str) -> bool:
-        joint, _, rest = name.partition('.')
-        return joint in self.names and rest in self.own
-
-    def changed(self, parameters: Iterable[Parameter]) -> 'JointParameters':
-        """Return a copy with parameters set and checked; those not declared here are skipped."""
-        values = dict(self.values)
-        for parameter in parameters:
-            if parameter.name in self.specs:
-                values[parameter.name] = self.specs[parameter.name].taken(parameter.value)
-        return replace(self, values=values)
+    def changed(self, given: Mapping[str, Any]) -> 'JointParameters':
+        """Return a copy with other values, by full name."""
+        return replace(self, values={**self.values, **given})
 
 
 def declare_joints(
@@ -301,14 +300,11 @@ def declare_joints(
     """
     values = dict(declare(node, specs))
     names = joint_names(values)
-    declared = {spec.name: spec for spec in specs}
     for joint in names if values[JOINTS.name] else ():
         filled = from_files(node, values, joint)
         for general in own:
             spec = replace(general, name=f'{joint}.{general.name}')
-            declared[spec.name] = spec
             value = declare_one(node, spec, filled.get(general.name))
             if value is not None:
-                values[spec.name] = spec.taken(value)
-    return JointParameters(
-        names, declared, values, frozenset(spec.name for spec in own))
+                values[spec.name] = value
+    return JointParameters(names, values)

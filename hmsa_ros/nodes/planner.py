@@ -1,10 +1,11 @@
 """Planner node: setpoints in, the shaped stream of stamped flux density commands out."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from time import monotonic_ns, time_ns
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import JumpThreshold, TimeJump
@@ -361,8 +362,8 @@ class PlannerNode(ManagedNode):
 
     # -- parameters ----------------------------------------------------------------------------
 
-    def _take_parameters(self, parameters: Sequence[Parameter]) -> None:
-        changed = self._settings.changed(parameters)
+    def _take_parameters(self, given: Mapping[str, Any]) -> None:
+        changed = self._settings.changed(given)
         settings, models = settings_from(changed), models_from(changed, self._runtime.group)
         self._settings = changed
         self._runtime.change(settings, models, simultaneous=changed['simultaneous_arrival'])

@@ -1,6 +1,6 @@
 """Plant node: simulated actuators, driven by stamped flux density commands."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from functools import partial
 import math
 from time import monotonic_ns
@@ -310,8 +310,8 @@ class PlantNode(DeviceNode):
         self._pacer.set_paused(paused, self.device.time)
         return True, 'paused' if paused else 'running'
 
-    def _take_parameters(self, parameters: Sequence[Parameter]) -> None:
-        changed = self.values.changed(parameters)
+    def _take_parameters(self, given: Mapping[str, Any]) -> None:
+        changed = self.values.changed(given)
         _joints_from(changed)
         self.values = changed
         factor = changed['real_time_factor']

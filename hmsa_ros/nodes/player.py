@@ -11,7 +11,7 @@ As a managed node it opens the bag and offers its topics when it is configured, 
 active, and gives both up when it is cleaned up.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import contextlib
 import os
 import sys
@@ -22,7 +22,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.duration import Duration
 from rclpy.expand_topic_name import expand_topic_name
-from rclpy.parameter import Parameter
 
 from hmsa_ros.bag.limits import CHUNK_SIZE
 from hmsa_ros.bag.reader import BagReader
@@ -364,25 +363,20 @@ class Player(ManagedNode):
         self.every(0.1, self._transport.stop)
         return True, 'stopped'
 
-    def _take_parameters(self, parameters: Sequence[Parameter]) -> None:
+    def _take_parameters(self, given: Mapping[str, Any]) -> None:
         """Take a new rate, or a time to go on from."""
-        specs = {spec.name: spec for spec in PARAMETERS}
-        playing = not self._transport.stopped
-        for parameter in parameters:
-            if parameter.name in specs:
-                specs[parameter.name].check(parameter.value)
-            if parameter.name == 'play.seek' and playing:
-                length = (self._excerpt.end - self._excerpt.first) * 1e-9
-                if parameter.value > length:
-                    raise BadInputError(
-                        f'parameter play.seek is {parameter.value:g}: '
-                        f'expected at most {length:g} s, where playing ends')
-        # A rate set when nothing is played is that of the next time.
-        for parameter in parameters if playing else ():
-            if parameter.name == 'play.rate':
-                self._transport.set_rate(parameter.value)
-            elif parameter.name == 'play.seek' and parameter.value >= 0.0:
-                self._transport.seek(self._excerpt.first + round(parameter.value * 1e9))
+        if self._transport.stopped:
+            # A rate set when nothing is played is that of the next time.
+            return
+        seek, length = given.get('play.seek', -1.0), self._excerpt.end - self._excerpt.first
+        if seek > length * 1e-9:
+            raise BadInputError(
+                f'parameter play.seek is {seek:g}: expected at most {length * 1e-9:g} s, where '
+                'playing ends')
+        if 'play.rate' in given:
+            self._transport.set_rate(given['play.rate'])
+        if seek >= 0.0:
+            self._transport.seek(self._excerpt.first + round(seek * 1e9))
 
     def _report(self) -> Iterable[DiagnosticStatus]:
         transport, excerpt = self._transport, self._excerpt
