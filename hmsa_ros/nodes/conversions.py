@@ -17,6 +17,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.schedule import obeyed
 from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.nodes.capture import decode
 
 if TYPE_CHECKING:
     # It comes along with the planner, which a recorder has no use for.
@@ -151,8 +152,17 @@ def to_planner_status(status: 'StatusChanged') -> DiagnosticStatus:
     return to_status('planner: request', ', '.join(each), severity, message, values)
 
 
-def from_samples(message: JointState) -> Iterator[tuple[str, int, tuple[float, float, float]]]:
-    """Yield joint, stamp in ns, and stretch, rate in 1/s and flux density in T of samples."""
+def from_samples(data: bytes) -> Iterator[tuple[str, int, tuple[float, float, float]]]:
+    """
+    Yield joint, stamp in ns, and stretch, rate in 1/s and flux density in T of samples.
+
+    Raises
+    ------
+    BadInputError
+        If the bytes are no JointState.
+
+    """
+    message = decode(data, JointState)
     stamp = from_time(message.header.stamp)
     # A field that is not measured is empty.
     for name, stretch, rate, flux_density in zip_longest(

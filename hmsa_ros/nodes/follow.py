@@ -15,7 +15,6 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.serialization import serialize_message
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectoryPoint
 
@@ -25,7 +24,7 @@ from hmsa_ros.control.records import Severity, StatusChanged, Trajectory
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.nodes import conversions, endpoints
-from hmsa_ros.nodes.capture import decode, RawSubscription
+from hmsa_ros.nodes.capture import RawSubscription
 from hmsa_ros.nodes.cdr import read_trajectory
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.planning import path
@@ -130,7 +129,7 @@ class FollowJointTrajectory:
         taken = self._samples.take()
         for x in taken if self._goals.wants_all else taken[-_NEWEST:]:
             with suppress(BadInputError):
-                for name, stamp, values in conversions.from_samples(decode(x.data, JointState)):
+                for name, stamp, values in conversions.from_samples(x.data):
                     self._goals.observe(name, stamp, *values[:2], self._node.now())
         self._serve()
         if not wanted:

@@ -10,8 +10,6 @@ from typing import Any, TYPE_CHECKING
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
-from rclpy.parameter import Parameter
-from sensor_msgs.msg import JointState
 
 from hmsa_ros.control import records
 from hmsa_ros.control.aside import Aside
@@ -24,7 +22,7 @@ from hmsa_ros.model.actuators import unheld
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
-from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
+from hmsa_ros.nodes.capture import RawSubscription, Taken
 from hmsa_ros.nodes.cdr import read_trajectory, stamp_of
 from hmsa_ros.nodes.channel import JointChannel
 from hmsa_ros.nodes.managed import ManagedNode
@@ -203,7 +201,7 @@ class PlannerNode(ManagedNode):
         if self._runtime.crowded or not self._runtime.looks_at(stamp_of(taken.data)):
             return
         try:
-            message = decode(taken.data, JointState)
+            samples = [*conversions.from_samples(taken.data)]
         except BadInputError as error:
             self.get_logger().error(f'sample ignored: {error}', throttle_duration_sec=1.0)
             return
@@ -211,7 +209,7 @@ class PlannerNode(ManagedNode):
         # makes a sample come before it was made.
         ago = min(self._ago(taken), monotonic_ns() - after)
         came = self.now() - ago
-        for name, stamp, values in conversions.from_samples(message):
+        for name, stamp, values in samples:
             self._runtime.observed(name, stamp, *values, came=came)
 
     def _ago(self, taken: Taken) -> int:
@@ -224,16 +222,12 @@ class PlannerNode(ManagedNode):
         for taken in reversed([] if self._newest is None else self._newest.take()):
             if not missing:
                 return
-            try:
-                message = decode(taken.data, JointState)
-            except BadInputError:
-                continue
-            for name, stamp, values in conversions.from_samples(message):
-                if name in missing:
-                    missing.discard(name)
-                    yield name, Seen(
-                        stamp, *values,
-                        lag=None if self._one_clock() else self.now() - self._ago(taken) - stamp)
+            with suppress(BadInputError):
+                for name, stamp, values in conversions.from_samples(taken.data):
+                    if name in missing:
+                        missing.discard(name)
+                        yield name, Seen(stamp, *values, lag=(
+                            None if self._one_clock() else self.now() - self._ago(taken) - stamp))
 
     def _one_clock(self) -> bool:
         """Return whether one clock tells the times of all nodes."""
