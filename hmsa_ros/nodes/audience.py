@@ -81,7 +81,7 @@ class Audience:
             except NodeNameNonExistentError:
                 return [f'topics of {node}']
         return [x for x in sorted(names) if self._selects.wants(x) and not any(
-            _name(info) == self._recorder
+            endpoints.node_of(info) == self._recorder
             for info in self._node.get_subscriptions_info_by_topic(x))]
 
     def _has_been_active(self, name: str) -> bool:
@@ -98,7 +98,7 @@ class Audience:
         if not self._nodes:
             return bool(sender.get_subscription_count() > 0)
         return any(
-            _name(x) in self._nodes
+            endpoints.node_of(x) in self._nodes
             for x in self._node.get_subscriptions_info_by_topic(sender.topic_name))
 
     def found(self, also: Any) -> bool:
@@ -109,11 +109,6 @@ class Audience:
             return False
         return bool(self._topics or self._states) or all(
             x.get_subscription_count() for x in self._senders.values())
-
-
-def _name(endpoint: Any) -> str:
-    """Return the full name of the node that has an endpoint."""
-    return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
 
 
 class Followers:

@@ -50,6 +50,11 @@ def profile(quality: Quality) -> QoSProfile:
         else DurabilityPolicy.VOLATILE)
 
 
+def node_of(endpoint: Any) -> str:
+    """Return the full name of the node of a publisher or subscriber in the graph."""
+    return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
+
+
 def publisher(node: Node, topic: Topic, owner: str = '') -> Publisher:
     """Return a node's publisher of a topic, or of another node's private topic."""
     return node.create_publisher(

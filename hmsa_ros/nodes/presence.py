@@ -7,21 +7,21 @@ the samples are heard. Publishers are told apart by their identifiers (GIDs), wh
 that of the process.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 import math
 from time import time_ns
-from typing import NamedTuple
 
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from sensor_msgs.msg import JointState
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
-from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
+from hmsa_ros.nodes.capture import RawSubscription, Taken
+from hmsa_ros.nodes.conversions import from_samples
 
 #: How long a process that was heard counts as running, in s.
 LATELY_SECONDS = 2.5
@@ -30,20 +30,12 @@ _PROCESS_BYTES = 12
 _SAMPLES = replace(topics.JOINT_STATES, qos=topics.Quality(100, reliable=False))
 
 
-class Publisher(NamedTuple):
-    """A publisher in the graph."""
-
-    node: str  #: full name of its node
-    gid: bytes
-
-
-def several(what: str, publishers: Sequence[Publisher]) -> str:
+def several(what: str, nodes: Sequence[str]) -> str:
     """Return that there are several planners, plants or the like; empty for fewer than two."""
-    if len(publishers) < 2:
+    if len(nodes) < 2:
         return ''
-    names = ' and '.join(sorted(x.node for x in publishers))
-    left = 'one' if len(publishers) == 2 else 'all but one'
-    return f'{len(publishers)} {what} ({names}): stop {left}'
+    left = 'one' if len(nodes) == 2 else 'all but one'
+    return f'{len(nodes)} {what} ({" and ".join(sorted(nodes))}): stop {left}'
 
 
 class Presence:
@@ -73,38 +65,31 @@ class Presence:
             self._note(taken := self._samples.take())
             # The newest of each publisher: reading all would take long.
             for one in {x.publisher: x for x in taken}.values():
-                for joint in _measured(one):
-                    self._sampled[joint, one.publisher] = one.received_ns
+                with suppress(BadInputError):
+                    for joint, _, (stretch, *_) in from_samples(one.data):
+                        if math.isfinite(stretch):
+                            self._sampled[joint, one.publisher] = one.received_ns
 
     def devices(self, joints: Sequence[str]) -> str:
         """Return that several plants or drivers run of one of a node's joints; empty for none."""
         for joint in joints:
             what = f'plants or drivers of joint {joint}'
             applied = topics.of_joint(topics.FLUX_DENSITY_APPLIED, joint, joints).name
-            if found := several(what, self.running(applied)) or several(
-                    what, self.sampling(joint)):
+            if found := several(what, self._running(applied)) or several(what, [
+                    node for gid, node in self._publishers(topics.JOINT_STATES.name)
+                    if _lately(self._sampled.get((joint, gid), 0))]):
                 return found
         return ''
 
     def planners(self, owner: str = '') -> str:
         """Return that several planners run under this node's name, or the owner's; or nothing."""
-        return several('planners', self.running(topics.from_outside(topics.STATUS.name, owner)))
+        return several('planners', self._running(topics.from_outside(topics.STATUS.name, owner)))
 
     def crowded(self, joints: Sequence[str], owner: str) -> bool:
         """Return whether the graph, killed processes included, has several of anything."""
         return any(len(self._publishers(x)) > 1 for x in (
             topics.from_outside(topics.STATUS.name, owner), topics.JOINT_STATES.name,
             *(topics.of_joint(topics.FLUX_DENSITY_APPLIED, x, joints).name for x in joints)))
-
-    def running(self, topic: str) -> list[Publisher]:
-        """Return the publishers of a topic whose processes are heard."""
-        return [x for x in self._publishers(topic)
-                if _lately(self._heard.get(x.gid[:_PROCESS_BYTES]))]
-
-    def sampling(self, joint: str) -> list[Publisher]:
-        """Return who publishes measured samples of a joint, where there are several at all."""
-        return [x for x in self._publishers(topics.JOINT_STATES.name)
-                if _lately(self._sampled.get((joint, x.gid)))]
 
     def close(self) -> None:
         """Listen no more."""
@@ -116,27 +101,21 @@ class Presence:
         for one in taken:
             self._heard[one.publisher[:_PROCESS_BYTES]] = one.received_ns
 
-    def _publishers(self, topic: str) -> list[Publisher]:
+    def _running(self, topic: str) -> list[str]:
+        """Return the nodes that publish a topic and whose processes are heard."""
+        return [node for gid, node in self._publishers(topic)
+                if _lately(self._heard.get(gid[:_PROCESS_BYTES], 0))]
+
+    def _publishers(self, topic: str) -> list[tuple[bytes, str]]:
+        """Return a topic's publishers in the graph: identifier, and full name of the node."""
         try:
             name = self._node.resolve_topic_name(topic)
         except rclpy_implementation.RCLError:
             # Joints that messages name may have any name.
             return []
-        return [Publisher(f'{x.node_namespace.rstrip("/")}/{x.node_name}', bytes(x.endpoint_gid))
+        return [(bytes(x.endpoint_gid), endpoints.node_of(x))
                 for x in self._node.get_publishers_info_by_topic(name)]
 
 
-def _lately(received_ns: int | None) -> bool:
-    return received_ns is not None and (
-        time_ns() - received_ns < LATELY_SECONDS * NANOSECONDS)
-
-
-def _measured(taken: Taken) -> Iterator[str]:
-    """Yield the joints of a message whose position is measured."""
-    try:
-        message = decode(taken.data, JointState)
-    except BadInputError:
-        return
-    for name, position in zip(message.name, message.position, strict=False):
-        if math.isfinite(position):
-            yield str(name)
+def _lately(received_ns: int) -> bool:
+    return time_ns() - received_ns < LATELY_SECONDS * NANOSECONDS
