@@ -41,10 +41,11 @@ class Audience:
         self._node = node
         self._senders = senders
         self._topics = topics
-        self._states = {
+        # Managed nodes that have not said yet that they are active.
+        self._inactive = {
             x: ServiceCall(node, GetState, f'{x}/get_state', GetState.Request())
             for x in (*nodes, *filter(None, [recorder]))}
-        self._active: set[str] = set()
+        self._demands = bool(topics or self._inactive)
         self._nodes = nodes
         self._recorder = recorder
         self._selects: Selection | None = None
@@ -54,8 +55,12 @@ class Audience:
 
     def missing(self) -> list[str]:
         """Return in words who is not there yet, of those that must be."""
+        for name, call in [*self._inactive.items()]:
+            answer = call.answer()
+            if answer is not None and answer.current_state.id == State.PRIMARY_STATE_ACTIVE:
+                del self._inactive[name]
         return [
-            *(f'active node {name}' for name in self._states if not self._has_been_active(name)),
+            *(f'active node {name}' for name in self._inactive),
             *(f'subscriber of {name}' for name in self._topics if not self._subscribed(name)),
             *(f'recorder of {name}' for name in self._unrecorded())]
 
@@ -84,14 +89,6 @@ class Audience:
             endpoints.node_of(info) == self._recorder
             for info in self._node.get_subscriptions_info_by_topic(x))]
 
-    def _has_been_active(self, name: str) -> bool:
-        """Return whether a managed node has said that it is active; ask until it has."""
-        if name not in self._active:
-            answer = self._states[name].answer()
-            if answer is not None and answer.current_state.id == State.PRIMARY_STATE_ACTIVE:
-                self._active.add(name)
-        return name in self._active
-
     def _subscribed(self, topic: str) -> bool:
         """Return whether somebody who counts subscribes to a topic."""
         sender = self._senders[topic]
@@ -107,7 +104,7 @@ class Audience:
         if any(x.get_subscription_count() < self._node.count_subscribers(x.topic_name)
                for x in senders):
             return False
-        return bool(self._topics or self._states) or all(
+        return self._demands or all(
             x.get_subscription_count() for x in self._senders.values())
 
 
