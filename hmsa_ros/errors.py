@@ -5,6 +5,7 @@ Every message is one sentence that says what was wrong, what was got, what was e
 where it is not obvious, how to mend it.
 """
 
+from collections.abc import Iterable
 import reprlib
 import sys
 
@@ -51,6 +52,13 @@ def printable(text: str) -> str:
     return ''.join(
         character if character.isprintable()
         else character.encode('unicode_escape').decode() for character in text)
+
+
+def listed(names: Iterable[str], most: int = 4) -> str:
+    """Return names for a sentence, the first of many."""
+    every = list(names)
+    more = f' and {len(every) - most} more' if len(every) > most else ''
+    return ', '.join(every[:most]) + more
 
 
 def excerpt(value: object) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 import math
 
+from hmsa_ros.errors import listed
 from hmsa_ros.model.parameters import ActuatorParameters
 
 _OK, _WARN, _ERROR = 0, 1, 2
@@ -48,11 +49,6 @@ def _verdict(fine: str, *notes: tuple[int, str]) -> tuple[int, str]:
 def judge_interlock(why: str) -> tuple[int, str]:
     """Return the verdict on an interlock, of why it is open."""
     return (_ERROR, f'open: {why}') if why else (_OK, 'closed')
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return names for a sentence, the first few of many."""
-    return ', '.join(names[:4]) + (f' and {len(names) - 4} more' if len(names) > 4 else '')
 
 
 def enough_samples(actuator: ActuatorParameters) -> float:

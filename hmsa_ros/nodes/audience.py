@@ -12,12 +12,12 @@ from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.parameter import parameter_value_to_python
 
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.errors import BadInputError, listed
 from hmsa_ros.interfaces import topics
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.cdr import stamp_of
 from hmsa_ros.nodes.selection import Selection
-from hmsa_ros.nodes.senders import listed
+from hmsa_ros.nodes.senders import NAMED_AT_MOST
 from hmsa_ros.nodes.service_call import ServiceCall
 
 
@@ -37,7 +37,7 @@ class Audience:
         if unsent:
             raise BadInputError(
                 f'parameter play.wait_for_subscribers names {", ".join(unsent)}: expected topics '
-                f'that are sent, {listed(senders) or "of which there is none"}')
+                f'that are sent, {listed(senders, NAMED_AT_MOST) or "of which there is none"}')
         self._node = node
         self._senders = senders
         self._topics = topics

@@ -14,11 +14,11 @@ from std_msgs.msg import Bool
 from hmsa_ros.device.coil import HardwareJoint
 from hmsa_ros.device.driven import HardwareDevice
 from hmsa_ros.device.hardware import Calls, load, OPTIONAL
-from hmsa_ros.device.health import judge_hardware, judge_interlock, listed
+from hmsa_ros.device.health import judge_hardware, judge_interlock
 from hmsa_ros.device.interlock import Interlock
 from hmsa_ros.device.worker import HardwareWorker
 from hmsa_ros.ending import Deadline, ENDING
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.errors import BadInputError, HmsaError, listed
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.parameters import ParameterSpec, PUBLISH_RATE
 from hmsa_ros.model.units import NANOSECONDS

@@ -6,7 +6,7 @@ from typing import Any
 from rclpy.node import Node
 
 from hmsa_ros.bag.reader import BagReader, Topic
-from hmsa_ros.errors import BadInputError, BagError, printable
+from hmsa_ros.errors import BadInputError, BagError, listed, printable
 from hmsa_ros.interfaces import topics
 from hmsa_ros.nodes.endpoints import interface_class
 from hmsa_ros.nodes.qos import publisher
@@ -14,8 +14,8 @@ from hmsa_ros.nodes.selection import Filter, is_full_name
 
 #: A publisher takes 1.5 ms and 35 kB.
 MOST_TOPICS = 1000
-# Topics named in a sentence or in the log; of the others only the number is.
-_NAMED_AT_MOST = 20
+#: Topics named in a sentence or in the log; of the others only the number is.
+NAMED_AT_MOST = 20
 
 
 def create_senders(
@@ -47,12 +47,13 @@ def create_senders(
             reason = f'it cannot be published ({" ".join(str(error).split())})'
         if reason:
             told.append(f'topic {name} is left out: {reason}')
-    if len(told) > _NAMED_AT_MOST:
-        told[_NAMED_AT_MOST:] = [f'{len(told) - _NAMED_AT_MOST} more topics are left out']
+    if len(told) > NAMED_AT_MOST:
+        told[NAMED_AT_MOST:] = [f'{len(told) - NAMED_AT_MOST} more topics are left out']
     missing = [x for x in (*selection.topics, *selection.allow_commands) if x not in held]
     if missing:
         told.append(
-            f'the bag has no topic {", ".join(missing)}; it has {listed(held) or "none"}')
+            f'the bag has no topic {", ".join(missing)}; it has '
+            f'{listed(held, NAMED_AT_MOST) or "none"}')
     for sentence in told:
         node.get_logger().warning(printable(sentence))
     return result
@@ -83,10 +84,3 @@ def latched(reader: BagReader, topics: Iterable[str]) -> dict[str, int]:
     profiles = {name: reader.topics[name].profiles for name in topics}
     return {name: publisher(x).depth for name, x in profiles.items()
             if any(profile.durability == 'transient_local' for profile in x)}
-
-
-def listed(names: Iterable[str]) -> str:
-    """Return names for a sentence, not all of very many."""
-    every = list(names)
-    more = f' and {len(every) - _NAMED_AT_MOST} more' if len(every) > _NAMED_AT_MOST else ''
-    return ', '.join(every[:_NAMED_AT_MOST]) + more
