@@ -11,12 +11,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import (
-    GetParameters,
-    ListParameters,
-    SetParameters,
-    SetParametersAtomically,
-)
+from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.clock import Clock as RclpyClock
 from rclpy.clock import ClockType
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -64,7 +59,7 @@ class ManagedNode(LifecycleNode):
         # asked for that does not begin in the present state.
         change = self._service_change_state.callback
 
-        def change_state(request, response):  # type: ignore[no-untyped-def]
+        def change_state(request: Any, response: Any) -> Any:
             try:
                 return change(request, response)
             except rclpy_implementation.RCLError:
@@ -261,51 +256,35 @@ class _CarefulParameterService(ParameterService):
     value, and answer nothing at all where the value of one of them is asked for.
     """
 
-    def _list_parameters_callback(
-            self, request: ListParameters.Request,
-            response: ListParameters.Response) -> ListParameters.Response:
+    def _list_parameters_callback(self, request: Any, response: Any) -> Any:
         found = super()._list_parameters_callback(request, response)
         node = self._get_node()
         found.result.names = [
             x for x in found.result.names if node.get_parameter_or(x).value is not None]
         return found
 
-    def _get_parameters_callback(
-            self, request: GetParameters.Request,
-            response: GetParameters.Response) -> GetParameters.Response:
+    def _get_parameters_callback(self, request: Any, response: Any) -> Any:
         node = self._get_node()
         if all(node.has_parameter(x) for x in request.names):
             response.values = [
                 node.get_parameter_or(x).get_parameter_value() for x in request.names]
         return response
 
-    def _set_parameters_callback(
-            self, request: SetParameters.Request,
-            response: SetParameters.Response) -> SetParameters.Response:
-        change = super()._set_parameters_callback
-        response.results = []
-        for parameter in request.parameters:
-            # One at a time: what cannot be read is no reason to refuse the others.
-            try:
-                check_former_names([parameter.name])
-                one = change(
-                    SetParameters.Request(parameters=[parameter]), SetParameters.Response())
-                response.results.append(one.results[0])
-            except Exception as error:  # rclpy raises errors of several unrelated classes here
-                response.results.append(_refused(error))
+    def _set_parameters_callback(self, request: Any, response: Any) -> Any:
+        # One at a time: what cannot be read is no reason to refuse the others.
+        response.results = [
+            self._set_parameters_atomically_callback(
+                SetParametersAtomically.Request(parameters=[x]),
+                SetParametersAtomically.Response()).result
+            for x in request.parameters]
         return response
 
-    def _set_parameters_atomically_callback(
-            self, request: SetParametersAtomically.Request,
-            response: SetParametersAtomically.Response) -> SetParametersAtomically.Response:
+    def _set_parameters_atomically_callback(self, request: Any, response: Any) -> Any:
         try:
             check_former_names(x.name for x in request.parameters)
             return super()._set_parameters_atomically_callback(request, response)
-        except Exception as error:  # as above
-            response.result = _refused(error)
+        except Exception as error:  # rclpy raises errors of several unrelated classes here
+            response.result = SetParametersResult(
+                successful=False, reason=str(error) if isinstance(error, HmsaError)
+                else f'{error}: expected a declared parameter of its own type')
             return response
-
-
-def _refused(error: Exception) -> SetParametersResult:
-    return SetParametersResult(successful=False, reason=str(error) if isinstance(
-        error, HmsaError) else f'{error}: expected a declared parameter of its own type')
