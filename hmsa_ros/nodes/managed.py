@@ -16,16 +16,18 @@ from rclpy.clock import Clock as RclpyClock
 from rclpy.clock import ClockType
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 from rclpy.timer import Timer
+from rosgraph_msgs.msg import Clock
 
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.parameters import ParameterSpec
 from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.conversions import to_diagnostics
-from hmsa_ros.nodes.newest_clock import NewestClock
 from hmsa_ros.nodes.outlet import Outlet
 from hmsa_ros.nodes.parameters import check_former_names, check_names, checked, declare
 
@@ -118,6 +120,14 @@ class ManagedNode(LifecycleNode):
             return SetParametersResult(successful=True)
 
         self.add_on_set_parameters_callback(change)
+
+    def complain(self, sentence: str, failure: bool) -> None:
+        """Log a failure or a warning."""
+        # On two lines: rclpy lets no line log with two severities.
+        if failure:
+            self.get_logger().error(sentence)
+        else:
+            self.get_logger().warning(sentence)
 
     def now(self) -> int:
         """Return the node's time in ns."""
@@ -245,6 +255,53 @@ def silence(entity: Any) -> None:
         entity.callback = nothing
     if hasattr(entity, 'send_response'):
         entity.send_response = nothing
+
+
+class NewestClock:
+    """
+    Sets a node's clock from /clock when it is read, instead of its own subscription.
+
+    The executor would keep an event for each message, without limit where the node cannot keep
+    up with them. A subscription that is read here keeps the newest message alone. Time before
+    zero, which anybody may publish and rclpy raises on, is passed over.
+    """
+
+    def __init__(self, node: Node) -> None:
+        """Subscribe, if the node follows simulated time already."""
+        self._node = node
+        self._source = node._time_source
+        self._subscription: RawSubscription | None = None
+        self._source._subscribe_to_clock_topic = self._subscribe
+        if self._source._clock_sub is not None:
+            node.destroy_subscription(self._source._clock_sub)
+            self._source._clock_sub = None
+            self._subscribe()
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the node follows simulated time."""
+        return bool(self._source.ros_time_is_active)
+
+    def _subscribe(self) -> None:
+        if self._subscription is None:
+            self._subscription = endpoints.listen(self._node, topics.CLOCK_TOPIC)
+
+    def read(self) -> int:
+        """Return the node's time in ns, by the newest message if it is simulated."""
+        if not self.simulated:
+            # What rclpy's clock reads then, without its objects.
+            return time_ns()
+        if self._subscription is not None:
+            for taken in self._subscription.take()[-1:]:
+                try:
+                    message = decode(taken.data, Clock)
+                    if message.clock.sec < 0:
+                        raise BadInputError(f'time {message.clock.sec} s: expected at least 0')
+                    self._source.clock_callback(message)
+                except BadInputError as error:
+                    self._node.get_logger().error(
+                        f'message on /clock skipped: {error}', throttle_duration_sec=1.0)
+        return int(self._node.get_clock().now().nanoseconds)
 
 
 class _CarefulParameterService(ParameterService):
