@@ -27,7 +27,7 @@ from hmsa_ros.nodes.cdr import read_trajectory, stamp_of
 from hmsa_ros.nodes.channel import JointChannel
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.markers import TargetMarkers
-from hmsa_ros.nodes.parameters import check_names, declare_joints
+from hmsa_ros.nodes.parameters import declare_joints
 from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from, SPECS
 from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.runner import run
@@ -71,7 +71,6 @@ class PlannerNode(ManagedNode):
         self._listen_until = self._read = 0
         self._crowded = ''
         self._action: FollowJointTrajectory | None = None
-        check_names(self)
         self.on_change(self._take_parameters)
         self.autostart()
 
@@ -106,7 +105,9 @@ class PlannerNode(ManagedNode):
         self._publish: dict[type, Callable[..., None]] = {
             records.Send: self._publish_command, records.PlanChanged: self._publish_plan,
             records.StatusChanged: self._publish_status,
-            records.EstimateChanged: self._publish_estimate, records.Note: self._log}
+            records.EstimateChanged: self._publish_estimate,
+            records.Note: lambda x: self.complain(
+                x.message, x.severity is records.Severity.ERROR)}
         endpoints.subscribe(self, topics.JOINT_TRAJECTORY, self._on_trajectory, raw=True)
         self.offer(topics.STOP, self._on_stop)
         self.offer(topics.RESET_ESTIMATE, lambda: (True, self._runtime.feedback.reset()))
@@ -324,12 +325,6 @@ class PlannerNode(ManagedNode):
             estimate.time, conversions.to_status(
                 f'{self.get_name()}: estimate', estimate.joint, estimate.severity,
                 estimate.message, estimate.values)))
-
-    def _log(self, note: records.Note) -> None:
-        if note.severity is records.Severity.ERROR:
-            self.get_logger().error(note.message)
-        else:
-            self.get_logger().warning(note.message)
 
     def _report(self) -> Iterable[DiagnosticStatus]:
         severity, message, values = self._runtime.report()

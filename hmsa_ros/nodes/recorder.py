@@ -122,9 +122,8 @@ class Recorder(ManagedNode):
         """Open the bag and start receiving."""
         values = self._parameters_in
         selection = Selection.of(values, self._full_name)
-        # While inactive it is paused.
-        self._paused = True
-        self._resumes = not values['record.start_paused']
+        # While inactive it is paused anyway.
+        self._paused: bool = values['record.start_paused']
         self._sim_time = SimulatedTime() if self.simulated else None
         self._experiment: dict[str, str] = {'hmsa_ros.version': __version__}
         self._setpoints = SetpointLog()
@@ -132,27 +131,22 @@ class Recorder(ManagedNode):
         # Topics of which a publisher was found at the last look, and nodes whose parameters are
         # stored.
         self._matched = self._known = 0
-        limits = _limits(values)
-        writer = _writer(values, self._experiment)
+        limits = Limits(
+            values['storage.flush_period'], values['storage.max_bagfile_size'],
+            values['storage.max_bagfile_duration'] * 10**9, values['storage.max_cache_size'],
+            round(values['record.snapshot_duration'] * 1e9)
+            if values['record.snapshot_mode'] else 0)
+        writer = BagWriter(
+            values['storage.uri'] or datetime.datetime.now().strftime('hmsa_%Y_%m_%d-%H_%M_%S'),
+            preset=values['storage.storage_preset_profile'],
+            custom_data={**self._experiment, **parse_custom_data(values['storage.custom_data'])},
+            ros_distro=os.environ.get('ROS_DISTRO', 'jazzy'), fsync=values['storage.fsync'])
         self.folder: Path = writer.folder
-        self._recording = Recording(writer, limits, self._report)
+        self._recording = Recording(writer, limits, self.complain)
         self._capture = Capture(self._deliver)
         self._recorded = Subscriptions(
             self, selection, self._recording, self._capture, values['record.queue_depth'])
         self._closed = False
-        self._start()
-
-    def activate(self) -> None:
-        """Record, unless it was paused before."""
-        self._paused = not self._resumes
-
-    def deactivate(self) -> None:
-        """Pause."""
-        self._resumes = not self._paused
-        self._paused = True
-
-    def _start(self) -> None:
-        """Create what the node offers and start receiving."""
         if self._sim_time is not None:
             self._capture.add(self._sim_time, endpoints.listen(self, replace(
                 topics.CLOCK_TOPIC, qos=topics.Quality(1000, reliable=False))))
@@ -160,7 +154,7 @@ class Recorder(ManagedNode):
         self.offer(topics.PAUSE, lambda: self._set_paused(True))
         self.offer(topics.RESUME, lambda: self._set_paused(False))
         self.offer(topics.IS_PAUSED, lambda: (
-            self._paused, 'paused' if self._paused else 'recording'))
+            self._pausing, 'paused' if self._pausing else 'recording'))
         self.offer(topics.SPLIT_BAGFILE, lambda: (True, self._recording.split()))
         self.offer(topics.SNAPSHOT, lambda: (True, self._recording.snapshot()))
         for topic in _SETPOINTS.values():
@@ -174,6 +168,11 @@ class Recorder(ManagedNode):
         self.every(max(interval, 1e-3), self._on_poll)
         self._diagnose = self.diagnose(self._status_of_bag)
         self.get_logger().info(f'recording to {self.folder}')
+
+    @property
+    def _pausing(self) -> bool:
+        """Whether what comes is not recorded."""
+        return self._paused or not self.active
 
     def _full_name(self, name: str) -> str:
         """Return the full, remapped name of a topic or node."""
@@ -260,22 +259,18 @@ class Recorder(ManagedNode):
             earlier, rest = _parted(rest, message.received_ns)
             for key, messages in earlier:
                 self._take_in(key, messages)
-            self._begin_anew(before, now)
+            # A simulation began anew, or a bag is played in a loop.
+            self.get_logger().warning(
+                f'simulated time jumped back from {before * 1e-9:.3f} s to {now * 1e-9:.3f} s: '
+                'recording continues in a new file')
+            self._recording.begin_anew()
+            self._note({'time_jumps': str(clock.jumps)})
         return rest
-
-    def _begin_anew(self, before: int, now: int) -> None:
-        """Go on in a new file: a simulation began anew, or a bag is played in a loop."""
-        self.get_logger().warning(
-            f'simulated time jumped back from {before * 1e-9:.3f} s to {now * 1e-9:.3f} s: '
-            'recording continues in a new file')
-        self._recording.begin_anew()
-        if self._sim_time is not None:
-            self._note({'time_jumps': str(self._sim_time.jumps)})
 
     def _take_in(self, topic: RecordedTopic, messages: list[Taken]) -> None:
         """Count gaps and hand the messages to the writer."""
         batch, size = topic.take(
-            messages, None if self._sim_time is None else self._sim_time.at, paused=self._paused)
+            messages, None if self._sim_time is None else self._sim_time.at, paused=self._pausing)
         if batch:
             self._recording.put(batch, size)
 
@@ -347,13 +342,6 @@ class Recorder(ManagedNode):
         yield to_status(
             f'{self.get_fully_qualified_name().lstrip("/")}: bag', '', level, text, values)
 
-    def _report(self, sentence: str, failure: bool) -> None:
-        # On two lines: rclpy lets no line log with two severities.
-        if failure:
-            self.get_logger().error(sentence)
-        else:
-            self.get_logger().warning(sentence)
-
     def cleanup(self) -> None:
         """Close the bag."""
         self.close()
@@ -375,13 +363,12 @@ class Recorder(ManagedNode):
               f'{self.folder}, {sum(lost.values())} lost'
               + f', {sum(before.values())} sent before the recorder was matched' * any(
                   before.values()), flush=True)
-        for name, count in sorted(lost.items()):
-            if count:
-                print(f'hmsa recorder: lost {count} of {name}', flush=True)
-        for name, count in sorted(before.items()):
-            if count:
-                print(f'hmsa recorder: {count} of {name} were sent before the recorder was '
-                      'matched', flush=True)
+        for sentence, counts in (
+                ('lost {} of {}', lost),
+                ('{} of {} were sent before the recorder was matched', before)):
+            for name, count in sorted(counts.items()):
+                if count:
+                    print('hmsa recorder:', sentence.format(count, name), flush=True)
         if silent := self._recorded.silent():
             print(f'hmsa recorder: nothing was received of {", ".join(silent)}', flush=True)
         if status.error and self.failure is None:
@@ -398,21 +385,6 @@ def _parted(
         earlier.append((key, messages[:count]))
         rest.append((key, messages[count:]))
     return earlier, rest
-
-
-def _limits(values: Mapping[str, Any]) -> Limits:
-    return Limits(
-        values['storage.flush_period'], values['storage.max_bagfile_size'],
-        values['storage.max_bagfile_duration'] * 10**9, values['storage.max_cache_size'],
-        round(values['record.snapshot_duration'] * 1e9) if values['record.snapshot_mode'] else 0)
-
-
-def _writer(values: Mapping[str, Any], experiment: Mapping[str, str]) -> BagWriter:
-    return BagWriter(
-        values['storage.uri'] or datetime.datetime.now().strftime('hmsa_%Y_%m_%d-%H_%M_%S'),
-        preset=values['storage.storage_preset_profile'],
-        custom_data={**experiment, **parse_custom_data(values['storage.custom_data'])},
-        ros_distro=os.environ.get('ROS_DISTRO', 'jazzy'), fsync=values['storage.fsync'])
 
 
 #: Run by ``hmsa recorder`` with the command line's arguments; returns the exit status.
