@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 import math
 from typing import Any
 
@@ -29,48 +30,43 @@ from hmsa_ros.planning.timeline import Model
 
 _OPTIONS = Options()
 _SETTINGS = Settings()
+_changeable = partial(ParameterSpec, read_only=False)
 
 #: Parameters that a joint may have a value of its own for.
 OWN = (
     *(replace(x, read_only=x.name in shared.FIXED) for x in shared.BLOCK),
     shared.INITIAL_STRETCH,
-    ParameterSpec(
-        'shaper', 'two_step', 'Shaper that plans each move.', choices=tuple(SHAPERS),
-        read_only=False),
-    ParameterSpec(
+    _changeable(
+        'shaper', 'two_step', 'Shaper that plans each move.', choices=tuple(SHAPERS)),
+    _changeable(
         'robust_order', 2, 'Number of two-step commands that the shaper robust cascades.', '',
-        1, MOST_ORDER, read_only=False),
-    ParameterSpec(
+        1, MOST_ORDER),
+    _changeable(
         'minimax_errors', list(ERRORS),
         'Relative errors in shear modulus, damping coefficient and J_lim for which the shaper '
         'minimax minimises the worst residual vibration; it takes as long as robust.', '',
-        0.0, LARGEST_ERROR, read_only=False, items=float),
-    ParameterSpec(
+        0.0, LARGEST_ERROR, items=float),
+    _changeable(
         'minimax_file', '',
         'File of hmsa identify --out: the shaper minimax plans for the ellipsoid of its '
         'covariance, and minimax_errors apply to parameters that were not identified; empty for '
-        'none.',
-        read_only=False),
-    ParameterSpec(
+        'none.'),
+    _changeable(
         'smooth_periods', _OPTIONS.pace.periods,
         'Minimum duration of a move of the shaper smooth in natural periods; limits of flux '
         'density, slew rate or stretch rate extend it.', '',
-        LEAST_PERIODS, MOST_PERIODS, read_only=False),
-    ParameterSpec(
+        LEAST_PERIODS, MOST_PERIODS),
+    _changeable(
         'stretch_rate_max', 0.0,
-        'Maximum stretch rate of the shaper smooth; 0 for any.', '1/s', 0.0, 1e12,
-        read_only=False),
-    replace(shared.SLEW_LIMIT, read_only=False),
-    replace(shared.COIL_TIME_CONSTANT, read_only=False),
-    *(replace(x, read_only=False) for x in shared.VISCOELASTIC),
-    replace(shared.CREEP_TOLERANCE, read_only=False),
-    ParameterSpec(
+        'Maximum stretch rate of the shaper smooth; 0 for any.', '1/s', 0.0, 1e12),
+    *(replace(x, read_only=False) for x in (
+        shared.SLEW_LIMIT, shared.COIL_TIME_CONSTANT, *shared.VISCOELASTIC,
+        shared.CREEP_TOLERANCE)),
+    _changeable(
         'path_tolerance', _OPTIONS.path_tolerance,
         'Maximum deviation from a path (trajectory_mode path) as a fraction of its range; a '
-        'smaller value needs more levels, in proportion to its cube root.', '', 1e-9, 1.0,
-        read_only=False),
-    replace(shared.FLUX_DENSITY_MIN, read_only=False),
-    replace(shared.FLUX_DENSITY_MAX, read_only=False),
+        'smaller value needs more levels, in proportion to its cube root.', '', 1e-9, 1.0),
+    *(replace(x, read_only=False) for x in (shared.FLUX_DENSITY_MIN, shared.FLUX_DENSITY_MAX)),
     *shared.KNOWN,
 )
 
@@ -78,22 +74,20 @@ SPECS = (
     *OWN,
     shared.JOINT,
     JOINTS,
-    ParameterSpec(
+    _changeable(
         'allow_partial_joints', _SETTINGS.allow_partial_joints,
-        'Whether a trajectory may name only some of the joints; the others continue as planned.',
-        read_only=False),
-    ParameterSpec(
+        'Whether a trajectory may name only some of the joints; the others continue as planned.'),
+    _changeable(
         'simultaneous_arrival', False,
         'Whether faster joints start a move later so that all joints arrive at the same time; a '
-        'joint that is still moving is not delayed.',
-        read_only=False),
+        'joint that is still moving is not delayed.'),
     ParameterSpec(
         'frame_id', 'coil', 'Frame of the coil, in commands and markers.'),
     MARKER_SCALE,
-    ParameterSpec(
+    _changeable(
         'lead_time', _OPTIONS.lead_time / NANOSECONDS,
         'Interval by which a command is sent ahead of its '
-        'timestamp.', 's', 0.0, 1e6, read_only=False),
+        'timestamp.', 's', 0.0, 1e6),
     ParameterSpec(
         'command_mode', 'continuous',
         'Times at which commands may apply: any time, or only the grid of command_period.',
@@ -101,82 +95,80 @@ SPECS = (
     ParameterSpec(
         'command_period', 0.001, 'Grid period in command_mode sampled.', 's',
         1e-9, 1e3),
-    ParameterSpec(
+    _changeable(
         'max_points', _SETTINGS.max_points,
         'Largest number of setpoints in one trajectory, summed over its joints.', '',
-        1, 10_000_000, read_only=False),
-    ParameterSpec(
+        1, 10_000_000),
+    _changeable(
         'trajectory_mode', _SETTINGS.trajectory_mode,
         'What to do with a trajectory that has velocities: refuse it, since the actuator comes to '
         'rest at each point, or follow it as a path; without velocities, each point is a rest.',
-        choices=TRAJECTORY_MODES, read_only=False),
-    ParameterSpec(
+        choices=TRAJECTORY_MODES),
+    _changeable(
         'short_spell', _OPTIONS.short_spell,
         'What to do if a setpoint is too short for its move: refuse the request, or continue to '
         'the next setpoint from the state reached.',
-        choices=SHORT_SPELL, read_only=False),
-    ParameterSpec(
+        choices=SHORT_SPELL),
+    _changeable(
         'heartbeat_period', _SETTINGS.heartbeat_period / NANOSECONDS,
         'Heartbeat: period at which the current level is sent again; 0 for never.', 's',
-        0.0, 1e3, read_only=False),
-    ParameterSpec(
+        0.0, 1e3),
+    _changeable(
         'replan_late', _SETTINGS.replan_late,
         'Whether to plan the rest of a sequence again after a late command, if that leaves less '
-        'vibration.',
-        read_only=False),
-    ParameterSpec(
+        'vibration.'),
+    _changeable(
         'lateness_tolerance', _SETTINGS.lateness_tolerance / NANOSECONDS,
         'Lateness of a command that never counts; more counts by the vibration that it leaves.',
         's',
-        0.0, 1.0, read_only=False),
-    ParameterSpec(
+        0.0, 1.0),
+    _changeable(
         'arrival_tolerance', _SETTINGS.tolerances.arrival,
         'Maximum steady-state error of an arrived setpoint, as a fraction of the '
-        'step.', '', 0.0, 1e3, read_only=False),
-    ParameterSpec(
+        'step.', '', 0.0, 1e3),
+    _changeable(
         'vibration_tolerance', _SETTINGS.tolerances.vibration,
         'Maximum residual vibration, peak to peak, as a fraction of the step.', '',
-        0.0, 1e3, read_only=False),
-    ParameterSpec(
+        0.0, 1e3),
+    _changeable(
         'stretch_tolerance', _SETTINGS.tolerances.stretch,
         'Steady-state error and residual vibration that are tolerated for any step.', '',
-        0.0, 1e3, read_only=False),
-    ParameterSpec(
+        0.0, 1e3),
+    _changeable(
         'feedback', _SETTINGS.feedback,
         'Use of the samples on joint_states: off; observe estimates the parameters and publishes '
         'them on ~/estimate; adapt also corrects plans, and plans with the estimate.',
-        choices=MODES, read_only=False),
+        choices=MODES),
     ParameterSpec(
         'feedback_parameters', list(_SETTINGS.feedback_parameters),
         'Parameters that feedback estimates: shear_modulus, damping_coefficient, '
         'stretch_bias, remanence, chain_limit, coil_time_constant and others of hmsa identify.'),
-    ParameterSpec(
+    _changeable(
         'feedback_cautious', _SETTINGS.feedback_cautious,
         'Whether feedback adapt extends moves whose predicted error exceeds feedback_tolerance, '
         'to correct them on the way: three times (five times for six estimated parameters, and up '
-        'to twice that for large noise).',
-        read_only=False),
-    ParameterSpec(
+        'to twice that for large noise).'),
+    _changeable(
         'feedback_tolerance', _SETTINGS.feedback_tolerance,
         'Predicted error (vibration amplitude plus steady-state error, as a fraction of the step) '
-        'above which feedback_cautious extends a move.', '', 0.0, 1.0, read_only=False),
-    ParameterSpec(
+        'above which feedback_cautious extends a move.', '', 0.0, 1.0),
+    _changeable(
         'feedback_trim', _SETTINGS.feedback_trim,
         'Maximum change of a holding level by which feedback adapt compensates a constant force, '
         'in small moves; constant_force must be among '
-        'feedback_parameters.', 'T', 0.0, 10.0, read_only=False),
-    ParameterSpec(
+        'feedback_parameters.', 'T', 0.0, 10.0),
+    _changeable(
         'feedback_frozen', _SETTINGS.feedback_frozen,
         'Whether feedback keeps its estimate of the parameters and estimates the state '
-        'only.', read_only=False),
-    ParameterSpec(
+        'only.'),
+    _changeable(
         'feedback_file', _SETTINGS.feedback_file,
-        'Parameter file to which ~/save_estimate writes the estimate.', read_only=False),
-    ParameterSpec(
+        'Parameter file to which ~/save_estimate writes the estimate.'),
+    _changeable(
         'after_cut_off', _SETTINGS.after_cut_off,
         'Reaction to a cut-off of the coil: drop the rest of the sequence and wait for a request, '
         'or resume it with a shaped move from the current state.',
-        choices=AFTER_CUT_OFF, read_only=False),
+        choices=AFTER_CUT_OFF),
     ParameterSpec(
         'takeover_timeout', _SETTINGS.takeover_timeout / NANOSECONDS,
         'Time that the first request waits for a plant or driver and, if samples are published, '
