@@ -8,8 +8,6 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
-from rclpy.impl.rcutils_logger import RcutilsLogger
-from rclpy.parameter import Parameter
 
 from hmsa_ros.device.health import too_few_samples
 from hmsa_ros.device.sensor import SensorErrors
@@ -79,19 +77,21 @@ class PlantJoint(DeviceJoint):
                 f'{self._of_me}disturbance refused: {error}', throttle_duration_sec=1.0)
 
 
-def joint_from(values: Mapping[str, Any]) -> SimulatedJoint:
-    """Return the joint that the values of `OWN` describe: the block times the mismatch."""
-    actuator = planned_from(values)
-    if values['reset_stretch']:
-        check_stretch(
-            values['reset_stretch'], actuator.nondimensional, 'reset_stretch')
-    return SimulatedJoint(
-        Setup(actuator, values['initial_stretch'], values['slew_limit'] or math.inf,
-              values['coil_time_constant']),
-        fallback_from(values),
-        SensorErrors(
-            values['stretch_noise'], values['rate_noise'], values['stretch_bias'],
-            values['stretch_gain']))
+def _joints_from(values: JointParameters) -> dict[str, SimulatedJoint]:
+    """Return the joints that the values of `OWN` describe: the block times the mismatch."""
+    def joint(_: str, own: Mapping[str, Any]) -> SimulatedJoint:
+        actuator = planned_from(own)
+        if own['reset_stretch']:
+            check_stretch(own['reset_stretch'], actuator.nondimensional, 'reset_stretch')
+        return SimulatedJoint(
+            Setup(
+                actuator, own['initial_stretch'], own['slew_limit'] or math.inf,
+                own['coil_time_constant']),
+            fallback_from(own),
+            SensorErrors(*(own[x] for x in (
+                'stretch_noise', 'rate_noise', 'stretch_bias', 'stretch_gain'))))
+
+    return values.each(joint)
 
 
 def _from_wrench(message: WrenchStamped) -> tuple[int, float]:
@@ -181,7 +181,17 @@ class PlantNode(DeviceNode):
                 'leads simulated time or follows it')
         start = round(values['start_time'] * NANOSECONDS) if self._authority else 0
         factor = values['real_time_factor'] if self._authority else 1.0
-        self.device = _make_device(values, start, self.get_logger())
+        joints = _joints_from(values)
+        for name, joint in joints.items():
+            for odd in (too_few_samples(joint.setup.actuator, values['publish_rate']),
+                        unheld(joint.setup.actuator.nondimensional)):
+                if odd:
+                    self.get_logger().warning(f'joint {name}: {odd}')
+        self.device = SimulatedDevice(
+            [*joints.values()], period=max(round(NANOSECONDS / values['publish_rate']), 1),
+            time=start, command_delay=round(values['command_delay'] * NANOSECONDS),
+            measurement_delay=round(values['measurement_delay'] * NANOSECONDS),
+            seed=values['seed'])
         self._pacer = Pacer(start, factor, paused=values['start_paused'])
         self._clock_published = 0
         self._measured = (start, monotonic_ns())
@@ -218,14 +228,10 @@ class PlantNode(DeviceNode):
         return self.device.time if self._joints and self._authority else None
 
     def _go_on(self) -> None:
-        """Let time run as far as it has come."""
-        if self._authority:
-            self._lead()
-        else:
+        """Let time run as far as it has come, at the real-time factor where the plant leads it."""
+        if not self._authority:
             self._follow()
-
-    def _lead(self) -> None:
-        """Advance simulated time at the real-time factor, and publish it."""
+            return
         steady = monotonic_ns()
         if self._standing:
             if steady - self._clock_published >= _PAUSED_CLOCK_NS:
@@ -243,8 +249,14 @@ class PlantNode(DeviceNode):
         jump = self.device.follow(now, standing=self._standing)
         if jump:
             self._fell += max(jump, 0) if behind else 0
+            seconds = abs(jump) / 1e9
             self.get_logger().warning(
-                _jump_in_words(jump, behind=behind), throttle_duration_sec=1.0)
+                f'the clock jumped back by {seconds:.3f} s: the simulation starts again from its '
+                'initial state' if jump < 0 else
+                (f'the plant fell {seconds:.3f} s behind the clock (lower publish_rate)'
+                 if behind else f'the clock jumped ahead by {seconds:.3f} s')
+                + ': the simulation continues from there in its present state',
+                throttle_duration_sec=1.0)
         if not self._standing:
             self._run(now)
 
@@ -354,36 +366,6 @@ class PlantNode(DeviceNode):
             f'{self.get_name()}: time', '', level, message,
             {'state': self.state, 'real_time_factor': f'{requested:g}',
              'real_time_factor_achieved': f'{achieved:.3f}', 'clock_publishers': clocks})
-
-
-def _joints_from(values: JointParameters) -> dict[str, SimulatedJoint]:
-    return values.each(lambda _, own: joint_from(own))
-
-
-def _make_device(values: JointParameters, start: int, logger: RcutilsLogger) -> SimulatedDevice:
-    """Return the device at a start time in ns; what is odd is warned of."""
-    joints = _joints_from(values)
-    for name, joint in joints.items():
-        if few := too_few_samples(joint.setup.actuator, values['publish_rate']):
-            logger.warning(f'joint {name}: {few}')
-        if lost := unheld(joint.setup.actuator.nondimensional):
-            logger.warning(f'joint {name}: {lost}')
-    return SimulatedDevice(
-        [*joints.values()], period=max(round(NANOSECONDS / values['publish_rate']), 1), time=start,
-        command_delay=round(values['command_delay'] * NANOSECONDS),
-        measurement_delay=round(values['measurement_delay'] * NANOSECONDS),
-        seed=values['seed'])
-
-
-def _jump_in_words(jump: int, *, behind: bool) -> str:
-    """Describe a jump of the clock by some ns, which may be the plant's own fault."""
-    seconds = abs(jump) / 1e9
-    if jump < 0:
-        return (f'the clock jumped back by {seconds:.3f} s: the simulation starts again from its '
-                'initial state')
-    cause = (f'the plant fell {seconds:.3f} s behind the clock (lower publish_rate)'
-             if behind else f'the clock jumped ahead by {seconds:.3f} s')
-    return f'{cause}: the simulation continues from there in its present state'
 
 
 #: Run by ``hmsa plant`` with the command line's arguments; returns the exit status.

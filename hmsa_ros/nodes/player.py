@@ -155,7 +155,11 @@ class Player(ManagedNode):
         self._excerpt = self._choose_excerpt()
         self._clock_out = self._offer_clock()
         self._senders = create_senders(
-            self, self._reader, self._filter(), own_clock=self._clock_out is not None)
+            self, self._reader, Filter(
+                self._names('play.topics_to_filter'), values['play.regex_to_filter'],
+                self._names('play.exclude_topics_to_filter'),
+                values['play.exclude_regex_to_filter'], self._names('play.allow_commands')),
+            own_clock=self._clock_out is not None)
         self._audience = Audience(
             self, self._senders, self._names('play.wait_for_subscribers'),
             self._names('play.wait_for_nodes'), ''.join(self._names('play.wait_for_recorder')))
@@ -205,13 +209,6 @@ class Player(ManagedNode):
         given = self._values[parameter]
         return tuple(expand_topic_name(name, self.get_name(), self.get_namespace())
                      for name in ([given] if isinstance(given, str) else given) if name)
-
-    def _filter(self) -> Filter:
-        values = self._values
-        return Filter(
-            self._names('play.topics_to_filter'), values['play.regex_to_filter'],
-            self._names('play.exclude_topics_to_filter'),
-            values['play.exclude_regex_to_filter'], self._names('play.allow_commands'))
 
     def _choose_excerpt(self) -> Excerpt:
         """Return what is played of the bag."""
