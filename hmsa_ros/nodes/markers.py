@@ -16,10 +16,10 @@ deflection of a beam that would not stiffen.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
 import numpy as np
@@ -79,8 +79,8 @@ class Block:
     half_length: float
     half_thickness: float
     remanence: float  #: Br in T, greater than 0
+    per_tesla: float = 1.0  #: length of the arrow of the field in m/T, of a voltage in m/V
     width: float = 0.0  #: width of a beam in m; 0 for a block
-    per_tesla: float = 0.0  #: length of the arrow of a beam's field in m/T, of a voltage in m/V
     capacitance: bool = False  #: whether positions are capacitances, of what is not magnetised
 
     def __post_init__(self) -> None:
@@ -90,15 +90,14 @@ class Block:
     @classmethod
     def of(cls, joint: str, actuator: ActuatorParameters) -> 'Block':
         """Return the block of a joint's parameters."""
-        block = cls(joint, actuator.half_length, actuator.half_thickness, actuator.remanence)
-        per = 2.0 * actuator.half_length / (3.0 * actuator.flux_density_unit)
-        if actuator.coordinate is CAPACITANCE:
-            return replace(block, per_tesla=per, capacitance=True)
-        if actuator.law is None or not actuator.law.section:
-            return block
-        return replace(
-            block, per_tesla=per, width=2.0 * actuator.law.section * actuator.half_length ** 2
-            / actuator.half_thickness)
+        length, thickness = actuator.half_length, actuator.half_thickness
+        section = 0.0 if actuator.law is None else actuator.law.section
+        capacitance = actuator.coordinate is CAPACITANCE
+        return cls(
+            joint, length, thickness, actuator.remanence,
+            per_tesla=2.0 * length / (3.0 * actuator.flux_density_unit)
+            if section or capacitance else thickness / actuator.remanence,
+            width=2.0 * section * length ** 2 / thickness, capacitance=capacitance)
 
     def bent(self, deflection: float) -> list[tuple[float, float, float]]:
         """
@@ -135,8 +134,7 @@ class Block:
         return side, side, 2.0 * self.half_thickness * stretch
 
 
-@dataclass(frozen=True)
-class State:
+class State(NamedTuple):
     """Stretch, or deflection of a beam, and flux density along z in T of a joint at a moment."""
 
     stretch: float
@@ -192,7 +190,6 @@ class _Drawing:
     def state(self, state: State) -> Iterable[Marker]:
         """Yield block, arrows and label."""
         block = self.block
-        unit = block.per_tesla or block.half_thickness / block.remanence
         yield self.body(BLOCK, state.stretch)
         if block.width:
             height = block.half_length
@@ -201,8 +198,8 @@ class _Drawing:
             stretch = block.thickness(state.stretch)
             height = block.half_thickness * stretch
             if not block.capacitance:
-                yield self._arrow(MAGNETISATION, unit * block.remanence * stretch)
-        yield self._arrow(FIELD, unit * state.flux_density, BESIDE * block.half_length)
+                yield self._arrow(MAGNETISATION, block.per_tesla * block.remanence * stretch)
+        yield self._arrow(FIELD, block.per_tesla * state.flux_density, BESIDE * block.half_length)
         yield self._marker(
             LABEL, pose=self._pose(height + 0.8 * block.half_thickness),
             scale=Vector3(z=0.4 * block.half_length * self.scene.scale),
@@ -286,31 +283,28 @@ def scene_from(values: JointParameters, lifetime: float = 0.0) -> Scene:
         values[MARKER_FRAME.name], values[MARKER_SCALE.name], lifetime)
 
 
-class StateMarkers:
+def show_states(
+        node: ManagedNode, values: JointParameters, pace: float,
+        states: Callable[[], tuple[int, Sequence[State]]]) -> None:
     """
-    Publishes the joints as they are, at ``marker_rate``, while somebody looks.
+    Publish the joints as they are, with a stamp in ns, at ``marker_rate``, while somebody looks.
 
     ``pace`` is how many seconds of the node's time, in which lifetimes are counted, pass in a
     second; 0 if it has no bound.
     """
+    publisher = endpoints.publisher(node, topics.MARKERS)
+    rate: float = values[MARKER_RATE.name]
+    if rate == 0.0:
+        return
+    lifetime = max(1.0, pace) * max(_LIFETIME_SECONDS, _LIFETIME_PERIODS / rate)
+    scene = scene_from(values, lifetime if pace > 0.0 else 0.0)
 
-    def __init__(
-            self, node: ManagedNode, values: JointParameters, pace: float,
-            states: Callable[[], tuple[int, Sequence[State]]]) -> None:
-        self._publisher = endpoints.publisher(node, topics.MARKERS)
-        self._states = states
-        rate: float = values[MARKER_RATE.name]
-        lifetime = 0.0
-        if rate > 0.0:
-            lifetime = max(1.0, pace) * max(_LIFETIME_SECONDS, _LIFETIME_PERIODS / rate)
-            # The eye's time, whatever pace simulated time has.
-            node.every(1.0 / rate, self._show)
-        self._scene = scene_from(values, lifetime if pace > 0.0 else 0.0)
+    def show() -> None:
+        if publisher.get_subscription_count():
+            publisher.publish(scene.states(*states()))
 
-    def _show(self) -> None:
-        if self._publisher.get_subscription_count():
-            stamp, states = self._states()
-            self._publisher.publish(self._scene.states(stamp, states))
+    # The eye's time, whatever pace simulated time has.
+    node.every(1.0 / rate, show)
 
 
 class TargetMarkers:

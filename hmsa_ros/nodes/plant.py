@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from functools import partial
 import math
-from time import monotonic_ns
+from time import monotonic_ns, time_ns
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -23,7 +23,7 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.device_node import COMMON, DeviceJoint, DeviceNode, FALLBACK, fallback_from
 from hmsa_ros.nodes.managed import AUTOSTART
-from hmsa_ros.nodes.markers import MARKER_FRAME, MARKER_RATE, MARKER_SCALE, State, StateMarkers
+from hmsa_ros.nodes.markers import MARKER_FRAME, MARKER_RATE, MARKER_SCALE, show_states, State
 from hmsa_ros.nodes.parameters import declare_joints, JointParameters
 from hmsa_ros.nodes.runner import run
 
@@ -202,7 +202,7 @@ class PlantNode(DeviceNode):
         self._clock_publisher = (
             endpoints.publisher(self, topics.CLOCK_TOPIC) if self._authority else None)
         self._open(PlantJoint)
-        StateMarkers(self, values, factor, self._states)
+        show_states(self, values, factor, self._states)
         self.offer(topics.RESET, self._on_reset)
         self.offer(topics.STEP, self._on_step)
         self.offer(topics.SET_PAUSED, self._on_set_paused)
@@ -241,7 +241,8 @@ class PlantNode(DeviceNode):
 
     def _follow(self) -> None:
         """Advance to the node's clock: the wall clock, or somebody else's /clock."""
-        now = self.now()
+        # The wall clock is what rclpy's reads then, without its objects.
+        now = self.now() if self.simulated else time_ns()
         if now == 0:
             return
         behind = now - self._clock_seen < 1_000_000_000
