@@ -6,7 +6,6 @@ The states and services are those of ROS 2 (``ros2 lifecycle``, launch). With th
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from time import time_ns
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -16,7 +15,6 @@ from rclpy.clock import Clock as RclpyClock
 from rclpy.clock import ClockType
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 from rclpy.timer import Timer
@@ -26,7 +24,6 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.parameters import ParameterSpec
 from hmsa_ros.nodes import endpoints
-from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.conversions import to_diagnostics
 from hmsa_ros.nodes.outlet import Outlet
 from hmsa_ros.nodes.parameters import check_former_names, check_names, checked, declare
@@ -50,7 +47,7 @@ class ManagedNode(LifecycleNode):
     def __init__(self, name: str) -> None:
         super().__init__(name, start_parameter_services=False)
         self._parameter_service = _CarefulParameterService(self)
-        self._time = NewestClock(self)
+        self._guard_clock()
         self.active = False
         self.finished = False
         check_former_names(self._parameter_overrides)
@@ -72,6 +69,24 @@ class ManagedNode(LifecycleNode):
                 return response
 
         self._service_change_state.callback = change_state
+
+    def _guard_clock(self) -> None:
+        """Pass over time before zero, which rclpy raises on: anybody could end the node so."""
+        source = self._time_source
+        take = source.clock_callback
+
+        def take_carefully(message: Clock) -> None:
+            if message.clock.sec >= 0:
+                take(message)
+            else:
+                self.get_logger().error(
+                    f'time {message.clock.sec} s on /clock skipped: expected at least 0',
+                    throttle_duration_sec=1.0)
+
+        # For a subscription that is made later, when use_sim_time is set, and the one there is.
+        source.clock_callback = take_carefully
+        if source._clock_sub is not None:
+            source._clock_sub.callback = take_carefully
 
     @property
     def state(self) -> str:
@@ -129,14 +144,14 @@ class ManagedNode(LifecycleNode):
         else:
             self.get_logger().warning(sentence)
 
-    def now(self) -> int:
-        """Return the node's time in ns."""
-        return self._time.read()
-
     @property
     def simulated(self) -> bool:
         """Whether the node follows simulated time."""
-        return self._time.simulated
+        return bool(self._time_source.ros_time_is_active)
+
+    def now(self) -> int:
+        """Return the node's time in ns."""
+        return int(self.get_clock().now().nanoseconds)
 
     def keep(self, *entities: object) -> None:
         """Keep what was created when the node is cleaned up."""
@@ -255,53 +270,6 @@ def silence(entity: Any) -> None:
         entity.callback = nothing
     if hasattr(entity, 'send_response'):
         entity.send_response = nothing
-
-
-class NewestClock:
-    """
-    Sets a node's clock from /clock when it is read, instead of its own subscription.
-
-    The executor would keep an event for each message, without limit where the node cannot keep
-    up with them. A subscription that is read here keeps the newest message alone. Time before
-    zero, which anybody may publish and rclpy raises on, is passed over.
-    """
-
-    def __init__(self, node: Node) -> None:
-        """Subscribe, if the node follows simulated time already."""
-        self._node = node
-        self._source = node._time_source
-        self._subscription: RawSubscription | None = None
-        self._source._subscribe_to_clock_topic = self._subscribe
-        if self._source._clock_sub is not None:
-            node.destroy_subscription(self._source._clock_sub)
-            self._source._clock_sub = None
-            self._subscribe()
-
-    @property
-    def simulated(self) -> bool:
-        """Whether the node follows simulated time."""
-        return bool(self._source.ros_time_is_active)
-
-    def _subscribe(self) -> None:
-        if self._subscription is None:
-            self._subscription = endpoints.listen(self._node, topics.CLOCK_TOPIC)
-
-    def read(self) -> int:
-        """Return the node's time in ns, by the newest message if it is simulated."""
-        if not self.simulated:
-            # What rclpy's clock reads then, without its objects.
-            return time_ns()
-        if self._subscription is not None:
-            for taken in self._subscription.take()[-1:]:
-                try:
-                    message = decode(taken.data, Clock)
-                    if message.clock.sec < 0:
-                        raise BadInputError(f'time {message.clock.sec} s: expected at least 0')
-                    self._source.clock_callback(message)
-                except BadInputError as error:
-                    self._node.get_logger().error(
-                        f'message on /clock skipped: {error}', throttle_duration_sec=1.0)
-        return int(self._node.get_clock().now().nanoseconds)
 
 
 class _CarefulParameterService(ParameterService):

@@ -27,6 +27,7 @@ from hmsa_ros.nodes.cdr import read_trajectory, stamp_of
 from hmsa_ros.nodes.channel import JointChannel
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.markers import TargetMarkers
+from hmsa_ros.nodes.newest_clock import NewestClock
 from hmsa_ros.nodes.parameters import declare_joints
 from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from, SPECS
 from hmsa_ros.nodes.presence import Presence
@@ -63,6 +64,7 @@ class PlannerNode(ManagedNode):
         super().__init__(topics.PLANNER)
         self._settings = declare_joints(self, PARAMETERS, OWN)
         self._aside = Aside(self.get_logger().warning)
+        self._clock_reader = NewestClock(self)
         self._steps = StepWatch()
         self._runtime = self._new_runtime()
         self._channels: dict[str, JointChannel] = {}
@@ -247,7 +249,7 @@ class PlannerNode(ManagedNode):
     def now(self) -> int:
         """Return the node's time in ns; that the clock was set is noted."""
         before = monotonic_ns()
-        now = super().now()
+        now = self._clock_reader.read()
         if not self.simulated and (
                 by := self._steps.step(before, now, monotonic_ns())):
             self._runtime.clock_set(by)
