@@ -30,51 +30,44 @@ class ServiceCall:
         self._service = service_type, name
         self._request = request
         self._timeout = timeout
-        self._client: Any = None
-        self._future: Any = None
         self._sent = 0.0
-        # Clients whose answer counts as lost, and their requests: it may only be late.
-        self._earlier: list[tuple[Any, Any]] = []
+        # Clients with the answers that they wait for; all but the last may only be late.
+        self._asked: list[tuple[Any, Any]] = []
 
     @property
     def ready(self) -> bool:
         """Whether there is a server."""
-        if self._client is None:
-            self._client = self._node.create_client(*self._service)
-        return bool(self._client.service_is_ready())
+        if not self._asked:
+            self._asked.append((self._node.create_client(*self._service), None))
+        return bool(self._asked[-1][0].service_is_ready())
 
     def answer(self) -> Any:
         """Return the response, or None as long as there is none; send what is due."""
-        for client, future in [*self._earlier, (self._client, self._future)]:
+        for client, future in self._asked:
             if future is not None and future.done() and (response := future.result()) is not None:
-                self._earlier = [x for x in self._earlier if x[0] is not client]
-                if client is not self._client:
-                    self._earlier.append((self._client, self._future))
-                self._client, self._future = client, None
-                self._destroy_earlier()
+                self._destroy_all_but(client)
                 return response
-        if not self.ready:
+        ready = self.ready
+        client, future = self._asked[-1]
+        if not ready:
             # Whoever was asked is gone: the next server is asked from the beginning.
-            self._future = None
-        elif self._future is None:
-            self._future = self._client.call_async(self._request)
+            self._asked[-1] = client, None
+        elif future is None:
+            self._asked[-1] = client, client.call_async(self._request)
             self._sent = monotonic()
         elif monotonic() - self._sent > self._timeout:
-            self._earlier.append((self._client, self._future))
-            self._client = self._future = None
+            self._asked.append((self._node.create_client(*self._service), None))
         return None
 
     def close(self) -> None:
         """Destroy what the call holds; it cannot be used any more."""
-        self._earlier.append((self._client, self._future))
-        self._client = self._future = None
-        self._destroy_earlier()
+        self._destroy_all_but(None)
 
-    def _destroy_earlier(self) -> None:
-        for client, _ in self._earlier:
-            if client is not None:
+    def _destroy_all_but(self, kept: Any) -> None:
+        for client, _ in self._asked:
+            if client is not kept:
                 self._node.destroy_client(client)
-        self._earlier.clear()
+        self._asked = [] if kept is None else [(kept, None)]
 
 
 _SERVICES = {
