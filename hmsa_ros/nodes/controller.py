@@ -44,8 +44,8 @@ class LinkedPlanner(PlannerNode):
     @property
     def drives_hardware(self) -> bool:
         """Whether parameters for all nodes of the process name hardware."""
-        return any(given is not None and bool(given.value) for given in (
-            self._parameter_overrides.get(x) for x in (HARDWARE.name, SHORT)))
+        given = self._parameter_overrides
+        return any(x in given and given[x].value for x in (HARDWARE.name, SHORT))
 
     def send(self) -> None:
         """Give the plant the commands that are due."""
