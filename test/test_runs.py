@@ -15,19 +15,14 @@ from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, replacing, write_text
 from hmsa_ros.interfaces.actuator import parameters_of
+from hmsa_ros.interfaces.parameters import number_of
 from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.model.simulation import ActuatorSimulation
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings import bags
 from hmsa_ros.recordings.levels import lateness_of, Level
-from hmsa_ros.recordings.parameters import (
-    actuators,
-    number_of,
-    read_parameter_file,
-    recorded,
-    values_of,
-)
+from hmsa_ros.recordings.parameters import actuators, read_parameter_file, recorded, values_of
 from hmsa_ros.recordings.record import Run
 from hmsa_ros.recordings.tables import levels_of, samples_of, write_table
 from hmsa_ros.recordings.topics import APPLIED, COMMAND

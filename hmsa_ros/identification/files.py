@@ -22,14 +22,14 @@ from hmsa_ros.identification import quantities
 from hmsa_ros.identification.known import Known, PREFIX
 from hmsa_ros.identification.result import Identification
 from hmsa_ros.interfaces.actuator import actuator_from, parameters_of
-from hmsa_ros.interfaces.parameters import BLOCK
+from hmsa_ros.interfaces.parameters import BLOCK, number_of
 from hmsa_ros.interfaces.topics import PLANNER, PLANT
 from hmsa_ros.model.flows import CONSTANTS, FLOWS
 from hmsa_ros.model.flows.record import Flow, MAXWELL
 from hmsa_ros.model.mismatch import Ellipsoid, Uncertainty
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.planning.shapers.request import as_errors, LARGEST_ERROR
-from hmsa_ros.recordings.parameters import Entries, entries_of, number_of, values_of
+from hmsa_ros.recordings.parameters import Entries, entries_of, values_of
 
 # What coil and sensor have, by the name in parameter files.
 _OTHERS = {

@@ -19,6 +19,17 @@ WORDS = {False: ('off', 'no'), True: ('on', 'yes')}
 Value = bool | int | float | str | list[str] | list[float]
 
 
+def number_of(value: object) -> float | None:
+    """Return a number as a float; None for anything else, NaN or a number too large."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return None if math.isnan(number) else number
+
+
 @dataclass(frozen=True)
 class ParameterSpec:
     """
@@ -61,6 +72,13 @@ class ParameterSpec:
         if isinstance(self.default, str) and not isinstance(value, str):
             raise BadInputError(
                 f'parameter {self.name} is {excerpt(value)}: expected a text')
+        if isinstance(self.default, float):
+            number = number_of(value)
+            if number is None:
+                raise BadInputError(
+                    f'parameter {self.name} is {excerpt(value)}: expected a number, '
+                    + self.range_text())
+            value = number
         self.check(value)
         return value
 
@@ -70,16 +88,14 @@ class ParameterSpec:
         several = not isinstance(value, str) and (
             isinstance(value, Sequence) or hasattr(value, 'typecode'))
         values = list(value) if several else [value]
-        kinds = (int, float) if self.items is float else (str,)
-        if not all(isinstance(x, kinds) and not isinstance(x, bool) for x in values):
-            of = 'numbers' if self.items is float else 'strings'
+        if self.items is float:
+            values, of = [number_of(x) for x in values], 'numbers'
+        else:
+            values, of = [x if isinstance(x, str) else None for x in values], 'strings'
+        if None in values:
             raise BadInputError(
                 f'parameter {self.name} is {excerpt(value)}: expected a list of {of}')
-        try:
-            return [self.items(x) for x in values]
-        except OverflowError as error:
-            raise BadInputError(
-                f'parameter {self.name} is {excerpt(value)}: expected finite numbers') from error
+        return values
 
     def check(self, value: Any) -> None:
         """

@@ -2,17 +2,16 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 import json
-import math
 from pathlib import Path
 from typing import Any
 
 from hmsa_ros.bag.experiment import parameters_of
 from hmsa_ros.bag.limits import load_yaml
-from hmsa_ros.errors import BadInputError, BagError, excerpt
+from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.files import read_at_most
 from hmsa_ros.interfaces import parameters as shared
 from hmsa_ros.interfaces.actuator import actuator_from, creep_from
-from hmsa_ros.interfaces.parameters import ParameterSpec
+from hmsa_ros.interfaces.parameters import number_of, ParameterSpec
 from hmsa_ros.interfaces.topics import PLANNER, PLANT
 from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
@@ -22,17 +21,6 @@ _LARGEST_FILE = 1 << 20
 
 #: Node, dotted name and value of each parameter in a file; no node if all are meant.
 Entries = list[tuple[str, str, object]]
-
-
-def number_of(value: object) -> float | None:
-    """Return a number as a float; None for anything else, NaN or a number too large."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return None
-    try:
-        number = float(value)
-    except OverflowError:
-        return None
-    return None if math.isnan(number) else number
 
 
 def of_joint(parameters: Mapping[str, object], joint: str, name: str) -> object:
@@ -164,20 +152,7 @@ def values_of(
 
     Raises `BadInputError` if a value is of another type or out of range.
     """
-    values = {}
-    for spec in specs:
-        value = parameters.get(f'{node}.{spec.name}', spec.default)
-        if isinstance(spec.default, (str, list)):
-            values[spec.name] = spec.taken(value)
-            continue
-        number = number_of(value)
-        if number is None:
-            raise BadInputError(
-                f'parameter {spec.name} is {excerpt(value)}: expected a number, '
-                f'{spec.range_text()}')
-        spec.check(number)
-        values[spec.name] = number
-    return values
+    return {x.name: x.taken(parameters.get(f'{node}.{x.name}', x.default)) for x in specs}
 
 
 def entries_of(path: Path) -> Entries:

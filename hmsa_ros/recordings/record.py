@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces.parameters import number_of
 from hmsa_ros.judge.records import Sensor
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.recordings.levels import in_force, Level
-from hmsa_ros.recordings.parameters import number_of, of_joint
+from hmsa_ros.recordings.parameters import of_joint
 from hmsa_ros.recordings.topics import APPLIED
 
 if TYPE_CHECKING:

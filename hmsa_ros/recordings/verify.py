@@ -20,11 +20,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces.parameters import number_of
 from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.bags import read_runs
 from hmsa_ros.recordings.levels import in_force, lateness_of, Level, without_repeats
-from hmsa_ros.recordings.parameters import creep_of, number_of, of_joint
+from hmsa_ros.recordings.parameters import creep_of, of_joint
 from hmsa_ros.recordings.record import Run
 from hmsa_ros.recordings.topics import APPLIED, COMMAND, FORCE, JOINT_STATES
 

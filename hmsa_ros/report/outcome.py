@@ -7,10 +7,11 @@ import math
 import numpy as np
 
 from hmsa_ros.control.holds import Hold
+from hmsa_ros.interfaces.parameters import number_of
 from hmsa_ros.judge.records import Finding, Sensor, Tolerances, unobserved
 from hmsa_ros.model.equations import equilibrium_stretch
 from hmsa_ros.model.units import Drive, FLUX, NANOSECONDS
-from hmsa_ros.recordings.parameters import number_of, of_joint
+from hmsa_ros.recordings.parameters import of_joint
 from hmsa_ros.recordings.record import Run
 from hmsa_ros.recordings.setpoints import Requested, setpoints_of
 from hmsa_ros.table import Column, Table
