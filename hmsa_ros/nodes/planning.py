@@ -196,17 +196,15 @@ def options_from(values: Mapping[str, Any]) -> Options:
         raise BadInputError(
             f'parameter flux_density_min is {least:g} T: expected less than flux_density_max, '
             f'which is {largest:g} T')
+    plain: dict[str, Any] = {x: values[x] for x in (
+        'shaper', 'short_spell', 'flux_density_min', 'flux_density_max', 'coil_time_constant',
+        'creep_tolerance', 'path_tolerance')}
     return Options(
-        shaper=values['shaper'], short_spell=values['short_spell'],
-        flux_density_min=least, flux_density_max=largest,
-        lead_time=_nanoseconds(values['lead_time']),
+        **plain, lead_time=_nanoseconds(values['lead_time']),
         period=0 if values['command_mode'] == 'continuous'
         else _nanoseconds(values['command_period']),
         slew_limit=values['slew_limit'] or math.inf, order=values['robust_order'],
         errors=errors_from(values['minimax_file'], values['minimax_errors']),
-        coil_time_constant=values['coil_time_constant'],
-        creep_tolerance=values['creep_tolerance'],
-        path_tolerance=values['path_tolerance'],
         pace=Pace(values['smooth_periods'], values['stretch_rate_max'] or math.inf))
 
 
