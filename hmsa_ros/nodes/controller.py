@@ -56,8 +56,7 @@ class LinkedPlanner(PlannerNode):
         """Do what is due, and publish a message at least, others while there is time left."""
         self._serve()
         while self._waiting:
-            output = self._waiting.popleft()
-            self._publish[type(output)](output)
+            self._publish(self._waiting.popleft())
             if not left() and len(self._waiting) < _CROWDED:
                 return
 
@@ -133,7 +132,7 @@ class Linked(DeviceNode):
 
     def __init__(self, planner: LinkedPlanner) -> None:
         self._planner = planner
-        self.companion = planner.get_name()
+        self.companion = planner.get_fully_qualified_name()
         self.cycles = Cycles(round(TICK_SECONDS * 1e9))
         super().__init__()  # type: ignore[call-arg]  # that of the node it is linked to
         planner.plant = self

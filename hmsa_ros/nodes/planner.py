@@ -1,6 +1,6 @@
 """Planner node: setpoints in, the shaped stream of stamped flux density commands out."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -10,6 +10,7 @@ from typing import Any, TYPE_CHECKING
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
+from rosgraph_msgs.msg import Clock
 
 from hmsa_ros.control import records
 from hmsa_ros.control.aside import Aside
@@ -22,12 +23,11 @@ from hmsa_ros.model.actuators import unheld
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
-from hmsa_ros.nodes.capture import RawSubscription, Taken
+from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
 from hmsa_ros.nodes.cdr import read_trajectory, stamp_of
 from hmsa_ros.nodes.channel import JointChannel
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.markers import TargetMarkers
-from hmsa_ros.nodes.newest_clock import NewestClock
 from hmsa_ros.nodes.parameters import declare_joints
 from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from, SPECS
 from hmsa_ros.nodes.presence import Presence
@@ -64,7 +64,15 @@ class PlannerNode(ManagedNode):
         super().__init__(topics.PLANNER)
         self._settings = declare_joints(self, PARAMETERS, OWN)
         self._aside = Aside(self.get_logger().warning)
-        self._clock_reader = NewestClock(self)
+        # The executor would keep an event for each message on /clock, without limit where the node
+        # cannot keep up with them. This subscription, read by `now`, keeps the newest alone. It is
+        # not for a node that has to take commands in before the time published after them.
+        self._ticks: RawSubscription | None = None
+        self._time_source._subscribe_to_clock_topic = self._follow_clock
+        if self.simulated:
+            self.destroy_subscription(self._time_source._clock_sub)
+            self._time_source._clock_sub = None
+            self._follow_clock()
         self._steps = StepWatch()
         self._runtime = self._new_runtime()
         self._channels: dict[str, JointChannel] = {}
@@ -104,12 +112,6 @@ class PlannerNode(ManagedNode):
         self._plan, self._status, self._estimate = (
             endpoints.publisher(self, x) for x in (topics.PLAN, topics.STATUS, topics.ESTIMATE))
         self._targets = TargetMarkers(self, self._settings)
-        self._publish: dict[type, Callable[..., None]] = {
-            records.Send: self._publish_command, records.PlanChanged: self._publish_plan,
-            records.StatusChanged: self._publish_status,
-            records.EstimateChanged: self._publish_estimate,
-            records.Note: lambda x: self.complain(
-                x.message, x.severity is records.Severity.ERROR)}
         endpoints.subscribe(self, topics.JOINT_TRAJECTORY, self._on_trajectory, raw=True)
         self.offer(topics.STOP, self._on_stop)
         self.offer(topics.RESET_ESTIMATE, lambda: (True, self._runtime.feedback.reset()))
@@ -248,12 +250,24 @@ class PlannerNode(ManagedNode):
 
     def now(self) -> int:
         """Return the node's time in ns; that the clock was set is noted."""
+        if self.simulated:
+            for taken in [] if self._ticks is None else self._ticks.take()[-1:]:
+                try:
+                    self._time_source.clock_callback(decode(taken.data, Clock))
+                except BadInputError as error:
+                    self.get_logger().error(
+                        f'message on /clock skipped: {error}', throttle_duration_sec=1.0)
+            return super().now()
         before = monotonic_ns()
-        now = self._clock_reader.read()
-        if not self.simulated and (
-                by := self._steps.step(before, now, monotonic_ns())):
+        # What rclpy's clock reads then, without its objects.
+        now = time_ns()
+        if by := self._steps.step(before, now, monotonic_ns()):
             self._runtime.clock_set(by)
         return now
+
+    def _follow_clock(self) -> None:
+        if self._ticks is None:
+            self._ticks = endpoints.listen(self, topics.CLOCK_TOPIC)
 
     def _on_jump(self, jump: TimeJump) -> None:
         if jump.delta.nanoseconds < 0:
@@ -307,26 +321,28 @@ class PlannerNode(ManagedNode):
 
     def _take(self, outputs: Iterable[records.Output]) -> None:
         for output in outputs:
-            self._publish[type(output)](output)
+            self._publish(output)
 
-    def _publish_command(self, command: records.Send) -> None:
-        self._channels[command.joint].send(command, self._settings['frame_id'])
-
-    def _publish_plan(self, plan: records.PlanChanged) -> None:
-        self._plan.publish(conversions.to_plan(plan.stamps, plan.samples))
-
-    def _publish_status(self, status: records.StatusChanged) -> None:
-        self._status.publish(conversions.to_planner_status(status))
-        if self._action is not None:
-            self._action.tell(status)
-        self._targets.show(self.now(), {
-            name: float(x.stretch) if x.stretch else None for name, x in status.each.items()})
-
-    def _publish_estimate(self, estimate: records.EstimateChanged) -> None:
-        self._estimate.publish(conversions.to_diagnostics(
-            estimate.time, conversions.to_status(
-                f'{self.get_name()}: estimate', estimate.joint, estimate.severity,
-                estimate.message, estimate.values)))
+    def _publish(self, output: records.Output) -> None:
+        match output:
+            case records.Send():
+                self._channels[output.joint].send(output, self._settings['frame_id'])
+            case records.PlanChanged():
+                self._plan.publish(conversions.to_plan(output.stamps, output.samples))
+            case records.StatusChanged():
+                self._status.publish(conversions.to_planner_status(output))
+                if self._action is not None:
+                    self._action.tell(output)
+                self._targets.show(self.now(), {
+                    name: float(x.stretch) if x.stretch else None
+                    for name, x in output.each.items()})
+            case records.EstimateChanged():
+                self._estimate.publish(conversions.to_diagnostics(
+                    output.time, conversions.to_status(
+                        f'{self.get_name()}: estimate', output.joint, output.severity,
+                        output.message, output.values)))
+            case records.Note():
+                self.complain(output.message, output.severity is records.Severity.ERROR)
 
     def _report(self) -> Iterable[DiagnosticStatus]:
         severity, message, values = self._runtime.report()
