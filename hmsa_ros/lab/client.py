@@ -172,7 +172,7 @@ class PlannerClient(Visitor):
             return monotonic() - since >= _SETTLED_SECONDS
 
         def subscribed() -> bool:
-            heard = graph.subscribers(self.node, self._publisher.topic_name)
+            heard = endpoints.subscribers_of(self.node, self._publisher.topic_name).values()
             return not graph.recorders(self.node).isdisjoint(heard) and (
                 self._publisher.get_subscription_count() >= len(heard))
 

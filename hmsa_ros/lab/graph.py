@@ -1,23 +1,18 @@
 """Who takes the commands of a planner, by the graph of ROS."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from rclpy.node import Node
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from hmsa_ros.interfaces import topics
+from hmsa_ros.nodes.endpoints import publishers_of, subscribers_of
 
 
 def unheard(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
     """Return a planner's topics of commands that nobody but recorders subscribes to."""
     leave_out = recorders(node)
     return [x for x in _commands(node, namespace, joints)
-            if leave_out.issuperset(subscribers(node, x))]
-
-
-def subscribers(node: Node, topic: str) -> list[str]:
-    """Return the full names of the nodes that subscribe to a topic, by its full name."""
-    return _names(node.get_subscriptions_info_by_topic(topic))
+            if leave_out.issuperset(subscribers_of(node, x).values())]
 
 
 def recorders(node: Node) -> set[str]:
@@ -33,11 +28,7 @@ def _commands(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
     named = [
         topic for topic, types in node.get_topic_names_and_types()
         if topics.FLUX_DENSITY_COMMAND.type in types
-        and planner in _names(node.get_publishers_info_by_topic(topic))]
+        and planner in publishers_of(node, topic).values()]
     return [x for x in named if x.split('/')[-2] in joints] or named or [
         node.resolve_topic_name(
             topics.of_joint(topics.FLUX_DENSITY_COMMAND, x, joints).name) for x in joints]
-
-
-def _names(ends: Iterable[TopicEndpointInfo]) -> list[str]:
-    return [f'{x.node_namespace.rstrip("/")}/{x.node_name}' for x in ends]

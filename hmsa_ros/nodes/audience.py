@@ -85,9 +85,9 @@ class Audience:
                     name, space or '/')}
             except NodeNameNonExistentError:
                 return [f'topics of {node}']
-        return [x for x in sorted(names) if self._selects.wants(x) and not any(
-            endpoints.node_of(info) == self._recorder
-            for info in self._node.get_subscriptions_info_by_topic(x))]
+        return [
+            x for x in sorted(names) if self._selects.wants(x)
+            and self._recorder not in endpoints.subscribers_of(self._node, x).values()]
 
     def _subscribed(self, topic: str) -> bool:
         """Return whether somebody who counts subscribes to a topic."""
@@ -95,8 +95,8 @@ class Audience:
         if not self._nodes:
             return bool(sender.get_subscription_count() > 0)
         return any(
-            endpoints.node_of(x) in self._nodes
-            for x in self._node.get_subscriptions_info_by_topic(sender.topic_name))
+            x in self._nodes
+            for x in endpoints.subscribers_of(self._node, sender.topic_name).values())
 
     def found(self, also: Any) -> bool:
         """Return whether all known subscribers hear us; ``also`` is one more publisher or None."""

@@ -53,9 +53,7 @@ class JointChannel:
     def reporters(self) -> frozenset[bytes]:
         """Identifiers of who reports what takes effect."""
         return frozenset(
-            bytes(x.endpoint_gid)
-            for x in self._node.get_publishers_info_by_topic(self._applied)) if (
-                self._applied) else frozenset()
+            endpoints.publishers_of(self._node, self._applied) if self._applied else ())
 
     def unheard(self) -> str:
         """Return why nobody carries out the commands; empty where somebody does."""

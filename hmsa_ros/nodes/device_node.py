@@ -27,13 +27,6 @@ from hmsa_ros.nodes.outlet import Outlet
 from hmsa_ros.nodes.parameters import JointParameters, JOINTS
 from hmsa_ros.nodes.presence import Presence
 
-
-def publishers_of(node: Node, topic: topics.Topic) -> dict[bytes, tuple[str, str]]:
-    """Return name and namespace of a topic's publishers by identifier, as in the graph."""
-    return {bytes(x.endpoint_gid): (x.node_name, x.node_namespace)
-            for x in node.get_publishers_info_by_topic(node.resolve_topic_name(topic.name))}
-
-
 #: What a joint does when nobody commands it; each may have values of its own.
 FALLBACK = (
     ParameterSpec(
@@ -103,8 +96,8 @@ class DeviceJoint:
         # something was told by a clock that is never set.
         self._newest, self._came, self._told = 0, 0, 0
         self._topic = topics.of_joint(topics.FLUX_DENSITY_COMMAND, self.name, names)
-        # Names of publishers at the last look, and the one that is obeyed if only one is.
-        self._publishers: dict[bytes, tuple[str, str]] = {}
+        # Publishers at the last look, and the one that is obeyed if only one is.
+        self._publishers: dict[bytes, str] = {}
         self._first: bytes | None = None
         self._only_first = node.values[COMMAND_SOURCE.name] == 'first'
         self._commands: Any = (
@@ -169,17 +162,17 @@ class DeviceJoint:
 
     def _obeys(self, publisher: bytes) -> bool:
         """Return whether commands that a publisher sends on the topic are obeyed."""
-        if self._node.companion:
-            own = self._node.companion, self._node.get_namespace()
+        if companion := self._node.companion:
             if publisher not in self._publishers:
-                self._publishers = publishers_of(self._node, self._topic)
-                self._first = next((x for x, y in self._publishers.items() if y == own), None)
-            if self._publishers.get(publisher) == own:
+                self._publishers = endpoints.publishers_of(self._node, self._topic.name)
+                self._first = next(
+                    (x for x, node in self._publishers.items() if node == companion), None)
+            if self._publishers.get(publisher) == companion:
                 return False
         if not self._only_first:
             return True
-        if self._first in (None, publisher) or self._first not in publishers_of(
-                self._node, self._topic):
+        if self._first in (None, publisher) or self._first not in endpoints.publishers_of(
+                self._node, self._topic.name):
             self._first = publisher
             return True
         self.refused_source += 1
@@ -278,7 +271,7 @@ class DeviceNode(ManagedNode):
     """
     Publishes what comes of a device in ``on_tick``; ``_go_on`` of a subclass lets it go on.
 
-    A planner in the same process may give its commands directly; ``companion`` is its name then,
+    A planner in the same process may give its commands directly; ``companion`` is its full name,
     and whoever links the two does what ``on_tick`` does.
     """
 

@@ -24,14 +24,7 @@ from hmsa_ros.interfaces.parameters import ParameterSpec, PUBLISH_RATE
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.capture import decode
-from hmsa_ros.nodes.device_node import (
-    COMMON,
-    DeviceJoint,
-    DeviceNode,
-    FALLBACK,
-    fallback_from,
-    publishers_of,
-)
+from hmsa_ros.nodes.device_node import COMMON, DeviceJoint, DeviceNode, FALLBACK, fallback_from
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.parameters import declare_joints, JointParameters
 from hmsa_ros.nodes.runner import run
@@ -195,7 +188,7 @@ class DriverNode(DeviceNode):
                 closed = False
             self._interlock.hear(
                 taken.publisher, now, closed=closed,
-                present=lambda: publishers_of(self, topics.INTERLOCK))
+                present=lambda: endpoints.publishers_of(self, topics.INTERLOCK.name))
         before, why = self.worker.locked, self._interlock.look(now)
         self.worker.lock(why)
         if bool(why) != bool(before):

@@ -1,6 +1,6 @@
 """Topics and services (`hmsa_ros.interfaces.topics`) on a node of rclpy."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib import import_module
 from typing import Any
 
@@ -50,9 +50,19 @@ def profile(quality: Quality) -> QoSProfile:
         else DurabilityPolicy.VOLATILE)
 
 
-def node_of(endpoint: Any) -> str:
-    """Return the full name of the node of a publisher or subscriber in the graph."""
-    return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
+def publishers_of(node: Node, topic: str) -> dict[bytes, str]:
+    """Return who publishes a topic: full names of nodes by identifiers, as in the graph."""
+    return _names(node.get_publishers_info_by_topic(node.resolve_topic_name(topic)))
+
+
+def subscribers_of(node: Node, topic: str) -> dict[bytes, str]:
+    """Return who subscribes to a topic, as `publishers_of` does."""
+    return _names(node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic)))
+
+
+def _names(endpoints: Iterable[Any]) -> dict[bytes, str]:
+    return {bytes(x.endpoint_gid): f'{x.node_namespace.rstrip("/")}/{x.node_name}'
+            for x in endpoints}
 
 
 def publisher(node: Node, topic: Topic, owner: str = '') -> Publisher:

@@ -76,7 +76,7 @@ class Presence:
             what = f'plants or drivers of joint {joint}'
             applied = topics.of_joint(topics.FLUX_DENSITY_APPLIED, joint, joints).name
             if found := several(what, self._running(applied)) or several(what, [
-                    node for gid, node in self._publishers(topics.JOINT_STATES.name)
+                    node for gid, node in self._publishers(topics.JOINT_STATES.name).items()
                     if _lately(self._sampled.get((joint, gid), 0))]):
                 return found
         return ''
@@ -103,18 +103,15 @@ class Presence:
 
     def _running(self, topic: str) -> list[str]:
         """Return the nodes that publish a topic and whose processes are heard."""
-        return [node for gid, node in self._publishers(topic)
+        return [node for gid, node in self._publishers(topic).items()
                 if _lately(self._heard.get(gid[:_PROCESS_BYTES], 0))]
 
-    def _publishers(self, topic: str) -> list[tuple[bytes, str]]:
-        """Return a topic's publishers in the graph: identifier, and full name of the node."""
+    def _publishers(self, topic: str) -> dict[bytes, str]:
         try:
-            name = self._node.resolve_topic_name(topic)
+            return endpoints.publishers_of(self._node, topic)
         except rclpy_implementation.RCLError:
             # Joints that messages name may have any name.
-            return []
-        return [(bytes(x.endpoint_gid), endpoints.node_of(x))
-                for x in self._node.get_publishers_info_by_topic(name)]
+            return {}
 
 
 def _lately(received_ns: int) -> bool:
