@@ -52,14 +52,10 @@ def run(
     # a true attribute ``finished`` ends it.
     ENDING.note()
     arguments = list(sys.argv[1:] if args is None else args)
-    try:
-        _initialise(arguments)
-    except BadInputError as error:
-        rclpy.try_shutdown()
-        return complain(error, 2)
     nodes: Sequence[Node] = ()
     status = 0
     try:
+        _initialise(arguments)
         made = factory()
         nodes = (made,) if isinstance(made, Node) else made
         _avoid_pauses()
