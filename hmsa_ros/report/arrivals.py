@@ -51,9 +51,9 @@ class Timing:
 def timing(run: Run) -> Timing:
     """Return when commands and samples of a run came."""
     commands, repeats = without_repeats(run.commands)
-    delay = _seconds(run.logged - run.time)
-    interval = _seconds(np.diff(run.time))
-    lead = _seconds(np.array([x.stamp - x.sent for x in commands], dtype=np.int64))
+    delay = (run.logged - run.time) / NANOSECONDS
+    interval = np.diff(run.time) / NANOSECONDS
+    lead = np.array([x.stamp - x.sent for x in commands], dtype=np.int64) / NANOSECONDS
     if abs(float(np.median(delay))) > _SAME_CLOCK:
         delay, lead = np.empty(0), np.empty(0)
     recorded: Times = np.sort(run.logged)
@@ -61,12 +61,8 @@ def timing(run: Run) -> Timing:
     gaps = np.rint(interval / usual) - 1.0
     lateness, unapplied = lateness_of(commands, run.applied, int(run.time[-1]))
     return Timing(
-        commands, repeats, lead, lateness, delay, interval, _seconds(np.diff(recorded)),
+        commands, repeats, lead, lateness, delay, interval, np.diff(recorded) / NANOSECONDS,
         int(np.sum(gaps[gaps > 0.0])) if len(interval) else 0, unapplied)
-
-
-def _seconds(nanoseconds: Times) -> Array:
-    return np.asarray(nanoseconds / NANOSECONDS, dtype=np.float64)
 
 
 # Of what a panel holds beyond what it shows at first, in durations of the move.

@@ -15,7 +15,6 @@ import jinja2
 import numpy as np
 
 from hmsa_ros import __version__
-from hmsa_ros.bag.info import BagSummary
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.interfaces.actuator import parameters_of
 from hmsa_ros.interfaces.parameters import ACTUATOR, ACTUATOR_FIELDS, LAW
@@ -140,7 +139,8 @@ def _summary(parts: Sequence[Part]) -> list[tuple[str, str]] | Table:
         f'{len(x.timing.commands)}' + (
             f' ({x.timing.late} late)' if len(x.timing.lead) or len(x.timing.lateness) else ''),
         f'{1.0 / np.median(x.timing.interval):.6g}' if len(x.timing.interval) else '–',
-        _lost(x.run.summary)] for x in parts]
+        'not counted' if x.run.summary is None or x.run.summary.lost is None
+        else str(x.run.summary.lost)] for x in parts]
     if len(parts) == 1:
         return list(zip(rows[0], header, strict=True))
     return _table(dict.fromkeys(('run', *header), ''), [
@@ -269,11 +269,6 @@ def _timing(parts: Sequence[Part]) -> Table:
     return _table({
         'run': '', 'quantity': '', 'count': 'd', 'least [ms]': '.4f', 'median [ms]': '.4f',
         '99 % [ms]': '.4f', 'largest [ms]': '.4f', 'jitter [ms]': '.4f'}, rows)
-
-
-def _lost(summary: BagSummary | None) -> str:
-    """Return how many messages were lost, as far as the bag counts them."""
-    return 'not counted' if summary is None or summary.lost is None else str(summary.lost)
 
 
 def _losses(parts: Sequence[Part]) -> Table:
