@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from benchmarks.laboratory import Bench, KINDS
 from hmsa_ros.estimation.motion import follow, Levels, rest
-from hmsa_ros.identification.quantities import values_of
-from hmsa_ros.identification.response import complete
+from hmsa_ros.identification.quantities import complete, values_of
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.planner import Options, Planner

@@ -17,8 +17,7 @@ from scipy.optimize import lsq_linear
 
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.estimation.motion import follow, Levels
-from hmsa_ros.identification.quantities import values_of
-from hmsa_ros.identification.response import complete
+from hmsa_ros.identification.quantities import complete, values_of
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.units import NANOSECONDS

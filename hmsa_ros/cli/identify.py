@@ -122,17 +122,17 @@ def run(arguments: argparse.Namespace) -> int:
 
 def known_of(text: str) -> tuple[dict[str, float], dict[str, float]]:
     """Return values and standard deviations of --known by name; raise `BadInputError`."""
-    from hmsa_ros.identification.quantities import GEOMETRY, QUANTITIES
+    from hmsa_ros.identification.quantities import QUANTITIES
 
     values, deviations = {}, {}
     for part in filter(None, (x.strip() for x in text.split(','))):
         name, equals, rest = (x.strip() for x in part.partition('='))
         name = name.removeprefix('actuator.')
-        if not equals or name not in QUANTITIES and name not in GEOMETRY:
+        if not equals or name not in QUANTITIES:
             raise BadInputError(
                 f'--known has {part!r}: expected NAME=VALUE or NAME=VALUE+-STD, with a name of '
-                f'{", ".join([*QUANTITIES, *GEOMETRY])}')
-        unit = QUANTITIES[name].unit if name in QUANTITIES else 'm'
+                f'{", ".join(QUANTITIES)}')
+        unit = QUANTITIES[name].unit
         value, _, std = (x.strip() for x in rest.partition('+-'))
         values[name] = number_of(value, unit, name)
         if std.endswith('%'):

@@ -14,9 +14,17 @@ from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
 from hmsa_ros.estimation.prior import Prior
 from hmsa_ros.estimation.screening import Screening
 from hmsa_ros.estimation.suspects import Suspects
-from hmsa_ros.estimation.window import coordinates, Doubt, Rest, Solution, Trial, values_at, Window
+from hmsa_ros.estimation.window import Doubt, Rest, Solution, Trial, Window
 from hmsa_ros.identification.fit import robust_scale
-from hmsa_ros.identification.quantities import actuator_of, BRANCHES, derivative, QUANTITIES
+from hmsa_ros.identification.quantities import (
+    actuator_of,
+    BRANCHES,
+    complete,
+    coordinates,
+    derivative,
+    QUANTITIES,
+    values_at,
+)
 from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters
@@ -141,7 +149,7 @@ class Estimate:
         z += instead + spread[:, known] @ np.linalg.pinv(
             spread[np.ix_(known, known)], hermitian=True) @ left[known]
         z[known] = kept
-        found = replace(self, values=values_at(self.values, self.free, z))
+        found = replace(self, values=complete(values_at(self.values, self.free, z), self.free))
         return Model(
             replace(found.block(sure), creep=block.creep),
             replace(options, **{x: found.values[x] for x in ESTIMATED}))

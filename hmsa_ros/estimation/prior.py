@@ -11,11 +11,11 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.known import Known
 from hmsa_ros.identification.quantities import (
     check_free,
+    complete,
     derivative,
     QUANTITIES,
     values_of,
 )
-from hmsa_ros.identification.response import complete
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import Coordinate, coordinate_of
 from hmsa_ros.model.parameters import ActuatorParameters

@@ -8,7 +8,7 @@ along with the motion (C. V. Rao, J. B. Rawlings and D. Q. Mayne, IEEE Trans. Au
 (2003) 246).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 import math
 from typing import Any, NamedTuple
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
 from hmsa_ros.estimation.suspects import GAIN, inverse, Look, optimum, Others, Suspects
 from hmsa_ros.identification.fit import loss, weights_of
-from hmsa_ros.identification.quantities import from_coordinate, QUANTITIES, to_coordinate
-from hmsa_ros.identification.response import clip, complete, sensed
+from hmsa_ros.identification.quantities import complete, QUANTITIES, values_at
+from hmsa_ros.identification.response import sensed
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import coordinate_of
 
@@ -133,7 +133,7 @@ class Window:
 
     def values_at(self, z: Array) -> dict[str, Any]:
         """Return the values of all quantities for coordinates."""
-        return values_at(self.values, self.free, z)
+        return complete(values_at(self.values, self.free, z[:-2]), self.free)
 
     def settle(self, z: Array, off: float) -> None:
         """
@@ -320,7 +320,7 @@ class Window:
             values, motion, residual, self._about_rest(values, by[:n]),
             weights_of(residual, noise, convex=True), cost)
 
-    def _about_rest(self, values: Mapping[str, Any], by: Array) -> Array:
+    def _about_rest(self, values: dict[str, Any], by: Array) -> Array:
         """Return derivatives of what the sensor shows by a suspected gain about rest."""
         if self.suspects.gain >= 0:
             by[:, self.suspects.gain] -= (
@@ -352,16 +352,3 @@ class Window:
             self.values, self.free, here + change @ step,
             0.5 * (covariance + covariance.T), self.bounds, begin,
             self.time[count:], self.stretch[count:], self.suspects, self.suspected)
-
-
-def coordinates(values: Mapping[str, float], free: Sequence[str]) -> Array:
-    """Return the coordinates of the free parameters."""
-    return np.array([to_coordinate(x, values[x]) for x in free], dtype=np.float64)
-
-
-def values_at(values: Mapping[str, Any], free: Sequence[str], z: Array) -> dict[str, Any]:
-    """Return the values of all quantities with those of the coordinates of the free ones."""
-    found = dict(values)
-    for name, x in zip(free, z.tolist(), strict=False):
-        found[name] = clip(name, from_coordinate(name, x))
-    return complete(found, free)

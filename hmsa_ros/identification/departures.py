@@ -17,8 +17,8 @@ import numpy as np
 
 from hmsa_ros.identification.fit import Fit
 from hmsa_ros.identification.noise import inflation, Whiteness, whiteness
-from hmsa_ros.identification.quantities import BRANCHES, QUANTITIES
-from hmsa_ros.identification.response import complete, respond
+from hmsa_ros.identification.quantities import BRANCHES, quantity_of
+from hmsa_ros.identification.response import respond
 from hmsa_ros.identification.result import Signature
 from hmsa_ros.model.equations import Array
 from hmsa_ros.motion import theta as places
@@ -57,7 +57,7 @@ class Departure:
 
 def _columns(fit: Fit) -> Iterator[Departure]:
     recording, time = fit.recording, fit.recording.time
-    values = complete(fit.values, fit.free)
+    values = dict(fit.values)
     # Switches at unknown times look like lag and latency, and stand for both.
     names = [x for x in _PARAMETERS if x not in fit.free and not (
         recording.earlier and x in _DELAYS)]
@@ -178,12 +178,11 @@ def dead_band(fit: Fit, deviation: float) -> float:
 
 def _change(fit: Fit, name: str) -> Array:
     """Return what a unit more of a given value does to the samples."""
-    values = complete(fit.values, fit.free)
-    timed = name in QUANTITIES and QUANTITIES[name].unit == 's'
+    values, timed = fit.values, quantity_of(name).unit == 's'
     little = 1e-3 * abs(values[name]) or (1e-3 * values['time_unit'] if timed else 1e-4)
     ends = []
     for change in (little, -little):
-        response = respond(fit.recording, {**fit.values, name: values[name] + change}, ())
+        response = respond(fit.recording, {**values, name: values[name] + change}, ())
         ends.append(fit.response.stretch if response is None else response.stretch)
     found: Array = (ends[0] - ends[1]) / (2.0 * little)
     return found

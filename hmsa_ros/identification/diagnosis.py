@@ -12,7 +12,6 @@ from hmsa_ros.identification.departures import GAIN, USUAL_GAIN
 from hmsa_ros.identification.fit import Fit
 from hmsa_ros.identification.noise import autocorrelation, Whiteness
 from hmsa_ros.identification.repeats import Repeated
-from hmsa_ros.identification.response import complete
 from hmsa_ros.identification.result import Signature
 from hmsa_ros.identification.start import segments
 from hmsa_ros.model import equations
@@ -181,8 +180,8 @@ def second_mode(fit: Fit) -> list[Signature]:
 def frequency_of(fit: Fit) -> float:
     """Return the frequency in Hz at which it rings about rest."""
     group = quantities.group_of(fit.values)
-    return float(equations.natural_frequency(group.rest, group)) / complete(
-        fit.values, fit.free)['time_unit'] / (2.0 * math.pi)
+    return float(equations.natural_frequency(group.rest, group) / (
+        2.0 * math.pi * fit.values['time_unit']))
 
 
 def in_motion(fit: Fit) -> float:

@@ -7,7 +7,6 @@ from the residuals themselves. Under normal noise that costs 0.1 % of the accura
 """
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 import math
@@ -15,10 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import quantities
 from hmsa_ros.identification.recording import Recording
-from hmsa_ros.identification.response import clip, respond, Response
+from hmsa_ros.identification.response import respond, Response
 from hmsa_ros.model.equations import Array
 
 _FULL, _NONE = 3.0, 6.0
@@ -40,7 +38,6 @@ class Fit:
     """A minimum that was found."""
 
     recording: Recording
-    values: dict[str, Any]  # of all quantities, and the law
     free: tuple[str, ...]  # columns of the Jacobian
     response: Response
     residual: Array  # measured less simulated stretch, shape (n,)
@@ -52,6 +49,11 @@ class Fit:
     # Information on each uncertain switch besides the samples, for a noise of 1.
     prior: float = 0.0
 
+    @property
+    def values(self) -> dict[str, Any]:
+        """Values of all quantities, and the law."""
+        return self.response.values
+
     @cached_property
     def root(self) -> Array:
         """By which residuals and derivatives are multiplied to count as they should."""
@@ -62,8 +64,6 @@ class Fit:
     def jacobian(self) -> Array:
         """Derivatives by the coordinates, less what uncertain switches could do; (n, p)."""
         jacobian, extra = self.response.jacobian, self.response.by_switch
-        if not extra.shape[1]:
-            return jacobian
         weighted = self.root[:, None] ** 2 * extra
         matrix = extra.T @ weighted + self.prior * np.eye(extra.shape[1])
         found: Array = jacobian - extra @ np.linalg.solve(matrix, weighted.T @ jacobian)
@@ -113,18 +113,9 @@ def loss(residual: Array, scale: float, *, convex: bool = False) -> float:
     return float(np.sum(loss))
 
 
-def moved(values: Mapping[str, float], free: Sequence[str], step: Array) -> dict[str, float]:
+def moved(values: Mapping[str, Any], free: Sequence[str], step: Array) -> dict[str, Any]:
     """Return values after a step of the coordinates, kept in their ranges."""
-    done: dict[str, Any] = dict(values)
-    for name, change in zip(free, step.tolist(), strict=True):
-        there = quantities.to_coordinate(name, values[name]) + change
-        done[name] = clip(name, quantities.from_coordinate(name, there))
-        if name == 'chain_limit' and not math.isfinite(done[name]):
-            done[name] = 1e9
-    # Where constants make no law there is no motion either.
-    with suppress(BadInputError):
-        done = quantities.with_constants(done)
-    return done
+    return quantities.values_at(values, free, quantities.coordinates(values, free) + step)
 
 
 def fit(
@@ -174,7 +165,6 @@ class _Search:
 
     def run(self, values: Mapping[str, float]) -> Fit | None:
         """Descend from start values."""
-        values = dict(values)
         shifts: Array = np.full(len(self._recording.uncertain), self._middle)
         response = self._respond(values, shifts)
         if response is None:
@@ -198,12 +188,12 @@ class _Search:
                 scaled: Array = np.asarray(np.linalg.solve(
                     matrix + damping * np.eye(len(size)), gradient / size), dtype=np.float64)
                 step = scaled / size
-                stride = _stride(values, self._free, step[:len(self._free)])
+                stride = _stride(response.values, self._free, step[:len(self._free)])
                 step = step * stride
-                trial_values = moved(values, self._free, step[:len(self._free)])
                 trial_shifts = np.clip(
                     shifts + step[len(self._free):], -self._recording.earlier, 0.0)
-                trial = self._respond(trial_values, trial_shifts)
+                trial = self._respond(
+                    moved(response.values, self._free, step[:len(self._free)]), trial_shifts)
                 if trial is not None:
                     trial_residual = self._residual(trial)
                     after = self._loss(trial_residual, trial_shifts, scale)
@@ -223,8 +213,7 @@ class _Search:
             small = stride == 1.0 and (
                 float(scaled @ matrix @ scaled) <= (_SMALL * scale) ** 2
                 or before - after < _SMALL ** 2)
-            values, shifts, response, residual = (
-                trial_values, trial_shifts, trial, trial_residual)
+            shifts, response, residual = trial_shifts, trial, trial_residual
             if small and damping <= 1.0:
                 if not self._convex:
                     converged = True
@@ -237,7 +226,7 @@ class _Search:
                 scale = min(scale, now)
             damping = max(0.1 * damping, 1e-12)
         return Fit(
-            self._recording, values, self._free, response, residual * self._spread,
+            self._recording, self._free, response, residual * self._spread,
             weights_of(residual, scale), scale, converged, self._passes, self._spread,
             self._prior(scale))
 
@@ -245,17 +234,12 @@ class _Search:
             self, response: Response, residual: Array, weights: Array, shifts: Array,
             scale: float) -> tuple[Array, Array, Array]:
         """Return the normal equations, scaled to a diagonal of 1, and the scales."""
-        jacobian = response.jacobian
-        if len(shifts):
-            jacobian = np.hstack([jacobian, response.by_switch])
-        jacobian = jacobian / self._spread[:, None]
+        jacobian = np.hstack([response.jacobian, response.by_switch]) / self._spread[:, None]
         matrix = jacobian.T @ (weights[:, None] * jacobian)
         gradient = jacobian.T @ (weights * residual)
-        if len(shifts):
-            prior, first = self._prior(scale), len(self._free)
-            places = np.arange(first, len(matrix))
-            matrix[places, places] += prior
-            gradient[first:] -= prior * (shifts - self._middle)
+        prior, first = self._prior(scale), len(self._free)
+        matrix[first:, first:] += prior * np.eye(len(shifts))
+        gradient[first:] -= prior * (shifts - self._middle)
         size = np.sqrt(np.maximum(np.diag(matrix), 1e-12))
         return matrix / np.outer(size, size), gradient, size
 

@@ -14,7 +14,6 @@ from hmsa_ros.identification.intervals import estimates_of, Precision, precision
 from hmsa_ros.identification.noise import errors_of_stamps, whiteness
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.repeats import repeated
-from hmsa_ros.identification.response import complete
 from hmsa_ros.identification.result import Identification, Verdict
 from hmsa_ros.identification.search import rivals, search, unmoved
 from hmsa_ros.identification.start import begins_at_rest, segments
@@ -68,7 +67,9 @@ def identify(
             f'{actuator.coordinate.plural}, as the law of the actuator has')
     free = quantities.check_free(free, actuator.law)
     known, uncertain = known or {}, uncertain or {}
-    values = _values(actuator, known, uncertain, free)
+    values = quantities.complete(
+        quantities.values_of(actuator, known), ('time_unit',) if 'time_unit' in known else ())
+    _check_uncertain(uncertain, free)
     if actuator.law is not None and set(free) & set(quantities.constants_of(actuator.law)):
         values |= quantities.constant_values(actuator.law, actuator.shear_modulus)
     sought = [time for ratio, time in quantities.BRANCHES if ratio in free]
@@ -98,29 +99,17 @@ def identify(
         {**dict.fromkeys(known), **uncertain})
 
 
-def _values(
-        actuator: ActuatorParameters, known: Mapping[str, float],
-        uncertain: Mapping[str, float], free: Sequence[str]) -> dict[str, float]:
-    """Return start values of all that there is, with what is known."""
-    actuator = replace(
-        actuator, half_length=known.get('half_length', actuator.half_length),
-        half_thickness=known.get('half_thickness', actuator.half_thickness))
-    unknown = [x for x in uncertain if x not in (*quantities.QUANTITIES, *quantities.GEOMETRY)]
-    if unknown:
-        raise BadInputError(
-            f'unknown parameter {unknown[0]!r}: expected some of '
-            f'{", ".join(quantities.QUANTITIES)}')
-    both = [x for x in {**known, **uncertain} if x in free and x in uncertain]
-    bad = [x for x, y in uncertain.items() if not 0.0 <= y < math.inf]
-    if both or bad:
-        raise BadInputError(
-            f'{both[0]} is free and known to a standard deviation: expected one of the two'
-            if both else
-            f'the standard deviation of {bad[0]} is {uncertain[bad[0]]:g}: expected a finite '
-            'number of at least 0')
-    values = quantities.values_of(
-        actuator, {x: y for x, y in known.items() if x not in quantities.GEOMETRY})
-    return complete(values, ('time_unit',) if 'time_unit' in known else ())
+def _check_uncertain(uncertain: Mapping[str, float], free: Sequence[str]) -> None:
+    """Raise `BadInputError` for standard deviations that are none, or of what is sought."""
+    for name, std in uncertain.items():
+        quantities.quantity_of(name)
+        if name in free:
+            raise BadInputError(
+                f'{name} is free and known to a standard deviation: expected one of the two')
+        if not 0.0 <= std < math.inf:
+            raise BadInputError(
+                f'the standard deviation of {name} is {std:g}: expected a finite number of at '
+                'least 0')
 
 
 def _with_errors_of_stamps(best: Fit) -> tuple[Fit, Array]:
@@ -195,7 +184,7 @@ def _conclude(
         verdict, reason, warnings, parameters, best.free, matrix, known.deviation,
         float(np.sqrt(np.mean(best.residual ** 2))), len(best.recording.time), outliers,
         best.recording, best.response.stretch, best.residual, best.weights, best.spread, found,
-        marks, float(np.max(known.correlated)), complete(best.values, best.free), tried, agreed,
+        marks, float(np.max(known.correlated)), best.values, tried, agreed,
         diagnosis.cost(best, marks, alike))
 
 

@@ -11,7 +11,7 @@ from hmsa_ros.identification import diagnosis, quantities
 from hmsa_ros.identification.departures import Departures, departures
 from hmsa_ros.identification.fit import Fit, fit, LEAST_SCALE, moved
 from hmsa_ros.identification.noise import Whiteness, whiteness, widening
-from hmsa_ros.identification.response import complete, respond
+from hmsa_ros.identification.response import respond
 from hmsa_ros.identification.result import Estimate, Identification
 from hmsa_ros.model.equations import Array
 
@@ -128,7 +128,7 @@ def estimates_of(
     quantile = float(stdtrit(known.freedom, 0.975))
     whole = np.sqrt(np.diag(known.covariance) + sum(
         x ** 2 for x in known.missing.considered.values()))
-    values = complete(best.values, best.free)
+    values = best.values
     scales = np.array([quantities.derivative(x, values[x]) for x in best.free])
     matrix = known.covariance * np.outer(scales, scales)
     estimates: dict[str, Estimate] = {}
@@ -149,9 +149,6 @@ def estimates_of(
                 value, math.sqrt(matrix[place, place]), ends[0], ends[1], quantity.unit, True)
         else:
             estimates[name] = Estimate(value, 0.0, value, value, quantity.unit, False)
-    for name in quantities.GEOMETRY:
-        value = values[name]
-        estimates[name] = Estimate(value, 0.0, value, value, 'm', False)
     for place, name in enumerate(best.free):
         if name in lost:
             matrix[place, :] = matrix[:, place] = math.nan

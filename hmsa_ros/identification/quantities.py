@@ -1,13 +1,16 @@
 """What can be estimated: names, units, ranges, and the coordinate in which each is sought."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 import math
 from typing import Any
 
+import numpy as np
+
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.equations import Array
 from hmsa_ros.model.flows import CONSTANTS, FLOWS
 from hmsa_ros.model.flows.record import Flow, MAXWELL
 from hmsa_ros.model.laws import LAWS
@@ -33,6 +36,8 @@ _SCALE = ('only ratios of shear_modulus, density and remanence act on the motion
           'them (weigh the actuator for the density) and leave it out of --free')
 _CREEP = 'record rest far from that without field for several times the time of the creep'
 _NUMBERS = ('', '_2', '_3')
+#: Fields of `ActuatorParameters` that are measured with a ruler, and are never sought.
+GEOMETRY = ('half_length', 'half_thickness')
 #: By name; those of the actuator are named as its parameters are.
 QUANTITIES: dict[str, Quantity] = {
     'shear_modulus': Quantity('Pa', advice=_STEP),
@@ -70,6 +75,7 @@ QUANTITIES: dict[str, Quantity] = {
         '', 1.0, 'linear', constant.minimum, constant.maximum,
         f'{_CREEP}, from steps of different heights')
        for name, constant in CONSTANTS.items() for x in _NUMBERS},
+    **dict.fromkeys(GEOMETRY, Quantity('m')),
 }
 #: Ratio and time of each branch of creep.
 BRANCHES = tuple((f'viscoelastic_ratio{x}', f'viscoelastic_time{x}') for x in _NUMBERS)
@@ -87,8 +93,6 @@ DEFAULT_FREE = (
     'shear_modulus', 'damping_coefficient', 'chain_limit', 'remanence', 'stretch_bias')
 #: What levels at rest alone hold, if the frequency is not known.
 STATIC = {'chain_limit', 'stretch_bias', 'stretch_gain', 'initial_stretch'}
-#: Fields of `ActuatorParameters` that are measured with a ruler, and are never sought.
-GEOMETRY = ('half_length', 'half_thickness')
 
 
 def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, ...]:
@@ -113,11 +117,12 @@ def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, .
         whole[first] = [x for x in constants if x.split('.')[1] == first]
     free = tuple(dict.fromkeys(z for x in names for y in [
         x.strip().removeprefix('actuator.').removeprefix('law.')] for z in whole.get(y, [y])))
-    unknown = [x for x in free if x not in QUANTITIES and x not in constants]
+    possible = [*(x for x in QUANTITIES if x not in GEOMETRY), *constants]
+    unknown = [x for x in free if x not in possible]
     if unknown or not free:
         raise BadInputError(
             f'free parameter {", ".join(map(repr, unknown)) or "missing"}: expected some of '
-            f'{", ".join([*QUANTITIES, *constants])}')
+            f'{", ".join(possible)}')
     sought = [x for x in free if x in constants]
     scales = [x for x in free if x in ('shear_modulus', 'time_unit')]
     if sought and scales:
@@ -186,55 +191,66 @@ def constant_values(law: Elastic, modulus: float) -> dict[str, float]:
     return found
 
 
-def with_constants(values: Mapping[str, Any]) -> dict[str, Any]:
+def complete(values: Mapping[str, Any], free: Iterable[str]) -> dict[str, Any]:
     """
-    Return values whose law and shear modulus are those of the constants among them, if any.
+    Return values in which the density and the time unit agree, and the law and its constants.
 
-    Raises `BadInputError` if there is no such law.
+    Where the time unit is free the density follows from it, else the other way round. Raises
+    `BadInputError` if there is no law with such constants.
     """
-    law: Elastic | None = values.get('law')
-    scaled = None if law is None else LAWS[law.law].scaled
-    names = constants_of(law)
-    if scaled is None or not any(x in values for x in names):
-        return dict(values)
-    given: dict[str, Any] = {}
-    for name, (constant, _) in names.items():
-        if constant.kind is list:
-            given.setdefault(constant.name, []).append(values[name])
-        else:
-            given[constant.name] = values[name]
-    modulus, elastic = scaled(given)
-    return {**values, 'law': elastic, 'shear_modulus': modulus}
+    done = dict(values)
+    law: Elastic | None = done['law']
+    names, scaled = constants_of(law), law and LAWS[law.law].scaled
+    if scaled and any(x in done for x in names):
+        given: dict[str, Any] = {}
+        for name, (constant, _) in names.items():
+            if constant.kind is list:
+                given.setdefault(constant.name, []).append(done[name])
+            else:
+                given[constant.name] = done[name]
+        done['shear_modulus'], done['law'] = scaled(given)
+    if 'time_unit' in free:
+        done['density'] = done['shear_modulus'] * (done['time_unit'] / done['half_length']) ** 2
+    else:
+        done['time_unit'] = done['half_length'] * math.sqrt(
+            done['density'] / done['shear_modulus'])
+    return done
 
 
 def quantity_of(name: str) -> Quantity:
-    """Return what is known of a parameter, a constant of a law included."""
-    found = QUANTITIES.get(name)
-    return found if found is not None else _OF_LAWS['.'.join(name.split('.')[:2])]
+    """
+    Return what is known of a parameter, a constant of a law included.
+
+    Raises `BadInputError` if there is none of that name.
+    """
+    found = QUANTITIES.get(name) or _OF_LAWS.get('.'.join(name.split('.')[:2]))
+    if found is None:
+        raise BadInputError(
+            f'unknown parameter {name!r}: expected some of {", ".join(QUANTITIES)}')
+    return found
 
 
 def values_of(
         actuator: ActuatorParameters, others: Mapping[str, float] | None = None
 ) -> dict[str, Any]:
     """
-    Return values of all quantities, geometry included, and the law under the name ``law``.
+    Return values of all quantities, and the law under the name ``law``.
 
-    Others are those of coil and sensor that are not the defaults. Raises `BadInputError` if a name
-    of them is unknown or a value out of range.
+    Others take the place of those of the actuator and of the defaults. Raises `BadInputError` if a
+    name of them is unknown or a value out of range.
     """
-    values: dict[str, Any] = {name: x.default for name, x in QUANTITIES.items()}
-    values |= actuator.numbers | {
-        'time_unit': actuator.time_unit, 'law': actuator.law, 'initial_stretch': actuator.rest}
-    for name, value in (others or {}).items():
-        quantity = QUANTITIES.get(name)
-        if quantity is None:
-            raise BadInputError(
-                f'unknown parameter {name!r}: expected some of {", ".join(QUANTITIES)}')
+    others = {x: float(y) for x, y in (others or {}).items()}
+    for name, value in others.items():
+        quantity = quantity_of(name)
         if not (quantity.least <= value <= quantity.most and math.isfinite(value)):
             raise BadInputError(
                 f'{name} is {value:g}: expected a finite number of at least {quantity.least:g}')
-        values[name] = float(value)
-    return values
+    actuator = replace(
+        actuator, half_length=others.get('half_length', actuator.half_length),
+        half_thickness=others.get('half_thickness', actuator.half_thickness))
+    return {name: x.default for name, x in QUANTITIES.items()} | actuator.numbers | {
+        'time_unit': actuator.time_unit, 'law': actuator.law, 'initial_stretch': actuator.rest,
+        **others}
 
 
 def actuator_of(values: Mapping[str, Any]) -> ActuatorParameters:
@@ -298,6 +314,20 @@ def from_coordinate(name: str, x: float) -> float:
     if scale == 'inverse':
         return 1.0 / x if x > 1e-9 else 1e9
     return x
+
+
+def coordinates(values: Mapping[str, Any], free: Iterable[str]) -> Array:
+    """Return the coordinates of the free parameters."""
+    return np.array([to_coordinate(x, values[x]) for x in free], dtype=np.float64)
+
+
+def values_at(values: Mapping[str, Any], free: Sequence[str], z: Array) -> dict[str, Any]:
+    """Return values with those of the coordinates of the free parameters, kept in their ranges."""
+    found = dict(values)
+    for name, x in zip(free, z.tolist(), strict=True):
+        quantity = quantity_of(name)
+        found[name] = min(max(from_coordinate(name, x), quantity.least), quantity.most)
+    return found
 
 
 def derivative(name: str, value: float) -> float:

@@ -25,6 +25,10 @@ from hmsa_ros.motion import theta as places
 RTOL = 1e-8
 _NOTHING: Array = np.empty(0)
 _SENSOR = ('stretch_bias', 'stretch_gain', 'sensor_latency')
+# Parameters that numbers of theta are proportional to, in their order.
+_LINEAR = {
+    'shear_modulus': places.STIFFNESS, 'damping_coefficient': places.DAMPING,
+    'remanence': places.DRIVE, 'constant_force': places.FORCE}
 # Parameters that are numbers of theta as they are.
 _PLACES = {
     'coil_time_constant': places.LAG, 'initial_stretch': places.STRETCH,
@@ -39,6 +43,7 @@ _PLACES = {
 class Response:
     """What the sensor would have shown."""
 
+    values: dict[str, Any]  # of all quantities, as `quantities.complete` returns them
     stretch: Array  # measured, shape (n,)
     rate: Array  # of the block in 1/s
     # Of the measured stretch by the coordinates of the free parameters, shape (n, p).
@@ -52,36 +57,33 @@ def _chain(
     """Return theta of the motion and, by name, its derivatives by the free parameters."""
     geometry, density = quantities.geometry_of(values), values['density']
     inertia = density * geometry.half_length ** 2
-    a = values['shear_modulus'] / inertia
+    modulus, remanence = values['shear_modulus'], values['remanence']
+    a, k = modulus / inertia, remanence / (MU_0 * inertia)
     per_damping = 0.5 * geometry.c1 * geometry.half_length / geometry.damped / inertia
-    d = per_damping * values['damping_coefficient']
-    k = values['remanence'] / (MU_0 * inertia)
     per_force = 1.0 / (geometry.loaded * inertia)
-    f = per_force * values['constant_force']
     theta = np.zeros(places.FIRST_BRANCH + places.BRANCH * branches)
-    theta[:places.FIRST_BRANCH] = (
-        a, d, k, f, values['coil_time_constant'], values['initial_stretch'],
-        values['initial_rate'])
+    theta[:places.LAG] = (
+        a, per_damping * values['damping_coefficient'], k, per_force * values['constant_force'])
+    by_value = dict(zip(
+        _LINEAR.values(), (a / modulus, per_damping, k / remanence, per_force), strict=True))
+    for name, i in _PLACES.items():
+        if i < len(theta):
+            theta[i] = values[name]
     if 'creep' in values:
         rows = np.array(values['creep'].rows())
         rows[:, SPEED] = values['creep'].times
         theta[places.FIRST_BRANCH:] = rows[:, :places.BRANCH].ravel()
     else:
-        for name, i in _PLACES.items():
-            if places.FIRST_BRANCH <= i < len(theta):
-                theta[i] = values[name]
         theta[places.FIRST_BRANCH + places.FLOW::places.BRANCH] = quantities.flow_of(
             values, free).kind
-    per_density = {
-        places.STIFFNESS: -a / density, places.DAMPING: -d / density,
-        places.DRIVE: -k / density, places.FORCE: -f / density}
+    per_density = {i: -float(theta[i]) / density for i in by_value}
     chain: dict[str, dict[int, float]] = {}
     for name in free:
         if name in _PLACES:
             chain[name] = {_PLACES[name]: 1.0}
-        elif name == 'shear_modulus':
-            chain[name] = {places.STIFFNESS: a / values[name]}
-            if 'time_unit' in free:
+        elif name in _LINEAR:
+            chain[name] = {_LINEAR[name]: by_value[_LINEAR[name]]}
+            if name == 'shear_modulus' and 'time_unit' in free:
                 # The density that goes with a time unit, L sqrt(rho/G).
                 for i, x in per_density.items():
                     chain[name][i] = chain[name].get(i, 0.0) + x * density / values[name]
@@ -89,12 +91,6 @@ def _chain(
             chain[name] = {i: 2.0 * x * density / values[name] for i, x in per_density.items()}
         elif name == 'density':
             chain[name] = per_density
-        elif name == 'remanence':
-            chain[name] = {places.DRIVE: k / values[name]}
-        elif name == 'damping_coefficient':
-            chain[name] = {places.DAMPING: per_damping}
-        elif name == 'constant_force':
-            chain[name] = {places.FORCE: per_force}
         elif name == 'chain_limit':
             chain[name] = {places.CONSTANT: -1.0 / values[name] ** 2}
         elif name not in _SENSOR:
@@ -103,23 +99,6 @@ def _chain(
             chain[name] = {places.CONSTANT + constant.place + 2 * i: (
                 1.0 / values['shear_modulus'] if constant.unit == 'Pa' else 1.0)}
     return theta, chain
-
-
-def complete(values: Mapping[str, float], free: Sequence[str]) -> dict[str, float]:
-    """
-    Return values in which the density and the time unit agree, and the law and its constants.
-
-    Where the time unit is free the density follows from it, else the other way round. Raises
-    `BadInputError` if there is no law with such constants.
-    """
-    done = quantities.with_constants(values)
-    if 'time_unit' in free:
-        done['density'] = (
-            done['shear_modulus'] * (done['time_unit'] / done['half_length']) ** 2)
-    else:
-        done['time_unit'] = done['half_length'] * math.sqrt(
-            done['density'] / done['shear_modulus'])
-    return done
 
 
 @lru_cache(maxsize=32)
@@ -145,7 +124,7 @@ class Setup:
             cls, values: Mapping[str, Any], free: Sequence[str], more: Sequence[int] = ()
     ) -> 'Setup':
         """
-        Work it out for values as `complete` returns them, with arrays of its own.
+        Work it out for values as `quantities.complete` returns them, with arrays of its own.
 
         Maxwell branches may be given under the name ``creep``. More places to differentiate by
         come last, and each is a column of its own.
@@ -186,12 +165,11 @@ def respond(
     the motion to differentiate by are columns of the Jacobian, after those of the free parameters.
     """
     try:
-        values = complete(values, free)
+        values = quantities.complete(values, free)
     except BadInputError:
         return None
     setup = Setup.of(values, free, more)
     theta, material, wanted = setup.theta, setup.material, setup.wanted
-    branches = setup.branches
     times = recording.time - values['sensor_latency']
     begin = float(recording.time[0])
     if recording.at_rest:
@@ -217,12 +195,12 @@ def respond(
     n = len(times)
     stretch, rate, raw = np.empty(n), np.empty(n), np.empty((n, len(wanted)))
     if not motion.respond(
-            theta, material, branches, wanted, start, begins, levels, slopes, float(levels[0]),
-            0.0, times, rtol, stretch, rate, raw, _NOTHING, _NOTHING, _NOTHING):
+            theta, material, setup.branches, wanted, start, begins, levels, slopes,
+            float(levels[0]), 0.0, times, rtol, stretch, rate, raw, _NOTHING, _NOTHING, _NOTHING):
         return None
     raw *= values['stretch_gain']
     shown, jacobian = sensed(values, free, stretch, rate, raw[:, :inner_count] @ setup.mixing)
-    return Response(shown, rate, jacobian, raw[:, inner_count:])
+    return Response(values, shown, rate, jacobian, raw[:, inner_count:])
 
 
 def sensed(
@@ -241,9 +219,3 @@ def sensed(
         if name in by_sensor:
             by[:, j] = by_sensor[name]
     return gain * stretch + values['stretch_bias'], by
-
-
-def clip(name: str, value: float) -> float:
-    """Return a value within its range."""
-    quantity = quantities.quantity_of(name)
-    return min(max(value, quantity.least), quantity.most)

@@ -11,7 +11,7 @@ from hmsa_ros.identification import diagnosis
 from hmsa_ros.identification.fit import Fit, fit, loss, robust_scale
 from hmsa_ros.identification.quantities import STATIC
 from hmsa_ros.identification.recording import Recording
-from hmsa_ros.identification.response import complete, respond, sensed, Setup
+from hmsa_ros.identification.response import respond, sensed, Setup
 from hmsa_ros.identification.start import at_units, scan, seeks_time, segments, starts, static
 from hmsa_ros.model.equations import Array
 
@@ -149,7 +149,7 @@ def rivals(best: Fit) -> tuple[Fit, list[Fit]]:
             best.values, best.free):
         return best, []
     found = [best]
-    natural = diagnosis.frequency_of(best) * complete(best.values, best.free)['time_unit']
+    natural = diagnosis.frequency_of(best) * best.values['time_unit']
     units = np.asarray(natural / np.geomspace(
         1.0 / longest, _HIGHEST / gap, _FREQUENCIES), dtype=np.float64)
     for start in at_units(
@@ -176,7 +176,7 @@ def unmoved(best: Fit) -> set[str]:
     # Slow to load, and no use to a planner that estimates.
     from scipy.special import fdtrc
 
-    recording, values = best.recording, complete(best.values, best.free)
+    recording, values = best.recording, best.values
     setup = Setup.of(values, best.free)
     place = np.searchsorted(
         recording.level_times, recording.time - values['sensor_latency'], side='right').clip(1) - 1

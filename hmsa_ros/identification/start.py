@@ -303,7 +303,7 @@ def _candidate(
         for name in stresses:
             values[name] *= values['shear_modulus'] / before
         with suppress(BadInputError):
-            values = quantities.with_constants(values)
+            values = quantities.complete(values, ())
     elif 'time_unit' in free or 'density' in free:
         values['density'] = values['shear_modulus'] * (unit / length) ** 2
     values['time_unit'] = unit
