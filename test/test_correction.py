@@ -139,7 +139,7 @@ def test_a_block_that_is_known_exactly_is_left_alone():
 def test_what_a_course_is_expected_to_leave_is_what_errors_drawn_from_the_covariance_leave():
     prior = Prior.nominal(oracle.BLOCK, ('shear_modulus',), deviations={'shear_modulus': 0.01})
     estimator = Estimator(prior, Options(noise=1e-3))
-    estimator.level(0, 0.0)
+    estimator.set_levels([(0, 0.0)])
     estimator.sample(0, 1.0)
     estimate = estimator.update(MS)
     plan = Planner(oracle.BLOCK, PlannerOptions(lead_time=0)).setpoint(TARGET, MS)

@@ -32,7 +32,7 @@ def run(samples, free=None, options=None, prior=None, times=SAMPLED, levels=LEVE
                                                           'stretch_bias'))
     estimator = Estimator(prior, options)
     for time, level in zip(TIMES, levels, strict=True):
-        estimator.level(ns(time), level)
+        estimator.set_levels([(ns(time), level)])
     estimate = None
     for time, value in zip(times, samples, strict=True):
         estimator.sample(ns(time), value)
@@ -217,7 +217,7 @@ def test_parameters_that_are_frozen_stay_with_their_deviations_and_are_learnt_ag
     samples = measured(block)
     estimator = Estimator(Prior.nominal(oracle.BLOCK), Options(noise=NOISE))
     for time, level in zip(TIMES, LEVELS, strict=True):
-        estimator.level(ns(time), level)
+        estimator.set_levels([(ns(time), level)])
     found = {}
     for i, (time, value) in enumerate(zip(SAMPLED, samples, strict=True)):
         # Frozen in mid-move, with little learnt.
@@ -315,7 +315,7 @@ def _unsure(*, expected=True):
     """Return an estimate of a block as given whose G and ratio of creep lean on each other."""
     prior = Prior.nominal(oracle.BLOCK, suspects=True)
     estimator = Estimator(prior)
-    estimator.level(0, 0.0)
+    estimator.set_levels([(0, 0.0)])
     found = estimator.predict(0)
     places = [found.free.index(x) for x in ('shear_modulus', 'viscoelastic_ratio')]
     covariance = np.zeros_like(found.covariance)

@@ -189,11 +189,6 @@ class Estimator:
         window = self._window
         return 0 if window is None else int(np.sum(window.time >= self._seconds(stamp)))
 
-    def level(self, stamp: int, flux_density: float) -> None:
-        """Take in a level in T from a stamp in ns on; it supersedes what comes at or after it."""
-        place = bisect_left(self._levels, stamp, key=lambda x: x[0])
-        self._levels[place:] = [(stamp, flux_density)]
-
     def set_levels(self, levels: Sequence[tuple[int, float]]) -> None:
         """Take in all levels from a time on, by stamps in ns and in T; earlier ones stay."""
         first = levels[0][0]
@@ -265,14 +260,14 @@ class Estimator:
         if motion is None:
             return None
         return self._estimate(
-            time, replace(found, motion=motion, residual=np.zeros(0)), window)
+            time, replace(found, here=found.here._replace(motion=motion)), window)
 
     def _follow(
             self, found: Solution, window: Window, time: float, free: Sequence[str] = ()
     ) -> Motion | None:
         """Return the motion of a solution at a time in s."""
         return follow(
-            found.values, free, (float(found.z[-2]), float(found.z[-1])), self._as_levels(),
+            found.here.values, free, (float(found.z[-2]), float(found.z[-1])), self._as_levels(),
             window.begin, np.array([time]))
 
     def _leave_behind(self, time: int) -> None:
@@ -299,7 +294,7 @@ class Estimator:
         if known is None:
             gone = min(_DRIFT ** 2 * max(self._seconds(time), 0.0), 1.0)
             known = found.covariance[:-2, :-2] + np.diag(gone * prior.spread ** 2)
-        values = {x: y for x, y in found.values.items() if x != 'behind'}
+        values = {x: y for x, y in found.here.values.items() if x != 'behind'}
         return replace(prior, values=values, covariance=known)
 
     def _new_window(self, stamp: int, shown: float, prior: Prior | None = None) -> Window:
@@ -358,18 +353,19 @@ class Estimator:
         return None
 
     def _follow_noise(self, found: Solution) -> None:
-        if self.options.noise or len(found.residual) < _FEWEST_FOR_NOISE:
+        residual = found.here.residual
+        if self.options.noise or len(residual) < _FEWEST_FOR_NOISE:
             return
-        seen = max(robust_scale(found.residual), _LEAST_NOISE)
+        seen = max(robust_scale(residual), _LEAST_NOISE)
         gain = _NOISE_GAIN if self.noise < 3.0 * seen else 0.5
         self.noise = math.exp(
             (1.0 - gain) * math.log(self.noise) + gain * math.log(seen))
 
     def _estimate(self, time: int, found: Solution, window: Window) -> Estimate:
         state, covariance, off, doubt = found.at_end()
-        values = found.values
-        if found.motion.behind:
-            values = {**values, 'behind': found.motion.behind}
+        values = found.here.values
+        if found.here.motion.behind:
+            values = {**values, 'behind': found.here.motion.behind}
         # A bias may be a force as well, or told from one by the gain of the sensor alone.
         variances = np.where(
             [x == 'stretch_bias' for x in (*self.prior.free, '', '')],
@@ -378,7 +374,7 @@ class Estimator:
             covariance[:-2, :-2], off = self._fixed, np.zeros_like(off)
             variances, doubt = np.diag(covariance), Doubt(off, covariance)
         deviations = {
-            name: abs(derivative(name, found.values[name])) * math.sqrt(variances[i])
+            name: abs(derivative(name, values[name])) * math.sqrt(variances[i])
             for i, name in enumerate(self.prior.free)}
         trouble = self.screening.trouble or self._strange(found.z)
         return Estimate(
@@ -396,8 +392,8 @@ class Estimator:
 
     def _go_along(self, window: Window, found: Solution, until: float) -> None:
         """Let the oldest samples go, or, where none come any more, the time."""
-        span = _LONGEST * found.values['time_unit']
-        count = len(window.time)
+        here, count = found.here, len(window.time)
+        span = _LONGEST * here.values['time_unit']
         # A whole move is fitted at once: early in one the fit is no place to sum it up from.
         before = int(np.searchsorted(window.time, self._seconds(self._move_begins(until))))
         if before > 1:
@@ -417,7 +413,7 @@ class Estimator:
         time = float(window.time[place]) if place < count else until
         drift = np.zeros(len(window.mean))
         # Vibration decays to nothing, and a state that is known exactly has no covariance.
-        drift[-2:] = _AT_REST ** 2, (_AT_REST / found.values['time_unit']) ** 2
+        drift[-2:] = _AT_REST ** 2, (_AT_REST / here.values['time_unit']) ** 2
         if self._fixed is None:
             drift[:-2] = _DRIFT ** 2 * (time - window.begin) * self.prior.spread ** 2
         shift = round(time * NANOSECONDS)
@@ -425,21 +421,21 @@ class Estimator:
         # How a rest depends on parameters shows in the motion after it.
         at = window.rest if self.learning is (self._fixed is None) and self._unchanged(
             self._origin, self._origin + shift, 0.0) else None
-        moved = window.move_on(place, time, found, self.noise, drift) if at is None else (
-            window.rest_on(at, place, time, found, self.noise, drift))
+        moved = window.move_on(place, time, found.z, here, self.noise, drift) if at is None else (
+            window.rest_on(at, place, time, here, self.noise, drift))
         self._fix(moved, found)
-        if found.motion.behind:
+        if here.motion.behind:
             until_then = self._follow(found, window, time)
             if until_then is not None:
-                found = replace(found, values={**found.values, 'behind': until_then.behind})
+                here = here._replace(values={**here.values, 'behind': until_then.behind})
                 moved.values = {**moved.values, 'behind': until_then.behind}
         moved.begin -= seconds
         moved.time = moved.time - seconds
         self._origin += shift
         self._window = moved
         self._solution = replace(found, z=np.append(
-            found.z[:-2], [found.motion.stretch[place], found.motion.rate[place]]),
-            covariance=moved.covariance if at is None else found.covariance,
+            found.z[:-2], [here.motion.stretch[place], here.motion.rate[place]]),
+            here=here, covariance=moved.covariance if at is None else found.covariance,
             off=np.zeros_like(found.off), instead=np.zeros_like(found.off),
             doubt=Doubt(np.zeros_like(found.off), moved.covariance) if at is None else found.doubt)
         first = bisect_right(self._levels, self._origin, key=lambda x: x[0]) - 1

@@ -32,7 +32,6 @@ DEVIATIONS = {
 _LEAST_LIMIT, _LEAST_ZETA = 0.02, 0.1
 # The planner has no parameters of these.
 _SENSED = ('stretch_bias', 'stretch_gain', 'sensor_latency', 'constant_force')
-_SCALED = ('constant_force', 'sensor_latency', 'coil_time_constant')
 _NOT_TRACKED = (
     'initial_stretch', 'initial_rate', *(x for x in QUANTITIES if x.startswith('viscoelastic_')))
 #: Tracked unless others are named.
@@ -90,14 +89,12 @@ class Prior:
             values['creep'] = actuator.creep.held
         if 'chain_limit' in free:
             values['chain_limit'] = min(values['chain_limit'], 1e9)
-        size = []
+        size, given = [], deviations or {}
         for name in free:
-            deviation = (deviations or {}).get(name, DEVIATIONS[name])
-            if name in (deviations or {}) and name in _SCALED:
-                pass
-            elif name == 'constant_force':
+            deviation = given.get(name, DEVIATIONS[name])
+            if name == 'constant_force' and name not in given:
                 deviation /= actuator.load_per_newton
-            elif name in _SCALED:
+            elif name in ('sensor_latency', 'coil_time_constant') and name not in given:
                 deviation *= actuator.time_unit
             elif name == 'damping_coefficient':
                 deviation *= max(values[name], _LEAST_ZETA * actuator.damping_unit)

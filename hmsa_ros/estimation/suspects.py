@@ -72,11 +72,6 @@ class Suspects:
         """Place of the gain of the sensor if that is suspected; -1 else."""
         return next((i for i in self.places if self.names[i] == GAIN and i >= self.named), -1)
 
-    @property
-    def all_sought(self) -> tuple[int, ...]:
-        """Places of all suspects that may be sought."""
-        return tuple(i for i in self.places if i != self.gain)
-
     @cached_property
     def with_gain(self) -> NDArray[np.bool_]:
         """Which sets have the gain of the sensor, shape (n,)."""

@@ -9,7 +9,7 @@ along with the motion (C. V. Rao, J. B. Rawlings and D. Q. Mayne, IEEE Trans. Au
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 import math
 from typing import Any, NamedTuple
 
@@ -75,11 +75,7 @@ class Solution:
     """The most probable motion."""
 
     z: Array  # coordinates, stretch and rate at the begin, shape (q,)
-    values: dict[str, Any]  # of all quantities
-    motion: Motion  # at the samples, and at the time asked for last
-    by: Array  # derivatives of what the sensor shows by z, shape (n, q)
-    residual: Array  # measured less simulated, shape (n,)
-    weights: Array  # how far each counts, 0 to 1
+    here: Trial  # what these make of the samples
     covariance: Array  # of z, about itself
     off: Array  # how far what is expected is from z, shape (q,)
     # As `off` of what plans use, with what shows as much as a gain of the sensor in its place.
@@ -88,9 +84,9 @@ class Solution:
 
     def at_end(self) -> tuple[Array, Array, Array, Doubt]:
         """Return coordinates and state at the time asked for, their covariance, how far off."""
-        change = transport(self.motion, len(self.residual))
-        state = np.append(
-            self.z[:-2], [self.motion.stretch[-1], self.motion.rate[-1]])
+        motion = self.here.motion
+        change = transport(motion, -1)
+        state = np.append(self.z[:-2], [motion.stretch[-1], motion.rate[-1]])
         return state, change @ self.covariance @ change.T, change @ self.off, Doubt(
             change @ self.doubt.off, change @ self.doubt.covariance @ change.T)
 
@@ -130,6 +126,7 @@ class Window:
     weighed: int = 0  # samples there were when these were chosen
     others: Others = Others(1.0, *(np.zeros(()),) * 3)  # than these
     rest: Rest | None = None  # that it begins at
+    information: Array = field(init=False)  # inverse of the covariance, as it was settled
 
     def values_at(self, z: Array) -> dict[str, Any]:
         """Return the values of all quantities for coordinates."""
@@ -141,34 +138,37 @@ class Window:
 
         Far from them a force shifts it otherwise, so that one would seem to be shown.
         """
-        if self.rest is None:
-            return
+        if self.rest is not None:
+            self._rest(self.rest, z, off)
+        self.information = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
+
+    def _rest(self, known: Rest, z: Array, off: float) -> None:
+        """Begin at a rest."""
         values = self.values_at(z)
-        at = rest(values, self.free, self.rest.level)
+        at = rest(values, self.free, known.level)
         if at is None:
             return
         tie = np.vstack([np.eye(len(z) - 2), at[2], np.zeros(len(z) - 2)])
         there = np.append(z[:-2], [at[0], 0.0])
-        self.mean = there + tie @ (self.rest.mean - z[:-2])
-        self.covariance = tie @ self.rest.covariance @ tie.T
+        self.mean = there + tie @ (known.mean - z[:-2])
+        self.covariance = tie @ known.covariance @ tie.T
         self.covariance[[-2, -1], [-2, -1]] += np.square([off, off * at[1]])
-        if self.rest.weight > 0.0:
+        if known.weight > 0.0:
             state = np.zeros((1, len(z)))
             state[0, -2] = values['stretch_gain']
             shown, by_all = sensed(values, self.free, np.array([at[0]]), np.zeros(1), state)
             by = self._about_rest(values, by_all)[0]
             pull = self.covariance @ by
-            share = pull / (by @ pull + 1.0 / self.rest.weight)
-            self.mean += share * (
-                self.rest.shown - float(shown[0]) - by @ (self.mean - there))
+            share = pull / (by @ pull + 1.0 / known.weight)
+            self.mean += share * (known.shown - float(shown[0]) - by @ (self.mean - there))
             self.covariance -= np.outer(share, pull)
 
     def rest_on(
-            self, at: Rest, count: int, begin: float, solution: Solution, noise: float,
+            self, at: Rest, count: int, begin: float, here: Trial, noise: float,
             drift: Array) -> 'Window':
         """Return the window, all at rest, without the first samples; as `move_on`."""
-        before, weights = at.weight, solution.weights[:count]
-        before /= 1.0 + before * float(np.sum(np.square(solution.by[:count][-1:]) @ drift))
+        before, weights = at.weight, here.weights[:count]
+        before /= 1.0 + before * float(np.sum(np.square(here.by[:count][-1:]) @ drift))
         weight = before + float(np.sum(weights)) / noise ** 2
         shown = before * at.shown + float(weights @ self.stretch[:count]) / noise ** 2
         return replace(
@@ -186,37 +186,29 @@ class Window:
         The noise is the standard deviation of a sample. The motion is wanted until a time that is
         not before the last sample. What `simulate` says of the coordinates may be given.
         """
-        prior: Array = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
-
         def descend(z: Array, here: Trial | None = None) -> Found | None:
-            return self._descend(z, here, levels, noise, until, prior)
-
-        def look(found: Found) -> Found:
-            return self._look(found, descend)
+            return self._descend(z, here, levels, noise, until)
 
         found = descend(z, here) or descend(self._at_ease(self.mean))
         if found is None:
             return None
         if len(self.time) >= _MORE * self.weighed or self._is_poor(found, noise):
-            found = look(found)
+            found = self._look(found, descend)
             if self._is_poor(found, noise):
                 # There may be another valley.
                 before = self.suspected, self.others
-                self.suspected = self.suspects.all_sought
+                self.suspected = tuple(
+                    i for i in self.suspects.places if i != self.suspects.gain)
                 other = descend(self._at_ease(self.mean))
-                if other is not None:
-                    other = look(other)
-                if other is not None and other.here.cost < found.here.cost:
+                other = other and self._look(other, descend)
+                if other and other.here.cost < found.here.cost:
                     found = other
                 else:
                     self.suspected, self.others = before
         sure, off, square, instead = self.others
-        _, motion, residual, by, weights, _ = found.here
-        covariance = inverse(found.matrix, found.loose)
         return Solution(
-            found.z, found.here.values, motion, by, residual, weights,
-            sure * covariance + square, np.broadcast_to(off, z.shape),
-            np.broadcast_to(instead, z.shape), self._doubt(found))
+            found.z, found.here, sure * inverse(found.matrix, found.loose) + square,
+            np.broadcast_to(off, z.shape), np.broadcast_to(instead, z.shape), self._doubt(found))
 
     def _doubt(self, found: Found) -> Doubt:
         """Return what is expected where a constant force and a gain are wrong besides."""
@@ -241,20 +233,20 @@ class Window:
         return descend(self._at_ease(found.z)) or found
 
     def _descend(
-            self, z: Array, here: Trial | None, levels: Levels, noise: float, until: float,
-            prior: Array) -> Found | None:
+            self, z: Array, here: Trial | None, levels: Levels, noise: float, until: float
+    ) -> Found | None:
         """
         Seek the most probable coordinates of what is sought.
 
         The last step, which is small, is not simulated.
         """
-        here = here or self.simulate(z, levels, noise, until, prior)
+        here = here or self.simulate(z, levels, noise, until)
         if here is None:
             return None
         for number in range(_PASSES + 1):
             weighted = here.weights[:, None] * here.by / noise ** 2
-            matrix = prior + here.by.T @ weighted
-            gradient = weighted.T @ here.residual + prior @ (self.mean - z)
+            matrix = self.information + here.by.T @ weighted
+            gradient = weighted.T @ here.residual + self.information @ (self.mean - z)
             step, loose = self._step(z, matrix, gradient)
             if float(step @ matrix @ step) < _SMALL ** 2:
                 z = z + step
@@ -263,7 +255,7 @@ class Window:
                 break
             there = None
             for _ in range(_HALVINGS if number < _PASSES else 0):
-                there = self.simulate(self._bounded(z + step), levels, noise, until, prior)
+                there = self.simulate(self._bounded(z + step), levels, noise, until)
                 if there is not None and there.cost <= here.cost:
                     break
                 step *= 0.4
@@ -300,12 +292,9 @@ class Window:
             np.maximum(low, -longest), np.minimum(high, longest))
 
     def simulate(
-            self, z: Array, levels: Levels, noise: float, until: float, prior: Array | None = None
-    ) -> Trial | None:
-        """Return what coordinates make of the samples; the prior is the inverse covariance."""
+            self, z: Array, levels: Levels, noise: float, until: float) -> Trial | None:
+        """Return what coordinates make of the samples."""
         values, times = self.values_at(z), np.append(self.time, until)
-        if prior is None:
-            prior = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
         motion = follow(
             values, self.free, (float(z[-2]), float(z[-1])), levels, self.begin,
             times - values['sensor_latency'])
@@ -315,7 +304,8 @@ class Window:
         shown, by = motion.measured(values, self.free)
         residual: Array = self.stretch - shown[:n]
         apart = z - self.mean
-        cost = loss(residual, noise, convex=True) + 0.5 * float(apart @ prior @ apart)
+        cost = loss(residual, noise, convex=True) + 0.5 * float(
+            apart @ self.information @ apart)
         return Trial(
             values, motion, residual, self._about_rest(values, by[:n]),
             weights_of(residual, noise, convex=True), cost)
@@ -328,7 +318,7 @@ class Window:
         return by
 
     def move_on(
-            self, count: int, begin: float, solution: Solution, noise: float,
+            self, count: int, begin: float, z: Array, here: Trial, noise: float,
             drift: Array) -> 'Window':
         """
         Return the window without the first samples, and with a prior that knows them.
@@ -336,19 +326,16 @@ class Window:
         It begins at the time of the next sample, or at the time asked for last. The drift is the
         variance that parameters and state gain on the way, shape (q,).
         """
-        by, weights = solution.by[:count], solution.weights[:count, None]
-        prior: Array = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
-        matrix = prior + by.T @ (weights * by) / noise ** 2
-        gradient = by.T @ (solution.weights[:count] * solution.residual[:count]) / noise ** 2
-        gradient = gradient + prior @ (self.mean - solution.z)
-        every = np.ones(len(self.mean), dtype=np.bool_)
-        covariance = inverse(matrix, every)
-        step = covariance @ gradient
-        change = transport(solution.motion, count)
-        here = np.append(
-            solution.z[:-2], [solution.motion.stretch[count], solution.motion.rate[count]])
+        by, weights = here.by[:count], here.weights[:count]
+        matrix = self.information + by.T @ (weights[:, None] * by) / noise ** 2
+        gradient = by.T @ (weights * here.residual[:count]) / noise ** 2
+        gradient = gradient + self.information @ (self.mean - z)
+        covariance = inverse(matrix, np.ones(len(z), dtype=np.bool_))
+        change = transport(here.motion, count)
+        there = np.append(z[:-2], [here.motion.stretch[count], here.motion.rate[count]])
+        there = there + change @ (covariance @ gradient)
         covariance = change @ covariance @ change.T + np.diag(drift)
         return Window(
-            self.values, self.free, here + change @ step,
+            self.values, self.free, there,
             0.5 * (covariance + covariance.T), self.bounds, begin,
             self.time[count:], self.stretch[count:], self.suspects, self.suspected)
