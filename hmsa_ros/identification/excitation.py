@@ -8,7 +8,6 @@ levels and dwells is repeated; levels and dwells are sought at random and improv
 """
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 import math
 from typing import TYPE_CHECKING
@@ -23,7 +22,7 @@ from hmsa_ros.model import equations
 from hmsa_ros.model.delivery import Delivery
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.moves import Limits, State
-from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.model.status import RefusedError
 from hmsa_ros.planning.sequence import plan_sequence
 from hmsa_ros.planning.setpoint import Setpoint
@@ -41,6 +40,7 @@ _LEAST_DWELL, _MOST_DWELL = 0.2, 6.0  # periods on a level
 _BEGIN = 0.2  # periods of rest before the first level
 _LAST = 3.0  # durations of a period that the last move and its rest take
 _SHORTEST = 3.0  # duration in periods that holds a sequence at all
+_PERIODS = 180.0  # duration unless another is given
 _MARGIN = 0.95  # of the way to the limits of the chains
 #: The paper's sequence, and a pass of unshaped steps; from rest.
 PAPER = (0.1, 0.2, 0.4)
@@ -141,12 +141,12 @@ class Designer:
     """
     Searches sequences for one actuator.
 
-    The duration is in s, the rate in samples per second, and the noise the standard deviation of a
-    sample. A duration that holds no sequence is refused.
+    The duration is in s (default 180 periods of the block), the rate in samples per second, and
+    the noise the standard deviation of a sample. A duration that holds no sequence is refused.
     """
 
     def __init__(
-            self, actuator: ActuatorParameters, bounds: Bounds, duration: float, *,
+            self, actuator: ActuatorParameters, bounds: Bounds, duration: float | None, *,
             rate: float = 1000.0, noise: float = 1e-3,
             free: Sequence[str] = quantities.DEFAULT_FREE) -> None:
         least, most = bounds.of_motion(actuator)
@@ -158,6 +158,7 @@ class Designer:
         if not (rate > 0.0 and math.isfinite(rate) and noise > 0.0):
             raise BadInputError(
                 f'rate is {rate:g} Hz and noise {noise:g}: expected finite numbers above 0')
+        duration = _PERIODS * self.period if duration is None else duration
         if not (_SHORTEST + _LAST) * self.period <= duration < math.inf:
             raise BadInputError(
                 f'duration is {duration:g} s: expected at least '
@@ -176,7 +177,6 @@ class Designer:
         lower, upper = equations.stretch_limits(self._group)
         if math.isinf(upper):
             upper = 10.0
-        unit = actuator.flux_density_unit
         rest = self._group.rest
         low = max(least, rest - _MARGIN * (rest - lower))
         high = min(most, rest + _MARGIN * (upper - rest))
@@ -184,7 +184,6 @@ class Designer:
         self._range = (
             max(bounds.flux_density_min, self._holding(low)),
             min(bounds.flux_density_max, self._holding(high)))
-        self._unit = unit
 
     def _holding(self, stretch: float) -> float:
         return float(equations.elastic_force(stretch, self._group)
@@ -209,16 +208,15 @@ class Designer:
             return None
         matrix = response.jacobian.T @ response.jacobian / self._noise ** 2
         sign, size = np.linalg.slogdet(matrix)
-        if sign <= 0.0:
-            return Program(level_times, levels, dict.fromkeys(self._free, math.inf),
-                             -math.inf, reach, rest)
-        deviations = np.sqrt(np.maximum(np.diag(np.linalg.inv(matrix)), 0.0))
+        deviations = np.full(len(matrix), math.inf) if sign <= 0.0 else np.sqrt(
+            np.maximum(np.diag(np.linalg.inv(matrix)), 0.0))
         std = {}
         for name, deviation in zip(self._free, deviations.tolist(), strict=True):
             value = self._values[name]
             absolute = abs(quantities.derivative(name, value)) * deviation
             std[name] = absolute / abs(value) if value else absolute
-        return Program(level_times, levels, std, float(size), reach, rest)
+        return Program(
+            level_times, levels, std, float(size) if sign > 0.0 else -math.inf, reach, rest)
 
     def _ended(self, level_times: Array, levels: Array) -> tuple[Array, Array]:
         """Return a sequence with a move to rest without field at its end."""
@@ -228,23 +226,29 @@ class Designer:
         # Ramps have to be over before the last move begins.
         state = self._respond(
             np.linspace(0.0, end, 50, dtype=np.float64), level_times, levels, 1e-9)
-        time, level = self._actuator.time_unit, float(levels[-1])
-        slew = self._bounds.slew_limit / self._unit * time
-        more = [(end, 0.0)]
-        if state is not None:
-            start = State(
-                float(state.stretch[-1]), float(state.rate[-1]) * time, level / self._unit)
-            with suppress(RefusedError, BadInputError):
-                limits = Limits(self._bounds.flux_density_min / self._unit,
-                                self._bounds.flux_density_max / self._unit)
-                segment, = plan_sequence(
-                    [Setpoint(self._group.rest, math.inf)],
-                    Request.of(self._group, start, limits=limits, delivery=Delivery(slew=slew)))
-                if math.isfinite(segment.move.duration):
-                    more = [
-                        (end + x.time * time, x.load * self._unit) for x in segment.move.levels]
-        return (np.append(level_times, [x for x, _ in more]),
-                np.append(levels, [x for _, x in more]))
+        time, unit = self._actuator.time_unit, self._actuator.flux_density_unit
+        move = None if state is None else self._planned(
+            [Setpoint(self._group.rest, math.inf)], end, Request.of(
+                self._group, State(float(state.stretch[-1]), float(state.rate[-1]) * time,
+                                   float(levels[-1]) / unit),
+                limits=Limits(self._bounds.flux_density_min / unit,
+                              self._bounds.flux_density_max / unit),
+                delivery=Delivery(slew=self._bounds.slew_limit / unit * time)))
+        if move is None or not np.all(np.isfinite(move)):
+            move = np.array([[end, 0.0]])
+        return np.append(level_times, move[:, 0]), np.append(levels, move[:, 1])
+
+    def _planned(
+            self, setpoints: Sequence[Setpoint], begin: float,
+            request: Request | NondimensionalParameters) -> Array | None:
+        """Return times in s, from a begin on, and levels in T of a plan; None without one."""
+        time, unit = self._actuator.time_unit, self._actuator.flux_density_unit
+        try:
+            segments = plan_sequence(setpoints, request)
+        except (RefusedError, BadInputError):
+            return None
+        return np.array([(begin + x.begin * time + y.time * time, y.load * unit)
+                         for x in segments for y in x.move.levels])
 
     def _pattern(self, targets: Array, dwells: Array) -> tuple[Array, Array]:
         """Return the levels of a pattern that is repeated; the first is rest without field."""
@@ -267,11 +271,9 @@ class Designer:
 
     def _score(self, found: Program | None) -> float:
         """Return the information of a sequence inside the limits, with a rest at its end."""
-        if found is None or not found.ends_at_rest:
-            return -math.inf
         low, high = self._reach
-        over = max(low - found.reach[0], found.reach[1] - high)
-        if over > 0.0:
+        if found is None or not found.ends_at_rest or (
+                found.reach[0] < low or found.reach[1] > high):
             return -math.inf
         # The volume, and with as much weight the worst parameter against unshaped steps.
         worst = min(_ratios(self._reference, found.std).values())
@@ -364,18 +366,12 @@ class Designer:
 
     def paper(self) -> Program | None:
         """Return the paper's sequence, shaped; None where there is no plan."""
-        time = self._actuator.time_unit
         span = self.duration / len(PAPER)
-        try:
-            segments = plan_sequence(
-                [Setpoint(self._group.rest + x, span / time) for x in PAPER], self._group)
-        except (RefusedError, BadInputError):
-            return None
-        rows = [(0.0, 0.0)] + [
-            (1e-3 * span + x.begin * time + y.time * time, y.load * self._unit)
-            for x in segments for y in x.move.levels]
-        table = np.array(rows)
-        return self.judge(table[:, 0], table[:, 1])
+        levels = self._planned(
+            [Setpoint(self._group.rest + x, span / self._actuator.time_unit) for x in PAPER],
+            1e-3 * span, self._group)
+        return None if levels is None else self.judge(
+            np.append(0.0, levels[:, 0]), np.append(0.0, levels[:, 1]))
 
 
 def excite(
@@ -389,13 +385,10 @@ def excite(
     block), the rate in samples per second, and the noise as the standard deviation of a sample.
     Bounds or numbers that allow no sequence are refused.
     """
-    bounds = bounds or Bounds()
-    if duration is None:
-        duration = 180.0 * actuator.period
-    designer = Designer(actuator, bounds, duration, rate=rate, noise=noise, free=free)
+    designer = Designer(actuator, bounds or Bounds(), duration, rate=rate, noise=noise, free=free)
     best = designer.search()
     nothing = Program(
         np.zeros(1), np.zeros(1), dict.fromkeys(best.std, math.inf), -math.inf,
         (actuator.rest, actuator.rest), True)
     return Excitation(
-        duration, best, designer.plain() or nothing, designer.paper() or nothing)
+        designer.duration, best, designer.plain() or nothing, designer.paper() or nothing)
