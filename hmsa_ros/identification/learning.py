@@ -224,15 +224,6 @@ class _Mode:
     damping: float
     gain: float = 1.0
 
-    def steps(self, knots: Array, time: Array) -> Array:
-        """Return its response at some times to 1 T from each knot to the next, shape (n, m)."""
-        since = np.maximum(time[:, None] - knots, 0.0) * self.frequency
-        root = math.sqrt(1.0 - self.damping**2)
-        response = self.gain * (1.0 - np.exp(-self.damping * since) * (
-            np.cos(root * since) + self.damping / root * np.sin(root * since)))
-        found: Array = response - np.append(response[:, 1:], np.zeros((len(time), 1)), axis=1)
-        return found
-
     def driven(self, times: Array, levels: Array, time: Array) -> Array:
         """Return its response at some times, from the first on, to levels from others on."""
         power = self.frequency * complex(-self.damping, math.sqrt(1.0 - self.damping**2))
@@ -331,10 +322,10 @@ def learn(
     mode = _second_mode(sequence, trials[0], noise)
     slopes = sequence.derivatives(levels, trial.time)
     if mode is not None:
-        response = mode.steps(sequence.knots, trial.time)
         slopes = slopes + np.concatenate([
-            response[x] / step / math.sqrt(len(x)) for x, step in zip(
-                sequence.windows(trial.time), sequence.steps, strict=True)])
+            np.column_stack([mode.driven(sequence.knots, one, trial.time[x])
+                             for one in np.eye(len(sequence.knots))]) / step / math.sqrt(len(x))
+            for x, step in zip(sequence.windows(trial.time), sequence.steps, strict=True)])
     size = float(np.ptp(np.append(levels, 0.0)))
     # As the noise, and what is expected of the changes, have it.
     weight = max(noise, 1e-7) / min(map(abs, sequence.steps)) / math.sqrt(
