@@ -31,11 +31,9 @@ from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.planning.shapers.request import as_errors, LARGEST_ERROR
 from hmsa_ros.recordings.parameters import Entries, entries_of, values_of
 
-# What coil and sensor have, by the name in parameter files.
-_OTHERS = {
-    'coil_time_constant': 'coil_time_constant', 'stretch_bias': 'stretch_bias',
-    'stretch_gain': 'stretch_gain', 'sensor_latency': 'sensor_latency',
-    'initial_stretch': 'initial_stretch'}
+# What coil and sensor have, named in parameter files as here.
+_OTHERS = (
+    'coil_time_constant', 'stretch_bias', 'stretch_gain', 'sensor_latency', 'initial_stretch')
 _LISTS = dict(zip(
     ('viscoelastic.ratio', 'viscoelastic.time', *(f'viscoelastic.{x}' for x in CONSTANTS)),
     zip(*map(tuple.__add__, quantities.BRANCHES, quantities.FLOWING), strict=True), strict=True))
@@ -89,8 +87,7 @@ def read_belief(path: Path | None, entries: Entries | None = None) -> Belief:
     settings: dict[str, Any] = {
         name: value for _, name, value in sorted(entries, key=lambda x: _RANKS.get(x[0], 0))}
     values = values_of({f'{PLANNER}.{x}': y for x, y in settings.items()}, PLANNER, BLOCK)
-    others = {name: _number(path, key, settings[key])
-              for name, key in _OTHERS.items() if key in settings}
+    others = {x: _number(path, x, settings[x]) for x in _OTHERS if x in settings}
     flow = FLOWS.get(str(settings.get('viscoelastic.flow')), MAXWELL)
     for key, names in _LISTS.items():
         value = settings.get(key) if _has(flow, key) else None
@@ -197,10 +194,10 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
                 if constant.name == key and x in found.names]
             lines.append(_line(key, value, found, *sought))
             written[key] = value
-    for name, key in _OTHERS.items():
+    for name in _OTHERS:
         if name in found.names or name in belief.others:
-            written[key] = found.values[name]
-            lines.append(_line(key, written[key], found, name))
+            written[name] = found.values[name]
+            lines.append(_line(name, written[name], found, name))
     held = [i for i, pair in enumerate(quantities.BRANCHES)
             if found.values[pair[0]] > 0.0 or set(pair + quantities.FLOWING[i]) & set(found.names)]
     flow = quantities.flow_of(found.values, found.names)

@@ -16,17 +16,14 @@ PREFIX = 'identification.'
 _SINGULAR = 1e-12
 
 
-def _nothing() -> Array:
-    return np.zeros((0, 0))
-
-
 @dataclass(frozen=True, eq=False)
 class Known:
     """Values of parameters and their covariance, in SI; empty if nothing was identified."""
 
     names: tuple[str, ...] = ()
     values: tuple[float, ...] = ()  # empty if they are only known from elsewhere
-    covariance: Array = field(default_factory=_nothing)  # shape (p, p)
+    # Of shape (p, p).
+    covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
         matrix, size = self.covariance, len(self.names)
