@@ -222,7 +222,7 @@ def test_begin_in_motion_frees_the_initial_state():
     found = identify(Recording(
         whole.time[late], whole.stretch[late], level_times, whole.levels[1:]))
     assert found.verdict == 'identified', found.reason
-    assert not found.at_rest
+    assert not found.recording.at_rest
     assert found.names[-2:] == ('initial_stretch', 'initial_rate')
     assert max(map(abs, relative(found).values())) < 4.0
 

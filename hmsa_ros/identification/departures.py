@@ -12,6 +12,7 @@ what it may be (S. F. Schmidt, "Application of state-space methods to navigation
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,8 +47,7 @@ _FORCES = {
     places.SQUARE: 'damping by the square of the rate'}
 
 
-@dataclass(frozen=True, eq=False)
-class Departure:
+class Departure(NamedTuple):
     """What a little of something does."""
 
     name: str  # in words
@@ -82,10 +82,10 @@ def _columns(fit: Fit) -> Iterator[Departure]:
     signs = np.sign(np.diff(levels, prepend=levels[0]))
     for i in range(1, len(signs)):
         signs[i] = signs[i] or signs[i - 1]
-    place = np.searchsorted(recording.level_times, time, side='right').clip(1) - 1
-    if len(set(signs[place].tolist()) - {0.0}) > 1:
+    sign = signs[recording.place(time)]
+    if len(set(sign.tolist()) - {0.0}) > 1:
         yield Departure(
-            'hysteresis: rest depends on whether the level was raised or lowered', signs[place])
+            'hysteresis: rest depends on whether the level was raised or lowered', sign)
 
 
 @dataclass(frozen=True, eq=False)

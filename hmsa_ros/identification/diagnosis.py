@@ -1,7 +1,6 @@
 """Whether data hold the parameters, and whether the model holds the data."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -71,17 +70,9 @@ def _of_law(fit: Fit, name: str) -> float:
     return _RELATIVE * max(abs(value), least)
 
 
-@dataclass(frozen=True)
-class Weakness:
-    """Parameters, or a combination of them, that the data do not hold."""
-
-    names: tuple[str, ...]  # parameters without a number
-    words: str  # what is not held, and what to record instead
-
-
-def weakness(fit: Fit, deviation: float, factors: Array) -> Weakness | None:
+def weakness(fit: Fit, deviation: float, factors: Array) -> tuple[set[str], str]:
     """
-    Return what the data do not hold; None if every number can be given.
+    Return what has no number that the data hold, why, and what to record instead; empty if all do.
 
     The deviation is that of a sample; correlation widens those of the parameters by the factors.
     """
@@ -91,9 +82,9 @@ def weakness(fit: Fit, deviation: float, factors: Array) -> Weakness | None:
     size, directions = np.linalg.eigh(matrix)
     size = np.maximum(size, 1e-13 * max(float(size[-1]), 1e-300))
     variances = (directions ** 2) @ (1.0 / size)
-    names = tuple(x for x, y in zip(fit.free, variances, strict=True) if y > 1.0)
+    names = [x for x, y in zip(fit.free, variances, strict=True) if y > 1.0]
     if not names:
-        return None
+        return set(), ''
     sentences = []
     for i in np.flatnonzero(size < 1.0 * len(limits)):
         parts = directions[:, i] * limits
@@ -118,12 +109,12 @@ def weakness(fit: Fit, deviation: float, factors: Array) -> Weakness | None:
         advice = [quantities.QUANTITIES['density'].advice]
     kept = next((x for x in _FIRST_KEPT if x in names), names[0])
     listed = '; '.join(sentences) or 'the recorded motion hardly depends on them'
-    return Weakness(names, (
-        f'{_listed(list(names))} cannot be identified from this recording: {listed}. Instead, '
+    return set(names), (
+        f'{_listed(names)} cannot be identified from this recording: {listed}. Instead, '
         f'{"; or ".join(advice[:3])}; or ' + (
             f'keep what is known, as with --free=-{kept} or --known {kept}=VALUE+-STD'
             if kept in quantities.DEFAULT_FREE else f'leave {kept} out, as with '
-            f'{freeing(fit, [kept])}')))
+            f'{freeing(fit, [kept])}'))
 
 
 def _change(fit: Fit, place: int, change: float, first: float) -> str:
@@ -207,7 +198,7 @@ def mistaken(fit: Fit, chance: float = 0.02) -> bool:
     from scipy.special import bdtrc
 
     out, recording = fit.weights < _OUT, fit.recording
-    changes = recording.level_times[1:][np.diff(recording.levels) != 0.0]
+    changes = recording.changes
     if not np.any(out) or not len(changes):
         return False
     place = np.searchsorted(recording.time, changes)
@@ -226,7 +217,7 @@ def distant(fit: Fit, found: Whiteness) -> bool:
         float(found.autocorrelation[1])) > 0.2
 
 
-def check_plausible(fit: Fit, unknown: Sequence[str] = ()) -> None:
+def check_plausible(fit: Fit, unknown: Collection[str]) -> None:
     """Raise `BadInputError` for what can only come from data in other units."""
     recording = fit.recording
     modulus, ratio = quantities.modulus_of(fit.values.get('law'))

@@ -126,24 +126,25 @@ def fit(
 
     The spread is the deviation of each sample over that of one at rest; all alike without it.
     """
-    return _Search(recording, tuple(free), most, spread).run(values)
+    return _Search(recording, tuple(free), most, np.ones(
+        len(recording.time)) if spread is None else spread).run(values)
 
 
+@dataclass(eq=False)
 class _Search:
     """A descent, with the uncertain switches beside the parameters."""
 
-    def __init__(
-            self, recording: Recording, free: tuple[str, ...], most: int,
-            spread: Array | None) -> None:
-        self._spread: Array = np.ones(len(recording.time)) if spread is None else spread
-        self._recording, self._free = recording, free
-        self._most = most
-        self._passes = 0
-        # First no sample is left out, so that the few in motion are not taken for outliers.
-        self._convex = True
-        # A switch lies anywhere in its interval: as far off as that in the mean.
-        self._deviation = recording.earlier / math.sqrt(12.0)
-        self._middle = -0.5 * recording.earlier
+    _recording: Recording
+    _free: tuple[str, ...]
+    _most: int
+    _spread: Array
+    _passes: int = 0
+    # First no sample is left out, so that the few in motion are not taken for outliers.
+    _convex: bool = True
+
+    @property
+    def _middle(self) -> float:
+        return -0.5 * self._recording.earlier
 
     def _respond(self, values: Mapping[str, float], shifts: Array) -> Response | None:
         self._passes += 1
@@ -156,7 +157,9 @@ class _Search:
         return (self._recording.stretch - response.stretch) / self._spread
 
     def _prior(self, scale: float) -> float:
-        return (scale / self._deviation) ** 2 if self._deviation else 0.0
+        # A switch lies anywhere in its interval: as far off as that in the mean.
+        deviation = self._recording.earlier / math.sqrt(12.0)
+        return (scale / deviation) ** 2 if deviation else 0.0
 
     def _loss(self, residual: Array, shifts: Array, scale: float) -> float:
         apart = float(np.sum((shifts - self._middle) ** 2))

@@ -17,6 +17,7 @@ from hmsa_ros.identification.repeats import repeated
 from hmsa_ros.identification.result import Identification, Verdict
 from hmsa_ros.identification.search import rivals, search, unmoved
 from hmsa_ros.identification.start import begins_at_rest, segments
+from hmsa_ros.interfaces.actuator import parameters_of
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 
@@ -70,8 +71,11 @@ def identify(
     values = quantities.complete(
         quantities.values_of(actuator, known), ('time_unit',) if 'time_unit' in known else ())
     _check_uncertain(uncertain, free)
-    if actuator.law is not None and set(free) & set(quantities.constants_of(actuator.law)):
-        values |= quantities.constant_values(actuator.law, actuator.shear_modulus)
+    constants = quantities.constants_of(actuator.law)
+    if set(free) & set(constants):
+        given = parameters_of(actuator)
+        values |= {name: given[x.name][i] if x.kind is list else given[x.name]
+                   for name, (x, i) in constants.items()}
     sought = [time for ratio, time in quantities.BRANCHES if ratio in free]
     if len(sought) > 1:
         # From the swing on to what is left at the end.
@@ -151,17 +155,17 @@ def _conclude(
         marks = tuple(sorted(
             [*marks, *diagnosis.second_mode(best)], key=lambda x: (-x.found, -x.share)))
     distant = diagnosis.distant(best, found)
-    weak = None if distant else diagnosis.weakness(best, known.deviation, known.proved)
-    lost = set(best.free) if distant else set(weak.names if weak else ())
-    still = set() if weak or distant else unmoved(best)
+    lost, weak = (set(best.free), '') if distant else diagnosis.weakness(
+        best, known.deviation, known.proved)
+    still = set() if lost else unmoved(best)
     if not distant and not others and not still:
-        diagnosis.check_plausible(best, tuple(lost))
+        diagnosis.check_plausible(best, lost)
     verdict: Verdict = 'model_rejected'
     reason = diagnosis.misfit(best, found, marks, alike)
-    if weak is not None:
+    if weak:
         # What the model lacks widens all intervals, and may be why nothing is held.
         verdict = 'not_identifiable'
-        reason = f'{weak.words}; besides, {reason}' if reason else weak.words
+        reason = f'{weak}; besides, {reason}' if reason else weak
     elif not reason and (still or others):
         verdict, lost = 'not_identifiable', still or set(best.free) - quantities.STATIC
         reason = diagnosis.resting(best, still) if still else diagnosis.alike(best, others)
@@ -183,9 +187,8 @@ def _conclude(
     return Identification(
         verdict, reason, warnings, parameters, best.free, matrix, known.deviation,
         float(np.sqrt(np.mean(best.residual ** 2))), len(best.recording.time), outliers,
-        best.recording, best.response.stretch, best.residual, best.weights, best.spread, found,
-        marks, float(np.max(known.correlated)), best.values, tried, agreed,
-        diagnosis.cost(best, marks, alike))
+        best.recording, best, found, marks, float(np.max(known.correlated)), best.values, tried,
+        agreed, diagnosis.cost(best, marks, alike))
 
 
 def _warnings(

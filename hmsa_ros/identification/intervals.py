@@ -135,9 +135,9 @@ def estimates_of(
     constants = [x for x in quantities.constants_of(values.get('law')) if x in values]
     for name in (*quantities.QUANTITIES, *constants):
         value, quantity = values[name], quantities.quantity_of(name)
+        std, ends = 0.0, [value, value]
         if name in lost:
-            estimates[name] = Estimate(
-                math.nan, math.nan, math.nan, math.nan, quantity.unit, True)
+            value, std, ends = math.nan, math.nan, [math.nan, math.nan]
         elif name in best.free:
             place = best.free.index(name)
             half = quantile * float(whole[place])
@@ -145,10 +145,9 @@ def estimates_of(
             ends = sorted(quantities.from_coordinate(name, y) for y in (x - half, x + half))
             if quantity.scale == 'inverse' and x - half <= 1e-9:
                 ends[1] = math.inf
-            estimates[name] = Estimate(
-                value, math.sqrt(matrix[place, place]), ends[0], ends[1], quantity.unit, True)
-        else:
-            estimates[name] = Estimate(value, 0.0, value, value, quantity.unit, False)
+            std = math.sqrt(matrix[place, place])
+        estimates[name] = Estimate(
+            value, std, ends[0], ends[1], quantity.unit, name in best.free)
     for place, name in enumerate(best.free):
         if name in lost:
             matrix[place, :] = matrix[:, place] = math.nan
@@ -191,13 +190,13 @@ def profile(
     std = math.sqrt(float(found.covariance[place, place])) / abs(
         quantities.derivative(name, found.values[name])) if math.isfinite(
             found.covariance[place, place]) else 0.2 * max(abs(centre), 0.1)
-    weights = found.weights / found.spread ** 2
-    base = float(np.sum(weights * found.residual ** 2))
+    best, weights = found.fit, found.fit.root ** 2
+    base = float(np.sum(weights * best.residual ** 2))
     kept = replace(found.recording, notes=())
     rows = []
     for x in centre + 4.0 * std * np.linspace(-1.0, 1.0, points):
         values = {**found.values, name: quantities.from_coordinate(name, float(x))}
-        one = fit(kept, values, others, spread=found.spread) if others else None
+        one = fit(kept, values, others, spread=best.spread) if others else None
         if one is not None:
             loss = float(np.sum(weights * one.residual ** 2))
             rows.append((values[name], max(loss - base, 0.0) / found.noise_std ** 2))

@@ -38,6 +38,11 @@ class Whiteness:
         """Whether they may be white."""
         return self.window == 0
 
+    @property
+    def taper(self) -> Array:
+        """Weights of the lags that matter."""
+        return 1.0 - np.arange(self.window + 1) / (self.window + 1.0)
+
 
 def autocorrelation(values: Array) -> Array:
     """Return the autocorrelation of values over their lags, biased, from 1 on; shape (n,)."""
@@ -130,13 +135,12 @@ def widening(jacobian: Array, residual: Array, inverse: Array, found: Whiteness)
     if found.white:
         return np.ones(count)
     variance = float(residual @ residual) / max(len(residual) - count, 1)
-    taper = 1.0 - np.arange(found.window + 1) / (found.window + 1.0)
     projected = jacobian @ inverse
     plain = variance * np.sum(projected ** 2, axis=0)
     by_noise, by_score = (
         _sum_of_lags(x, weights) for x, weights in (
-            (projected, variance * found.autocorrelation[:found.window + 1] * taper),
-            (projected * residual[:, None], taper)))
+            (projected, variance * found.autocorrelation[:found.window + 1] * found.taper),
+            (projected * residual[:, None], found.taper)))
     largest = np.maximum(np.maximum(by_noise, by_score), plain)
     factors: Array = np.sqrt(largest / np.maximum(plain, 1e-300))
     return factors
@@ -152,8 +156,7 @@ def inflation(column: Array, found: Whiteness) -> float:
     """Return the factor on the deviation of a projection of the residuals on a column."""
     if found.white:
         return 1.0
-    taper = 1.0 - np.arange(found.window + 1) / (found.window + 1.0)
     norm = float(column @ column)
     total = float(_sum_of_lags(
-        column[:, None], found.autocorrelation[:found.window + 1] * taper)[0])
+        column[:, None], found.autocorrelation[:found.window + 1] * found.taper)[0])
     return math.sqrt(max(total / norm, 1.0)) if norm > 0.0 else 1.0

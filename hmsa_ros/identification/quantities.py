@@ -181,16 +181,6 @@ def constants_of(law: Elastic | None) -> dict[str, tuple[Constant, int]]:
     return found
 
 
-def constant_values(law: Elastic, modulus: float) -> dict[str, float]:
-    """Return the constants of a law in SI, by name, for a shear modulus in Pa."""
-    given, found = dict(law.given), {}
-    for name, (constant, i) in constants_of(law).items():
-        value = given[constant.name]
-        value = value[i] if isinstance(value, tuple) else value
-        found[name] = float(value * modulus if constant.unit == 'Pa' else value)
-    return found
-
-
 def complete(values: Mapping[str, Any], free: Iterable[str]) -> dict[str, Any]:
     """
     Return values in which the density and the time unit agree, and the law and its constants.

@@ -123,10 +123,8 @@ class Recording:
         spread = float(np.quantile(self.stretch, 0.99) - np.quantile(self.stretch, 0.01))
         # White noise spreads by 4.65 of its deviation, and so much from one sample to the next.
         jitter = float(np.median(np.abs(np.diff(self.stretch)))) / 0.954
-        during = self.levels[np.searchsorted(
-            self.level_times, [self.time[0], self.time[-1]], side='right').clip(1) - 1]
-        inside = (self.level_times > self.time[0]) & (self.level_times < self.time[-1])
-        driven = np.ptp(np.append(during, self.levels[inside])) > 0.0
+        first, last = self.place(self.time[[0, -1]])
+        driven = np.ptp(self.levels[first:last + 1]) > 0.0
         still = spread < _LEAST_MOTION or (not driven and spread < _TIMES_SCATTER * jitter)
         if driven and not still:
             still = self._unmoved(jitter)
@@ -152,8 +150,7 @@ class Recording:
         """Refuse what the coordinate cannot be."""
         # A few samples may have lost the actuator.
         low, middle, high = np.quantile(self.stretch, (_FEW, 0.5, 1.0 - _FEW)).tolist()
-        place = np.searchsorted(self.level_times, self.time, side='right').clip(1) - 1
-        without = self.stretch[self.levels[place] == 0.0]
+        without = self.stretch[self.levels[self.place(self.time)] == 0.0]
         seen = len(without) >= _CLIPPED_SAMPLES
         rest = float(np.median(without)) if seen else middle
         what = self.coordinate
@@ -206,6 +203,16 @@ class Recording:
             return 0, round(float(np.median(lengths[again & inside])))
         clipped = int(np.count_nonzero(~inside & (lengths >= _CLIPPED_SAMPLES)))
         return (clipped if clipped > 1 else 0), 0
+
+    def place(self, time: Array) -> NDArray[np.intp]:
+        """Return the places of the levels in force at some times; the first before all."""
+        return np.searchsorted(self.level_times, time, side='right').clip(1) - 1
+
+    @cached_property
+    def changes(self) -> Array:
+        """Times in s at which the level changes, after that of the first one."""
+        found: Array = self.level_times[1:][np.diff(self.levels) != 0.0]
+        return found
 
     @property
     def uncertain(self) -> NDArray[np.int64]:

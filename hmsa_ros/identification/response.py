@@ -143,10 +143,8 @@ class Setup:
             material[KIND] = GENT
         mixing = np.zeros((len(inner) + len(more), len(free) + len(more)))
         for j, name in enumerate(free):
-            if name in chain:
-                scale = quantities.derivative(name, values[name])
-                for i, x in chain[name].items():
-                    mixing[rows[i], j] = scale * x
+            for i, x in chain.get(name, {}).items():
+                mixing[rows[i], j] = quantities.derivative(name, values[name]) * x
         for j in range(1, len(more) + 1):
             mixing[-j, -j] = 1.0
         return cls(theta, material, branches, np.array([*inner, *more], dtype=np.int64), mixing)

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, replace
 import math
 from typing import Any, Literal
 
+from hmsa_ros.identification.fit import Fit
 from hmsa_ros.identification.noise import Whiteness
 from hmsa_ros.identification.quantities import actuator_of, modulus_of
 from hmsa_ros.identification.recording import Recording
@@ -101,9 +102,8 @@ class Identification:
         How many samples there are, and how many of them did not count.
     recording : Recording
         What was measured.
-    fitted, residual, weights, spread : ndarray, shape (n,)
-        Simulated stretch, measured less simulated, how far each sample counted, and its deviation
-        over that of one at rest.
+    fit : Fit
+        The optimum: simulated stretch, residuals, and how far each sample counted.
     whiteness : Whiteness
         Of the residuals.
     signatures : tuple of Signature
@@ -130,10 +130,7 @@ class Identification:
     samples: int
     outliers: int
     recording: Recording
-    fitted: Array
-    residual: Array
-    weights: Array
-    spread: Array
+    fit: Fit
     whiteness: Whiteness
     signatures: tuple[Signature, ...]
     widened: float
@@ -153,11 +150,6 @@ class Identification:
         return (
             self.verdict == 'model_rejected' and 0.0 < self.cost <= ACCEPTABLE
             and all(math.isfinite(self.parameters[x].std) for x in self.names))
-
-    @property
-    def at_rest(self) -> bool:
-        """Whether the motion began at rest."""
-        return self.recording.at_rest
 
     def shown(self, name: str) -> tuple[str, Estimate]:
         """Return a parameter as readers know it: the modulus of a beam is Young's."""

@@ -41,17 +41,19 @@ _RIVAL, _ANOTHER = 10.0, 1.05
 _MOVES = 1e-3
 
 
+def _near(found: Fit) -> bool:
+    """Whether a fit came to its end near the motion, whatever did not count."""
+    return found.converged and found.scale < diagnosis.DISTANT * float(
+        np.std(found.recording.stretch)) and not diagnosis.mistaken(found, _DOUBT)
+
+
 def _good(found: Fit) -> bool:
     """Whether a fit leaves little but white noise, and outliers here and there."""
-    differences = np.diff(found.residual)
     out = found.weights < 0.5
-    return bool(
-        found.converged
-        and found.scale < _NEAR_WHITE * robust_scale(differences) / math.sqrt(2.0)
-        # Of few samples a level even what is far off differs from one to the next.
-        and found.scale < diagnosis.DISTANT * float(np.std(found.recording.stretch))
-        and np.count_nonzero(out[1:] & out[:-1]) <= _ADJACENT * len(out)
-        and not diagnosis.mistaken(found, _DOUBT))
+    # Of few samples a level even what is far off differs from one to the next.
+    return _near(found) and bool(
+        found.scale < _NEAR_WHITE * robust_scale(np.diff(found.residual)) / math.sqrt(2.0)
+        and np.count_nonzero(out[1:] & out[:-1]) <= _ADJACENT * len(out))
 
 
 def search(
@@ -107,10 +109,7 @@ def _promising(found: Sequence[Fit], one: Fit) -> bool:
 def _settled(found: Sequence[Fit]) -> bool:
     """Whether several starts ended at the likeliest fit, though it leaves more than noise."""
     best, agreed = _best(found)
-    return (
-        agreed >= _ENOUGH and best.converged
-        and best.scale < diagnosis.DISTANT * float(np.std(best.recording.stretch))
-        and not diagnosis.mistaken(best, _DOUBT))
+    return agreed >= _ENOUGH and _near(best)
 
 
 def _miss(recording: Recording, candidate: Mapping[str, float]) -> float:
@@ -178,8 +177,7 @@ def unmoved(best: Fit) -> set[str]:
 
     recording, values = best.recording, best.values
     setup = Setup.of(values, best.free)
-    place = np.searchsorted(
-        recording.level_times, recording.time - values['sensor_latency'], side='right').clip(1) - 1
+    place = recording.place(recording.time - values['sensor_latency'])
     levels, which = np.unique(recording.levels[place], return_inverse=True)
     rests: Array = np.empty(len(levels))
     slopes: Array = np.empty((len(levels), len(setup.wanted)))

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 import math
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -81,9 +82,7 @@ def begins_at_rest(recording: Recording) -> bool:
     # Slow to load, and no use to a planner that estimates.
     from scipy.special import fdtri
 
-    changes = recording.level_times[1:][np.diff(recording.levels) != 0.0]
-    first = float(changes[0]) if len(changes) else math.inf
-    before = recording.stretch[recording.time <= first]
+    before = recording.stretch[recording.time <= np.min(recording.changes, initial=math.inf)]
     if len(before) < _FEWEST_AT_REST:
         return True
     tails = np.array([(end - max((end - begin) // 3, 3), end)
@@ -101,12 +100,6 @@ def begins_at_rest(recording: Recording) -> bool:
     return float(np.std(before)) < float(np.min(allowed, initial=math.inf))
 
 
-def _median(values: Array) -> float:
-    """Return the median; NumPy's takes ten times as long for a few values."""
-    ordered = np.sort(values)
-    return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
-
-
 def _evaluated(what: int, values: Array, material: Array) -> Array:
     found = np.empty_like(values)
     evaluate(what, values, material, found)
@@ -121,12 +114,12 @@ def static(
     rests = []
     for begin, end, when, level in segments(recording, 1):
         tail = recording.stretch[begin + (end - begin) * 2 // 3:end]
-        rests.append((when, level, _median(tail)))
+        rests.append((when, level, median(tail.tolist())))
     # Each level once: short ones have not come to rest, but ring about it.
     fields = np.unique([x[1] for x in rests])
     if len(fields) < 2:
         return Static(math.nan, usual, tuple(rests))
-    stretch = np.array([_median(np.array([x[2] for x in rests if x[1] == y])) for y in fields])
+    stretch = np.array([median(x for _, level, x in rests if level == y) for y in fields])
     low, high = float(np.min(recording.stretch)), float(np.max(recording.stretch))
     best = (math.inf, math.nan, usual)
     group = quantities.group_of(values)
@@ -162,13 +155,10 @@ def ringing(recording: Recording, rests: Sequence[tuple[float, float, float]]) -
     found: list[tuple[float, float, float, float]] = []
     for place in np.argsort(-sizes, kind='stable')[:_MOST_LEVELS].tolist():
         begin, end, when, _ = spans[place]
-        mean = means[when]
         part = slice(begin, min(end, begin + _MOST_SAMPLES))
-        t = recording.time[part] - recording.time[begin]
-        y = recording.stretch[part] - mean
-        found += [(*x, mean) for x in _oscillations(t, y)]
-    found.sort(key=lambda x: -x[0])
-    return [(w, d, mean) for _, w, d, mean in found]
+        found += [(*x, means[when]) for x in _oscillations(
+            recording.time[part] - recording.time[begin], recording.stretch[part] - means[when])]
+    return [x[1:] for x in sorted(found, key=lambda x: -x[0])]
 
 
 def _oscillations(t: Array, y: Array) -> list[tuple[float, float, float]]:
@@ -235,11 +225,9 @@ def scan(
     That finds them where nothing rings, or where the samples are too few to see it.
     """
     found = static(recording, values, free)
-    first = _SCAN_SAMPLES
     changes = np.searchsorted(recording.time, recording.level_times)
-    begin = int(np.min(changes[changes > 0], initial=len(recording.time)))
-    if begin < len(recording.time):
-        first = max(first, min(begin + _SCAN_SAMPLES, len(recording.time)))
+    begins = changes[(changes > 0) & (changes < len(recording.time))]
+    first = _SCAN_SAMPLES + (int(begins[0]) if len(begins) else 0)
     part = replace(recording, time=recording.time[:first], stretch=recording.stretch[:first]) \
         if first < len(recording.time) else recording
     shortest = _SHORTEST * float(np.median(np.diff(recording.time)))

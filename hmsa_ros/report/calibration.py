@@ -46,7 +46,7 @@ def draw_delays(paths: Sequence[Path], found: Delays, paper: Paper) -> None:
         motion = found.motion
         _draw(paths, (style.axis('time', 't', 's'), style.axis('stretch', r'\lambda')),
               (motion.recording.time, motion.recording.stretch),
-              (motion.recording.time, motion.fitted), paper)
+              (motion.recording.time, motion.fit.response.stretch), paper)
         return
     end = max(seen.transport.value + _LAGS * seen.lag.value, _SHORTEST)
     since, near = np.linspace(0.0, end, _LINE, dtype=np.float64), seen.since <= end

@@ -88,16 +88,18 @@ def _fitted(found: Identification) -> tuple[Array, Array]:
     course = Course(dense, recording.level_times, recording.levels, recording.slew_limit,
                     at_rest=recording.at_rest)
     response = None if recording.earlier else respond(course, found.values, ())
-    return (recording.time, found.fitted) if response is None else (dense, response.stretch)
+    if response is None:
+        return recording.time, found.fit.response.stretch
+    return dense, response.stretch
 
 
 def _residuals(found: Identification) -> Figure:
     """Return the residuals over time, outliers apart."""
-    out = found.weights == 0.0
-    data = [_samples(found, 'residual', found.residual, ~out)]
+    out, residual = found.fit.weights == 0.0, found.fit.residual
+    data = [_samples(found, 'residual', residual, ~out)]
     if np.any(out):
         data.append(curve(
-            'outlier', _unit(found).of(found.recording.time[out]), found.residual[out], 'markers',
+            'outlier', _unit(found).of(found.recording.time[out]), residual[out], 'markers',
             marker={'size': 6, 'symbol': 'x', 'color': VERMILION}))
     return Figure('residuals', 'Residuals over time', 300, data, {
         'xaxis': _time_axis(found), 'yaxis': axis('measured less fitted')})
