@@ -139,8 +139,7 @@ class _Search:
     _most: int
     _spread: Array
     _passes: int = 0
-    # First no sample is left out, so that the few in motion are not taken for outliers.
-    _convex: bool = True
+    _convex: bool = True  # whether no sample is left out
 
     @property
     def _middle(self) -> float:
@@ -173,61 +172,56 @@ class _Search:
         if response is None:
             return None
         residual = self._residual(response)
-        scale = robust_scale(residual, len(self._free))
-        damping, converged = 1e-4, False
-        while self._passes < self._most:
-            weights = weights_of(residual, scale, convex=self._convex)
-            matrix, gradient, size = self._normal(response, residual, weights, shifts, scale)
-            if _at_bottom(matrix, gradient / size, len(residual), scale):
-                if not self._convex:
+        count = len(self._free)
+        scale = robust_scale(residual, count)
+        damping = 1e-4
+        # First no sample is left out, so that the few in motion are not taken for outliers.
+        for self._convex in (True, False):
+            converged = False
+            while not converged and self._passes < self._most:
+                weights = weights_of(residual, scale, convex=self._convex)
+                matrix, gradient, size = self._normal(response, residual, weights, shifts, scale)
+                if _at_bottom(matrix, gradient / size, len(residual), scale):
                     converged = True
                     break
-                self._convex = False
-                continue
-            before = self._loss(residual, shifts, scale)
-            allowed = before + _SMALL ** 2 + _NUMERICAL * float(
-                np.linalg.norm(weights * residual)) / scale ** 2
-            while self._passes < self._most:
-                scaled: Array = np.asarray(np.linalg.solve(
-                    matrix + damping * np.eye(len(size)), gradient / size), dtype=np.float64)
-                step = scaled / size
-                stride = _stride(response.values, self._free, step[:len(self._free)])
-                step = step * stride
-                trial_shifts = np.clip(
-                    shifts + step[len(self._free):], -self._recording.earlier, 0.0)
-                trial = self._respond(
-                    moved(response.values, self._free, step[:len(self._free)]), trial_shifts)
-                if trial is not None:
-                    trial_residual = self._residual(trial)
-                    after = self._loss(trial_residual, trial_shifts, scale)
-                    if after <= allowed:
+                before = self._loss(residual, shifts, scale)
+                allowed = before + _SMALL ** 2 + _NUMERICAL * float(
+                    np.linalg.norm(weights * residual)) / scale ** 2
+                while self._passes < self._most:
+                    scaled: Array = np.asarray(np.linalg.solve(
+                        matrix + damping * np.eye(len(size)), gradient / size), dtype=np.float64)
+                    step = scaled / size
+                    stride = _stride(response.values, self._free, step[:count])
+                    step = step * stride
+                    trial_shifts = np.clip(shifts + step[count:], -self._recording.earlier, 0.0)
+                    trial = self._respond(
+                        moved(response.values, self._free, step[:count]), trial_shifts)
+                    if trial is not None:
+                        trial_residual = self._residual(trial)
+                        after = self._loss(trial_residual, trial_shifts, scale)
+                        if after <= allowed:
+                            break
+                    damping = max(10.0 * damping, 1e-6)
+                    if damping > _MAX_DAMPING:
                         break
-                damping = max(10.0 * damping, 1e-6)
-                if damping > _MAX_DAMPING:
+                else:
                     break
-            else:
-                break
-            if trial is None or damping > _MAX_DAMPING:
-                if not self._convex:
+                if trial is None or damping > _MAX_DAMPING:
+                    damping = 1e-4
                     break
-                self._convex, damping = False, 1e-4
-                continue
-            # Switches at the end of their intervals never come to rest: the loss does.
-            small = stride == 1.0 and (
-                float(scaled @ matrix @ scaled) <= (_SMALL * scale) ** 2
-                or before - after < _SMALL ** 2)
-            shifts, response, residual = trial_shifts, trial, trial_residual
-            if small and damping <= 1.0:
-                if not self._convex:
-                    converged = True
+                # Switches at the end of their intervals never come to rest: the loss does.
+                converged = damping <= 1.0 and stride == 1.0 and (
+                    float(scaled @ matrix @ scaled) <= (_SMALL * scale) ** 2
+                    or before - after < _SMALL ** 2)
+                shifts, response, residual = trial_shifts, trial, trial_residual
+                if converged and not self._convex:
                     break
-                self._convex = False
-            now = robust_scale(residual, len(self._free))
-            if self._convex or scale >= 2.0 * now:
-                # Fixed once samples may be left out (Yohai, Ann. Statist. 15 (1987) 642), and
-                # never rising, so that it comes to an end.
-                scale = min(scale, now)
-            damping = max(0.1 * damping, 1e-12)
+                now = robust_scale(residual, count)
+                if self._convex and not converged or scale >= 2.0 * now:
+                    # Fixed once samples may be left out (Yohai, Ann. Statist. 15 (1987) 642), and
+                    # never rising, so that it comes to an end.
+                    scale = min(scale, now)
+                damping = max(0.1 * damping, 1e-12)
         return Fit(
             self._recording, self._free, response, residual * self._spread,
             weights_of(residual, scale), scale, converged, self._passes, self._spread,
@@ -237,7 +231,10 @@ class _Search:
             self, response: Response, residual: Array, weights: Array, shifts: Array,
             scale: float) -> tuple[Array, Array, Array]:
         """Return the normal equations, scaled to a diagonal of 1, and the scales."""
-        jacobian = np.hstack([response.jacobian, response.by_switch]) / self._spread[:, None]
+        jacobian = response.jacobian
+        if len(shifts):
+            jacobian = np.hstack([jacobian, response.by_switch])
+        jacobian = jacobian / self._spread[:, None]
         matrix = jacobian.T @ (weights[:, None] * jacobian)
         gradient = jacobian.T @ (weights * residual)
         prior, first = self._prior(scale), len(self._free)
