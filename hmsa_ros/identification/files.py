@@ -180,43 +180,39 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
         f'{found.samples} samples.',
         *(f'# Note: {x}.' for x in found.warnings),
         '/**:', '  ros__parameters:']
-    written: dict[str, Any] = {}
+    written: dict[str, str] = {}
     actuator = quantities.actuator_of(found.values)
     for name, value in actuator.numbers.items():
         source = 'time_unit' if name == 'density' and 'time_unit' in found.names else name
-        lines.append(_line(f'actuator.{name}', value, found, source))
-        written[f'actuator.{name}'] = value
+        written[f'actuator.{name}'] = _line(f'actuator.{name}', value, found, source)
     for key, value in parameters_of(actuator).items():
         if key not in written:
             scale = key == f'law.{found.shown("shear_modulus")[0]}'
             sought = ['shear_modulus'] if scale else [
                 x for x, (constant, _) in quantities.constants_of(actuator.law).items()
                 if constant.name == key and x in found.names]
-            lines.append(_line(key, value, found, *sought))
-            written[key] = value
+            written[key] = _line(key, value, found, *sought)
     for name in _OTHERS:
         if name in found.names or name in belief.others:
-            written[name] = found.values[name]
-            lines.append(_line(name, written[name], found, name))
+            written[name] = _line(name, found.values[name], found, name)
     held = [i for i, pair in enumerate(quantities.BRANCHES)
             if found.values[pair[0]] > 0.0 or set(pair + quantities.FLOWING[i]) & set(found.names)]
     flow = quantities.flow_of(found.values, found.names)
     creeps = any(x in found.names for names in _LISTS.values() for x in names)
     if creeps and flow is not MAXWELL:
-        written['viscoelastic.flow'] = flow.name
-        lines.append(f'    viscoelastic.flow: {flow.name}')
+        written['viscoelastic.flow'] = f'    viscoelastic.flow: {flow.name}'
     for key, names in _LISTS.items():
         if creeps and _has(flow, key):
-            written[key] = [found.values[names[i]] for i in held]
-            lines.append(_line(
-                key, written[key], found, *(names[i] for i in held if names[i] in found.names)))
+            written[key] = _line(
+                key, [found.values[names[i]] for i in held], found,
+                *(names[i] for i in held if names[i] in found.names))
     for key, value in belief.settings.items():
-        if key not in written and not key.startswith(PREFIX):
-            lines.append(f'    {key}: {yaml_text(value)}')
+        if not key.startswith(PREFIX):
+            written.setdefault(key, _line(key, value, found))
     # What the recording does not determine has no covariance.
-    lines += known_lines(Known(
+    lines += [*written.values(), *known_lines(Known(
         found.names, tuple(float(found.values[x]) for x in found.names), found.covariance)
-        if np.all(np.isfinite(found.covariance)) else Known())
+        if np.all(np.isfinite(found.covariance)) else Known())]
     return '\n'.join(lines) + '\n'
 
 
