@@ -306,7 +306,7 @@ class Estimator:
         mean = coordinates(prior.values, prior.free)
         self._fixed = None if self.learning else prior.covariance
         known = prior.covariance * (1.0 if self.learning else _FIXED)
-        level = self._in_force(stamp)
+        level = self._levels[bisect_right(self._levels, stamp, key=lambda x: x[0]) - 1][1]
         at = rest(prior.values, prior.free, level)
         stretch, frequency = at[:2] if at else (shown, 1.0 / prior.values['time_unit'])
         rests = at is not None and self._unchanged(stamp, stamp, _SETTLED)
@@ -462,10 +462,6 @@ class Estimator:
         times, time = self._window.time, self._seconds(stamp)
         place = int(np.searchsorted(times, time - 0.5 / NANOSECONDS))
         return place < len(times) and float(times[place]) < time + 0.5 / NANOSECONDS
-
-    def _in_force(self, stamp: int) -> float:
-        place = bisect_right(self._levels, stamp, key=lambda x: x[0]) - 1
-        return self._levels[max(place, 0)][1]
 
     def _unchanged(self, begin: int, end: int, units: float) -> bool:
         """Return whether no level changed from so many units of time before a begin to an end."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hmsa_ros.identification.recording import pieces
-from hmsa_ros.identification.response import sensed, Setup
+from hmsa_ros.identification.response import Setup
 from hmsa_ros.model.delivery import late
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.law import elastic_force, natural_frequency
@@ -53,12 +53,6 @@ class Motion:
     rate_by: Array
     #: How far what branches follow is from the elastic force at the last time, in units of G.
     behind: tuple[float, ...]
-
-    def measured(
-            self, values: Mapping[str, float], free: Sequence[str]) -> tuple[Array, Array]:
-        """Return what the sensor shows, shape (n,), and its derivatives, shape (n, p + 2)."""
-        return sensed(
-            values, free, self.stretch, self.rate, values['stretch_gain'] * self.by)
 
 
 def follow(

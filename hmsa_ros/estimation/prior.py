@@ -82,7 +82,10 @@ class Prior:
                 + ', '.join(x for x in DEVIATIONS if x not in _NOT_TRACKED))
         named = len(free)
         if suspects:
-            free = _with_suspects(free, actuator)
+            free = (*free, *(
+                x for x in SUSPECTS if x not in free
+                and not (x == 'chain_limit' and actuator.law is not None)
+                and not (x.startswith('viscoelastic') and any(actuator.creep.ratios))))
         values: dict[str, Any] = complete(values_of(actuator, others), free)
         values['viscoelastic_time'] = _RELAXATION * actuator.time_unit
         if actuator.creep:
@@ -141,11 +144,3 @@ class Prior:
         return replace(
             self, values=values, covariance=covariance,
             spread=np.maximum(self.spread, np.sqrt(np.diag(covariance))))
-
-
-def _with_suspects(free: Sequence[str], actuator: ActuatorParameters) -> tuple[str, ...]:
-    """Return names with those of suspects that a block may have."""
-    return (*free, *(
-        x for x in SUSPECTS if x not in free
-        and not (x == 'chain_limit' and actuator.law is not None)
-        and not (x.startswith('viscoelastic') and any(actuator.creep.ratios))))

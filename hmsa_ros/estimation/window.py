@@ -301,7 +301,8 @@ class Window:
         if motion is None:
             return None
         n = len(self.stretch)
-        shown, by = motion.measured(values, self.free)
+        shown, by = sensed(
+            values, self.free, motion.stretch, motion.rate, values['stretch_gain'] * motion.by)
         residual: Array = self.stretch - shown[:n]
         apart = z - self.mean
         cost = loss(residual, noise, convex=True) + 0.5 * float(

@@ -263,13 +263,10 @@ def flow_of(values: Mapping[str, Any], free: Iterable[str]) -> Flow:
     return MAXWELL
 
 
-def group_of(
-        values: Mapping[str, Any], *, zeta: float = 0.0, j_lim: float | None = None
-) -> NondimensionalParameters:
-    """Return the nondimensional group of values as `values_of` returns them, and the law."""
+def group_of(values: Mapping[str, Any]) -> NondimensionalParameters:
+    """Return the group of values as `values_of` returns them, and the law, without damping."""
     return NondimensionalParameters(
-        zeta, values['chain_limit'] if j_lim is None else j_lim, geometry_of(values).c1,
-        values.get('law'))
+        0.0, values['chain_limit'], geometry_of(values).c1, values.get('law'))
 
 
 def modulus_of(law: Elastic | None) -> tuple[str, float]:

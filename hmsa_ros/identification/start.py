@@ -197,7 +197,7 @@ def starts(
     if 'stretch_gain' in free:
         given['stretch_gain'] = 1.0
     found = static(recording, given, free)
-    material = quantities.group_of(given, zeta=0.2, j_lim=found.chain_limit)
+    material = quantities.group_of({**given, 'chain_limit': found.chain_limit})
     lower, upper = equations.stretch_limits(material)
     candidates: list[dict[str, float]] = []
     for frequency, decay, mean in ringing(recording, found.rests):
