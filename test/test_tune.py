@@ -33,7 +33,7 @@ BENCH = """\
     actuator.shear_modulus: 10000.0
 /**/plant:
   ros__parameters:
-    stretch_noise: 0.0005
+    stretch_noise: 0.0002
 """ + ''.join(f'    mismatch.{name}: {factor}\n' for name, factor in FACTORS.items())
 WORSE = """\
     coil_time_constant: 0.0005
