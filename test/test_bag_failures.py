@@ -14,6 +14,7 @@ import pytest
 from rosbags.rosbag2 import Reader as RosbagsReader
 
 from hmsa_ros.bag import metadata
+from hmsa_ros.bag.output import OutputFile
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.bag.reception import judge, WARN
 from hmsa_ros.bag.recording import Limits, lost_by_topic, Recording
@@ -59,6 +60,24 @@ def test_when_a_file_may_not_grow_the_next_takes_over(tmp_path):
     assert [item.sequence for item in reader.messages()] == list(range(10_000))
     assert not list((tmp_path / 'bag').glob('.*'))
     assert recover(tmp_path / 'bag', tmp_path / 'recovered').message_count == 10_000
+
+
+def test_a_write_that_fails_takes_room_for_the_end_again(tmp_path, monkeypatch):
+    def fails(*_):
+        raise OSError(5, 'Input/output error')
+
+    file = OutputFile(tmp_path / 'a.mcap', 'none', [TOPIC])
+    file.describe('', {})
+    with monkeypatch.context() as patch:
+        patch.setattr(os, 'write', fails)
+        with pytest.raises(OSError, match='Input/output'):
+            file.write([message(0)])
+    assert file.path.stat().st_size == file.size
+    file.write([message(1)])
+    assert file.path.stat().st_size > file.size
+    file.finish('', {}, fsync=False)
+    assert file.path.stat().st_size == file.size
+    assert file.counts == {0: 1}
 
 
 def test_a_removed_folder_costs_what_was_in_it_and_that_is_counted(tmp_path, wait_until):

@@ -239,6 +239,7 @@ class OutputFile:
         except OSError:
             os.ftruncate(self._descriptor, self.size)
             os.lseek(self._descriptor, self.size, os.SEEK_SET)
+            self._room = self.size
             raise
         self.size += len(data)
         self._crc = zlib.crc32(data, self._crc)
