@@ -286,8 +286,12 @@ class ActuatorSimulation:
 
     @property
     def time(self) -> int:
-        """Time in ns that the state belongs to."""
+        """Time in ns that the state belongs to; setting it skips what lies between."""
         return self._all.time
+
+    @time.setter
+    def time(self, time: int) -> None:
+        self._all.time = time
 
     @property
     def stretch(self) -> float:
