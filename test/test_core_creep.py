@@ -103,10 +103,10 @@ def test_a_branch_that_holds_nothing_changes_no_bit():
 
 
 def test_steps_of_time_and_a_pause_leave_the_motion_as_it_is():
-    whole, halved = (Actuators([Setup(replace(GENT, creep=THREE), 1.0)]) for _ in range(2))
-    for actuators in (whole, halved):
-        actuators.command(0, 0, 0.05)
-        actuators.advance(7 * MS)
+    whole, halved = (ActuatorSimulation(GENT, creep=THREE) for _ in range(2))
+    for simulation in (whole, halved):
+        simulation.command(0, 0.05)
+        simulation.advance(7 * MS)
     # Time that is skipped is no time in which the branches relax.
     halved.time = 500 * MS
     whole.advance(17 * MS)
