@@ -10,6 +10,7 @@ has something to put in order only notes them, and looks where it is safe to end
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+import gc
 import os
 import signal
 import sys
@@ -87,6 +88,11 @@ class Ending:
         letting go, for a thread that has just received the end of another one.
         """
         _deadline.set(_END, _LAST_SECONDS, status)
+        if 'rclpy' in sys.modules:
+            # What refers to itself, as nodes do, would keep the participant until after Python's
+            # end, where Fast DDS takes it away while a thread may still read from it.
+            gc.unfreeze()
+            gc.collect()
 
     def check(self) -> None:
         """Raise KeyboardInterrupt if the end has been asked for."""

@@ -26,6 +26,22 @@ from hmsa_ros import entry
 sys.argv[1:] = []
 sys.exit(entry.{entry}())
 """
+# Runs an entry point, with a signal as soon as its node runs; prints the threads that are left.
+ONCE_IT_RUNS = """
+import os, signal, sys
+from pathlib import Path
+from hmsa_ros import entry
+from hmsa_ros.nodes import runner
+spin = runner.spin
+def told_to_end(*arguments):
+    os.kill(os.getpid(), signal.SIGTERM)
+    spin(*arguments)
+runner.spin = told_to_end
+sys.argv[1:] = []
+entry.{entry}()
+names = {{x.read_text().strip() for x in Path('/proc/self/task').glob('*/comm')}}
+print(sorted(x for x in names if x.startswith('dds.')))
+"""
 # Begins `hmsa send`, with an interrupt where Python drops an exception.
 IN_A_DESTRUCTOR = """
 import os, signal, sys
@@ -115,6 +131,15 @@ def test_a_node_that_is_told_to_end_while_it_is_imported_ends_without_a_word(
     expected = (1, 'hmsa: error: the recorder was told to end before its bag was open: no bag is '
                    'written\n') if node == 'recorder' else (0, '')
     assert (done.returncode, done.stderr, done.stdout) == (*expected, '')
+
+
+@pytest.mark.parametrize('node', ['planner', 'plant'])
+def test_no_thread_of_fast_dds_outlives_a_node(ros_env, node):
+    done = subprocess.run(
+        [sys.executable, '-c', ONCE_IT_RUNS.format(entry=node)], capture_output=True, text=True,
+        check=True, timeout=60)
+    # This one is of the process, and reads nothing.
+    assert done.stdout in ('[]\n', "['dds.shm.wdog']\n")
 
 
 def test_a_process_that_goes_on_is_not_stopped_from_the_keyboard():
