@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline, PPoly
 
 from hmsa_ros.errors import BadInputError
@@ -186,10 +186,10 @@ def _knots(u: Array) -> Array:
     return knots
 
 
-def _points(knots: Array, shares: Array) -> Array:
+def _points(knots: Array, shares: ArrayLike) -> Array:
     """Return points at shares of each piece between knots."""
     breaks = knots[_DEGREE:-_DEGREE, None]
-    points: Array = (breaks[:-1] + np.diff(breaks, axis=0) * shares).ravel()
+    points: Array = (breaks[:-1] + np.diff(breaks, axis=0) * np.asarray(shares)).ravel()
     return points
 
 
