@@ -160,6 +160,16 @@ def test_a_snapshot_reaches_back_as_far_as_asked_for(tmp_path):
         range(399, 500))
 
 
+def test_messages_that_a_snapshot_has_no_room_for_are_counted(tmp_path):
+    recording = Recording(
+        BagWriter(tmp_path / 'bag'), Limits(snapshot_ns=10**9, cache_size=3000))
+    recording.add_topic(TOPIC)
+    recording.put([message(0)], 5)
+    recording.put([message(i) for i in range(1, 101)], 500)
+    assert recording.status().queued_bytes == 0
+    assert recording.close().overflowed == {'/a': 100}
+
+
 # A writer that is killed: it says after each flush what is safe.
 WRITER = """
 import sys

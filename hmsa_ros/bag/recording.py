@@ -240,13 +240,16 @@ class Recording:
             raise BagError(str(error)) from error
 
     def _keep(self, batch: _Batch) -> None:
-        """Keep messages in memory for a snapshot, the oldest giving way."""
+        """Keep messages in memory for a snapshot, the oldest giving way, or count them as lost."""
         self._queued += batch.size
         self._kept.append(batch)
         oldest = batch.messages[-1][1] - self._limits.snapshot_ns
         while self._kept and (self._kept[0].messages[-1][1] < oldest
                               or self._queued > self._limits.cache_size):
-            self._queued -= self._kept.popleft().size
+            given_way = self._kept.popleft()
+            self._queued -= given_way.size
+            if given_way is batch:
+                self._lose(batch.messages)
 
     def _lose(self, messages: Iterable[Entry]) -> None:
         """Count messages that will not be written."""
