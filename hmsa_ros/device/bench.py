@@ -65,7 +65,7 @@ class Bench:
     joint : str
         Name it is called with.
     calls : Calls, optional
-        What is told of each call.
+        Limits and times the calls of hardware.
 
     Raises
     ------

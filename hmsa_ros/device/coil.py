@@ -65,7 +65,7 @@ class Coil(GuardedJoint):
     joint : HardwareJoint
         What writes and reads; the limit of the hardware counts if it is smaller.
     calls : Calls
-        What is told of each call.
+        Limits and times the calls of hardware.
     clock : callable
         Returns the time of this host in ns.
     notices, changes : deque

@@ -28,7 +28,7 @@ class HardwareDevice(Device):
     period : int
         Between samples, in ns; 0 for none.
     calls : Calls
-        What is told of each call of hardware.
+        Limits and times the calls of hardware.
     clock : callable
         Returns the time in ns, as ``time`` is; for hardware with a clock of its own.
 
