@@ -1,1 +1,1 @@
-"""What ``import hmsa_ros`` offers: an actuator, its plans and motions, in seconds and tesla."""
+"""Public Python interface: an actuator, its plans and motions, in seconds and tesla."""

@@ -1,4 +1,4 @@
-"""An actuator with its coil: what plans, simulates and writes parameter files."""
+"""An actuator with its coil: planning, simulation and parameter files."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from hmsa_ros.identification.files import Belief
 
 _STRONGEST: Any = FLUX_DENSITY_MAX.default
-# Nobody has to send the levels of such a plan: unless a file says how fine, they are very fine.
+# Plans made here need not be sent, so the levels are very fine unless a file sets the tolerance.
 _SPECS = (*PLANNED, *VISCOELASTIC, replace(CREEP_TOLERANCE, default=IDEAL.ripple))
 
 
@@ -67,36 +67,36 @@ class Actuator:
     Parameters
     ----------
     shear_modulus : float, optional
-        G in Pa; default 10 kPa. With a law that has moduli of its own it follows from these.
+        G in Pa; default 10 kPa. Models with moduli among their constants determine it.
     density : float
         rho in kg/m^3.
     half_length : float
         L in m, across the field.
     half_thickness : float, optional
-        H in m, along the field; default as the half length.
+        H in m, along the field; default the half length.
     remanence : float
         Residual flux density Br in T.
     chain_limit : float
         J_lim of the Gent model; infinite for neo-Hookean.
     zeta, damping_coefficient : float, optional
-        Damping, without a dimension or in N s/m; default zeta 0.2.
+        Damping, dimensionless or in N s/m; default zeta 0.2.
     law : str
-        Hyperelastic model, a name in `hmsa_ros.model.laws.LAWS`, such as ``'yeoh'``.
+        Name of the hyperelastic model, a key of `hmsa_ros.model.laws.LAWS`, such as ``'yeoh'``.
     constants : mapping of str, optional
-        Constants of that model in SI units, as in ``{'c10': 5e3, 'c20': 200.0, 'c30': 0.0}``.
+        Constants of the model in SI units, such as ``{'c10': 5e3, 'c20': 200.0, 'c30': 0.0}``.
     creep : sequence of (float, float)
-        Maxwell branches: stiffness in units of that of the law, and relaxation time in s.
+        Viscoelastic branches: stiffness relative to the model's, and relaxation time in s.
     flux_density_limits : float or (float, float)
-        Of the coil in T; one number for both directions.
+        Limits of the coil in T; one number for both directions.
     slew_limit : float
-        Of the amplifier in T/s; infinite for steps.
+        Slew rate of the amplifier in T/s; infinite for ideal steps.
     coil_time_constant : float
         L/R of the coil in s; 0 for none.
 
     Raises
     ------
     BadInputError
-        If a value is of another type or out of range.
+        If a value has the wrong type or is out of range.
 
     Examples
     --------
@@ -128,7 +128,7 @@ class Actuator:
             'coil_time_constant': coil_time_constant}
         if zeta is None and damping_coefficient is None:
             zeta = ZETA
-        #: What plans are made with.
+        #: Parameters that plans are made with.
         self.model = _model(parameters_in(given), zeta)
         self._belief: Belief | Path | None = None
 
@@ -136,10 +136,11 @@ class Actuator:
     def from_parameters(
             cls, values: Mapping[str, Any], belief: 'Belief | Path | None' = None) -> 'Actuator':
         """
-        Return the actuator of parameters as the nodes have them, ``{'actuator.remanence': 0.1}``.
+        Return the actuator with node parameters, such as ``{'actuator.remanence': 0.1}``.
 
-        What is left out has its default. ``belief`` is how well they are known, if it is, or the
-        file with it. A value of another type or out of range is a `BadInputError`.
+        Missing parameters take their defaults. ``belief`` is their uncertainty, if known, or the
+        file that contains it. Raise `BadInputError` if a value has the wrong type or is out of
+        range.
         """
         return cls._of(
             _model(mapping_of(values, 'parameters', "'actuator.remanence': 0.1")), belief)
@@ -153,7 +154,7 @@ class Actuator:
     @classmethod
     def from_yaml(cls, path: str | Path) -> 'Actuator':
         """
-        Return the actuator of a parameter file, as ``hmsa init`` and ``hmsa identify`` write it.
+        Return the actuator of a parameter file written by ``hmsa init`` or ``hmsa identify``.
 
         Raises
         ------
@@ -174,7 +175,7 @@ class Actuator:
         """
         Return a beam, clamped at one end and magnetised along its length.
 
-        Its positions are deflections of the tip over the length.
+        Positions are tip deflections divided by the length.
 
         Parameters
         ----------
@@ -183,19 +184,19 @@ class Actuator:
         youngs_modulus : float
             E in Pa.
         damping_ratio, damping_coefficient : float, optional
-            Of the first mode, or c of the tip in N s/m; default a ratio of 0.05.
+            Damping ratio of the first mode, or c of the tip in N s/m; default a ratio of 0.05.
         **more
-            Density, remanence, creep and coil, as of `Actuator`.
+            Density, remanence, creep and coil parameters of `Actuator`.
 
         Returns
         -------
         Actuator
-            With the law ``beam``.
+            The beam; its `law` is ``'beam'``.
 
         Raises
         ------
         BadInputError
-            If a value is of another type or out of range.
+            If a value has the wrong type or is out of range.
 
         Examples
         --------
@@ -218,32 +219,32 @@ class Actuator:
         """
         Return a dielectric elastomer between compliant electrodes, driven by steps of a voltage.
 
-        A layer or a stack of them, free at its sides. Positions are capacitances over that at
-        rest, `levels` and ``flux_densities`` voltages in V.
+        The actuator is a layer or a stack of layers, free at its sides. Positions are capacitances
+        relative to that at rest; `levels` and ``flux_densities`` contain voltages in V.
 
         Parameters
         ----------
         layer_thickness : float
-            Of the elastomer between two electrodes at rest, in m.
+            Thickness of the elastomer between two electrodes at rest, in m.
         permittivity : float
-            Over that of vacuum.
+            Relative permittivity.
         voltage_max : float
-            Of the amplifier, in V; the least voltage is 0.
+            Maximum voltage of the amplifier, in V; the minimum is 0.
         damping_ratio, damping_coefficient : float, optional
-            About rest, or c of the thickness in N s/m; default a ratio of 0.05.
+            Damping ratio at rest, or c of the thickness in N s/m; default a ratio of 0.05.
         **more
-            Shear modulus, density, half length, half thickness and chain limit, as of `Actuator`.
+            Shear modulus, density, half length, half thickness and chain limit of `Actuator`.
 
         Returns
         -------
         Actuator
-            With the law ``dielectric``.
+            The actuator; its `law` is ``'dielectric'``.
 
         Raises
         ------
         BadInputError
-            If a value is of another type or out of range, or a remanence, creep, slew limit or
-            time constant of a coil is given.
+            If a value has the wrong type or is out of range, or a remanence, creep, slew limit or
+            coil time constant is given.
 
         Examples
         --------
@@ -264,11 +265,11 @@ class Actuator:
             'flux_density_limits': (0.0, number(voltage_max, 'voltage_max', 'V', above=0.0)),
             **more})
 
-    # -- what it is ----------------------------------------------------------------------------
+    # -- properties ----------------------------------------------------------------------------
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """All parameters by the names that the nodes have for them."""
+        """All parameters, by their names in the nodes."""
         actuator, options = self.block, self.model.options
         return parameters_of(actuator) | actuator.creep.parameters | {
             'flux_density_min': options.flux_density_min,
@@ -288,7 +289,7 @@ class Actuator:
 
     @property
     def zeta(self) -> float:
-        """Damping without a dimension."""
+        """Dimensionless damping."""
         return self.model.material.zeta
 
     @property
@@ -303,23 +304,23 @@ class Actuator:
 
     @cached_property
     def scales(self) -> Scales:
-        """What follows from the parameters: times in s, flux densities in T, and reach."""
+        """Derived quantities: times in s, flux densities in T, and reachable stretches."""
         return scales(self.block, *self.flux_density_limits)
 
     def flux_density(self, stretch: ArrayLike) -> Any:
-        """Return the flux density in T that holds a stretch, or an array of them."""
+        """Return the flux densities in T that hold stretches; a number or an array."""
         found = self.model.units.level(
             elastic_force(numbers(stretch, 'stretches'), self.model.material))
         return found if np.ndim(found) else float(found)
 
     def stretch(self, flux_density: ArrayLike) -> Any:
-        """Return the stretch that a flux density in T holds, or an array of them."""
+        """Return the equilibrium stretches at flux densities in T; a number or an array."""
         load = self.model.units.of_level(numbers(flux_density, 'flux densities'))
         found = equilibrium_stretch(load, self.model.material)
         return found if np.ndim(found) else float(found)
 
     def report(self) -> Table:
-        """Return what follows from the parameters as a table."""
+        """Return a table of the derived quantities."""
         return Table(
             (Column('quantity'), Column('value')), tuple(facts(self.scales, self.block)))
 
@@ -335,16 +336,16 @@ class Actuator:
     def _repr_html_(self) -> str:
         return self.report()._repr_html_()
 
-    # -- another one ---------------------------------------------------------------------------
+    # -- variants ------------------------------------------------------------------------------
 
     def replace(self, **parameters: Any) -> 'Actuator':
         """
-        Return the actuator with other parameters.
+        Return a copy of the actuator with some parameters replaced.
 
         Parameters
         ----------
         **parameters
-            As `Actuator` takes them; zeta stays unless damping is given.
+            As for `Actuator`; zeta stays unless damping is given.
 
         Returns
         -------
@@ -354,7 +355,7 @@ class Actuator:
         Raises
         ------
         BadInputError
-            If a name is not one of these, or a value is of another type or out of range.
+            If a name is unknown, or a value has the wrong type or is out of range.
 
         Examples
         --------
@@ -368,7 +369,7 @@ class Actuator:
             raise BadInputError(
                 f'{unknown[0]} is no parameter of an actuator: expected {", ".join(_KEYS)}')
         changed = parameters_in(parameters, self.law)
-        # What is given anew takes the place of all that was.
+        # A new model or new branches replace all previous ones.
         groups = ('law',) * (changed[LAW_NAME.name] != self.law) + (
             'viscoelastic',) * ('creep' in parameters)
         zeta = self.zeta if parameters.get('zeta') is None else parameters['zeta']
@@ -378,14 +379,14 @@ class Actuator:
 
     def scaled(self, **factors: float) -> 'Actuator':
         """
-        Return the actuator that differs from this one by factors on its parameters.
+        Return a copy of the actuator with some parameters multiplied by factors.
 
         Parameters
         ----------
         **factors
-            By name, of `shear_modulus`, `density`, `half_length`, `half_thickness`, `remanence`,
-            `chain_limit` and `damping_coefficient`; above 0. A factor on the shear modulus is one
-            on all moduli of a law.
+            Factors above 0 on `shear_modulus`, `density`, `half_length`, `half_thickness`,
+            `remanence`, `chain_limit` and `damping_coefficient`. A factor on the shear modulus
+            multiplies all moduli of the hyperelastic model.
 
         Returns
         -------
@@ -395,7 +396,7 @@ class Actuator:
         Raises
         ------
         BadInputError
-            If a name is not one of these, or a factor is out of range.
+            If a name is unknown, or a factor is out of range.
 
         Examples
         --------
@@ -412,7 +413,7 @@ class Actuator:
             f'mismatch.{name}': number(x, f'the factor on {name}') for name, x in factors.items()})
         return self._of(Model(replace(block, creep=self.block.creep), self.model.options))
 
-    # -- what it does --------------------------------------------------------------------------
+    # -- plans and motions ---------------------------------------------------------------------
 
     def plan(
             self, setpoints: Any, shaper: str = 'two_step', *,
@@ -426,37 +427,37 @@ class Actuator:
         Parameters
         ----------
         setpoints : pairs, array of shape (n, 2), mapping or DataFrame
-            Stretch, or deflection of a beam, and duration in s (move and dwell) of each; columns
-            are named ``stretch`` and ``duration``.
+            Stretch, or deflection of a beam, and duration in s (move and dwell) of each setpoint;
+            columns are named ``stretch`` and ``duration``.
         shaper : str
-            A name in `hmsa_ros.planning.shapers.SHAPERS`.
+            A key of `hmsa_ros.planning.shapers.SHAPERS`.
         limits : float or (float, float), optional
-            Flux densities in T; default those of the coil.
+            Limits of the flux density in T; default those of the coil.
         start : float, optional
-            Stretch at rest before; default without a field.
+            Initial stretch, at rest; default that without a field.
         order : int
-            Of the shapers robust and minimax, 1 to 16.
+            Order of the shapers robust and minimax, 1 to 16.
         errors : (float, float, float), optional
             Relative errors of shear modulus, damping and J_lim that minimax must tolerate; default
-            what the parameter file contains of them, else 0.1 each.
+            those of the parameter file, else 0.1 each.
         periods, max_rate : float
-            Of smooth: natural periods that a move takes at the least, and largest rate in 1/s.
+            For smooth: minimum duration of a move in natural periods, and maximum rate in 1/s.
         period : float
             Of the sampling grid of the command in s; 0 for any time.
         short_spell : {'refuse', 'continue'}
-            What to do with a duration that ends before the move.
+            How to treat a duration that is shorter than the move.
 
         Returns
         -------
         Plan
-            Times and levels, and the motion they predict.
+            Times and levels, and the predicted motion.
 
         Raises
         ------
         BadInputError
-            If an argument is of another type or out of range.
+            If an argument has the wrong type or is out of range.
         RefusedError
-            If a setpoint cannot be reached, with why.
+            If a setpoint cannot be reached; the message gives the reason.
 
         Examples
         --------
@@ -500,17 +501,17 @@ class Actuator:
             accelerations: ArrayLike | None = None, *, tolerance: float = 1e-6,
             period: float = 0.0) -> 'Plan':
         """
-        Plan to follow a path from rest to rest.
+        Plan a command that follows a path from rest to rest.
 
         Parameters
         ----------
         times : array_like, shape (n,)
             In s, increasing, at least two.
         stretches : array_like, shape (n,)
-            At these times; at the first, the actuator rests.
+            Stretches at these times; the actuator is at rest at the first.
         rates, accelerations : array_like, shape (n,), optional
-            In 1/s and 1/s^2, the last rate 0. The path is a Hermite spline through them, or the
-            smoothest spline through the stretches alone.
+            In 1/s and 1/s^2; the last rate is 0. The path is a Hermite spline through all given
+            columns, or the smoothest spline through the stretches alone.
         tolerance : float
             Deviation that the levels may leave, as a fraction of the range of the path.
         period : float
@@ -519,15 +520,15 @@ class Actuator:
         Returns
         -------
         Plan
-            Its one segment notes the largest deviation where limits keep the actuator from the
-            path.
+            One segment, whose notes contain the maximum deviation if limits keep the actuator from
+            the path.
 
         Raises
         ------
         BadInputError
-            If an argument is of another type or out of range.
+            If an argument has the wrong type or is out of range.
         RefusedError
-            If the path leaves the stretches that the law has.
+            If the path leaves the stretches that the hyperelastic model allows.
 
         Examples
         --------
@@ -549,22 +550,22 @@ class Actuator:
             self, shape: Any, frequency: float, amplitude: float, *, offset: float | None = None,
             cycles: float = 10.0, last: float | None = None, tolerance: float = 1e-4) -> 'Plan':
         """
-        Plan a periodic motion of the stretch, from rest without a field and back to it.
+        Plan a periodic motion of the stretch that starts and ends at rest without a field.
 
         Parameters
         ----------
         shape : {'sine', 'triangle', 'square'} or pairs, array of shape (n, 2), mapping, DataFrame
-            Of the stretch, not of the field; or one period of it, times and stretches, of which
-            mean and peak become offset and amplitude. A square wave is a sequence of two-step
+            Shape of the stretch (not of the field), or one period of times and stretches, which is
+            shifted and scaled to offset and amplitude. A square wave is a sequence of two-step
             moves.
         frequency : float
             In Hz.
         amplitude : float
-            Of the stretch about the offset.
+            Amplitude of the stretch about the offset.
         offset : float, optional
             Mean stretch; default that without a field.
         cycles : float
-            At full amplitude, besides those in which the wave fades in and out.
+            Cycles at full amplitude, in addition to those that fade in and out.
         last : float, optional
             Frequency in Hz at the end of a sweep; default no sweep.
         tolerance : float
@@ -578,9 +579,9 @@ class Actuator:
         Raises
         ------
         BadInputError
-            If an argument is of another type or out of range.
+            If an argument has the wrong type or is out of range.
         RefusedError
-            If the limits of the coil do not allow the frequency; `wave_bands` returns those.
+            If the limits of the coil do not allow the frequency; see `wave_bands`.
 
         Examples
         --------
@@ -606,17 +607,17 @@ class Actuator:
 
     def wave_bands(self, shape: Any, amplitude: float, offset: float | None = None) -> Array:
         """
-        Return the bands of frequencies in Hz that the limits of the coil allow, shape (n, 2).
+        Return the frequency bands in Hz that the limits of the coil allow, shape (n, 2).
 
-        The arguments are as of `wave`. Within 0.001 to 30 natural frequencies; a square wave is
-        possible from 0 on. What is no wave is a `BadInputError`.
+        The arguments are those of `wave`. Bands lie within 0.001 to 30 natural frequencies; the
+        band of a square wave starts at 0. Raise `BadInputError` if the arguments describe no wave.
         """
         from hmsa_ros.api.paths import bands
 
         return bands(self, shape, amplitude, offset)
 
     def _errors(self, shaper: str) -> Uncertainty:
-        """Return for which errors minimax plans unless given."""
+        """Return the default relative errors that minimax must tolerate."""
         if shaper != 'minimax' or self._belief is None:
             return ERRORS
         from hmsa_ros.identification.files import errors_of, read_belief
@@ -630,25 +631,25 @@ class Actuator:
             noise: float = 0.0, seed: int = 0, start: float | None = None,
             label: str = 'simulated') -> 'Motion':
         """
-        Simulate the response to a command of your own.
+        Simulate the response to given levels.
 
         Parameters
         ----------
         levels : pairs, array of shape (n, 2), mapping, DataFrame or path
-            Time in s and flux density in T from then on; columns, also of a CSV, are named
-            ``time`` and ``flux_density``.
+            Time in s and flux density in T from that time on; columns, also in a CSV file, are
+            named ``time`` and ``flux_density``.
         until : float, optional
-            End in s; default when the last level has settled.
+            End in s; default after the motion has settled at the last level.
         rate : float, optional
-            Samples a second in Hz; default 1000, or 40 a period of the actuator if these are more.
+            Sampling rate in Hz; default 1000 Hz, or 40 samples per natural period if this is more.
         noise : float
             Standard deviation of the samples of the stretch.
         seed : int
-            Of the noise.
+            Seed of the noise.
         start : float, optional
-            Stretch at rest before; default without a field.
+            Initial stretch, at rest; default that without a field.
         label : str
-            Name in pictures and comparisons.
+            Name in figures and comparisons.
 
         Returns
         -------
@@ -658,7 +659,7 @@ class Actuator:
         Raises
         ------
         BadInputError
-            If an argument is of another type or out of range.
+            If an argument has the wrong type or is out of range.
         HmsaError
             If a level is too large to follow.
 
@@ -683,16 +684,16 @@ class Actuator:
 
     def amplifiers(self, setpoints: Any, **more: Any) -> Table:
         """
-        Plan a sequence for amplifiers from fast to slow: what each has to give, and the time lost.
+        Compare amplifiers from fast to slow: demands of a planned sequence on each, and time lost.
 
         Parameters
         ----------
         setpoints : pairs, array of shape (n, 2), mapping or DataFrame
             As for `plan`.
         **more
-            ``slew_limits`` in T/s and ``bandwidths`` in Hz to try, by default about the fastest
-            move; ``inductance`` in H, ``resistance`` in ohm and ``tesla_per_ampere`` of the coil,
-            for currents and voltages; ``shaper`` and other arguments of `plan`.
+            ``slew_limits`` in T/s and ``bandwidths`` in Hz to try, by default around those of the
+            fastest move; ``inductance`` in H, ``resistance`` in ohm and ``tesla_per_ampere`` of
+            the coil, for currents and voltages; ``shaper`` and other arguments of `plan`.
 
         Returns
         -------
@@ -702,7 +703,7 @@ class Actuator:
         Raises
         ------
         BadInputError
-            If an argument is of another type or out of range.
+            If an argument has the wrong type or is out of range.
 
         Examples
         --------
@@ -724,7 +725,7 @@ class Actuator:
         Raises
         ------
         BadInputError
-            If it cannot be written.
+            If the file cannot be written.
 
         """
         write_text(file_of(path), '\n'.join([
@@ -735,7 +736,7 @@ class Actuator:
 def _damped(
         cls: type[Actuator], ratio: float | None, coefficient: float | None,
         made: Mapping[str, Any]) -> Actuator:
-    """Return an actuator with a damping coefficient, or a ratio about rest, by default 0.05."""
+    """Return an actuator with a damping coefficient or a damping ratio at rest (default 0.05)."""
     if coefficient is not None:
         return cls(**made, damping_coefficient=coefficient)
     undamped = cls(**made, zeta=0.0).model.material
@@ -747,7 +748,7 @@ _KEYS = tuple(x for x in Actuator.__init__.__annotations__ if x != 'return')
 
 
 def _model(values: Mapping[str, Any], zeta: float | None = None) -> Model:
-    """Return what plans with parameters, of which a zeta takes the place of the damping."""
+    """Return the planning model of parameters; a zeta replaces the damping coefficient."""
     if zeta is not None:
         unit = actuator_from(_checked(values)).damping_unit
         values = {**values, 'actuator.damping_coefficient': unit * number(
@@ -756,5 +757,5 @@ def _model(values: Mapping[str, Any], zeta: float | None = None) -> Model:
 
 
 def _checked(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all parameters that a plan needs, checked."""
+    """Return all parameters that a plan needs, checked and with defaults."""
     return values_of({f'{PLANNER}.{x}': y for x, y in values.items()}, PLANNER, _SPECS)

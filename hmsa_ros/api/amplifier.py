@@ -1,4 +1,4 @@
-"""Which amplifier a plan needs: slew rate, bandwidth, current and voltage against time lost."""
+"""Amplifiers compared for a plan: slew rate, bandwidth, current, voltage and time lost."""
 
 from collections.abc import Sequence
 import math
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from hmsa_ros.api.actuator import Actuator
     from hmsa_ros.api.plan import Plan
 
-# Of the slew rates and bandwidths that are tried, in units of what the plan with ideal steps
-# changes in the time of its fastest move.
+# Range of the slew rates and bandwidths to try, relative to those at which the largest step of the
+# ideal plan takes as long as its fastest move.
 _SLOWEST, _FASTEST = 0.1, 15.0
 _DECADE = (1.0, 2.0, 5.0)
-# What is known of a coil, with its units.
+# Optional coil data and their units.
 _COIL = {'inductance': 'H', 'resistance': 'ohm', 'tesla_per_ampere': 'T/A'}
-# Columns and what they are; the last four take what is known of the coil, the last two all of it.
+# Columns and their descriptions; the last four need data of the coil, the last two all of them.
 _COLUMNS = (
     (Column('slew', 'T/s', '.4g'), 'of ramps'),
     (Column('bandwidth', 'Hz', '.4g'), 'of a first-order lag'),
@@ -45,7 +45,7 @@ def amplifiers(
     Raises
     ------
     BadInputError
-        If an argument is of another type or out of range.
+        If an argument has the wrong type or is out of range.
 
     """
     given = {x: more.pop(x, None) for x in _COIL}
@@ -97,7 +97,7 @@ def amplifiers(
 
 
 def _series(middle: float) -> list[float]:
-    """Return round numbers about one, the largest first."""
+    """Return round numbers around the given one, the largest first."""
     decades = range(
         math.floor(math.log10(_SLOWEST * middle)), math.ceil(math.log10(_FASTEST * middle)) + 1)
     found = [x * 10.0 ** y for y in decades for x in _DECADE]
@@ -108,7 +108,7 @@ def _series(middle: float) -> list[float]:
 def _row(
         plan: 'Plan', best: 'Plan', slew: float, band: float,
         coil: dict[str, float]) -> tuple[Any, ...]:
-    """Return what an amplifier has to give for a plan."""
+    """Return the demands of a plan on an amplifier: one row of the table."""
     longest, lost = (1e3 * float(np.max(x)) for x in (
         plan.move_times, plan.move_times - best.move_times))
     most = float(np.max(np.abs(plan.flux_densities)))
@@ -116,7 +116,7 @@ def _row(
     if 'tesla_per_ampere' not in coil:
         return row
     factor = coil['tesla_per_ampere']
-    # The field of each level where it begins, and where the next one does.
+    # The field at the start of each level, and at the start of the next one.
     fields = response(
         plan.actuator.block, plan.actuator.model.delivery, plan.times, plan.flux_densities,
         np.append(plan.times, plan.times[-1] + 1.0), plan.segments[0].start.stretch)[2]

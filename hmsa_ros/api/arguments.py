@@ -1,4 +1,4 @@
-"""Arguments of the public functions, checked: numbers, columns of them, those of an actuator."""
+"""Checks of the arguments of public functions: numbers, columns and actuator parameters."""
 
 from collections.abc import Mapping
 import math
@@ -15,12 +15,12 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws import LAWS
 from hmsa_ros.planning.setpoint import impossible
 
-# Arguments of an actuator that are one number, and those that may be None.
+# Arguments of `Actuator` that are single numbers, and those that may be None.
 _NUMBERS = {x.name.rpartition('.')[2]: x for x in (*ACTUATOR, COIL_TIME_CONSTANT)}
 _OPTIONAL = ('shear_modulus', 'half_thickness', 'zeta', 'damping_coefficient', 'constants')
-# Period of a grid in s, below which commands have any time.
+# Shortest period of a sampling grid in s.
 _FINEST = 1e-9
-#: Other names of a column.
+#: Alternative names of columns.
 _ALIASES = {'duration': ('span', 'seconds'), 'stretch': ('deflection', 'position')}
 
 
@@ -31,11 +31,11 @@ def columns_of(value: Any, names: tuple[str, str], what: str) -> tuple[Array, Ar
     Parameters
     ----------
     value : pairs, tuple of two arrays, array of shape (n, 2), mapping or DataFrame
-        The numbers; a mapping has the columns by name.
+        The numbers; a mapping contains the columns by name.
     names : tuple of str
-        Of the columns.
+        Names of the columns.
     what : str
-        What they are, for messages.
+        Description of the numbers, for messages.
 
     Returns
     -------
@@ -45,7 +45,7 @@ def columns_of(value: Any, names: tuple[str, str], what: str) -> tuple[Array, Ar
     Raises
     ------
     BadInputError
-        If it is none of these.
+        If the value has none of these forms.
 
     """
     expected = (
@@ -77,8 +77,8 @@ def setpoints_of(value: Any, rest: float) -> tuple[Array, Array]:
     Raises
     ------
     BadInputError
-        If they are none, no actuator with such a rest has a stretch, or a duration is not above 0,
-        or endless before the last.
+        If the value is no such columns, a stretch is impossible for an actuator with this rest,
+        a duration is not above 0, or one before the last is infinite.
 
     """
     stretches, durations = columns_of(value, ('stretch', 'duration'), 'setpoints')
@@ -100,7 +100,7 @@ def file_of(value: Any, what: str = 'the path of a file') -> Path:
 
 
 def grid_of(period: Any) -> float:
-    """Return the period of a grid in s, 0 for any time, or raise `BadInputError`."""
+    """Return the period of a sampling grid in s, 0 for none, or raise `BadInputError`."""
     if 0.0 < number(period, 'period', 's', least=0.0) < _FINEST:
         raise BadInputError(
             f'period is {period:g} s: expected 0 for any time, or at least {_FINEST:g} s')
@@ -127,7 +127,7 @@ def names_of(value: Any, what: str) -> list[str]:
 
 
 def whole(value: Any, what: str, least: float = -math.inf) -> int:
-    """Return a whole number of at least one, or raise `BadInputError`."""
+    """Return a whole number of at least ``least``, or raise `BadInputError`."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
         raise BadInputError(
             f'{what} is {excerpt(value)}: expected a whole number'
@@ -158,12 +158,12 @@ def number(
         value: Any, what: str, unit: str = '', *, least: float = -math.inf,
         above: float = -math.inf, most: float = math.inf) -> float:
     """
-    Return a number of at least one, above another and at most a third.
+    Return a number, checked against the bounds ``least``, ``above`` (exclusive) and ``most``.
 
     Raises
     ------
     BadInputError
-        If it is none, out of range, or with a bound from below not finite.
+        If the value is no number or out of range, or not finite although it has a lower bound.
 
     """
     units = f' {unit}' if unit else ''
@@ -184,20 +184,20 @@ def number(
 
 
 def several(value: Any) -> list[Any]:
-    """Return what may be an item or some of them as a list."""
+    """Return the items as a list; a single item becomes a list of one."""
     return list(value) if np.iterable(value) and not isinstance(value, str) else [value]
 
 
 def parameters_in(given: Mapping[str, Any], law: str = 'gent') -> dict[str, Any]:
     """
-    Return the parameters of the nodes for arguments of `Actuator`, but zeta.
+    Return the node parameters for arguments of `Actuator`, except zeta.
 
-    Constants are of the law that is given, else of that named.
+    The constants belong to the model in ``given``, else to ``law``.
 
     Raises
     ------
     BadInputError
-        If an argument is of another type, or some of them do not go together.
+        If an argument has the wrong type, or some of them exclude each other.
 
     """
     given = {x: y for x, y in given.items() if y is not None or x not in _OPTIONAL}
@@ -222,7 +222,7 @@ def parameters_in(given: Mapping[str, Any], law: str = 'gent') -> dict[str, Any]
 
 
 def _law_values(name: Any, constants: Any, modulus_given: bool) -> dict[str, Any]:
-    """Return the parameters of a law; a constant of several values may be one number."""
+    """Return the parameters of a model; a number is accepted for a constant that is a list."""
     if not isinstance(name, str) or name not in LAWS:
         raise BadInputError(f'law is {excerpt(name)}: expected one of {", ".join(LAWS)}')
     law = LAWS[name]
@@ -247,7 +247,7 @@ def _law_values(name: Any, constants: Any, modulus_given: bool) -> dict[str, Any
 
 
 def _creep_values(creep: Any) -> dict[str, Any]:
-    """Return the parameters of branches, pairs of ratio and time."""
+    """Return the parameters of viscoelastic branches, pairs of stiffness ratio and time."""
     if isinstance(creep, (tuple, list)) and not creep:
         return {}
     ratios, times = columns_of(creep, ('ratio', 'time'), 'branches of creep')
@@ -256,12 +256,12 @@ def _creep_values(creep: Any) -> dict[str, Any]:
 
 def limits_of(limits: Any) -> tuple[float, float]:
     """
-    Return the least and the largest flux density in T.
+    Return the minimum and the maximum flux density in T.
 
     Raises
     ------
     BadInputError
-        If they are no numbers or not in this order.
+        If they are no numbers or not in increasing order.
 
     """
     given = [number(x, 'a flux density limit', 'T') for x in several(limits)]

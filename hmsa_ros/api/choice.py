@@ -1,4 +1,4 @@
-"""Which shaper suits an actuator that is known so well."""
+"""Choice of a shaper for an actuator whose parameters have a known uncertainty."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,26 +12,26 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.known import Known
 from hmsa_ros.interfaces.parameters import ACTUATOR_FIELDS
 
-#: Shapers that are compared, the quickest first.
+#: Compared shapers, the fastest first.
 CANDIDATES = ('two_step', 'zvd', 'robust', 'minimax', 'smooth')
 _DRAWS = 24
-# Share of the draws that leave at most the vibration given.
+# Fraction of the draws with at most the reported residual vibration.
 _MOST = 0.95
-# Smaller steps, in stretch, have no share worth comparing.
+# Smaller steps, in stretch, are not evaluated.
 _STEP = 1e-9
 
 
 @dataclass(frozen=True)
 class Expected:
-    """What a shaper is expected to do with an actuator that is known so well."""
+    """Expected performance of a shaper with uncertain parameters."""
 
     shaper: str
-    #: residual vibration, peak to peak, as a share of the step, that 95 % of the actuators that
-    #: the actuator may be leave at most; of the worst move; NaN where it does not plan them
+    #: 95th percentile, over the possible parameters, of the residual vibration after the worst
+    #: move, peak to peak, as a fraction of the step; NaN if the shaper rejects the moves
     vibration: float
-    #: of the longest move, in s
+    #: move time of the longest move in s
     move_time: float
-    #: why it does not plan the moves; empty if it does
+    #: reason if the shaper rejects the moves; else empty
     reason: str = ''
 
 
@@ -39,18 +39,18 @@ def compare_shapers(
         actuator: Actuator, setpoints: Sequence[tuple[float, float]], known: Known, *,
         seed: int = 0) -> list[Expected]:
     """
-    Return what each of `CANDIDATES` is expected to leave.
+    Return the expected residual vibration and move time of each of `CANDIDATES`.
 
     Parameters
     ----------
     actuator : Actuator
-        As identified.
+        The identified actuator.
     setpoints : pairs
-        Stretch and duration in s.
+        Stretches and durations in s.
     known : Known
-        Values and covariance; what is not in it counts as exact.
+        Values and covariance; other parameters count as exact.
     seed : int
-        Of the actuators that are drawn.
+        Seed of the drawn parameters.
 
     Returns
     -------
@@ -80,12 +80,14 @@ def compare_shapers(
 
 def choose(expected: Sequence[Expected], tolerance: float) -> Expected:
     """
-    Return the quickest shaper that leaves at most a share of the step; else the best one.
+    Return the fastest shaper whose residual vibration is within tolerance, else the best one.
+
+    The tolerance is a fraction of the step.
 
     Raises
     ------
     BadInputError
-        If none of them plans the moves.
+        If every shaper rejects the moves.
 
     """
     able = [x for x in expected if not x.reason]
@@ -96,7 +98,7 @@ def choose(expected: Sequence[Expected], tolerance: float) -> Expected:
 
 
 def _vibration(plan: Plan, truth: Actuator) -> float:
-    """Return what a plan leaves on an actuator, after the worst of its moves."""
+    """Return the residual vibration of a plan, as a fraction of the step, after the worst move."""
     motion = plan.simulate(truth=truth)
     ends = np.cumsum(plan.setpoints[:, 1])
     arrivals = ends - plan.setpoints[:, 1] + plan.move_times

@@ -1,4 +1,4 @@
-"""What follows from the parameters of an actuator, in words."""
+"""Derived quantities of an actuator, as text."""
 
 import math
 
@@ -7,7 +7,7 @@ from hmsa_ros.planning.scales import Scales
 
 
 def facts(found: Scales, block: ActuatorParameters) -> list[tuple[str, str]]:
-    """Return what follows from parameters, as names and values with their units."""
+    """Return names and values, with units, of the derived quantities."""
     beam, drive = block.rest == 0.0, block.coordinate.drive
     words = block.coordinate.plural
     return [
@@ -29,7 +29,7 @@ def facts(found: Scales, block: ActuatorParameters) -> list[tuple[str, str]]:
 
 
 def _time_text(seconds: float) -> str:
-    """Return a time in a unit that suits it."""
+    """Return a time in s, ms or us."""
     for size, unit in ((1.0, 's'), (1e-3, 'ms')):
         if seconds >= size:
             return f'{seconds / size:.4g} {unit}'

@@ -29,14 +29,14 @@ from hmsa_ros.table import Table
 @dataclass(frozen=True, eq=False)
 class Identified:
     """
-    What an identification has found; `identify` makes them.
+    Result of an identification; `identify` returns it.
 
     Attributes
     ----------
     result : Identification
-        Values, covariance, residuals and verdict, whole.
+        The complete result: values, covariance, fit residuals and verdict.
     actuator : Actuator
-        With these values, and the coil as it was given; trust it only if the verdict is
+        The actuator with these values and the given coil; use it only if the verdict is
         ``identified``.
 
     """
@@ -52,7 +52,7 @@ class Identified:
 
     @property
     def reason(self) -> str:
-        """Why, in sentences."""
+        """Reason for the verdict."""
         return self.result.reason
 
     @property
@@ -67,7 +67,7 @@ class Identified:
         return {x: (found[x].low, found[x].high) for x in self.result.names}
 
     def report(self, path: str | Path | None = None) -> Table:
-        """Return the table of ``hmsa identify``; a path writes its page, or `BadInputError`."""
+        """Return the table of ``hmsa identify``; with a path, also write the HTML page there."""
         if path is not None:
             from hmsa_ros.report.identified import page
 
@@ -81,7 +81,7 @@ class Identified:
         Raises
         ------
         BadInputError
-            If nothing was identified, or the file cannot be written.
+            If the verdict is not ``identified``, or the file cannot be written.
 
         """
         if self.verdict != 'identified':
@@ -101,28 +101,30 @@ def identify(
         free: Sequence[str] | None = None, known: Mapping[str, float] | None = None,
         uncertain: Mapping[str, float] | None = None) -> Identified:
     """
-    Find the parameters of an actuator in samples of its motion.
+    Identify the parameters of an actuator from samples of its motion.
 
     Parameters
     ----------
     samples : Motion, path, pairs, array of shape (n, 2), mapping or DataFrame
-        Times in s and stretches, in columns ``time`` and ``stretch``; or a motion, a bag or a CSV.
+        Times in s and stretches, in columns ``time`` and ``stretch``; or a motion, a bag or a CSV
+        file.
     commands : pairs, array of shape (m, 2), mapping, DataFrame or path, optional
-        Times in s and flux densities in T from then on, in columns ``time`` and
-        ``flux_density``; a motion and a bag have their own.
+        Times in s and flux densities in T from that time on, in columns ``time`` and
+        ``flux_density``; a motion and a bag already contain them.
     actuator : Actuator, optional
-        What is known of it, such as sizes, density, law and coil; default the example block.
+        Known parameters, such as size, density, hyperelastic model and coil; default the example
+        block.
     free : sequence of str, optional
-        Names of the parameters to find; default shear modulus, damping, J_lim, remanence and bias
-        of the sensor.
+        Names of the parameters to identify; default shear modulus, damping, J_lim, remanence and
+        sensor bias.
     known, uncertain : mapping of str to float, optional
-        What is known besides, in SI units, such as ``{'sensor_latency': 2e-3}``, and standard
-        deviations of it.
+        Other known values in SI units, such as ``{'sensor_latency': 2e-3}``, and standard
+        deviations of known values.
 
     Returns
     -------
     Identified
-        Values with their 95 % intervals, or why the samples cannot determine them.
+        Values with 95 % intervals, or the reason why the samples cannot determine them.
 
     Raises
     ------
@@ -173,7 +175,7 @@ def identify(
         time, stretch = columns_of(samples, ('time', 'stretch'), 'samples')
         times, levels = columns_of(commands, ('time', 'flux_density'), 'commands')
         if times[0] > time[0]:
-            # As a coil is before anybody commands it.
+            # The field is zero before the first command.
             times, levels = np.append(time[0], times), np.append(0.0, levels)
         recording = Recording(
             time - time[0], stretch, times - time[0], levels, options.slew_limit,
@@ -186,7 +188,7 @@ def identify(
     text = file_text(
         result, Belief(result.actuator, others, base.parameters, Known()),
         recording.label, datetime.now().astimezone())
-    # The file is the one place that has all of it under the names of the nodes.
+    # Only the file has all values under their names in the nodes.
     belief = belief_in(text)
     return Identified(result, Actuator.from_parameters(
         belief.settings, belief if result.verdict == 'identified' else None), text)

@@ -1,4 +1,4 @@
-"""A motion, simulated or recorded: its samples, what drove it, and what came of it."""
+"""A simulated or recorded motion: samples, levels and report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,19 +23,19 @@ if TYPE_CHECKING:
     from hmsa_ros.api.actuator import Actuator
     from hmsa_ros.api.plan import Plan
 
-# Samples a second and, where these are more, a period of the actuator.
+# Default sampling rate in Hz, and minimum number of samples per natural period.
 _RATE, _A_PERIOD = 1000.0, 40.0
 _MOST_SAMPLES = 5_000_000
-# When a simulated sequence was sent before it began, in ns.
+# Time between sending and start of a simulated sequence, in ns.
 _AHEAD = 50_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
     """
-    Samples of a motion, and the levels that drove it.
+    Samples of a motion, and the field levels that drove it.
 
-    `read` returns those of a bag, `Plan.simulate` and `Actuator.simulate` simulated ones.
+    `read` returns a recorded motion; `Plan.simulate` and `Actuator.simulate` simulate one.
 
     Examples
     --------
@@ -65,17 +65,17 @@ class Motion:
 
     @property
     def flux_densities(self) -> Array:
-        """Flux densities in T in force at the samples, NaN where unknown, shape (n,)."""
+        """Flux densities in T at the samples, NaN where unknown, shape (n,)."""
         return samples_of(self.run)['flux_density']
 
     @property
     def levels(self) -> Array:
-        """Times in s and flux densities in T of the levels that drove it, shape (m, 2)."""
+        """Times in s and flux densities in T of the levels, shape (m, 2)."""
         return np.column_stack(list(levels_of(self.run).values()))
 
     @property
     def actuator(self) -> 'Actuator':
-        """The actuator that moved, as far as the record contains its parameters."""
+        """The actuator, with the parameters that the record contains."""
         from hmsa_ros.api.actuator import Actuator
         from hmsa_ros.interfaces.actuator import parameters_of
 
@@ -85,10 +85,10 @@ class Motion:
 
     def report(self, path: str | Path | None = None) -> Table:
         """
-        Return what was measured of each setpoint, or, without setpoints, of each level.
+        Return the measured results of each setpoint or, without setpoints, of each level.
 
-        A path writes the page of ``hmsa report`` as well; if it cannot be written, this is a
-        `BadInputError`.
+        With a path, also write the page of ``hmsa report`` there; raise `BadInputError` if it
+        cannot be written.
         """
         from hmsa_ros.report.arrivals import Part
         from hmsa_ros.report.comparison import setpoints
@@ -107,20 +107,20 @@ class Motion:
 
     def plot(self, path: str | Path | Sequence[str | Path] | None = None, **paper: Any) -> Any:
         """
-        Draw command, response, phase plane and the moves, as ``hmsa report --picture`` does.
+        Draw command, response, phase plane and moves, as ``hmsa report --picture`` does.
 
         Parameters
         ----------
         path : str, Path or sequence of these, optional
-            Files to write, each of a name that ends in .png, .pdf, .svg or .pgf.
+            Files to write; names end in .png, .pdf, .svg or .pgf.
         **paper
-            ``width`` in mm, ``letters`` in pt, ``dpi``, and ``data`` for a CSV of the curves, as
-            of `hmsa_ros.report.paper.Paper`.
+            ``width`` in mm, ``letters`` in pt, ``dpi``, and ``data`` for a CSV file of the curves;
+            see `hmsa_ros.report.paper.Paper`.
 
         Returns
         -------
         Figure
-            Of matplotlib, which a notebook shows.
+            The Matplotlib figure, which a notebook displays.
 
         Raises
         ------
@@ -132,9 +132,9 @@ class Motion:
 
     def save(self, path: str | Path) -> list[Path]:
         """
-        Write the samples, and the levels beside them, as ``hmsa export`` does.
+        Write the samples, and the levels to a second file, as ``hmsa export`` does.
 
-        A name ends in .csv, .parquet or .mat. What cannot be written is a `BadInputError`.
+        The name ends in .csv, .parquet or .mat. Raise `BadInputError` if a file cannot be written.
         """
         return write_run(file_of(path), self.run)
 
@@ -153,12 +153,12 @@ class Motion:
 
 def read(path: str | Path, *, joint: str = '') -> Motion:
     """
-    Read a bag, without ROS.
+    Read a bag without ROS.
 
     Parameters
     ----------
     path : str or Path
-        Folder of a bag, or an ``.mcap`` file, in the format of rosbag2.
+        Folder of a rosbag2 bag, or an ``.mcap`` file.
     joint : str
         Actuator to read, if the bag has several.
 
@@ -170,7 +170,7 @@ def read(path: str | Path, *, joint: str = '') -> Motion:
     Raises
     ------
     BadInputError
-        If there is no bag, it has no samples, or it has several actuators and none is named.
+        If there is no bag, it has no samples, or it has several actuators and ``joint`` is empty.
 
     """
     from hmsa_ros.recordings.bags import read_run
@@ -184,16 +184,16 @@ def compare(
         *motions: Motion, picture: str | Path | Sequence[str | Path] | None = None,
         **paper: Any) -> Table:
     """
-    Compare motions in numbers: move time, offset and vibration of each setpoint, and the curves.
+    Compare motions: move time, steady-state error and vibration of each setpoint, and curves.
 
     Parameters
     ----------
     *motions : Motion
         Two or more; the others are compared with the first.
     picture : str, Path or sequence of these, optional
-        Pictures of all of them to write.
+        Files to which to write a figure of all motions.
     **paper
-        As of `Motion.plot`.
+        As for `Motion.plot`.
 
     Returns
     -------
@@ -203,7 +203,7 @@ def compare(
     Raises
     ------
     BadInputError
-        If there are fewer than two, or they have no setpoint.
+        If there are fewer than two motions, or they have no setpoint.
 
     Examples
     --------
@@ -228,7 +228,7 @@ def compare(
 
 
 def _draw(runs: list[Run], path: Any, paper: Mapping[str, Any]) -> Any:
-    """Draw runs over each other; return the figure of matplotlib."""
+    """Draw runs in one set of axes; return the Matplotlib figure."""
     from hmsa_ros.report.comparison import parts_of
     from hmsa_ros.report.paper import Paper
     from hmsa_ros.report.picture import draw
@@ -249,11 +249,11 @@ def simulated(
         plan: 'Plan | None' = None, *, until: float | None, rate: float | None, noise: float,
         seed: int, label: str) -> Motion:
     """
-    Simulate levels in T from times in s on; a plan adds what was asked and predicted.
+    Simulate levels in T at times in s; a plan adds its setpoints and predictions to the record.
 
-    The start is a stretch at rest, without a field by default; what follows is as in
-    `Actuator.simulate`. Raises `BadInputError` for what
-    cannot be used, `HmsaError` for levels that cannot be followed.
+    The start is a stretch at rest, by default that without a field; the other arguments are
+    those of `Actuator.simulate`. Raise `BadInputError` for unusable arguments, `HmsaError` for
+    levels that cannot be simulated.
     """
     model, units, unit = truth.model, truth.model.units, truth.model.units.load_name
     back = np.flatnonzero(np.diff(times) <= 0.0)
@@ -320,7 +320,7 @@ def simulated(
 
 
 def _rate(period: float) -> float:
-    """Return the default sample rate in Hz, a round number, for the period of an actuator."""
+    """Return the default sampling rate in Hz, a round number, for a natural period in s."""
     wanted = max(_RATE, _A_PERIOD / period)
     digits = 10 ** (math.floor(math.log10(wanted)) - 1)
     return float(math.ceil(wanted / digits) * digits)

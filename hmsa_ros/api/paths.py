@@ -1,4 +1,4 @@
-"""Paths that an actuator follows, from arrays or files in seconds."""
+"""Paths for an actuator to follow, from arrays or files, with times in seconds."""
 
 from dataclasses import replace
 from pathlib import Path as File
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from hmsa_ros.api.actuator import Actuator
     from hmsa_ros.api.plan import Plan
 
-# Shapes of waves; a square one is a sequence of moves between its extremes.
+# Shapes of waves; a square wave is a sequence of moves between its extremes.
 SHAPES: dict[str, Shape] = {'square': sine, 'sine': sine, 'triangle': triangle}
-# Points between two breaks of a wave.
+# Points between two spline knots of a wave.
 _OF_EACH = 8
-# Frequencies at which a sweep is held against the limits.
+# Number of frequencies at which a sweep is checked against the limits.
 _SWEPT = 50
 
 
@@ -37,7 +37,7 @@ def read_path(file: File) -> tuple[Array, Array]:
     """
     Read the points of a path from CSV: the columns ``time`` in s and ``stretch``.
 
-    `BadInputError` says why a file cannot be used.
+    Raise `BadInputError` if the file cannot be used.
     """
     table = read_table(file, ('time', 'stretch'))
     table.check_complete(file)
@@ -48,7 +48,7 @@ def path_of(actuator: 'Actuator', columns: tuple[Any, ...]) -> Path:
     """
     Return the path through times, stretches, rates and accelerations; the last may be None.
 
-    Columns that are no path are a `BadInputError`.
+    Raise `BadInputError` if the columns describe no path.
     """
     given = [_column(x) for i, x in enumerate(columns) if i < 2 or x is not None]
     if columns[2] is None and columns[3] is not None:
@@ -58,7 +58,7 @@ def path_of(actuator: 'Actuator', columns: tuple[Any, ...]) -> Path:
             f'the columns of the path have {", ".join(str(len(x)) for x in given)} numbers: '
             'expected as many in each, of at least 2 points')
     times, stretches, *more = given
-    # Without them the path is checked as one at rest in all points.
+    # Missing rates are checked as zero, missing accelerations as unknown.
     rates, accelerations = (*more, *[0.0 * times, np.full_like(times, np.nan)][len(more):])
     check_path(
         [((x, y, z), round(NANOSECONDS * t)) for x, y, z, t in zip(
@@ -81,9 +81,9 @@ def _column(values: Any) -> Array:
 def wave_of(
         actuator: 'Actuator', shape: Any, amplitude: float, offset: float | None) -> Wave:
     """
-    Return a wave by the name of its shape, or by one period of times and stretches.
+    Return a wave from the name of its shape, or from one period of times and stretches.
 
-    What is no wave is a `BadInputError`.
+    Raise `BadInputError` if the arguments describe no wave.
     """
     rest = actuator.block.rest
     mean = number(rest if offset is None else offset, 'offset')
@@ -105,7 +105,7 @@ def wave_of(
 
 
 def bands(actuator: 'Actuator', shape: Any, amplitude: float, offset: float | None) -> Array:
-    """Return the bands of frequencies in Hz that an actuator's limits allow, shape (n, 2)."""
+    """Return the frequency bands in Hz that the actuator's limits allow, shape (n, 2)."""
     wave, frame = wave_of(actuator, shape, amplitude, offset), _frame(actuator)
     if isinstance(shape, str) and shape == 'square':
         high, low, rest = wave.mean + wave.amplitude, wave.mean - wave.amplitude, frame.target
@@ -122,9 +122,10 @@ def bands(actuator: 'Actuator', shape: Any, amplitude: float, offset: float | No
 def wave_path(
         actuator: 'Actuator', wave: Wave, sweep: tuple[float, float], cycles: float) -> Path:
     """
-    Return the path of a wave between two rests without a field, from a frequency in Hz to another.
+    Return the path of a wave that starts and ends at rest without a field.
 
-    Frequencies that limits do not allow are a `RefusedError`, others out of range `BadInputError`.
+    The frequency sweeps between two values in Hz. Raise `RefusedError` if the limits do not allow
+    a frequency, `BadInputError` if one is out of range.
     """
     model, frame = actuator.model, _frame(actuator)
     unit = model.units.time
@@ -142,7 +143,7 @@ def wave_path(
 
 
 def wave_points(path: Path, unit: float) -> Array:
-    """Return times in s and stretches of a wave's path, by the unit of time, shape (n, 2)."""
+    """Return times in s and stretches of a wave's path with a time scale in s, shape (n, 2)."""
     count = len(path.breaks) - 1
     times = np.interp(
         np.arange(_OF_EACH * count + 1) / _OF_EACH, np.arange(count + 1), path.breaks)
@@ -153,7 +154,7 @@ def smooth_points(times: Array, stretches: Array) -> Array:
     """
     Return time, stretch, rate and acceleration of the smooth path through points, shape (n, 4).
 
-    Points that are no path are a `BadInputError`.
+    Raise `BadInputError` if the points describe no path.
     """
     times, stretches = _column(times), _column(stretches)
     if len(times) < 2 or np.any(np.diff(times) <= 0.0):
@@ -174,9 +175,10 @@ def followed(
         actuator: 'Actuator', path: Path, ends: tuple[float, float], tolerance: float,
         period: float = 0.0) -> 'Plan':
     """
-    Plan to follow a path between rests at its ends, on a grid with a period in s.
+    Plan a command that follows a path between rests at its ends; the grid period is in s.
 
-    A number out of range is a `BadInputError`, what cannot be followed a `RefusedError`.
+    Raise `BadInputError` if a number is out of range, `RefusedError` if the path cannot be
+    followed.
     """
     from hmsa_ros.api.plan import Plan
 

@@ -1,4 +1,4 @@
-"""A plan: what to send to the coil and when, and the motion that it predicts."""
+"""A plan: levels for the coil and their times, and the predicted motion."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -26,9 +26,9 @@ def table_of(
         between: Column, time: float, shown: Callable[[float], float],
         caption: str = '') -> Table:
     """
-    Return a table of moves: some values of each, other levels where one has more than two, status.
+    Return a table of moves: given values, further levels of moves with more than two, and status.
 
-    ``time`` is the unit of time, and ``shown`` takes a load to what is shown of it.
+    ``time`` is the time scale in s; ``shown`` converts a load to the displayed value.
     """
     inside = [_between(x, time, shown) for x in segments]
     many = any(inside)
@@ -40,7 +40,7 @@ def table_of(
 
 
 def _between(segment: Segment, time: float, shown: Callable[[float], float]) -> str:
-    """Return the levels between the first and the last of a move, each at its time; or nothing."""
+    """Return the levels between the first and the last of a move with their times, as text."""
     inside = segment.move.levels[1:-1]
     return ', '.join(
         f'{shown(x.load):.6g} at {x.time * time:.6g}' for x in inside
@@ -50,7 +50,7 @@ def _between(segment: Segment, time: float, shown: Callable[[float], float]) -> 
 @dataclass(frozen=True, eq=False)
 class Plan:
     """
-    A planned command: levels of the field, each in force from its time on.
+    A planned command: field levels, each valid from its time on.
 
     `Actuator.plan` makes plans.
 
@@ -67,8 +67,8 @@ class Plan:
 
     """
 
-    actuator: Actuator  #: for which it was planned
-    segments: tuple[Segment, ...]  #: one a setpoint, without a dimension
+    actuator: Actuator  #: the actuator that the plan was made for
+    segments: tuple[Segment, ...]  #: one per setpoint, dimensionless
     shaper: str = 'two_step'
 
     @cached_property
@@ -85,7 +85,7 @@ class Plan:
 
     @property
     def times(self) -> Array:
-        """Times in s from which on the levels are in force, shape (m,)."""
+        """Times in s at which the levels start, shape (m,)."""
         return self.levels[:, 0]
 
     @property
@@ -102,24 +102,24 @@ class Plan:
 
     @property
     def move_times(self) -> Array:
-        """Durations in s of the moves; infinite where a target is only approached, shape (n,)."""
+        """Move times in s; infinite where a target is only approached, shape (n,)."""
         return np.array([x.move.duration for x in self.segments]) * self.actuator.model.units.time
 
     def currents(self, tesla_per_ampere: float) -> Array:
         """
-        Return the levels in A, for a coil of so many T per A, shape (m,).
+        Return the levels in A, for a coil constant in T/A, shape (m,).
 
         Raises
         ------
         BadInputError
-            If this is not a number above 0.
+            If the coil constant is not a number above 0.
 
         """
         return self.flux_densities / number(
             tesla_per_ampere, 'tesla_per_ampere', 'T/A', above=0.0)
 
     def report(self) -> Table:
-        """Return the levels of each setpoint, its move time and its status."""
+        """Return a table of the levels, move time and status of each setpoint."""
         units, name = self.actuator.model.units, self.actuator.block.coordinate.name
         unit, level = units.load_name.strip(), units.level
         return table_of(
@@ -137,22 +137,22 @@ class Plan:
             rate: float | None = None, until: float | None = None, seed: int = 0,
             label: str = 'simulated') -> Motion:
         """
-        Simulate the plan, on the actuator it was made for or on another one.
+        Simulate the plan, on the planned actuator or on another one.
 
         Parameters
         ----------
         truth : Actuator, optional
-            What the actuator and its amplifier really are; default as planned.
+            True actuator and amplifier; default those of the plan.
         noise : float
             Standard deviation of the samples of the stretch.
         rate : float, optional
-            Samples a second in Hz; default 1000, or 40 a period of the actuator if these are more.
+            Sampling rate in Hz; default 1000 Hz, or 40 samples per natural period if this is more.
         until : float, optional
             End in s; default that of the last setpoint.
         seed : int
-            Of the noise.
+            Seed of the noise.
         label : str
-            Name in pictures and comparisons.
+            Name in figures and comparisons.
 
         Returns
         -------
@@ -162,7 +162,7 @@ class Plan:
         Raises
         ------
         BadInputError
-            If an argument is of another type or out of range.
+            If an argument has the wrong type or is out of range.
 
         Examples
         --------
@@ -190,8 +190,8 @@ class Plan:
         """
         Write the levels as CSV, Parquet or Matlab file (``.csv``, ``.parquet``, ``.mat``).
 
-        ``hmsa simulate`` and ``hmsa run --levels`` take the CSV. What cannot be written is a
-        `BadInputError`.
+        ``hmsa simulate`` and ``hmsa run --levels`` read the CSV file. Raise `BadInputError` if the
+        file cannot be written.
         """
         write_table(file_of(path), {'time': self.times, 'flux_density': self.flux_densities})
 
