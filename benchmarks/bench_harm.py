@@ -72,7 +72,7 @@ def run(bench: Bench, way: str) -> list[Left]:
             flux_density_min=-_LIMIT, flux_density_max=_LIMIT, lead_time=lead))}),
         Settings(takeover_timeout=0, heartbeat_period=0, **WAYS[way]), device)
     told: list[Output] = []
-    loop.tell = told.append
+    loop.deliver = told.append
     loop.run(device.time + round(_BEFORE * unit))
     found, start, words = [], 1.0, ''
     for target in bench.targets:

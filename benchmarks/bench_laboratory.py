@@ -286,7 +286,7 @@ class Trial:
         self.loop = Loop(PlannerGroup({_JOINT: planner}), Settings(
             takeover_timeout=0, heartbeat_period=100 * _MS), self.driver)
         self.verdicts: dict[int, str] = {}
-        self.loop.tell = self._hear
+        self.loop.deliver = self._hear
         self.loop.run(self.loop.now + 500 * _MS)
 
     def _hear(self, output: Output) -> None:

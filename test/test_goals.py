@@ -56,7 +56,7 @@ class Bench:
             if isinstance(x, Send):
                 self.device.receive(self.joints.index(x.joint), x.stamp, x.flux_density)
             elif isinstance(x, StatusChanged):
-                self.goals.tell(x)
+                self.goals.update(x)
 
     def run(self, ms):
         for _ in range(ms):

@@ -1,4 +1,4 @@
-"""Work that another process does, so that commands do not wait for it."""
+"""Execute work in another process, so that commands do not wait for it."""
 
 from collections.abc import Callable, Generator, Iterator
 import os
@@ -10,44 +10,44 @@ from time import monotonic_ns
 from typing import Any, TypeVar
 
 T = TypeVar('T')
-#: Yields while an answer is waited for, and returns it.
+#: Yields while waiting for a result, and returns it.
 Awaited = Generator[None, None, T]
-#: Does work, whose arguments and result can be pickled, here or in another process.
+#: Executes work, with picklable arguments and result, here or in another process.
 Doing = Callable[..., Awaited[Any]]
 
-#: How often to look for answers, in ns.
+#: Interval in ns at which results are polled.
 ANSWER = 5_000_000
-# Whatever work is made of is imported before the first.
+# All modules that the work uses are imported before the first work.
 _WORKER = (
     'import sys; sys.path[:] = {!r}; import hmsa_ros.control.feedback; '
     'from hmsa_ros.control.aside import serve; serve({})')
-# How long in ns an answer is waited for: the first takes seconds on a busy machine.
+# Longest wait for a result in ns: the first takes seconds on a busy machine.
 _PATIENCE = 20_000_000_000
-# By how much it gives way to whoever sends and obeys commands.
+# Niceness, relative to the processes that send and apply commands.
 _NICE = 5
 
 
 def here(work: Callable[..., T], *arguments: object) -> Awaited[T]:
-    """Do work in this process, at once."""
+    """Execute work in this process, immediately."""
     yield from ()
     return work(*arguments)
 
 
 def goes_on(work: Iterator[None]) -> bool:
-    """Go on with work; return whether its answer is waited for."""
+    """Continue work; return whether its result is still pending."""
     return next(work, work) is not work
 
 
 class Aside:
     """
-    Does work in a process of its own, one piece of work after another.
+    Execute work in a separate process, one piece after another.
 
-    The process starts with the first work, unless it was started before. Should it end, work is
-    done `here` from then on, and `tell` is called with a sentence that says so.
+    The process starts with the first work, or by `start`. If it ends, work is executed `here` from
+    then on, and ``report`` is called with a message.
     """
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell = tell
+    def __init__(self, report: Callable[[str], None]) -> None:
+        self._report = report
         self._worker: _Worker | None = None
         self._lost = False
 
@@ -63,7 +63,7 @@ class Aside:
         return work(*arguments)
 
     def start(self) -> None:
-        """Start the process, if it does not run."""
+        """Start the process if it is not running."""
         if self._worker is None and not self._lost:
             try:
                 self._worker = _Worker()
@@ -73,27 +73,28 @@ class Aside:
     def _lose(self) -> None:
         self.close()
         if not self._lost:
-            self._tell(
+            self._report(
                 'the process that estimates beside the planner has ended, does not answer, or '
                 'cannot start: the planner estimates itself, and commands may wait for that; see '
                 'what ended it (memory?), and start the planner again')
         self._lost = True
 
     def close(self) -> None:
-        """End the process, whatever it does; more work starts another one."""
+        """End the process immediately; further work starts another one."""
         worker, self._worker = self._worker, None
         if worker is not None:
             worker.end()
 
 
 class _Worker:
-    """The process, and what it was asked."""
+    """The process and its pending work."""
 
     def __init__(self) -> None:
-        from multiprocessing.connection import Pipe  # slow to load, and seldom of use
+        from multiprocessing.connection import Pipe  # slow to import and rarely needed
 
         self._line, its = Pipe()
-        # It ends with the line, not with the signal that a terminal sends to all.
+        # The worker ends with the pipe, not with the signal that a terminal sends to all
+        # processes.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             self._process = subprocess.Popen(
@@ -102,17 +103,17 @@ class _Worker:
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             its.close()
-        # Its own method makes a new one each time, which takes ten times as long.
+        # Connection.poll creates a new selector for each call, which takes ten times as long.
         self._look = select.poll()
         self._look.register(self._line, select.POLLIN)
-        # What takes the answer that it owes; the first one says that it is ready.
+        # List that receives the pending result; the first result signals that the worker is ready.
         self._owed: list[Any] | None = []
 
     def result(self, work: object, arguments: object) -> Awaited[Any]:
         """
-        Return the result of work, once what was asked for before is done.
+        Return the result of work, after the results of earlier work.
 
-        Raises `OSError` or `EOFError` if there is no answer to come, or none for long.
+        Raises `OSError` or `EOFError` if no result will come, or none came in time.
         """
         end = monotonic_ns() + _PATIENCE
         answer: list[Any] = []
@@ -127,21 +128,21 @@ class _Worker:
         return answer[0]
 
     def _owes(self) -> bool:
-        """Take an answer that has come, whoever waits for it; return whether one is to come."""
+        """Receive a pending result if there is one; return whether one is still pending."""
         if self._owed is not None and self._look.poll(0):
             self._owed.append(self._line.recv())
             self._owed = None
         return self._owed is not None
 
     def end(self) -> None:
-        """End the process, whatever it does."""
+        """End the process immediately."""
         self._line.close()
         self._process.kill()
         self._process.wait()
 
 
 def serve(place: int) -> None:
-    """Do the work that comes by a line, a file descriptor, and answer, until it is cut."""
+    """Execute the work that arrives at a file descriptor until its other end closes."""
     os.nice(_NICE)
     from multiprocessing.connection import Connection
 
@@ -152,5 +153,5 @@ def serve(place: int) -> None:
             work, arguments = line.recv()
         except (EOFError, OSError):
             return
-        # An error ends the process: whoever asked meets it in its own.
+        # An error ends the process: the caller then executes the work itself and gets the error.
         answer = work(*arguments)

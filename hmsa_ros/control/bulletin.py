@@ -1,4 +1,4 @@
-"""What a runtime tells: verdicts, progress and previews, in the order in which they happen."""
+"""Reports of a runtime: verdicts, progress and previews, in chronological order."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
@@ -20,70 +20,70 @@ from hmsa_ros.model.status import Code
 from hmsa_ros.planning.group import PlannerGroup, Progress
 from hmsa_ros.planning.timeline import PlannedSegment
 
-# Changes of level in one preview, and how soon in ns a correction is in one: it takes some time to
-# make, and those of several joints come together.
+# Changes of level in one preview, and the delay in ns until a preview shows a correction: a
+# preview takes time to make, and corrections of several joints arrive together.
 _PREVIEW, _SOON = 500, 50_000_000
-#: How often it is looked whether somebody listens, in ns.
+#: Interval in ns at which subscribers are looked up.
 LOOK = 200_000_000
 
 
 class Bulletin:
-    """Verdicts, progress, previews and notes that wait to be passed on."""
+    """Verdicts, progress, previews and notes that wait to be published."""
 
     def __init__(
             self, group: PlannerGroup, following: Following, watch: Watch,
             surroundings: Surroundings, outputs: list[Output], note: Callable[[str], None],
             *looks: Callable[[], str]) -> None:
-        """Begin with no verdict; looks return what `unheard` and `unseen` are to be."""
+        """Begin without a verdict; ``looks`` return the values of `unheard` and `unseen`."""
         self._group, self._following, self._watch = group, following, watch
         self._around, self._looks = surroundings, looks
         self.outputs, self.note = outputs, note
         self._look_again = 0
-        self.unheard = ''  # why nobody carries out commands; empty where somebody does
-        self.unseen = ''  # of which joint samples have ceased; empty for none
+        self.unheard = ''  # why commands are not carried out; empty if they are
+        self.unseen = ''  # joint whose samples have stopped; empty for none
         self.verdict = Verdict(Severity.OK, Code.NONE, 'no request yet')
         self.preview_again: int | None = None  # time in ns of the next part of a long plan
-        self._told: tuple[Progress, Mapping[str, Progress], bool] | None = None
-        # What progress follows from until then.
+        self._reported: tuple[Progress, Mapping[str, Progress], bool] | None = None
+        # The plans that progress was computed from, valid until `next_change`.
         self._segments: list[tuple[PlannedSegment, ...]] = []
         self.next_change: int | None = None  # time in ns at which progress changes next
-        self.tell()
+        self.report()
 
     def give(self, verdict: Verdict, *, log: bool = False) -> None:
-        """Give a verdict; what went wrong is not taken back by a correction."""
+        """Set the verdict; a correction does not replace a warning."""
         if verdict.code is not Code.CORRECTED or not self._warned:
             self.verdict = verdict
         if log:
             self.note(verdict.message)
-        self.tell()
+        self.report()
 
     def go_on(self, verdict: Verdict, *, log: bool = False) -> None:
-        """Give a verdict on the request that the one before was on."""
+        """Set a verdict on the same request as the previous one."""
         self.give(replace(verdict, request=self.verdict.request), log=log)
 
     @property
     def _warned(self) -> bool:
-        """Whether the verdict warns of something else than what was measured."""
+        """Whether the verdict is a warning that does not concern the measured result."""
         return self.verdict.severity > Severity.OK and self.verdict.code not in VERDICTS
 
-    def tell(self) -> None:
-        """Tell verdict and progress."""
-        self._told = self._state()
-        progress, each, watching = self._told
+    def report(self) -> None:
+        """Report verdict and progress."""
+        self._reported = self._state()
+        progress, each, watching = self._reported
         self.outputs.append(StatusChanged(
             self.verdict, progress, each, self._group.number, self._following.lateness.count,
             self._following.replanned, self._watch.findings, self._watch.worst, watching,
             self.unheard, self.unseen, self._watch.measuring,
             {name: x.model.units.coordinate for name, x in self._group.planners.items()}))
 
-    def tell_progress(self, now: int) -> None:
-        """Tell progress, if there is any by a time in ns."""
+    def report_progress(self, now: int) -> None:
+        """Report the progress if it has changed by a time in ns."""
         planners = self._group.planners.values()
-        # Where plans are as they were and nothing in them has begun or ended there is none.
+        # Progress is unchanged if no plan was replaced and no part of a plan has begun or ended.
         same = (self.next_change is None or now < self.next_change) and all(
             x.plan.segments is known for x, known in zip(planners, self._segments, strict=True))
-        if not same and self._state() != self._told:
-            self.tell()
+        if not same and self._state() != self._reported:
+            self.report()
 
     def _state(self) -> tuple[Progress, Mapping[str, Progress], bool]:
         now = self._around.clock()
@@ -93,21 +93,21 @@ class Bulletin:
         return *self._group.progress(now), self._watch.open
 
     def take_goals(self, request: Request) -> None:
-        """Have a request, whose plan was taken just now, judged by what it counts as arrived."""
+        """Apply the goal tolerances of a request whose plan has just been adopted."""
         self._watch.goals = request.goals if isinstance(request, Trajectory) else {}
 
     def show(self) -> None:
-        """Show what is planned; of a long plan the beginning, and the rest in time."""
+        """Preview the plan; of a long plan only the beginning, and the rest in time."""
         stamps, samples = self._group.preview(self._around.clock(), _PREVIEW)
         self.preview_again = stamps[_PREVIEW // 2] if len(stamps) == _PREVIEW else None
         self.outputs.append(PlanChanged(tuple(stamps), samples))
 
     def found(self, finding: Finding | None) -> None:
-        """Tell what was measured; the verdict is the worst of the request."""
+        """Report a finding; the verdict is the worst finding of the request."""
         worst = self._watch.worst
         if worst is None or self.verdict.severity is Severity.ERROR or not worst.failed and (
                 self._warned or not self._watch.finished):
-            self.tell()
+            self.report()
             return
         fine = worst.arrived or worst.verdict is Code.UNOBSERVED and not self._watch.measuring
         self.go_on(
@@ -115,14 +115,14 @@ class Bulletin:
             log=worst.failed and worst is finding)
 
     def corrected(self, names: Iterable[str], now: int) -> None:
-        """Take in that the plans of joints have been corrected at a time in ns; show them soon."""
+        """Record that plans were corrected at a time in ns, and preview them soon."""
         for name in names:
             self._watch.corrected(name)
         soon = now + _SOON
         self.preview_again = soon if self.preview_again is None else min(self.preview_again, soon)
 
     def look_for_listeners(self) -> None:
-        """Warn where nobody carries out what is sent, or samples cease, and say when that ends."""
+        """Warn if commands are not carried out or samples have stopped, and report recovery."""
         now = self._around.steady()
         if now < self._look_again:
             return
@@ -135,4 +135,4 @@ class Bulletin:
             if one != other:
                 self.note(other or well)
         if before != (self.unheard, self.unseen):
-            self.tell()
+            self.report()

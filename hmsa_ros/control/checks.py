@@ -1,4 +1,4 @@
-"""Whether a planner can take a request: active, for its joints, not for too many setpoints."""
+"""Check whether a planner can accept a request: its state, the joints, the setpoint count."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from hmsa_ros.model.status import Code, RefusedError
 
 
 def check_ready(now: int, *, active: bool) -> None:
-    """Raise `RefusedError` if no request can be taken at all, at a time in ns."""
+    """Raise `RefusedError` if no request can be accepted at a time in ns."""
     if not active:
         raise RefusedError(
             Code.INACTIVE, 'the planner is inactive: expected it active (ros2 lifecycle set NODE '
@@ -22,9 +22,9 @@ def check_ready(now: int, *, active: bool) -> None:
 
 def check_joints(request: Request, joints: Sequence[str], settings: Settings) -> None:
     """
-    Check whom a request is for.
+    Check the joints of a request and its number of setpoints.
 
-    Raises `RefusedError` if a joint is another one, there twice or missing, or there are too many
+    Raises `RefusedError` if a joint is unknown, repeated or missing, or if there are too many
     setpoints.
     """
     if isinstance(request, Target) and request.joint not in joints:

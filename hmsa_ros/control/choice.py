@@ -1,9 +1,9 @@
 """
-Which parameters to plan with: those in use, or those that samples suggest.
+Choose between the parameters in use and those that the samples suggest.
 
-Both are tried on moves that may come, from where the joint is. What each is expected to leave is
-worked out with the exact motion over all that samples leave open, so that an estimate has to be
-known well before it takes the place of what is in use.
+Both are tried on likely next moves from the current target. The predicted error of each move is
+computed with the exact motion and includes the uncertainty of the estimate, so an estimate
+replaces the parameters in use only once it is well determined.
 """
 
 from collections.abc import Sequence
@@ -27,11 +27,11 @@ from hmsa_ros.estimation.motion import rest
 from hmsa_ros.planning.planner import Planner
 from hmsa_ros.planning.timeline import Model
 
-# Other parameters are to leave less by this share of the step.
+# Other parameters must reduce the predicted error by at least this fraction of the step.
 _LEAST = 3e-4
-# Share of the step up to which a change is little; none is where the given ones are in use.
+# Fraction of the step up to which an increase counts as small; 0 for the given parameters.
 _LITTLE = 0.015
-# Smaller steps are tried as this one.
+# Shorter steps are replaced by this one.
 _STEP = 0.15
 
 
@@ -39,11 +39,11 @@ def clearly_better(
         estimate: Estimate, model: Model, used: Model, start: float, target: float, *,
         given: bool, shown: bool) -> bool:
     """
-    Return whether moves planned with a model are expected to leave clearly less than with another.
+    Return whether moves planned with a model have a clearly smaller predicted error.
 
-    The joint went from the start to the target, and is tried on the way back and further on. What
-    is given may be right: it is left for what is clearly better alone, and for what is much better
-    unless samples have shown an arrival.
+    The joint went from the start to the target; the trial moves lead back and further on. The
+    parameters in use are kept unless ``model`` is clearly better. If they are the ``given`` ones,
+    it must be much better until samples have ``shown`` an arrival.
     """
     step = math.copysign(max(abs(target - start), _STEP), target - start)
     tried = [[_left(estimate, each, target, to) for each in (used, model)]
@@ -58,7 +58,7 @@ def clearly_better(
 
 
 def _together(outcomes: Sequence[Outcome]) -> Outcome:
-    """Return what moves leave on average."""
+    """Return the average predicted error of several moves."""
     count = len(outcomes)
     size = len(outcomes[0].misses)
     covariance = np.zeros((count, size, count, size))
@@ -71,9 +71,9 @@ def _together(outcomes: Sequence[Outcome]) -> Outcome:
 
 def _left(estimate: Estimate, model: Model, start: float, target: float) -> Outcome | None:
     """
-    Return what a move from rest that is planned with a model is expected to leave.
+    Return the predicted error of a move from rest that is planned with a model.
 
-    Figures are shares of its step. None where it cannot be planned, or followed.
+    The values are fractions of the step. None if the move cannot be planned or simulated.
     """
     try:
         plan = Planner(
@@ -94,7 +94,7 @@ def _left(estimate: Estimate, model: Model, start: float, target: float) -> Outc
 
 
 def _at_rest(estimate: Estimate, level: float) -> Estimate | None:
-    """Return what is believed once a level in T has been in force for long, at the time 0."""
+    """Return the estimate at time 0 after a level in T has been in force for a long time."""
     values = {x: y for x, y in estimate.values.items() if x != 'behind'}
     at = rest(values, estimate.free, level)
     if at is None:

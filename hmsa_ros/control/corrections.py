@@ -1,4 +1,4 @@
-"""Plans that are corrected from what feedback has seen."""
+"""Correct plans with estimates from feedback."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -37,42 +37,45 @@ from hmsa_ros.planning.drafting import Steps
 from hmsa_ros.planning.planner import Planner
 from hmsa_ros.planning.timeline import Draft, Model, Plan, PlannedLevel
 
-# A correction gains at least this share of the step, less while a move has time for corrections:
-# what rests is not to be moved for little.
+# Minimum gain of a correction as a fraction of the step, and the smaller one during a move that
+# has time for corrections: an actuator at rest is not moved for a small gain.
 _GAIN, _LITTLE = 5e-4, 5e-5
-# And this share of the noise of a sample.
+# Minimum gain as a fraction of the noise of a sample.
 _NOISE = 0.02
-# Units of time before its end from which on a move is not corrected any more.
+# Time scales before its end from which a move is no longer corrected.
 _SHORTEST = 0.3
-# Share of the step from which on a bias matters that may be a force: after a move that began this
-# near to rest without field, where they look alike, what rests is then corrected for much alone.
+# Fraction of the step from which a bias that may be a force matters. After a move that began this
+# close to rest without field, where the two look alike, an actuator at rest is then corrected only
+# for a large gain.
 _HIDDEN, _FIRST = 0.01, 0.02
-# Levels that differ by less, in units of load, are the same.
+# Levels that differ by less, in units of load, count as equal.
 _SAME = 1e-5
-# Natural periods after which a path that was joined is looked at again, and at least as many times
-# as long as planning took; periods and samples it is looked ahead for; levels before that count.
+# Interval between checks of a replanned path in natural periods, and its minimum as a multiple of
+# the planning time; natural periods and samples of the prediction; earlier levels that still
+# matter.
 _JOINED, _IDLE, _PERIODS, _SAMPLES, _BEFORE = 2, 4, 3, 61, 8
-# Deviations by which creep is known that a path takes into account: of what samples cannot tell
-# apart the sum counts.
+# Standard deviations from which creep is included in a path: only the sum of quantities that
+# samples cannot distinguish matters.
 _CREEPS = 1.0
-# Units of time after the last change from which on a level is trimmed, so that it is slow beside
-# any vibration, and what share of the bound one change may be.
+# Time scales after the last change from which a level is trimmed, slowly compared with any
+# vibration, and the largest single change as a fraction of the bound.
 _PAUSE, _PART = 60.0, 0.25
-# Deviations by which the rest must be beside the target for that, and the least offset.
+# Standard deviations by which the actuator must rest off the target to be trimmed, and the
+# smallest such error.
 _SURE, _OFF = 3.0, 1e-4
 
 
 class Corrections:
-    """Corrects plans where that is expected to leave less."""
+    """Correct plans if that reduces the predicted error."""
 
     def __init__(self, feedback: Feedback, clock: Clock) -> None:
         self._feedback, self._clock = feedback, clock
 
     def cautious(self, drafts: Mapping[str, Draft]) -> Mapping[str, Draft]:
         """
-        Give first moves more time to be corrected in, where they are expected to leave much.
+        Give first moves with a large predicted error more time, so that they can be corrected.
 
-        Their levels stay: the early effect of these shows what the actuator is.
+        Their levels do not change: their early effect identifies the actuator.
         """
         joints = self._feedback.joints
         return {name: self._slowly(joints[name], draft) if name in joints else draft
@@ -92,7 +95,7 @@ class Corrections:
         joint.moves.expected = expect(estimate, course, slew).size
         if math.isinf(joint.tolerance):
             return draft
-        # What is only suspected is no reason to take longer.
+        # Parameters that are only suspected do not justify slowing down.
         named = len(joint.settings.feedback_parameters)
         if expect(estimate.sure_of(named), course, slew).size <= joint.tolerance * step:
             return draft
@@ -104,7 +107,7 @@ class Corrections:
         return replace(draft, segments=(replace(segment, arrival=arrival), *rest))
 
     def due(self, now: int) -> Iterator[Work]:
-        """Yield what may be worth correcting by a time in ns; the results are for `take`."""
+        """Yield corrections that may help at a time in ns; `take` adopts the results."""
         for joint in self._feedback.taken_back():
             yield self._work(joint, _take_back)
         for joint in self._feedback.news():
@@ -129,7 +132,7 @@ class Corrections:
             joint.name, joint.planner, partial(make, joint), self._clock, corrects=True)
 
     def _rejoin(self, joint: Joint, now: int) -> Steps[Draft | None]:
-        """Plan the rest of a path anew by what is known now, if that stays nearer to it."""
+        """Replan the rest of a path with the current estimate, if that follows it more closely."""
         planner, begun = joint.planner, self._clock()
         begin = planner.soonest(now + joint.planning)
         estimate, ahead = joint.state(begin), _ahead(planner, begin)
@@ -151,11 +154,11 @@ class Corrections:
         return draft
 
     def take(self, work: Work, drafts: Mapping[str, Draft], now: int) -> Verdict | None:
-        """Take a correction worked out for a time in ns; None where nothing changes."""
+        """Adopt a correction made for a time in ns; None if nothing changes."""
         name, = work.joints
         joint, draft = self._feedback.joints.get(name), drafts.get(name)
         if joint is not None:
-            # Commands have their share of the time after it.
+            # Leaves commands their fraction of the CPU time.
             self._feedback.spent(joint, work.spent)
         if joint is None or draft is None:
             return None
@@ -166,14 +169,14 @@ class Corrections:
         joint.moves.corrected.append(draft.begin)
         joint.moves.expected, joint.after = joint.after, 0.0
         if draft.segments[0].path is not None:
-            # What the path was corrected by also takes it to rest, should it be stopped.
+            # A stop of the path uses its corrected model too.
             joint.used = draft.levels[0].model
             joint.planner.take_model(joint.used)
         return Verdict(Severity.OK, Code.CORRECTED, f'corrected from samples: {words}')
 
 
 def _take_back(joint: Joint, now: int) -> Steps[Draft | None]:
-    """Go on by the model in force, whatever was corrected before."""
+    """Replan the rest with the model in force, discarding earlier corrections."""
     planner = joint.planner
     plan, model, soonest = planner.plan, planner.model, planner.soonest(now)
     place = plan.under_way(soonest)
@@ -193,31 +196,31 @@ def _take_back(joint: Joint, now: int) -> Steps[Draft | None]:
 
 
 def _trim(joint: Joint, now: int, *, level: float) -> Steps[Draft | None]:
-    """Hold by another level in T."""
+    """Hold the setpoint with another level in T."""
     return (yield from joint.planner.draft_trim(now, level))
 
 
 def _arrival(joint: Joint, now: int) -> int:
-    """Return the time in ns of rest of a move that has time for corrections; 0 without one."""
+    """Return the arrival in ns of a move that has time for corrections; else 0."""
     planner = joint.planner
     left = joint.waits - planner.soonest(now)
     return joint.waits if left >= _SHORTEST * planner.model.units.time * NANOSECONDS else 0
 
 
 def _may_gain(joint: Joint, estimate: Estimate, now: int) -> bool:
-    """Return whether a plan is expected to leave more than it must."""
+    """Return whether the predicted error of a plan exceeds the smallest useful gain."""
     share = _LITTLE if _arrival(joint, now) else _GAIN if joint.shown(now) else MUCH
     course, gain = course_of(joint.planner.plan, estimate.time, share)
     return expect(estimate, course, joint.planner.options.slew_limit).size > gain
 
 
 def _saturates(joint: Joint, draft: Draft) -> bool:
-    """Return whether a draft has a level that an amplifier which is saturated does not follow."""
+    """Return whether a draft has a level beyond the limit of a saturated amplifier."""
     return max(abs(x.flux_density) for x in draft.levels) > joint.largest
 
 
 def _correct(joint: Joint, now: int) -> Steps[Draft | None]:
-    """Plan the rest anew, if that is expected to leave less."""
+    """Replan the rest if that reduces the predicted error."""
     planner, arrival = joint.planner, _arrival(joint, now)
     try:
         draft = yield from planner.draft_resumption(now, arrival or None)
@@ -227,13 +230,13 @@ def _correct(joint: Joint, now: int) -> Steps[Draft | None]:
         return None
     estimate = None if draft is None else joint.state(draft.begin)
     if draft is None or estimate is None or draft.missed or _saturates(joint, draft):
-        # A correction leaves no setpoint out.
+        # A correction must not leave out a setpoint.
         return None
     slew = planner.options.slew_limit
     course, gain = course_of(planner.plan, draft.begin, _LITTLE if arrival else _GAIN)
     segment = draft.segments[0]
     step = max(abs(segment.stretch - joint.start), LEAST_STEP)
-    # A force that samples do not show either way is not to make it worse.
+    # A force of undetermined sign must not be made worse.
     doubted = estimate.doubted
     hidden = MUCH * step if not arrival and abs(
         joint.start - planner.model.actuator.rest) < _FIRST and confounded(
@@ -250,7 +253,7 @@ def _correct(joint: Joint, now: int) -> Steps[Draft | None]:
 
 
 def _leaves_path(joint: Joint, now: int) -> bool:
-    """Return whether a path under way may be expected to be left, every natural period."""
+    """Return whether an actuator may deviate from its path; checked every natural period."""
     planner = joint.planner
     begin = planner.soonest(now + joint.planning)
     ahead = _ahead(planner, begin) if begin >= joint.next_path else None
@@ -259,14 +262,14 @@ def _leaves_path(joint: Joint, now: int) -> bool:
         return False
     joint.next_path = begin + _period(planner)
     left = _leaves(estimate, planner, planner.plan.levels, ahead)
-    # At best nothing but what is not known.
+    # The best possible result leaves only the uncertainty.
     return _nearer(joint, left, replace(left, misses=0.0 * left.misses), estimate)
 
 
 def _leaves(
         estimate: Estimate, planner: Planner, levels: Sequence[PlannedLevel],
         ahead: Ahead) -> Outcome:
-    """Return how far levels from the time of an estimate on lead off a path."""
+    """Return the predicted deviation from a path with levels from the estimate's time on."""
     first, begin = planner.plan.place(estimate.time - 1), estimate.time
     end = begin + round(ahead.times[-1] * NANOSECONDS)
     course = (*planner.plan.levels[max(first - _BEFORE, 0):first + 1],
@@ -276,7 +279,7 @@ def _leaves(
 
 
 def _nearer(joint: Joint, before: Outcome, after: Outcome, estimate: Estimate) -> bool:
-    """Return whether another course of a path is to take the place of that in force."""
+    """Return whether a new course of a path is to replace that in force."""
     plan = joint.planner.plan
     path = plan.segments[plan.under_way(estimate.time)].path
     span = 0.0 if path is None else float(np.ptp(path.course(path.breaks)[0]))
@@ -286,7 +289,7 @@ def _nearer(joint: Joint, before: Outcome, after: Outcome, estimate: Estimate) -
 
 
 def _drafted(draft: Draft, plan: Plan) -> Course:
-    """Return the course of the first setpoint of a draft that takes the place of a plan."""
+    """Return the course of the first setpoint of a draft that replaces a plan."""
     segment, *rest = draft.segments
     before = _until(plan, plan.place(draft.begin - 1) + 1)
     return Course(
@@ -297,17 +300,17 @@ def _drafted(draft: Draft, plan: Plan) -> Course:
 
 
 def _relaxed(model: Model, stretch: float) -> float:
-    """Return the level in T where a tail leads that the next setpoint cuts; NaN without creep."""
+    """Return the final level in T of a tail cut by the next setpoint; NaN without creep."""
     return model.flux_density(model.holding(stretch)) if model.material.creep else math.nan
 
 
 def _until(plan: Plan, place: int) -> Sequence[PlannedLevel]:
-    """Return the last levels before a place, which the field of a coil that lags remembers."""
+    """Return the last levels before a place, which affect the field of a coil with lag."""
     return plan.levels[max(place - _BEFORE, 0):place]
 
 
 def course_of(plan: Plan, begin: int, gain: float) -> tuple[Course, float]:
-    """Return what is planned from a time in ns to its setpoint's end, and what counts then."""
+    """Return the course from a time in ns to the end of its setpoint, and the minimum gain."""
     levels, place = plan.levels, max(plan.under_way(begin), 0)
     segment = plan.segments[place]
     end = plan.segments[place + 1].begin if place + 1 < len(plan.segments) else None
@@ -322,13 +325,13 @@ def course_of(plan: Plan, begin: int, gain: float) -> tuple[Course, float]:
 
 
 def _period(planner: Planner) -> int:
-    """Return the natural period about the end of the plan in ns."""
+    """Return the natural period at the end of the plan in ns."""
     model = planner.model
     return model.ns(2.0 * math.pi / model.frequency(planner.plan.segments[-1].stretch))
 
 
 def _ahead(planner: Planner, begin: int) -> Ahead | None:
-    """Return the next part of the path under way at a time in ns; None where little is left."""
+    """Return the path after a time in ns; None if little of it is left."""
     plan = planner.plan
     segment, period = plan.segments[plan.under_way(begin)], _period(planner)
     if segment.path is None or segment is not plan.segments[-1]:
@@ -337,18 +340,18 @@ def _ahead(planner: Planner, begin: int) -> Ahead | None:
     left = segment.path.breaks[-1] - since
     if left * NANOSECONDS < _JOINED * period:
         return None
-    # Not the way back to it.
+    # Without the transition back to the path.
     times = np.linspace(period, min(_PERIODS * period, left * NANOSECONDS), _SAMPLES) / NANOSECONDS
     return Ahead(times, segment.path.course(times + since)[0])
 
 
 def _trimmed(joint: Joint, estimate: Estimate) -> float | None:
     """
-    Return the level in T to hold a setpoint by, which makes up for a constant force.
+    Return the level in T that holds a setpoint against a constant force.
 
-    It is at most ``feedback_trim`` off that of the model. The estimate is of the time from which
-    on levels may be changed. None where the level in force is to be kept: on the way, within what
-    is not known of the rest, at the bound, or where no constant force is tracked.
+    It differs from that of the model by at most ``feedback_trim``. The estimate is for the time
+    from which levels may be changed. None if the level in force is to be kept: during a move, if
+    the error is within its uncertainty, at the bound, or if no constant force is estimated.
     """
     plan, model, bound = joint.planner.plan, joint.planner.model, joint.settings.feedback_trim
     place = plan.under_way(estimate.time)

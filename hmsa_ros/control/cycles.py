@@ -1,4 +1,4 @@
-"""How a loop keeps time: its own work a cycle, what follows it, and cycles that begin late."""
+"""Timing of a loop: CPU time per cycle and between cycles, and cycles that begin late."""
 
 from time import monotonic_ns, thread_time_ns
 
@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from hmsa_ros.control.records import Severity
 from hmsa_ros.control.slices import Clock
 
-# Cycles whose work is remembered.
+# Number of cycles whose CPU times are stored.
 _REMEMBERED = 4096
 
 
 class Cycles:
     """
-    Measures the cycles of a loop, a context manager around each; all times are in ns.
+    Measure the cycles of a loop, each run in this context manager; all times are in ns.
 
     ``late`` counts the cycles that began more than a period after they were due.
     """
@@ -35,7 +35,7 @@ class Cycles:
         if lateness > self._period:
             self.late += 1
             self.largest = max(self.largest, lateness)
-        # The grid is that of the earliest cycles; those that were missed are left out.
+        # The grid is that of the first cycles; missed cycles are skipped.
         self._due = now + self._period - (
             lateness if 0 < lateness <= self._period else 0)
         self._begun = self._cpu()
@@ -47,21 +47,21 @@ class Cycles:
 
     @property
     def left(self) -> int:
-        """Time until the next cycle is due; below 0 if it is late."""
+        """Time until the next cycle is due; negative if it is late."""
         return self._due - self._steady()
 
     def note_rest(self) -> None:
-        """Note that what follows the cycle that ended last has been done."""
+        """Record the CPU time spent since the last cycle ended."""
         self._rest[(self.count - 1) % _REMEMBERED] = self._cpu() - self._ended
 
     def _figures(self, name: str, spent: NDArray[np.int64]) -> dict[str, object]:
-        """Return what half, 99 of 100 and all of the last cycles did not exceed, in us."""
+        """Return median, 99 % quantile and maximum of recent CPU times in us."""
         seen = spent[:max(self.count, 1)]
         return {f'{name}_{key}_us': f'{float(np.quantile(seen, x)) / 1e3:.1f}'
                 for key, x in (('p50', 0.5), ('p99', 0.99), ('largest', 1.0))}
 
     def report(self) -> tuple[Severity, str, dict[str, object]]:
-        """Return how the loop fares: severity, a sentence and counters; since the last time."""
+        """Return severity since the last call, message and counters."""
         count, late = self.count - self._reported[0], self.late - self._reported[1]
         self._reported = self.count, self.late
         message = f'{late} of {count} cycles late' if late else 'cycles in time'

@@ -1,4 +1,4 @@
-"""Commands to plant or driver, whether they arrive, and coils that were cut off."""
+"""Commands to plant or driver, their receipts, and coils that were cut off."""
 
 from collections.abc import Callable, Iterable, Mapping
 import math
@@ -12,27 +12,27 @@ from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.planner import Planner
 
-# How often a cut-off is acknowledged, in ns.
+# Interval in ns at which a cut-off is acknowledged.
 _AGAIN = 100_000_000
-# How long a request waits for a device that is heard and hears nothing, in ns: after an outage
-# DDS connects the two directions one after the other.
+# Time in ns that a request waits for a device that sends receipts but receives nothing: after an
+# outage, DDS connects the two directions one after the other.
 _PATIENCE = 10_000_000_000
-# Share of half a natural period, and of lead_time, from which on an offset of clocks is warned of.
+# Fraction of half a natural period, and of lead_time, from which a clock offset is reported.
 _SHARE = 0.1
 
 
-# So far ahead that all there is gets sent.
+# Far enough ahead to send all levels.
 _FAR = 2**62
 
 
 class Devices:
     """
-    Sends commands, follows what devices say of themselves, and draws conclusions for the plans.
+    Send commands, track the reports of devices, and adapt the plans to them.
 
-    ``fresh`` are the joints whose device has come after the last level, and has heard none.
-    ``cut`` are those whose device refuses commands of before a cut-off, ``open`` those whose
-    interlock is, and ``locked`` those that obey nothing but 0 T after that. ``since`` is when a
-    plan began to wait for devices, in ns by the steady clock.
+    ``fresh`` contains the joints whose device appeared after the last level and has not received
+    it. ``cut`` contains those whose device rejects commands from before a cut-off, ``open`` those
+    with an open interlock, and ``locked`` those that only accept 0 T after that. ``since`` is the
+    time at which a plan began to wait for devices, in ns by the steady clock.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class Devices:
             takeover: Takeover, surroundings: Surroundings, outputs: list[Output]) -> None:
         self._planners, self._following, self._takeover = planners, following, takeover
         self.receipts, self._around = receipts, surroundings
-        #: Takes a command at once: whatever else there is to do comes after it.
+        #: Delivers a command immediately, before any other work.
         self.deliver: Callable[[Send], None] = outputs.append
         self.sent = self.heartbeats = 0
         self._absent: set[str] = set()
@@ -56,21 +56,21 @@ class Devices:
 
     @property
     def deaf(self) -> bool:
-        """Whether no device is heard that was heard before."""
+        """Whether all devices have fallen silent."""
         return bool(self.receipts.silent) and self.receipts.silent >= self._planners.keys()
 
     def look(self) -> None:
-        """Doubt where joints are whose device has fallen silent, or is heard again."""
+        """Doubt the position of joints whose device has fallen silent or is received again."""
         for name in self.receipts.look():
             self._takeover.doubt(name)
 
     # -- commands ------------------------------------------------------------------------------
 
     def send(self, now: int, *, everything: bool = False) -> None:
-        """Send what is due at a time in ns, or everything that is planned."""
+        """Send the levels that are due at a time in ns, or all planned levels."""
         for name, planner in self._planners.items():
             if name in self.receipts.silent:
-                # It would arrive when its time has passed.
+                # The command would arrive too late.
                 continue
             for level in planner.due(_FAR if everything else now):
                 self.fresh.discard(name)
@@ -83,10 +83,10 @@ class Devices:
         self.receipts.sent(name, stamp, now)
 
     def beat(self, now: int) -> None:
-        """Send levels in force again: who listens learns that somebody is there."""
+        """Send the levels in force again, as a heartbeat of the planner."""
         for name, planner in self._planners.items():
             if name in self.receipts.silent | self.cut | self.fresh:
-                # It has not been led to the last level.
+                # The last level is not meant for this device.
                 continue
             stamp, following = planner.beat_stamp(now), planner.next_stamp
             if following is None or stamp < following:
@@ -95,9 +95,9 @@ class Devices:
 
     def acknowledge(self, joint: str) -> None:
         """
-        Send that its coil is off to a device that was cut off, if it is: seldom.
+        Acknowledge a cut-off by a command of 0 T if the coil is off; rate-limited.
 
-        It refuses other levels until then.
+        The device rejects other levels until then.
         """
         steady, now = self._around.steady(), self._around.clock()
         off = joint not in self.open if joint in self.locked else (
@@ -109,25 +109,25 @@ class Devices:
     # -- devices that are new, or cut off ------------------------------------------------------
 
     def look_for_newcomers(self) -> Verdict | None:
-        """Find devices that were not found at the last look; return the verdict on a plan."""
+        """Find devices that are new since the last look; return the verdict on a plan."""
         verdict, absent = None, self._absent
         self._absent = {x for x in self._planners if not self._around.found(x)}
         for joint in sorted(self._planners.keys() - self._absent):
             before, now = self._reporters.get(joint, frozenset()), self._around.reporters(joint)
             self._reporters[joint] = now or before
             if before and now - before:
-                # Another device took over: before its first receipt, or without any.
+                # Another device took over, before its first receipt or without receipts.
                 self._following.newest.pop(joint, None)
             elif before or joint not in absent:
-                # One that is known, and there again after an outage, is not new. Where there was
-                # none before, it is only found one topic after the other.
+                # A known device that is back after an outage is not new. Discovery of a first
+                # device finds one topic after the other.
                 continue
             found = self._appeared(joint)
             verdict = verdict or found
         return verdict
 
     def received(self, joint: str, time: int, command: int) -> Verdict | None:
-        """Take in a receipt as `Receipts.received` does; return the verdict on a plan."""
+        """Process a receipt as `Receipts.received` does; return the verdict on a plan."""
         anew = self.receipts.received(
             joint, time, command, self._around.clock(), comparable=not self._around.one_clock())
         if not anew:
@@ -136,7 +136,7 @@ class Devices:
         return self._appeared(joint)
 
     def _appeared(self, joint: str) -> Verdict | None:
-        """Take in that a device has come that has heard nothing of a plan."""
+        """Record a device that has not received the plan; return the verdict on the plan."""
         self.fresh.add(joint)
         planner = self._planners[joint]
         planned = bool(planner.plan.segments)
@@ -149,12 +149,12 @@ class Devices:
     def cut_off(
             self, joint: str, settings: Settings, *, in_force: bool,
             locked: bool) -> Verdict | None:
-        """Take in whether the coil of a joint was cut off; return the verdict on its plan."""
+        """Record whether the coil of a joint is cut off; return the verdict on its plan."""
         known = joint in (self.open if locked else self.cut)
         self.open.discard(joint)
         if not in_force:
             if joint in self.cut and self._planners[joint].last_sent.flux_density == 0.0:
-                # It has heard the level that is to be repeated.
+                # The device has received the level to be repeated.
                 self.fresh.discard(joint)
             self.cut.discard(joint)
             self.locked.discard(joint)
@@ -180,7 +180,7 @@ class Devices:
             'the rest of the sequence is dropped')
 
     def interlock(self, joint: str) -> RefusedError:
-        """Return why nothing is done with a joint that is locked."""
+        """Return the refusal of a request for a joint that is locked."""
         return RefusedError(
             Code.INTERLOCK, f'the interlock of the driver of joint {joint} is open, or its '
             'hardware out of reach (/diagnostics), and its coil off; close it (~/interlock of the '
@@ -188,12 +188,12 @@ class Devices:
 
     def check(self, joints: Iterable[str]) -> None:
         """
-        Look at devices before joints move.
+        Check devices before joints move.
 
         Raises
         ------
         RefusedError
-            If one is locked, or clocks are so far apart that every command would come too late.
+            If one is locked, or if the clocks differ so much that every command would be late.
 
         """
         for joint in joints:
@@ -207,7 +207,7 @@ class Devices:
                 f'every command would come too late, since {offset.words}')
 
     def _dropped(self, joint: str, code: Code, words: str) -> Verdict:
-        """Plan from a sample next, since a plan was dropped; return the verdict."""
+        """Have the next request start from a sample; return the verdict on a dropped plan."""
         self._takeover.doubt(joint)
         self._following.astray.discard(joint)
         return Verdict(
@@ -216,12 +216,12 @@ class Devices:
 
     def holds(self, settings: Settings) -> bool:
         """
-        Return whether to plan later: once a device that was cut off obeys, and commands arrive.
+        Return whether planning must wait until a cut-off device obeys and commands arrive.
 
         Raises
         ------
         RefusedError
-            If commands have not arrived for long at a device that is heard.
+            If commands have not arrived for a long time at a device that sends receipts.
 
         """
         names = self._following.astray
@@ -248,7 +248,7 @@ class Devices:
 
     @property
     def clocks(self) -> str:
-        """How far the clocks differ, where that shifts or spoils moves; else empty."""
+        """A message if the clock offset shifts or spoils moves; else empty."""
         offset, limits = self.receipts.offset, []
         for planner in self._planners.values():
             model, plan = planner.model, planner.plan

@@ -1,4 +1,4 @@
-"""Feedback: what samples say of the actuators, and models that are learnt from them."""
+"""Feedback: estimates from samples, and models learned from them."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -17,49 +17,49 @@ from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Believed
 from hmsa_ros.planning.timeline import Model
 
-#: What the parameter `feedback` can be.
+#: Values of the parameter `feedback`.
 MODES = ('off', 'observe', 'adapt')
-# How often the estimate is told, in ns.
-_TELL = 200_000_000
-# How many times as long as a look or a correction took, and as there are joints, the next look is
-# later at least.
+# Interval in ns at which the estimate is published.
+_REPORT = 200_000_000
+# Minimum delay of the next update, as a multiple of the time that an update or a correction took,
+# for each joint.
 _IDLE = 6
-# How many times as seldom at most where looks have kept commands waiting, and how it becomes less
-# with each look.
+# Largest factor of that delay after updates have kept commands waiting, and its decay with each
+# update.
 _SELDOM, _OFTENER = 32.0, 0.8
 
 
 class Feedback:
     """
-    Estimates from samples, reports what is wrong, and learns what to plan with.
+    Estimate from samples, report discrepancies, and learn parameters to plan with.
 
-    ``joints`` are those that are looked at: all, or none where feedback is off.
+    ``joints`` contains all joints, or none if feedback is off.
     """
 
     def __init__(
             self, group: PlannerGroup, settings: Settings, outputs: list[Output], clock: Clock,
-            tell_ended: Callable[[str], None]) -> None:
-        """Begin; what is called with a sentence that says why feedback of a joint has ended."""
+            report_ended: Callable[[str], None]) -> None:
+        """Begin; ``report_ended`` is called with the reason why feedback of a joint has ended."""
         self._group, self._outputs, self._clock = group, outputs, clock
-        self._tell_ended = tell_ended
-        #: Does what takes long.
+        self._report_ended = report_ended
+        #: Executes long-running work.
         self.doing: Doing = here
         self._settings = settings
         self.joints: dict[str, Joint] = {}
-        self.corrections = 0  # plans that were corrected
-        self._seldom = 1.0  # how many times as seldom samples are looked at
-        self._ended: list[Joint] = []  # those whose plans are to be taken back
+        self.corrections = 0  # number of corrected plans
+        self._seldom = 1.0  # factor of the delay between updates
+        self._ended: list[Joint] = []  # joints whose plans are to be reverted
         for name, planner in group.planners.items():
             planner.believed = partial(self._believed, name)
         self._begin({name: x.model for name, x in group.planners.items()})
 
     @property
     def on(self) -> bool:
-        """Whether samples count."""
+        """Whether samples are used."""
         return self._settings.feedback != 'off'
 
     def do(self, *work: Any) -> Awaited[Any]:
-        """Do work as what takes long is done, where samples count."""
+        """Execute work with ``doing`` if feedback is on, else in this process."""
         return (self.doing if self.on else here)(*work)
 
     def _believed(self, name: str, time: int) -> Believed | None:
@@ -67,15 +67,15 @@ class Feedback:
         return None if joint is None else joint.believed(time)
 
     def restart(self) -> None:
-        """Forget what was learnt: plan with what is given, from what is predicted."""
+        """Discard the estimates: plan with the given parameters, from the predicted state."""
         for joint in self.joints.values():
             joint.planner.take_model(joint.given)
         self._begin({name: x.given for name, x in self.joints.items()})
 
     def _begin(self, models: Mapping[str, Model]) -> None:
-        """Begin with nothing seen, and with models as given."""
+        """Begin without samples, with models as given."""
         for joint in self.joints.values():
-            # What is being worked out from it comes to nothing.
+            # This cancels a choice or an audit that is under way.
             joint.latest = None
         self.joints = {
             name: Joint(name, self._group.planners[name], model, self._settings, self._clock())
@@ -83,9 +83,9 @@ class Feedback:
 
     def change(self, settings: Settings, models: Mapping[str, Model]) -> Mapping[str, Model]:
         """
-        Take other settings and models as given; return the models to plan with.
+        Adopt new settings and given models; return the models to plan with.
 
-        What was learnt stays in them, as long as block and coil are given as before.
+        Estimates are kept as long as the given block and coil do not change.
         """
         before, self._settings = self._settings, settings
         if not (self.on and self.joints
@@ -102,13 +102,13 @@ class Feedback:
                 for name, x in self.joints.items()}
 
     def reset(self) -> str:
-        """Forget what was learnt and say so; refused where nothing is learnt at all."""
+        """Discard the estimates and return a confirmation; refused if feedback is off."""
         self._check_on()
         self.restart()
         return 'what was learnt is forgotten: plans use the parameters as given'
 
     def save(self, *, by_joint: bool) -> str:
-        """Write what was learnt to the file of the settings and say so; refused without any."""
+        """Write the estimates to the configured file and return a confirmation, or refuse."""
         self._check_on()
         return save(
             self._settings.feedback_file,
@@ -120,23 +120,23 @@ class Feedback:
                 'feedback is off and nothing is learnt: expected observe or adapt')
 
     def looks_at(self, stamp: int) -> bool:
-        """Return whether a sample with a stamp in ns is of use."""
+        """Return whether a sample with a timestamp in ns is needed."""
         return any(x.wants(stamp) for x in self.joints.values())
 
     def follows(self, name: str) -> bool:
-        """Return whether plans for a joint begin from what is estimated."""
+        """Return whether plans for a joint begin from its estimate."""
         joint = self.joints.get(name)
         return joint is not None and joint.adapted() and joint.state(self._clock()) is not None
 
     def sensor(self, name: str) -> Sensor:
-        """Return what was found of the sensor of a joint; one as given where nothing was."""
+        """Return the sensor of a joint as estimated; as given where there is no estimate."""
         return self.joints[name].sensor if name in self.joints else Sensor()
 
     # -- looks at samples ----------------------------------------------------------------------
 
     @property
     def wake(self) -> int | None:
-        """Time in ns at which to look at samples next; None for never, 0 for now."""
+        """Time in ns of the next update; None for never, 0 for now."""
         joints = self.joints.values()
         if any(x.looking or x.choosing or x.auditing for x in joints):
             return self._clock() + ANSWER
@@ -146,24 +146,24 @@ class Feedback:
                    default=None)
 
     def give_way(self, now: int) -> None:
-        """Look seldom from a time in ns on: commands have been kept waiting."""
+        """Update less often from a time in ns on, since commands have been kept waiting."""
         self._seldom = min(2.0 * self._seldom, _SELDOM)
         for joint in self.joints.values():
             joint.not_before = max(joint.not_before, now + round(self._seldom * RESTING))
 
     def spent(self, joint: Joint, time: int) -> None:
-        """Take in that work for a joint has taken a time in ns: the next look comes later."""
+        """Delay the next update, since work for a joint has taken a time in ns."""
         rest = round(_IDLE * len(self.joints) * self._seldom * time)
         joint.not_before = max(joint.not_before, self._clock() + rest)
 
     def update(self, now: int) -> bool:
         """
-        Process the samples of a joint that have come by a time in ns, and publish the estimate.
+        Process the samples of a joint that have arrived by a time in ns, and publish the estimate.
 
-        Returned is whether that has taken a while.
+        Return whether this took long.
         """
         busy = False
-        # A look that is under way is ended before the next one, which has waited longest.
+        # An update under way ends before the next one, which is that of the longest wait.
         for joint in sorted(
                 self.joints.values(), key=lambda x: (x.looking is None, x.next_look)):
             if joint.choosing is not None:
@@ -185,12 +185,12 @@ class Feedback:
                 self._look(joint, joint.looking, now)
             else:
                 continue
-            # Commands go out before the next joint has its turn.
+            # Commands are sent before the next joint is updated.
             return True
         return busy
 
     def _look(self, joint: Joint, looking: Iterator[None], now: int) -> bool:
-        """Go on with a look at samples; return whether it has ended, which takes a while."""
+        """Continue an update; return whether it has ended, which takes long."""
         begun = self._clock()
         if goes_on(looking):
             joint.spent += self._clock() - begun
@@ -200,13 +200,13 @@ class Feedback:
         self.spent(joint, joint.spent)
         self._seldom = max(_OFTENER * self._seldom, 1.0)
         joint.next_update = now + joint.interval
-        if now >= joint.next_tell:
-            joint.next_tell = now + _TELL
-            self._tell(joint, now)
+        if now >= joint.next_report:
+            joint.next_report = now + _REPORT
+            self._report(joint, now)
         joint.ready = len(joint.audits)
         return True
 
-    def _tell(self, joint: Joint, now: int) -> None:
+    def _report(self, joint: Joint, now: int) -> None:
         found, mode = joint.latest, self._settings.feedback
         bad = joint.trust.why or found is not None and mode == 'observe' and differences(
             found, joint.estimator.prior.values)
@@ -219,17 +219,17 @@ class Feedback:
     # -- what comes of them --------------------------------------------------------------------
 
     def audit(self, name: str, hold: Hold) -> None:
-        """Look at the samples of a setpoint of a joint, once all that have come are looked at."""
+        """Audit a setpoint of a joint, once all samples that have arrived are processed."""
         joint = self.joints.get(name)
         if joint is not None and joint.adapts and not joint.trust.ended and (
                 hold not in joint.audits):
             joint.audits.append(hold)
 
     def _audit(self, joint: Joint, hold: Hold) -> Awaited[None]:
-        """Find whether what a setpoint has left ends feedback."""
+        """Decide by the samples of a setpoint whether feedback ends."""
         if joint.lost or joint.trust.ended or joint.trust.why or (
                 joint.estimator.screening.trouble):
-            # Of a sensor that fails, nothing follows for the move.
+            # With a failing sensor, nothing can be concluded about the move.
             return
         plan = joint.planner.plan
         why = yield from joint.ledger.take(hold, plan, joint.given, joint.moves, joint.sensor)
@@ -239,15 +239,15 @@ class Feedback:
         joint.trust.end(why)
         joint.news, joint.fresh = True, True
         self._ended.append(joint)
-        self._tell_ended(joint.words(self._clock()))
+        self._report_ended(joint.words(self._clock()))
 
     def taken_back(self) -> list[Joint]:
-        """Return joints, once, whose plans are to be as if nothing had been learnt."""
+        """Return joints, once each, whose plans must be reverted to the given parameters."""
         found, self._ended = self._ended, []
         return found
 
     def news(self) -> Iterator[Joint]:
-        """Plan with what is known best by now, and yield joints with new estimates to act upon."""
+        """Plan with the best known parameters, and yield joints with new estimates to use."""
         for joint in self.joints.values():
             if not joint.adapts or not joint.news or joint.choosing is not None:
                 continue

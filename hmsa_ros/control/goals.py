@@ -1,8 +1,8 @@
 """
-Goals of the action FollowJointTrajectory: whether they are valid, how they fare and how they end.
+Goals of the action FollowJointTrajectory: validation, progress and result.
 
-Without ROS. Codes and semantics are those of ``control_msgs`` and of the
-``joint_trajectory_controller`` of ros2_controllers, but success is what samples have shown.
+Does not depend on ROS. Codes and semantics follow ``control_msgs`` and the
+``joint_trajectory_controller`` of ros2_controllers, except that success is decided by samples.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,19 +22,19 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.path import Path
 from hmsa_ros.planning.timeline import Plan
 
-#: Name of a joint, and its tolerances of stretch and rate (1/s): 0 for the default, -1 for none.
+#: Joint name and its tolerances of stretch and rate (1/s): 0 for the default, -1 for none.
 Tolerance = tuple[str, float, float]
-#: Stretch, and rate in 1/s.
+#: Stretch and rate in 1/s.
 Point = tuple[float, float]
 
 _UNSEEN = (math.nan, math.nan)
-# A tolerance that is erased.
+# Value that disables a tolerance.
 _NONE = -1.0
 _REPLACED = 'another request took the place of the goal'
 
 
 class ErrorCode(IntEnum):
-    """How a goal ended, by the numbers of ``control_msgs/action/FollowJointTrajectory``."""
+    """Result of a goal, numbered as in ``control_msgs/action/FollowJointTrajectory``."""
 
     SUCCESSFUL = 0
     INVALID_GOAL = -1
@@ -45,14 +45,14 @@ class ErrorCode(IntEnum):
 
     @classmethod
     def of(cls, code: Code) -> 'ErrorCode':
-        """Return what a refusal by a planner is to a client of the action."""
+        """Return the action's error code for a planner's refusal."""
         return {Code.UNKNOWN_JOINT: cls.INVALID_JOINTS,
                 Code.IN_THE_PAST: cls.OLD_HEADER_TIMESTAMP}.get(code, cls.INVALID_GOAL)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a goal ended: ``succeeded``, ``aborted`` or ``canceled``, and why."""
+    """Result of a goal: ``succeeded``, ``aborted`` or ``canceled``, and the reason."""
 
     state: str
     code: ErrorCode
@@ -62,15 +62,15 @@ class Outcome:
 @dataclass
 class _Goal:
     request: Trajectory
-    path: Mapping[str, Point]  # largest errors on the way, by joint
+    path: Mapping[str, Point]  # maximum errors during the motion, by joint
     plan: int | None = None  # number of the plan that carries it out; None until it is made
     canceled: bool = False
-    begin: int = 0  # in ns, from when the last setpoint holds: a clock that is set moves both
+    begin: int = 0  # in ns, relative to the begin of the last setpoint: a clock step shifts both
     duration: int = 0  # in ns
-    paths: dict[str, Path] = field(default_factory=dict)  # in s from its begin
+    paths: dict[str, Path] = field(default_factory=dict)  # in s from the begin of the goal
 
     def dropped(self, message: str, code: ErrorCode = ErrorCode.INVALID_GOAL) -> Outcome:
-        """Return how it ends where it is not carried out to its end."""
+        """Return the result of a goal that is not completed."""
         if self.canceled:
             return Outcome('canceled', ErrorCode.SUCCESSFUL, message)
         return Outcome('aborted', code, message)
@@ -80,8 +80,8 @@ class Goals:
     """
     The goals of a planner, of which one is carried out.
 
-    Whoever drives the planner passes on statuses to `tell` and samples to `observe`; ``ended``
-    is called with the name of a goal and its `Outcome`.
+    The caller passes statuses to `update` and samples to `observe`; ``ended`` is called with the
+    name of a goal and its `Outcome`.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class Goals:
             self, request: Trajectory, path_tolerance: Sequence[Tolerance] = (),
             goal_tolerance: Sequence[Tolerance] = (), goal_time_tolerance: int = 0) -> Verdict:
         """
-        Take a goal, named by its request; one that is refused changes nothing else.
+        Add a goal, named by its request; a refused goal has no other effect.
 
         The time tolerance is in ns.
         """
@@ -124,17 +124,17 @@ class Goals:
         return verdict
 
     def cancel(self, name: str) -> None:
-        """Come to rest instead of going on with a goal."""
+        """Come to rest instead of completing a goal."""
         goal = self._goals.get(name)
         if goal is not None:
             goal.canceled = True
             if goal.plan is None:
-                # It waits for that of the stop, which is to come.
+                # It waits for the plan of the stop, which is still to be made.
                 goal.plan = self._runtime.group.number
             self._runtime.request(Stop(name))
 
-    def tell(self, status: StatusChanged) -> None:
-        """Take in what the planner says."""
+    def update(self, status: StatusChanged) -> None:
+        """Process a status of the planner."""
         for name, goal in list(self._goals.items()):
             outcome = self._fares(name, goal, status)
             if outcome is not None:
@@ -152,7 +152,7 @@ class Goals:
                 self._begin(name, goal)
             goal.plan = status.plan
         if goal.plan is None:
-            # A clock that goes back drops what waits.
+            # A clock that is set back drops the waiting requests.
             back = verdict.code is Code.CLOCK_JUMPED and state == 'idle'
             return goal.dropped(verdict.message) if back else None
         if status.plan > goal.plan:
@@ -167,7 +167,7 @@ class Goals:
         return _measured(goal.request, status) if done else None
 
     def _begin(self, name: str, goal: _Goal) -> None:
-        """Take in that a goal has a plan, which replaces that of others."""
+        """Record that a goal has a plan, which replaces the plans of other goals."""
         for other, one in list(self._goals.items()):
             if one.plan is not None and other != name:
                 self._end(other, one.dropped(_REPLACED))
@@ -190,7 +190,7 @@ class Goals:
         return self._runtime.group.planners[goal.request.joints[0]].plan
 
     def _after(self, goal: _Goal, time: int) -> int:
-        """Return a time in ns from the begin of a goal."""
+        """Return a time in ns relative to the begin of a goal."""
         segments = self._plan(goal).segments
         return time - goal.begin - (segments[-1].since if segments else 0)
 
@@ -202,11 +202,11 @@ class Goals:
 
     @property
     def wants_all(self) -> bool:
-        """Whether each sample is of use, and not only the newest."""
+        """Whether every sample is needed, not only the newest."""
         return any(x.path for x in self._goals.values())
 
     def observe(self, joint: str, stamp: int, stretch: float, rate: float, now: int) -> None:
-        """Take in a sample (ns, stretch, 1/s) at a time; one too far off the path ends a goal."""
+        """Process a sample (ns, stretch, 1/s); one outside the path tolerance ends a goal."""
         if math.isnan(stretch) or stamp > now + AHEAD:
             return
         newest = self._seen.get(joint, (stamp,))[0]
@@ -229,7 +229,7 @@ class Goals:
                     break
 
     def _desired(self, goal: _Goal | None, joint: str, time: int) -> Point:
-        """Return where a joint is to be at a time in ns: on the goal's path, else as planned."""
+        """Return the desired point of a joint at a time in ns, on the path or as planned."""
         if goal is not None and joint in goal.paths:
             path, after = goal.paths[joint], self._after(goal, time) / NANOSECONDS
             if path.breaks[0] <= after <= path.breaks[-1]:
@@ -240,12 +240,12 @@ class Goals:
         return state.stretch, state.rate / planner.model.units.time
 
     def elapsed(self, name: str, time: int) -> int | None:
-        """Return the time in ns since a goal began; None if it has not been planned yet."""
+        """Return the time in ns since a goal began; None before it is planned."""
         goal = self._goals.get(name)
         return None if goal is None or goal.plan is None else self._after(goal, time)
 
     def readings(self, time: int, name: str = '') -> dict[str, tuple[Point, Point]]:
-        """Return the desired and the newest measured point of each joint of a goal, or of all."""
+        """Return desired and newest measured points of the joints of a goal, or of all joints."""
         goal = self._goals.get(name)
         joints = self._runtime.group.planners if goal is None else goal.request.joints
         return {x: (self._desired(goal, x, time), self._seen.get(x, (0, _UNSEEN))[1])
@@ -254,7 +254,7 @@ class Goals:
 
 def _tolerances(
         kind: str, given: Sequence[Tolerance], joints: Sequence[str]) -> dict[str, Point]:
-    """Return tolerances by joint, infinite where they are erased, or refuse them."""
+    """Return tolerances by joint, infinite if disabled; raise `RefusedError` if invalid."""
     found = {}
     for joint, *values in given:
         if joint not in joints:
@@ -272,14 +272,14 @@ def _tolerances(
 
 
 def _measured(request: Trajectory, status: StatusChanged) -> Outcome:
-    """Return how a goal ended whose motion is over, by what samples have shown."""
+    """Return the result of a goal whose motion is over, according to the samples."""
     worst, code = status.worst, ErrorCode.GOAL_TOLERANCE_VIOLATED
     if worst is None or worst.verdict is Code.UNOBSERVED:
         known = '' if worst is None else worst.message
         why = '; '.join(filter(None, (known, status.unheard))) or 'nothing was measured'
         return Outcome(
             'aborted', code, f'{why}: expected samples on joint_states that show the arrival')
-    # Another request may have been judged, to the same stretch, by other tolerances.
+    # Another request for the same stretch may have been judged with other tolerances.
     for finding in (worst, *(status.findings.get(x, worst) for x in request.joints)):
         if failure := _failure(request, finding):
             return Outcome('aborted', code, failure)
@@ -287,7 +287,7 @@ def _measured(request: Trajectory, status: StatusChanged) -> Outcome:
 
 
 def _failure(request: Trajectory, finding: Finding) -> str:
-    """Return why a finding is no success; empty if it is one."""
+    """Return why a finding is not a success; empty if it is."""
     setpoint = finding.setpoint
     offset, vibration = request.goals[setpoint.joint or request.joints[0]].of(setpoint)
     if setpoint.number < setpoint.count:

@@ -1,4 +1,4 @@
-"""Samples of one setpoint, and when there are enough of them to judge it."""
+"""Samples of one setpoint, and when they suffice to judge it."""
 
 from dataclasses import replace
 from functools import partial
@@ -19,22 +19,22 @@ from hmsa_ros.judge.records import (
 from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS
 
-# Time in ns in which samples that are rare are waited for after an arrival.
+# Time in ns after an arrival to wait for infrequent samples.
 _RARE = NANOSECONDS // 4
-# Samples of the move that are kept: they show whether the sensor moves at all.
+# Number of samples kept from the move: they show whether the sensor moves at all.
 _MOVING = 32
-# How long samples may stay away, by the steady clock, before it is judged without them.
+# Time without samples, by the steady clock, after which the setpoint is judged without them.
 _PATIENCE = NANOSECONDS // 2
 _TOLERANCES = Tolerances()
-#: How far in ns ahead of the clock a timestamp may be: news of the time may be late.
+#: Tolerated lead in ns of a timestamp over the clock, since clock updates may arrive late.
 AHEAD = NANOSECONDS // 20
 
 
 class Hold:
     """
-    Gathers the samples of a setpoint that count, and judges it when they are there.
+    Gather the relevant samples of a setpoint, and judge it once there are enough.
 
-    ``found`` is the newest finding; once ``over``, no more samples are waited for. ``doing`` does
+    ``found`` is the newest finding; once ``over``, no more samples are needed. ``doing`` executes
     the judging.
     """
 
@@ -44,20 +44,20 @@ class Hold:
         self.setpoint = setpoint
         self.found: Finding | None = None
         self.over = False
-        self.untold = False  # whether it is missed, which nobody has been told
-        self.news = False  # whether samples have been judged that nobody has looked at
-        # What was asked and found last.
+        self.unreported = False  # whether it is missed and this is not reported yet
+        self.news = False  # whether judged samples await an audit
+        # The setpoint judged last, and its finding.
         self._answer: tuple[Setpoint, Finding] | None = None
         self._doing = doing
         self._judging: Awaited[Finding | None] | None = None
         self._end, self._goal = setpoint.end, goal
         self._samples: dict[int, float] = {}
-        self._moving: set[int] = set()  # parts of the move of which there is one
-        # Newest sample by its stamp; newest of all that were looked at, and when that was.
+        self._moving: set[int] = set()  # parts of the move that have a sample
+        # Timestamp of the newest sample, the newest timestamp seen, and when that was.
         self._newest = self._seen = self._heard = 0
-        # Largest that a stamp was ahead of the clock.
+        # Largest lead of a timestamp over the clock.
         self._ahead = 0
-        # Arrival as it was requested, and by the newest plan.
+        # Arrival as requested, and according to the newest plan.
         self.asked = setpoint.rests_from
         self._begin_at(self.asked)
 
@@ -65,20 +65,21 @@ class Hold:
         setpoint = self.setpoint
         self._judging = None
         self._begin, self._length = begin, setpoint.look
-        # The last one is held on, so that there is always time for a look, at rare samples too.
+        # The last setpoint is held, so there is always time for a look, even at infrequent
+        # samples.
         least = begin + 2 * self._length if setpoint.held else begin
         self._enough = least if setpoint.end is None else max(setpoint.end, least)
         self._closes = max(self._enough, begin + _RARE) if setpoint.held else self._enough
-        # Until when it may arrive.
+        # Latest time of arrival that counts.
         self._grace = begin + (0 if self._goal is None else self._goal.time)
         self._closes = max(self._closes, self._grace)
         self.due = min(begin + self._length, self._closes)
         self._few: bool | None = None
-        self._waits = False  # whether the last sample to come is waited for
+        self._waits = False  # whether it waits for a last sample
 
     def move(self, arrival: int, *, corrected: bool) -> None:
-        """Take in that another plan arrives at a time in ns, perhaps one corrected on the way."""
-        # What is held on is corrected as long as it is.
+        """Adopt the arrival in ns of a new plan, ``corrected`` if it was made from samples."""
+        # A setpoint that is held may be corrected for as long as it is held.
         held = self.setpoint.held
         end = None if corrected and held else self._end
         if arrival == self._begin and (
@@ -90,19 +91,19 @@ class Hold:
         if not held and end is not None and arrival >= end:
             self.miss('a plan that was made anew reaches it only after its time')
             return
-        self.found, self.over, self.untold = None, False, False
+        self.found, self.over, self.unreported = None, False, False
         self._begin_at(arrival)
 
     def miss(self, reason: str) -> None:
-        """Take in that the setpoint is not carried out, whatever samples have shown by now."""
+        """Record that the setpoint is not carried out, whatever the samples have shown so far."""
         if self.found is None or self.found.verdict is not Code.MISSED:
-            self.found, self.over, self.untold = missed(self.setpoint, reason), True, True
+            self.found, self.over, self.unreported = missed(self.setpoint, reason), True, True
             self._judging = None
 
     # -- samples -------------------------------------------------------------------------------
 
     def lacks(self, stamp: int, steady: int) -> bool:
-        """Return whether a sample of a time is of use; old ones show that newer ones may come."""
+        """Return whether a sample is needed; old timestamps announce newer samples."""
         if self.over:
             return False
         if self._seen < stamp <= self._closes:
@@ -111,7 +112,7 @@ class Hold:
             stamp not in self._samples and self._counts(stamp))
 
     def add(self, stamp: int, stretch: float, now: int) -> None:
-        """Take a sample that arrives at a time in ns; none that is from the future."""
+        """Add a sample that arrives at a time in ns, unless its timestamp is in the future."""
         if stamp > now + AHEAD:
             self._ahead = max(self._ahead, stamp - now)
             return
@@ -122,7 +123,7 @@ class Hold:
                 self._moving.add(self._cell(stamp))
 
     def _counts(self, stamp: int) -> bool:
-        """Return whether a sample of a time is in one of the looks."""
+        """Return whether a timestamp is in one of the looks."""
         begins, asked = self.setpoint.begins, self.asked
         if stamp < min(asked, self._begin):
             return stamp >= begins and self._cell(stamp) not in self._moving
@@ -132,7 +133,7 @@ class Hold:
             self._looks_at(stamp - x) for x in {asked, self._begin} if x <= stamp)
 
     def _cell(self, stamp: int) -> int:
-        """Return which part of the move a time is in."""
+        """Return the number of the part of the move that contains a timestamp."""
         begins = self.setpoint.begins
         return (stamp - begins) // max((self.asked - begins) // _MOVING, 1)
 
@@ -146,7 +147,7 @@ class Hold:
         return self._few or looks == 1 << (looks.bit_length() - 1)
 
     def _first(self) -> int:
-        """Return how many samples of the first look there are."""
+        """Return the number of samples in the first look."""
         end = self._begin + self._length
         return sum(self._begin <= x <= end for x in self._samples)
 
@@ -155,9 +156,9 @@ class Hold:
     def judge(
             self, now: int, steady: int, tolerances: Tolerances, sensor: Sensor, *,
             observable: bool) -> Finding | None:
-        """Judge if that is due at a time in ns; None if not, or if that changes nothing."""
-        if self.untold:
-            self.untold = False
+        """Judge if due at a time in ns; None if not due or if the finding does not change."""
+        if self.unreported:
+            self.unreported = False
             return self.found
         if self._judging is None:
             if self.over or not self._ready(now, steady, observable=observable):
@@ -172,11 +173,11 @@ class Hold:
         return None
 
     def _judge(self, tolerances: Tolerances, sensor: Sensor) -> Awaited[Finding | None]:
-        """Judge the samples up to when that was due; return what has changed by that."""
-        # By samples up to now that was due, whenever it is looked at.
+        """Judge the samples up to the due time; return the finding if it changed."""
+        # Only samples up to the due time count, whenever the judging runs.
         after, setpoint = self.due - self._begin, self.setpoint
         if self._grace > self._begin:
-            # Or by those of the second half of the time, or of the last looks.
+            # Use the samples of the second half of the time, or of the last looks.
             setpoint = replace(setpoint, end=None, moved=(
                 self._begin + after // 2 if self.due < self._closes
                 else self._closes - 2 * self._length))
@@ -191,15 +192,15 @@ class Hold:
         before = self.found
         if before is not None and found.open and (
                 before.failed or before.arrived and found.verdict is Code.UNOBSERVED):
-            # A miss that was shown stays one, and an arrival until samples leave it open.
+            # A shown miss stays a miss, and an arrival stays one until samples leave it open.
             found = before
         self.found = found
         same = before is not None and before.verdict is found.verdict
         return None if same and not self.over else found
 
     def wake(self, now: int) -> int:
-        """Return when to judge next, a time in ns; 0 for now."""
-        if self.untold:
+        """Return the time in ns at which to judge next; 0 for now."""
+        if self.unreported:
             return 0
         if self._judging is not None:
             return now + ANSWER
@@ -218,7 +219,7 @@ class Hold:
         if now < self._closes:
             return False
         if not self._waits:
-            # Samples may wait to be read until then.
+            # Samples may still wait to be read.
             self._waits, self._heard = True, steady
         if steady - self._heard <= _PATIENCE:
             return False
@@ -226,7 +227,7 @@ class Hold:
         return True
 
     def shown(self, setpoint: Setpoint, *, sensor: Sensor) -> Awaited[Finding]:
-        """Return what `judge` has found of a setpoint, or find it."""
+        """Return the last finding of a setpoint, or judge it."""
         if self._answer is not None and self._answer[0] == setpoint:
             return self._answer[1]
         return (yield from self.judged(setpoint, sensor=sensor))
@@ -234,7 +235,7 @@ class Hold:
     def judged(
             self, setpoint: Setpoint, tolerances: Tolerances = _TOLERANCES, *,
             sensor: Sensor, until: int | None = None) -> Awaited[Finding]:
-        """Judge the samples that have come, up to a time in ns, as those of a setpoint."""
+        """Judge the samples up to a time in ns as those of a setpoint."""
         samples = self._samples if until is None else {
             x: y for x, y in self._samples.items() if x <= until}
         if not samples:

@@ -1,4 +1,4 @@
-"""How late commands take effect, and what helps: delays of transport and of the driver differ."""
+"""Lateness of commands and its remedies, for delays of transport and of the driver."""
 
 from collections import deque
 from statistics import median_low
@@ -8,46 +8,46 @@ from numpy.typing import NDArray
 
 from hmsa_ros.model.units import NANOSECONDS
 
-# Commands that are compared, and the least number that says something.
+# Number of commands that are compared, and the smallest number that is conclusive.
 _RECENT = 16
 _ENOUGH = 3
-# How many times their usual difference others are apart that are exceptions, and the least share
-# of those that are none.
+# A command is an exception if it differs by more than this many times the usual spread; smallest
+# fraction of commands that are none.
 _APART, _MOST = 5.0, 0.6
-# Commands of a joint whose time of sending is remembered.
+# Number of commands per joint whose sending time is stored.
 _REMEMBERED = 64
-# A driver's delay is called constant where sending earlier or later explains it less than this.
+# A driver's delay is constant if its spread is below this fraction of that of the send times.
 _CONSTANT = 0.5
-# Vibration, as a share of the step, that is not worth a word.
+# Vibration, as a fraction of the step, that is negligible.
 _NOTHING = 1e-3
-# Shares of the last commands that were less late than what all of the next may be.
+# Quantiles of the recent lateness that all of the next commands may have.
 _SHARES = (0.1, 0.5, 0.9)
-# Ways to go on after an exception, of which it lasts in one.
+# Number of scenarios after an exception, which persists in one of them.
 _RARE = 8
 
 
 class Lateness:
     """
-    Counts late commands, finds what they have in common, and expects the same of those to come.
+    Count late commands, find their pattern, and predict the lateness of the next commands.
 
-    A command that arrives late is the later the later it was sent. One that a driver applies late
-    is as late as any other, however far ahead of its stamp it was sent.
+    A command delayed in transport is later the later it is sent. A command delayed by the driver
+    is equally late, however far ahead of its timestamp it is sent.
     """
 
     def __init__(self) -> None:
         self.count = 0
-        self.largest = 0  # how late the latest was, in ns
-        self.earliest = 0  # how long before its stamp a command took effect, in ns
+        self.largest = 0  # largest lateness in ns
+        self.earliest = 0  # largest time in ns by which a command was early
         self._missed = False
-        self._effects: dict[str, int] = {}  # when the newest command took effect, in ns
+        self._effects: dict[str, int] = {}  # time of effect of the newest command, in ns
         self._sent: dict[str, dict[int, int]] = {}
-        # How late, in ns, and the vibration that each ns leaves, as a share of the step.
+        # Lateness in ns, and vibration per ns of lateness, as a fraction of the step.
         self._recent: deque[tuple[int, float]] = deque(maxlen=_RECENT)
-        # Of those that were late: by how much, and how long ahead of their stamps they were sent.
+        # Of late commands: lateness, and time from sending to the timestamp.
         self._late: deque[tuple[int, int]] = deque(maxlen=_RECENT)
 
     def sent(self, joint: str, stamp: int, now: int) -> None:
-        """Remember when a command was sent; times in ns."""
+        """Record when a command was sent; times in ns."""
         sent = self._sent.setdefault(joint, {})
         sent.pop(stamp, None)
         sent[stamp] = now
@@ -58,13 +58,13 @@ class Lateness:
             self, late: int, joint: str, stamp: int, tolerance: int = 0,
             cost: float = 0.0) -> None:
         """
-        Take in that a command of a joint took effect so many ns after its stamp.
+        Record that a command of a joint took effect ``late`` ns after its timestamp.
 
-        The cost is the vibration that each ns of that leaves, as a share of the step.
+        ``cost`` is the vibration per ns of lateness, as a fraction of the step.
         """
         before, self._effects[joint] = self._effects.get(joint), stamp + late
         if late < 0 or before is None or stamp + late > before + tolerance:
-            # One that comes with the one before was held up with it.
+            # A command that arrives with the previous one was delayed together with it.
             self._recent.append((late, cost))
         if late > tolerance:
             self.count += 1
@@ -76,7 +76,7 @@ class Lateness:
             self.earliest = max(self.earliest, -late)
 
     def missed(self, late: int) -> None:
-        """Count a command that is sent so many ns late, or not at all for that."""
+        """Count a command that is sent ``late`` ns late, or not sent for that reason."""
         self.count += 1
         self.largest = max(self.largest, late)
         self._missed = True
@@ -84,14 +84,14 @@ class Lateness:
     # -- what is expected ----------------------------------------------------------------------
 
     def _likely(self) -> tuple[list[int], list[int]]:
-        """Return how late, in ns, commands usually are, sorted, and the newest if that is not."""
-        # Before anything is known they are in time.
+        """Return the usual lateness in ns, sorted, and the newest one if it is an exception."""
+        # The initial assumption is that commands are in time.
         late = [0, 0, *(x for x, _ in self._recent)]
         middle, newest = median_low(late), late[-_ENOUGH:]
         spread = median_low(abs(x - middle) for x in late)
         usual = sorted(x for x in late if abs(x - middle) <= _APART * spread)
         if _APART * (max(newest) - min(newest)) < abs(median_low(newest) - middle):
-            # It has changed.
+            # The usual lateness has changed.
             return sorted(newest), []
         if len(usual) < _MOST * len(late):
             return sorted(late), []
@@ -99,21 +99,21 @@ class Lateness:
 
     @property
     def unsure(self) -> bool:
-        """Whether the newest command is an exception, or the first of many."""
+        """Whether the newest command is an exception, or the first after a change."""
         return bool(self._likely()[1])
 
     @property
     def expected(self) -> int:
-        """How late, in ns, the next commands are expected to be."""
+        """Expected lateness of the next commands in ns."""
         return median_low(self._likely()[0])
 
     def scenarios(self, count: int, most: int) -> NDArray[np.int64]:
-        """Return how late commands to come may be, in ns; shape (at most `most`, count)."""
+        """Return the possible lateness of commands in ns; shape (at most `most`, count)."""
         usual, exception = self._likely()
         if most == 1 or not exception and usual[0] == usual[-1]:
             return np.full((1, count), self.expected)
         if exception:
-            # It lasts, or it is over: the more probable the more were in time before.
+            # The exception persists or is over; the latter is more probable the more were in time.
             ways = [*exception, *usual[::-(-len(usual) // (min(most, _RARE) - 1))]]
             return np.repeat(np.array(ways)[:, None], count, axis=1)
         alike = np.array([usual[int(x * len(usual))] for x in _SHARES])[:most, None]
@@ -125,19 +125,19 @@ class Lateness:
 
     @property
     def cost(self) -> float:
-        """Vibration that the last commands left, not being alike late, as a share of the step."""
+        """Largest vibration due to uneven recent lateness, as a fraction of the step."""
         alike = self.expected
         return min(max((abs(late - alike) * x for late, x in self._recent), default=0.0), 1.0)
 
     @property
     def harms(self) -> bool:
-        """Whether late commands leave vibration; those do not that are all alike."""
+        """Whether late commands leave vibration; equally late commands do not."""
         return self._missed or self.count > 0 and self.cost >= _NOTHING
 
     def _by_driver(self) -> bool | None:
-        """Return whether the driver delays the last commands; None if that cannot be told."""
+        """Return whether the driver delays the last commands; None if that is undetermined."""
         if self._late and self._late[-1][1] < 0:
-            # They were sent too late.
+            # The commands were sent too late.
             return False
         if len(self._late) < _ENOUGH:
             return None
@@ -162,7 +162,7 @@ class Lateness:
         return f'{said}: about {cost:g} % of the step of residual vibration'
 
     def advice(self, lead_time: int) -> str:
-        """Return what helps, the rest of a sentence; commands are sent `lead_time` ns ahead."""
+        """Return the remedy as the rest of a sentence; `lead_time` is in ns."""
         if not self.largest:
             return 'let the driver apply commands at their timestamps' if self.earliest else (
                 'find out which other node publishes commands, or what drops them')

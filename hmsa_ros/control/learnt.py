@@ -1,4 +1,4 @@
-"""What was learnt of an actuator: as a model to plan with, as its sensor, and as a file."""
+"""Learned parameters of an actuator: as a model to plan with, as its sensor, and as a file."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -23,26 +23,27 @@ from hmsa_ros.model.simulation import check_stretch
 from hmsa_ros.planning.planner import Believed
 from hmsa_ros.planning.timeline import Model
 
-# A model is another one from this share of a parameter, and this many of its deviations, on.
+# A parameter has changed if it differs by this fraction and this many standard deviations.
 _NEWS, _SURE = 1e-3, 0.5
-# A force is known from so many deviations on.
+# A force counts as known from this many standard deviations on.
 _FORCED = 2.0
-# Parameters of planner and plant besides those of the block.
+# Parameters of planner and plant in addition to those of the block.
 _OTHERS = ('coil_time_constant', 'stretch_bias', 'stretch_gain')
-# What the judge calls figures of a sensor, and the share of what was not known of one before
-# below which it has been found.
+# Names of sensor figures in the judge, and the fraction of the prior standard deviation below
+# which such a figure counts as determined.
 _SENSOR = {'stretch_bias': 'bias', 'stretch_gain': 'gain', 'sensor_latency': 'latency'}
 _FOUND = 0.3
-# A bias of fewer deviations does not show.
+# A bias of fewer standard deviations is not significant.
 _SHOWS = 3.0
 
 
 def learnt_model(
         model: Model, estimate: Estimate, held: float, sure: float = CREEPS) -> Model:
     """
-    Return a model with an estimate's parameters; as it is if that cannot hold a stretch.
+    Return a model with an estimate's parameters, or the same model if these cannot hold a stretch.
 
-    It creeps if that is known by more deviations than given; default by as many as for a move.
+    The model creeps if creep is known by more than ``sure`` standard deviations; the default is
+    the value for a move.
     """
     try:
         found = estimate.model(model.options, sure)
@@ -54,9 +55,10 @@ def learnt_model(
 
 def as_of_path(model: Model, before: Model, estimate: Estimate) -> Model:
     """
-    Return a model learnt from a path with the force of the one before, unless it is known.
+    Return a model learned from a path, with the force of the previous model unless it is known.
 
-    About one rest, as of a wave, a force looks like a bias, and would shift the mean.
+    Around a single equilibrium, as in a wave, a force cannot be told from a bias and would shift
+    the mean.
     """
     force = before.options.constant_force
     if abs(model.options.constant_force - force) >= _FORCED * estimate.deviations.get(
@@ -66,13 +68,13 @@ def as_of_path(model: Model, before: Model, estimate: Estimate) -> Model:
 
 
 def believed(estimate: Estimate, *, creeps: bool) -> Believed:
-    """Return what a plan begins from, which takes creep into account or does not."""
+    """Return the initial state of a plan, with or without creep."""
     return estimate.stretch, estimate.rate, (
         followed(estimate.values, estimate.stretch) if creeps else ())
 
 
 def differs(model: Model, estimate: Estimate) -> bool:
-    """Return whether an estimate is known to be of another actuator than a model."""
+    """Return whether an estimate differs significantly from a model."""
     creep = model.actuator.creep
     if bool(creep) is not bool(estimate.actuator.creep):
         return True
@@ -87,7 +89,7 @@ def differs(model: Model, estimate: Estimate) -> bool:
 
 
 def alike(model: Model, other: Model) -> bool:
-    """Return whether two models are of the same actuator but for what is no news."""
+    """Return whether two models differ by less than a significant change."""
     one, two = (values_of(x.actuator, x.others) for x in (model, other))
     return model.actuator.creep == other.actuator.creep and all(
         math.isclose(one[x], two[x], rel_tol=_NEWS) if isinstance(one[x], float)
@@ -96,9 +98,9 @@ def alike(model: Model, other: Model) -> bool:
 
 def sensor_of(found: Estimate, prior: Prior) -> Sensor:
     """
-    Return what an estimate has found of a sensor; what it has not is as given.
+    Return the sensor according to an estimate; undetermined figures keep their given values.
 
-    What a force leaves open of a bias counts.
+    The uncertainty of a bias includes that of a force.
     """
     before, sure = np.diag(prior.covariance), np.diag(found.covariance)
     known = [x for i, x in enumerate(found.free) if x in _SENSOR and i != found.gain and (
@@ -117,8 +119,8 @@ def _shows_bias(found: Estimate) -> bool:
     """
     Return whether samples show that a sensor may have a bias.
 
-    Either it is known not to be 0, or the block is seen beside its rest without field, where a
-    force may hide the larger part of a bias.
+    Either the bias differs significantly from 0, or the block rests off its zero-field
+    equilibrium, where a force may hide the larger part of a bias.
     """
     at = rest(found.values, found.free, 0.0)
     if at is None:
@@ -131,8 +133,8 @@ def _shows_bias(found: Estimate) -> bool:
 
 
 def known_of(estimate: Estimate) -> Known:
-    """Return how well an estimate knows parameters."""
-    # A suspect that is none has no deviation.
+    """Return the uncertainty of the parameters of an estimate."""
+    # A suspected parameter that is not in use has no standard deviation.
     places = [i for i, x in enumerate(estimate.free)
               if estimate.deviations[x] > 0.0 and i != estimate.gain]
     names = tuple(estimate.free[i] for i in places)
@@ -143,7 +145,7 @@ def known_of(estimate: Estimate) -> Known:
 
 
 def file_text(estimates: Mapping[str, Estimate], now: datetime) -> str:
-    """Return a parameter file with what was learnt by joint; '' names all joints."""
+    """Return a parameter file with the learned values by joint; '' names all joints."""
     lines = [
         f'# What feedback learnt of an actuator until {now.isoformat(" ", "seconds")}.',
         '# Planner and plant take it after their own parameter file.',
@@ -163,9 +165,9 @@ def file_text(estimates: Mapping[str, Estimate], now: datetime) -> str:
 
 def save(file: str, estimates: Mapping[str, Estimate | None], *, by_joint: bool) -> str:
     """
-    Write what was learnt by joint, and say so.
+    Write the learned parameters by joint, and return a confirmation.
 
-    Raises `BadInputError` if nothing was learnt yet, or it cannot be written.
+    Raises `BadInputError` if nothing was learned yet, or if the file cannot be written.
     """
     if not file:
         raise BadInputError('parameter feedback_file is empty: expected the file to write to')

@@ -1,4 +1,4 @@
-"""What the moves of a joint have left with feedback and without, as measured."""
+"""Measured errors of a joint's moves, with feedback and in open loop."""
 
 from dataclasses import dataclass, field, replace
 import math
@@ -9,44 +9,44 @@ from hmsa_ros.judge.records import Finding, Sensor, Setpoint
 from hmsa_ros.model.equations import equilibrium_stretch
 from hmsa_ros.planning.timeline import Model, Plan
 
-# How much more of its step than without feedback a move leaves that is worse, and by how many
-# deviations.
+# A move is worse if its error exceeds the open-loop error by this fraction of the step and by this
+# many standard deviations.
 _WORSE, _SURE = 0.005, 3.0
-# How much more than expected is not expected: deviations of an amplitude, twice, peak to peak.
+# Largest usual vibration, peak to peak, over the predicted amplitude: twice three deviations.
 _EXPECTED = 6.0
-# Smaller steps show nothing.
+# Smaller steps are not informative.
 _STEP = 0.02
 
 
 @dataclass
 class Moves:
-    """How the moves of a request were planned; a time in ns is that of a stamp."""
+    """How the moves of a request were planned; times are timestamps in ns."""
 
-    learnt: bool = False  # with parameters that were learnt
-    expected: float = 0.0  # amplitude that the newest of them is expected to have
-    corrected: list[int] = field(default_factory=list)  # from when on plans were corrected
+    learnt: bool = False  # planned with learned parameters
+    expected: float = 0.0  # predicted amplitude of the newest move
+    corrected: list[int] = field(default_factory=list)  # times from which plans were corrected
 
 
 class Ledger:
     """
-    Compares what moves leave, by the one judge.
+    Compare the errors that moves leave, as judged from samples.
 
-    A move that was planned with the parameters given shows what vibration open loop leaves. Where
-    a level that was learnt holds the actuator, the offset that open loop would leave is known
-    too: the parameters given say well enough by how much the one level shifts the rest.
+    A move planned with the given parameters shows the open-loop vibration. If a learned level
+    holds the actuator, the open-loop steady-state error is known too, because the given parameters
+    predict the shift between the two levels accurately enough.
     """
 
     def __init__(self) -> None:
-        self.left = math.nan  # of the newest move, as a share of its step
-        self._without = math.nan  # largest vibration of a move in open loop, as such a share
+        self.left = math.nan  # error of the newest move, as a fraction of its step
+        self._without = math.nan  # largest open-loop vibration, as a fraction of the step
 
     def take(
             self, hold: Hold, plan: Plan, given: Model, moves: Moves,
             sensor: Sensor) -> Awaited[str]:
         """
-        Take in samples of a setpoint; return why feedback has made it worse, empty if it has not.
+        Process the samples of a setpoint; return why feedback made it worse, empty if it did not.
 
-        The plan is the one in force.
+        ``plan`` is the plan in force.
         """
         setpoint, asked = hold.setpoint, hold.asked
         self.left = math.nan
@@ -79,7 +79,7 @@ class Ledger:
     def _worse(
             self, found: Finding, setpoint: Setpoint, given: Model, level: float,
             expected: float) -> str:
-        """Return what open loop would have left less of; empty if nothing."""
+        """Return a message if open loop would have left a smaller error; empty if not."""
         rest = float(equilibrium_stretch(given.load(level), given.material))
         without = abs(found.offset - (rest - setpoint.target))
         more, variance = abs(found.offset) - without, found.offset_std**2
@@ -96,5 +96,5 @@ class Ledger:
 
 
 def _or(value: float, other: float) -> float:
-    """Return a value, or another one where it is not known."""
+    """Return a value, or another one if it is NaN."""
     return other if math.isnan(value) else value

@@ -1,8 +1,8 @@
 """
-The controller beside a device in one loop, in simulated time and as fast as that goes.
+Run the controller and a device in one loop, in simulated time, as fast as possible.
 
-What runs is `hmsa_ros.control.planner.PlannerRuntime`, which nodes drive too; the loop hands it
-the time, what took effect and what was measured.
+The controller is `hmsa_ros.control.planner.PlannerRuntime`, as in the nodes. The loop passes it
+the time, the applied levels and the samples.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,32 +15,32 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import PlannerGroup
 
-# How long to wait, in ns, where there is something to do that has to wait.
+# Time to wait, in ns, while the controller waits for something.
 _PATIENCE = NANOSECONDS // 1000
 
 
 class SimulatedDevice(Protocol):
-    """What carries out commands; times in ns, fields in T, joints by number."""
+    """A device that carries out commands; times in ns, fields in T, joints by number."""
 
     @property
     def time(self) -> int:
-        """Time that it has been advanced to."""
+        """Time that the device has been advanced to."""
 
     @property
     def next_sample(self) -> int:
-        """When it measures next."""
+        """Time of the next sample."""
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
-        """Take a level from a stamp on."""
+        """Accept a level that applies from a timestamp."""
 
     def advance(self, time: int) -> None:
-        """Do what is due up to a time."""
+        """Simulate until a time."""
 
     def changes(self) -> Sequence[tuple[int, int, float]]:
-        """Return which levels took effect: joint, stamp and level."""
+        """Return the levels that took effect: joint, timestamp and level."""
 
     def samples(self) -> Sequence[tuple[int, Array, Array, Array]]:
-        """Return what was measured: stamp, and stretch, rate (1/s) and field of each joint."""
+        """Return the samples: timestamp, and stretch, rate (1/s) and field of each joint."""
 
 
 class Loop:
@@ -52,9 +52,9 @@ class Loop:
     group : PlannerGroup
         The planners, in the order of the device's joints.
     settings : Settings
-        Of the controller.
+        Settings of the controller.
     device : SimulatedDevice
-        What it commands; its time is that of the loop.
+        The device to command; its time is that of the loop.
 
     """
 
@@ -66,12 +66,12 @@ class Loop:
             group, settings, Surroundings(
                 clock=lambda: self.now, steady=lambda: self.now, one_clock=lambda: True))
         self.runtime.active = True
-        #: Called with all that the controller says.
-        self.tell: Callable[[Output], None] = lambda output: None
+        #: Called with each output of the controller.
+        self.deliver: Callable[[Output], None] = lambda output: None
         self._names = list(group.planners)
 
     def run(self, until: int) -> None:
-        """Go on until a time in ns."""
+        """Run until a time in ns."""
         while self.now < until:
             self.serve()
             wakes = [self.runtime.wake, self.runtime.group.next_command()]
@@ -85,15 +85,15 @@ class Loop:
             self._follow()
 
     def serve(self) -> None:
-        """Do what is due now."""
+        """Do the work that is due now."""
         for output in self.runtime.tick(self.now):
             if isinstance(output, Send):
                 self.device.receive(
                     self._names.index(output.joint), output.stamp, output.flux_density)
-            self.tell(output)
+            self.deliver(output)
 
     def _follow(self) -> None:
-        """Let the device act up to now, and take in what came of it."""
+        """Advance the device to now, and pass on its changes and samples."""
         self.device.advance(self.now)
         self.now = max(self.now, self.device.time)
         for joint, stamp, level in self.device.changes():

@@ -1,9 +1,9 @@
 """
-A planner at work: requests and what really happened in, commands and verdicts out.
+A planner at work: takes requests, receipts and samples, and returns commands and verdicts.
 
-Knows no ROS. Whoever drives it calls `PlannerRuntime.tick` with the time of its clock often
-enough, at the latest when `PlannerRuntime.wake` says so, and passes on what that returns: a node
-to topics, a loop that has the coil at hand to the coil.
+Does not depend on ROS. The caller calls `PlannerRuntime.tick` with the time of its clock, at the
+latest at `PlannerRuntime.wake`, and delivers the returned outputs: a node to topics, a loop
+directly to the coil.
 """
 
 from collections.abc import Mapping
@@ -41,14 +41,14 @@ from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.timeline import Model
 from hmsa_ros.timekeeping import clock_set_words
 
-# Clock jumps nearer to each other than this make one verdict.
+# Clock jumps that follow each other within this time are reported once.
 _STORM = NANOSECONDS
 _WAITING = Verdict(
     Severity.OK, Code.WAITING, 'accepted: starts as soon as the current state is known')
 
 
 class PlannerRuntime:
-    """Plans requests in slices, sends commands in time and follows their effects."""
+    """Plan requests in slices, send commands in time and track their effects."""
 
     def __init__(
             self, group: PlannerGroup, settings: Settings, surroundings: Surroundings) -> None:
@@ -56,21 +56,21 @@ class PlannerRuntime:
         self.settings = settings
         self._prepare()
         self.active = False
-        #: Refuses requests, except to stop, while several planners or devices run.
+        #: Refuses requests except stops, while several planners or devices are running.
         self.crowded: RefusedError | None = None
         self.clock_jumps = 0
-        #: By how many ns the clock was set ahead since `tick` has taken that in.
+        # Time in ns by which the clock was set ahead since `tick` last processed that.
         self._stepped = 0
 
         def clock() -> int:
-            # One that is set meanwhile goes on until that is taken in.
+            # A clock that is set continues unchanged until that is processed.
             return surroundings.clock() - self._stepped
         around = self.surroundings = replace(surroundings, clock=clock)
         self._clock, self._steady = clock, around.steady
         self._outputs: list[Output] = []
         receipts = Receipts(around.steady)
         self.following = Following(group, receipts, self._note)
-        self.feedback = Feedback(group, settings, self._outputs, clock, self._tell_ended)
+        self.feedback = Feedback(group, settings, self._outputs, clock, self._report_ended)
         self._takeover = Takeover(
             group.planners, around, receipts, self.following.newest, self.feedback.follows,
             self._note)
@@ -84,11 +84,11 @@ class PlannerRuntime:
         self.planning = Planning(
             group, self.following, Corrections(self.feedback, clock), self._bulletin,
             around, lambda: self.devices.send(clock()))
-        self._next_beat = 0  # time in ns of the next sign of life
+        self._next_beat = 0  # time in ns of the next heartbeat
         self._last_jump: int | None = None
         self._set_back = 0
-        self._differ = False  # whether it has been noted that clocks do
-        self._tell_impossible = Seldom()
+        self._differ = False  # whether a clock offset was reported
+        self._impossible_due = Seldom()
 
     def _note(self, words: str) -> None:
         self._outputs.append(Note(Severity.WARN, words))
@@ -97,11 +97,11 @@ class PlannerRuntime:
 
     def request(self, request: Request) -> Verdict:
         """
-        Take a request, and work it out at once as far as a slice goes.
+        Accept a request, and plan it immediately for the duration of a slice.
 
-        One that replaces everything from now on is planned before those that wait, and they are
-        dropped if it can be carried out. The verdict is ``waiting`` if it is not this request's
-        yet.
+        A request that replaces all others from now on is planned before those that wait, which are
+        dropped if it can be carried out. The verdict is ``waiting`` until there is one for this
+        request.
         """
         try:
             check_ready(self._clock(), active=self.active)
@@ -123,15 +123,15 @@ class PlannerRuntime:
         self._engage(begin=True)
         sure = self._work_on()
         while sure and work in self.planning and not isinstance(request, Trajectory):
-            # Short work, which whoever asks wants to be done.
+            # It is short work, and the caller waits for it.
             sure = self._work_on()
         if self._set_back:
-            # While it was planned, for times that are not to come.
+            # The clock was set back during planning, so the planned times are invalid.
             return self.request(request)
         return _WAITING if work in self.planning else self._bulletin.verdict
 
     def _check(self, request: Request) -> None:
-        """Have joints looked at that are to move now; to stop nothing is waited for."""
+        """Have joints that are to move now checked; a stop does not wait."""
         self.devices.since = None
         if isinstance(request, Stop) or not self._takeover.engaged:
             return
@@ -154,17 +154,17 @@ class PlannerRuntime:
             self, joint: str, time: int, command: int, *, cut_off: bool,
             locked: bool = False) -> None:
         """
-        Take in a receipt: by its time in ns a device has received a command of a stamp.
+        Process a receipt: by its time in ns, a device has received the command of a timestamp.
 
-        A device that was cut off refuses commands of before, and one that is locked by an
-        interlock all.
+        A device that was cut off rejects commands from before that; one that is locked by an
+        interlock rejects all.
         """
         self.following.seen(time)
         self._drop(self.devices.received(joint, time, command))
         self.cut_off(joint, in_force=cut_off or locked, locked=locked)
 
     def cut_off(self, joint: str, *, in_force: bool, locked: bool = False) -> None:
-        """Take in whether a joint's device was cut off, or is locked, and refuses commands."""
+        """Record whether a joint's device is cut off, or locked, and rejects commands."""
         if locked and joint not in self.devices.open:
             self.planning.refuse_all(self.devices.interlock(joint))
             self.planning.clear()
@@ -174,25 +174,25 @@ class PlannerRuntime:
             self.devices.acknowledge(joint)
 
     def _drop(self, verdict: Verdict | None) -> None:
-        """Show and say that a plan was dropped, if a verdict says so."""
+        """Report that a plan was dropped, if there is a verdict."""
         if verdict is not None:
             self._bulletin.show()
             self._bulletin.go_on(verdict, log=True)
 
     def applied(self, joint: str, stamp: int, flux_density: float) -> None:
-        """Take in that a joint's level in T has really been in force from a stamp in ns on."""
+        """Record that a joint's level in T was in force from a timestamp in ns on."""
         if math.isnan(flux_density):
-            # Nobody knows what is in force.
+            # The applied level is unknown.
             return
         if not self.group.planners[joint].follows(flux_density):
-            if self._tell_impossible():
+            if self._impossible_due():
                 self._note(
                     f'joint {joint}: a report that {flux_density:g} T took effect is ignored, '
                     'since no motion can be predicted from there; see what publishes it')
             return
         now = self._clock()
         if self._stepped:
-            # The stamp is of the clock as it was set.
+            # The timestamp is of the clock after it was set.
             self._begin_anew()
             now = self._clock()
         if joint in self.feedback.joints:
@@ -206,9 +206,9 @@ class PlannerRuntime:
             self, joint: str, stamp: int, stretch: float, rate: float,
             flux_density: float, *, came: int | None = None) -> None:
         """
-        Take in a sample: stamp in ns, stretch, rate in 1/s and flux density in T.
+        Process a sample: timestamp in ns, stretch, rate in 1/s and flux density in T.
 
-        Where it waited to be read, `came` is the time in ns of its arrival.
+        If the sample waited to be read, `came` is the time in ns of its arrival.
         """
         came = self._clock() if came is None else came - self._stepped
         if self._takeover.waiting or not self._takeover.engaged:
@@ -220,22 +220,22 @@ class PlannerRuntime:
             self.feedback.joints[joint].add(stamp, stretch, flux_density, came)
 
     def clock_set(self, by: int) -> None:
-        """Take in that the clock was set ahead by some ns, and that what is planned goes on."""
+        """Record that the clock was set ahead by some ns; plans continue."""
         self.clock_jumps += 1
         self._stepped += by
 
     def clock_set_back(self, back: int) -> None:
         """
-        Take in that simulated time began anew, some ns back: the state in force is read again.
+        Record that simulated time restarted, some ns back: the actual state is read again.
 
-        The clock may find this out when it is read in the middle of planning, so the plans are
-        dropped when that is done.
+        The clock may detect this when it is read during planning, so the plans are dropped
+        afterwards.
         """
         self.clock_jumps += 1
         self._set_back = max(self._set_back, back)
 
     def _begin_anew(self) -> None:
-        """Take in that the clock was set, if it was, and report it."""
+        """Process a clock that was set, and report it."""
         back, self._set_back = self._set_back, 0
         by, self._stepped = self._stepped, 0
         if not (back or by):
@@ -252,13 +252,13 @@ class PlannerRuntime:
             self._takeover.drop()
             self._takeover.engaged = False
         else:
-            # All that is planned happens when it would have.
+            # All plans continue as if the clock had not been set.
             self.group.clock_set(by)
             self._watch.clock_set(by)
             self._takeover.clock_set(by)
             self._next_beat += by
             for request in requests:
-                # It was being planned for times that are others now.
+                # It was being planned for times that are now invalid.
                 self.planning.add(request, engaged=self._takeover.engaged)
             self._bulletin.show()
         last, self._last_jump = self._last_jump, self._steady()
@@ -272,10 +272,10 @@ class PlannerRuntime:
             clock_set_words(by, 'what is planned goes on,')), log=True)
 
     def deactivate(self) -> None:
-        """Come to rest, for which all commands are sent now, and take no more requests."""
+        """Come to rest, sending all commands for that now, and accept no more requests."""
         self._begin_anew()
         self.active = False
-        # What is seen before the joints have come to rest is not where they are later.
+        # Samples from before the joints come to rest do not show their later position.
         self._takeover.drop()
         self.planning.clear()
         now = self._clock()
@@ -292,7 +292,7 @@ class PlannerRuntime:
     def change(
             self, settings: Settings, models: Mapping[str, Model], *,
             simultaneous: bool) -> None:
-        """Take other settings now, and other models by joint from the next request on."""
+        """Adopt new settings now, and new models by joint from the next request on."""
         if settings.heartbeat_period != self.settings.heartbeat_period:
             self._next_beat = self._clock() + settings.heartbeat_period
         self.settings = settings
@@ -309,19 +309,19 @@ class PlannerRuntime:
 
     @property
     def wants_samples(self) -> bool:
-        """Whether samples are waited for now, or will be of use soon."""
+        """Whether samples are needed now or soon."""
         return self._takeover.waiting or self.active and (
             self._watch.open or self.feedback.on)
 
     def looks_at(self, stamp: int) -> bool:
-        """Return whether a sample with a stamp in ns is of use; most are not."""
+        """Return whether a sample with a timestamp in ns is needed; most are not."""
         self.following.seen(stamp)
         return (self._takeover.waiting or self._watch.wants(stamp)
                 or self.feedback.looks_at(stamp))
 
     @property
     def wake(self) -> int | None:
-        """Time in ns at which there is something to do next; None for never, 0 for now."""
+        """Time in ns of the next work; None for never, 0 for now."""
         if (self._set_back or self._stepped or self.planning or self._takeover.waiting
                 or self._outputs):
             return 0
@@ -341,13 +341,13 @@ class PlannerRuntime:
         return min((x for x in times if x is not None), default=None)
 
     def send(self, now: int) -> list[Output]:
-        """Return the commands that are due at a time in ns: of `tick`, what cannot wait."""
+        """Return the commands due at a time in ns: the urgent part of `tick`."""
         self._begin_anew()
         self._send(now)
         return self._taken()
 
     def tick(self, now: int) -> list[Output]:
-        """Do what is due at a time in ns, for some ms at most; return what to pass on."""
+        """Do the work due at a time in ns, for a few ms at most; return the outputs."""
         self._begin_anew()
         self._engage()
         estimated = self._send(now) and self.feedback.update(now)
@@ -355,7 +355,7 @@ class PlannerRuntime:
             self._work_on()
         if self._bulletin.preview_again is not None and now >= self._bulletin.preview_again:
             self._bulletin.show()
-        self._bulletin.tell_progress(now)
+        self._bulletin.report_progress(now)
         if self.active and (
                 self._watch.open or self._bulletin.unheard or self._bulletin.unseen
                 or self.devices.receipts or self._bulletin.next_change is not None):
@@ -366,21 +366,21 @@ class PlannerRuntime:
         return self._taken()
 
     def _send(self, now: int) -> bool:
-        """Send what is due, if commands are sent at all."""
+        """Send the commands that are due; return whether commands are sent at all."""
         if not (self._takeover.engaged and self.active):
             return False
         self.devices.look()
         if self.settings.replan_late:
             self.following.drop_missed(now, self.settings.lateness_tolerance)
         if self.following.astray:
-            # Before more of a plan is sent that does not hold.
+            # Replan before more of a plan is sent that no longer applies.
             self._work_on()
         late = self.following.lateness.count
         self.devices.send(now)
         if self.following.lateness.count > late:
             self.feedback.give_way(now)
         if self.settings.heartbeat_period and now >= self._next_beat:
-            # Signs of life; and a look which devices give some.
+            # Heartbeats, and a check which devices report.
             self._next_beat = now + self.settings.heartbeat_period
             if self.settings.replan_late:
                 self.following.look_for_unheard(now)
@@ -394,7 +394,7 @@ class PlannerRuntime:
         return outputs
 
     def _engage(self, *, begin: bool = False) -> None:
-        """Go on from where the joints are, as soon as that is known."""
+        """Start from the actual state of the joints, as soon as it is known."""
         engaged = self._takeover.engaged
         if begin:
             self._takeover.begin(self.settings)
@@ -410,14 +410,14 @@ class PlannerRuntime:
             self._next_beat = self._clock() + self.settings.heartbeat_period
 
     def _work_on(self) -> bool:
-        """Plan what waits, if it is known where the joints are; return whether it is."""
+        """Plan waiting work if the state of the joints is known; return whether it is."""
         if not self._takeover.engaged or not self._sure():
             return False
         self.planning.work_on()
         return True
 
     def _sure(self) -> bool:
-        """Return whether joints are where they are predicted, or seen, as far as that matters."""
+        """Return whether the joints are where predicted, or measured, as far as that matters."""
         requests = self.planning.requests
         if not requests and not self.following.astray:
             return True
@@ -433,7 +433,7 @@ class PlannerRuntime:
             return not requests
 
     def _judge(self, now: int) -> None:
-        """Judge arrivals by what was measured."""
+        """Judge arrivals from samples."""
         if not self._watch.open:
             return
         end, observable = self._steady() + SLICE, self.surroundings.observable()
@@ -445,12 +445,12 @@ class PlannerRuntime:
             if finding is None:
                 break
 
-    def _tell_ended(self, words: str) -> None:
-        """Say why feedback of a joint has ended."""
+    def _report_ended(self, words: str) -> None:
+        """Report why feedback of a joint has ended."""
         self._bulletin.go_on(Verdict(Severity.WARN, Code.FEEDBACK_ENDED, words), log=True)
 
     def report(self) -> tuple[Severity, str, dict[str, object]]:
-        """Return how commands fare: severity, a sentence and counters."""
+        """Return the state of the commands: severity, message and counters."""
         late, severity, message = self.following.lateness, Severity.OK, 'commands sent in time'
         receipts, clocks = self.devices.receipts, self.devices.clocks
         if late.count:

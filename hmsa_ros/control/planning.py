@@ -1,4 +1,4 @@
-"""Requests that wait to be planned, and what comes of planning them."""
+"""Requests that wait to be planned, and their results."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -14,12 +14,12 @@ from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.timeline import Draft
 
-# Levels and setpoints of replaced plans that are freed at a time.
+# Number of levels and setpoints of replaced plans that are freed at a time.
 _FREED = 2_000
 
 
 class Planning:
-    """Plans what waits in slices, and answers."""
+    """Plan waiting requests in slices, and report the results."""
 
     def __init__(
             self, group: PlannerGroup, following: Following, corrections: Corrections,
@@ -28,7 +28,7 @@ class Planning:
         self._corrections = corrections
         self._around, self._send = surroundings, send
         self._queue: deque[Work] = deque()
-        # What plans that were replaced consist of: to free it all at once takes tens of ms.
+        # Parts of replaced plans: freeing all at once takes tens of ms.
         self._leftovers: list[object] = []
         self.refused = 0
 
@@ -37,11 +37,11 @@ class Planning:
 
     @property
     def requests(self) -> list[Request]:
-        """What was asked for and is not answered yet."""
+        """Requests that have no result yet."""
         return [x.request for x in self._queue if x.request is not None]
 
     def refuse_all(self, error: HmsaError) -> None:
-        """Answer all that waits by the same refusal."""
+        """Refuse all waiting requests for the same reason."""
         for work in list(self._queue):
             if work.request is not None:
                 self._queue.remove(work)
@@ -51,12 +51,12 @@ class Planning:
         return work in self._queue
 
     def clear(self) -> None:
-        """Drop what waits."""
+        """Drop all waiting work."""
         self._queue.clear()
         self._leftovers.clear()
 
     def add(self, request: Request, *, engaged: bool) -> Work:
-        """Take a checked request; one that replaces all that waits comes first once engaged."""
+        """Add a checked request, first in the queue if it replaces all others."""
         work = work_on(request, self._group, self._around.clock, self._corrections.cautious)
         if engaged and work.replaces(self._queue):
             self._queue.appendleft(work)
@@ -65,7 +65,7 @@ class Planning:
         return work
 
     def _supersede(self, work: Work) -> None:
-        """Drop what came before and would be replaced as soon as it is planned."""
+        """Drop earlier requests that this one would replace as soon as they are planned."""
         for old in list(self._queue):
             if old.number < work.number and old.joints <= work.joints and not work.postponed:
                 self._queue.remove(old)
@@ -75,7 +75,7 @@ class Planning:
                         'planned', old.request.name))
 
     def work_on(self) -> None:
-        """Plan what waits, for the length of a slice."""
+        """Plan waiting work for the duration of a slice."""
         for name in self._following.to_resume():
             if not any(x.request is None and name in x.joints for x in self._queue):
                 self._queue.appendleft(self._following.resumption(name, self._around.clock))
@@ -91,7 +91,7 @@ class Planning:
             self._bulletin.go_on(self._following.verdicts.pop(0))
 
     def advance(self, work: Work) -> bool:
-        """Go on with one piece of work; say whether it is done."""
+        """Continue one piece of work; return whether it is done."""
         begun = self._around.clock() if work.corrects else 0
         found: tuple[Mapping[str, Draft], int] | None = None
         try:
@@ -123,11 +123,11 @@ class Planning:
         return True
 
     def _answer(self, request: Request, drafts: Mapping[str, Draft], now: int) -> None:
-        """Begin to carry out a request."""
+        """Start to carry out a request."""
         self._following.dropped(drafts)
         changed = self._group.take(drafts, now)
         self._bulletin.take_goals(request)
-        # First, since reporting takes time.
+        # Commands are sent first, since reporting takes time.
         self._send()
         warnings = [x.warning for x in drafts.values() if x.warning is not None]
         if changed:
@@ -141,7 +141,7 @@ class Planning:
         self._bulletin.give(Verdict(severity, code, words, request.name), log=bool(warnings))
 
     def refuse(self, error: HmsaError, request: Request) -> Verdict:
-        """Answer a request that cannot be read or carried out."""
+        """Report a request that cannot be read or carried out."""
         code = Code.BAD_INPUT if isinstance(error, BadInputError) else Code.NOT_CONVERGED
         if isinstance(error, RefusedError):
             code = error.code
@@ -151,7 +151,7 @@ class Planning:
         return self._bulletin.verdict
 
     def _go_on(self, work: Work, drafts: Mapping[str, Draft], now: int) -> None:
-        """Go on with a plan that was made anew, or corrected from samples."""
+        """Adopt a plan that was replanned, or corrected from samples."""
         by = self._corrections if work.corrects else self._following
         verdict = by.take(work, drafts, now)
         self._send()
@@ -162,11 +162,11 @@ class Planning:
         else:
             self._bulletin.show()
         self._bulletin.go_on(
-            verdict, log=not work.corrects and self._following.tell_replanned())
+            verdict, log=not work.corrects and self._following.replanned_due())
 
 
 def _accepted(drafts: Mapping[str, Draft]) -> str:
-    """Return in words that drafts are taken, and what following creep leaves."""
+    """Return a message that drafts are accepted, with the vibration that creep leaves."""
     left = max((x.vibration for draft in drafts.values() for x in draft.segments), default=0.0)
     if left == 0.0:
         return 'accepted'

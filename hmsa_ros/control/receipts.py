@@ -1,4 +1,4 @@
-"""What plant or driver acknowledge: that commands arrive, and what time it is there."""
+"""Receipts of plant or driver: acknowledged commands, and the time of the device's clock."""
 
 from collections import deque
 from collections.abc import Callable
@@ -7,27 +7,27 @@ from typing import NamedTuple
 
 from hmsa_ros.model.units import NANOSECONDS
 
-# Receipts come five times a second: how long they may stay away, in ns by the steady clock.
+# Receipts arrive five times a second: longest gap between them, in ns by the steady clock.
 _PATIENCE = 800_000_000
-# A pause between two looks that is longer is one of ours, in which none could be taken in.
+# A longer pause between two looks is a stall of this process, which could not receive any.
 _PAUSE = 300_000_000
-# A receipt that is older than the silence that it ends was on its way all the time.
+# A receipt that is older than the silence that it ends was delayed in transit.
 _STALE = 300_000_000
-# How often nobody who gives receipts is found, five times a second, until none are expected.
+# Number of looks, five a second, without a publisher until no receipts are expected.
 _MISSING = 25
-# Commands of a joint whose sending is remembered, and exchanges of which the quickest counts.
+# Number of commands per joint whose sending time is stored, and of exchanges compared.
 _REMEMBERED, _COMPARED = 64, 32
 
 
 class Offset(NamedTuple):
-    """How far the clock of a device is ahead of ours, and how wrong that may be; in ns."""
+    """Offset of a device's clock from the planner's, and its uncertainty; in ns."""
 
     ahead: int
     error: int
 
     @property
     def words(self) -> str:
-        """What it is, as a half sentence, and what helps."""
+        """The offset and the remedy, as a clause."""
         return (
             f'the clock of the plant or driver is {abs(self.ahead) / NANOSECONDS:.4f} s '
             f'{"ahead of" if self.ahead > 0 else "behind"} that of the planner (measured to '
@@ -37,26 +37,26 @@ class Offset(NamedTuple):
 
 @dataclass
 class _Joint:
-    """What is known of the device of a joint; times in ns, by the steady clock where not said."""
+    """State of the device of a joint; times in ns by the steady clock, unless noted."""
 
-    heard: int  # when the newest receipt came
-    time: int = 0  # when that was, by the clock of the device
-    command: int = 0  # the stamp that it named; 0 for none
-    unanswered: int | None = None  # since when no command is known to have arrived
+    heard: int  # arrival of the newest receipt
+    time: int = 0  # its time by the clock of the device
+    command: int = 0  # timestamp that it acknowledged; 0 for none
+    unanswered: int | None = None  # time since which no command is acknowledged
     silent: bool = False
-    missing: int = 0  # how often nobody was found since who gives any
-    # By stamp, when a command was sent by our clock.
+    missing: int = 0  # consecutive looks without a publisher of receipts
+    # Sending time of commands by timestamp, on the planner's clock.
     sent: dict[int, int] = field(default_factory=dict)
     exchanges: deque[Offset] = field(default_factory=lambda: deque(maxlen=_COMPARED))
-    # How old receipts were when they came, by our clock.
+    # Age of receipts at arrival, by the planner's clock.
     lags: deque[int] = field(default_factory=lambda: deque(maxlen=_COMPARED))
 
 
 class Receipts:
     """
-    Follows receipts, which are optional: only that they cease is an alarm.
+    Track receipts, which are optional: only their absence after the first one is an alarm.
 
-    ``silent`` are the joints whose device was heard before and is not any more.
+    ``silent`` contains the joints whose device has stopped sending receipts.
     """
 
     def __init__(self, steady: Callable[[], int]) -> None:
@@ -69,7 +69,7 @@ class Receipts:
         return bool(self._joints)
 
     def sent(self, joint: str, stamp: int, now: int) -> None:
-        """Take in that a command of a stamp in ns was sent at a time in ns of our clock."""
+        """Record that a command was sent; timestamp and time in ns of the planner's clock."""
         known = self._joints.get(joint)
         if known is None:
             return
@@ -82,11 +82,11 @@ class Receipts:
     def received(
             self, joint: str, time: int, command: int, now: int, *, comparable: bool) -> bool:
         """
-        Take in that the newest command there is one of a stamp, by a time of the device.
+        Process a receipt with the device's time; return whether the device restarted.
 
-        The time now is that of our clock; the two are ``comparable`` where they are two. One clock
-        for both may be in slow motion, or stand still. Returned is whether the device has begun
-        anew: it had received commands, and has received none now.
+        ``now`` is the time of the planner's clock. The two times are ``comparable`` if each side
+        has its own clock: a shared clock may be slowed down or paused. A device has restarted if
+        it reports no command after it reported one.
         """
         steady = self._steady()
         known = self._joints.get(joint)
@@ -97,7 +97,7 @@ class Receipts:
             return False
         anew, known.command = known.command != 0 and command == 0, command
         if anew:
-            # What was sent has gone with the old one.
+            # Commands that were sent to the previous device are lost.
             known.sent.clear()
             known.unanswered = None
         known.heard, known.time, known.missing = steady, time, 0
@@ -111,15 +111,15 @@ class Receipts:
         return anew
 
     def since(self, joint: str, time: int) -> bool:
-        """Return whether a receipt of a joint is at least as new as a time of its device."""
+        """Return whether a joint's newest receipt is no older than a time of its device."""
         known = self._joints.get(joint)
         return known is None or known.silent or known.time >= time
 
     def forget(self, joint: str) -> None:
         """
-        Expect no receipts of a joint, since whoever listens now gives none.
+        Expect no more receipts of a joint, since its current subscriber publishes none.
 
-        That is to be said again and again: what is found anew is found one topic after the other.
+        Only repeated calls take effect, because discovery finds one topic after the other.
         """
         known = self._joints.get(joint)
         if known is None:
@@ -130,14 +130,14 @@ class Receipts:
             self.silent.discard(joint)
 
     def clock_set_back(self) -> None:
-        """Forget what our clock has said before it was set back."""
+        """Discard times of the planner's clock from before it was set back."""
         for known in self._joints.values():
             known.sent.clear()
             known.exchanges.clear()
             known.lags.clear()
 
     def look(self) -> list[str]:
-        """Return joints whose device has fallen silent, or is heard of again."""
+        """Return the joints whose device has fallen silent, or is received again."""
         steady = self._steady()
         absent, self._looked = steady - self._looked, steady
         changed: list[str] = []
@@ -153,14 +153,14 @@ class Receipts:
         return changed
 
     def lost(self, joint: str, patience: int = _PATIENCE) -> bool:
-        """Return whether what was sent to a joint has not arrived for longer than that, in ns."""
+        """Return whether a command has been unacknowledged for longer than ``patience`` in ns."""
         known = self._joints.get(joint)
         return known is not None and known.unanswered is not None and (
             self._steady() - known.unanswered > patience)
 
     @property
     def words(self) -> str:
-        """Why commands do not arrive; empty where they do, or where nobody gives receipts."""
+        """Why commands do not arrive; empty if they do or if there are no receipts."""
         for name, known in self._joints.items():
             if known.silent:
                 return (
@@ -174,14 +174,14 @@ class Receipts:
         return ''
 
     def lag(self, joint: str) -> int | None:
-        """Return in ns how old the quickest receipt of a joint was by our clock; None for none."""
+        """Return the smallest age in ns of a joint's receipts at arrival; None for no receipt."""
         known = self._joints.get(joint)
         return None if known is None else min(known.lags, key=abs, default=None)
 
     @property
     def offset(self) -> Offset | None:
-        """How far the clock of a device is ahead, the one that is farthest off; None for none."""
-        # The quickest exchange says most.
+        """Largest clock offset among the devices; None if unknown."""
+        # The quickest exchange determines the offset best.
         found = [min(x.exchanges, key=lambda y: y.error)
                  for x in self._joints.values() if x.exchanges]
         return max(found, key=lambda x: abs(x.ahead), default=None)

@@ -1,4 +1,4 @@
-"""What goes into a planner runtime and what comes out of it."""
+"""Inputs and outputs of a planner runtime."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,36 +14,36 @@ from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import Progress
 
-#: What a trajectory with velocities is: refused, or a path to follow.
+#: How a trajectory with velocities is treated: rest at each point, or follow it as a path.
 TRAJECTORY_MODES = ('rest', 'path')
-#: What to do when a coil was cut off: wait for a request, or go on with a shaped move.
+#: What to do after a coil was cut off: wait for a request, or continue with a shaped move.
 AFTER_CUT_OFF = ('wait', 'resume')
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How a runtime deals with time and with what it hears; times in ns."""
+    """Settings of a planner runtime; times in ns."""
 
-    # How often the level in force is sent again; 0 for never.
+    # Interval at which the level in force is sent again; 0 for never.
     heartbeat_period: int = NANOSECONDS // 5
-    replan_late: bool = True  # plan the rest of a sequence anew when reality has left the plan
-    lateness_tolerance: int = 5000  # how late a command may be without a new plan
-    takeover_timeout: int = NANOSECONDS // 2  # wait for plant and sample at first; 0 for not
-    takeover_max_age: int = NANOSECONDS // 2  # largest age of such a sample
+    replan_late: bool = True  # replan the rest of a sequence after a deviation
+    lateness_tolerance: int = 5000  # largest lateness without a new plan
+    takeover_timeout: int = NANOSECONDS // 2  # initial wait for plant and sample; 0: no wait
+    takeover_max_age: int = NANOSECONDS // 2  # maximum age of such a sample
     after_cut_off: str = 'wait'  # one of `AFTER_CUT_OFF`
-    max_points: int = 100_000  # setpoints of one request, of all joints together
+    max_points: int = 100_000  # limit for one request, summed over its joints
     trajectory_mode: str = 'rest'  # one of `TRAJECTORY_MODES`
-    allow_partial_joints: bool = False  # whether a trajectory may lack joints
+    allow_partial_joints: bool = False  # whether a trajectory may omit joints
     tolerances: Tolerances = field(default_factory=Tolerances)
-    # ``off``; ``observe`` to estimate from samples; ``adapt`` to correct plans too.
+    # ``off``; ``observe`` to estimate from samples; ``adapt`` to correct plans as well.
     feedback: str = 'off'
-    feedback_parameters: tuple[str, ...] = TRACKED  # what is estimated besides the state
-    feedback_cautious: bool = False  # take longer for moves that are expected to leave much
-    feedback_tolerance: float = TOLERANCE  # share of its step from which on that is much
-    feedback_trim: float = 0.0  # largest change in T of a level against a force; 0: none
-    feedback_frozen: bool = False  # estimate the state alone, and keep the parameters
-    feedback_file: str = ''  # where to write what was learnt; empty for nowhere
-    # By joint, how well parameters are known before the first sample.
+    feedback_parameters: tuple[str, ...] = TRACKED  # estimated in addition to the state
+    feedback_cautious: bool = False  # slow down moves with a large predicted error
+    feedback_tolerance: float = TOLERANCE  # fraction of the step from which it is large
+    feedback_trim: float = 0.0  # limit in T for trimming against a force; 0: off
+    feedback_frozen: bool = False  # estimate only the state, keep the parameters
+    feedback_file: str = ''  # file for learned parameters; empty: none
+    # By joint, prior uncertainty of the parameters.
     known: Mapping[str, Known] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -60,28 +60,28 @@ class Trajectory:
     """
     A request to go through setpoints.
 
-    A point has the stretch of each joint, and the time in ns from the start until which it lasts;
-    if raw, the flux density in T of each joint, and the time from which it applies. Points are
-    read bit by bit, and again where they are planned again; they may raise `RefusedError` where
-    they cannot be read. Those of a ``path``, if there is one, have stretch, rate (1/s) and
-    acceleration (1/s^2, or NaN) of each joint; it is followed if settings, or ``follows``, say so.
+    Each point contains the stretch of each joint and the end of the setpoint in ns from the start.
+    If ``raw``, it contains the flux density in T of each joint and the time from which it applies.
+    Points are read in pieces, and again for each replanning; iterating them may raise
+    `RefusedError`. Points of a ``path`` contain stretch, rate (1/s) and acceleration (1/s^2, or
+    NaN) of each joint. The path is followed if the settings or ``follows`` request it.
     """
 
     joints: tuple[str, ...]
     points: Iterable[tuple[Sequence[Any], int]]
-    count: int  # of the points
+    count: int  # number of points
     stamp: int | None = None  # start in ns; None for now
     name: str = ''  # repeated in the verdict
     raw: bool = False
     path: Iterable[tuple[Sequence[Any], int]] | None = None
     follows: bool = False
-    # By joint, what counts as having arrived at the end, where it is not as in the settings.
+    # Goal tolerances by joint, where they differ from the settings.
     goals: Mapping[str, GoalTolerances] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Target:
-    """A request to go to one stretch now and to hold it."""
+    """A request to go to a stretch now and to hold it."""
 
     joint: str
     stretch: float
@@ -89,13 +89,13 @@ class Target:
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Whom it is for."""
+        """Names of the joints that it moves."""
         return (self.joint,)
 
 
 @dataclass(frozen=True)
 class Stop:
-    """A request to drop what is ahead and to come to rest."""
+    """A request to drop the remaining setpoints and to come to rest."""
 
     name: str = ''
 
@@ -106,7 +106,7 @@ Request = Trajectory | Target | Stop
 # -- out ----------------------------------------------------------------------------------------
 
 class Severity(IntEnum):
-    """How bad something is, as in diagnostics."""
+    """Severity, as in diagnostics."""
 
     OK = 0
     WARN = 1
@@ -115,18 +115,18 @@ class Severity(IntEnum):
 
 @dataclass(frozen=True)
 class Verdict:
-    """How a request fares; an error where it is not carried out."""
+    """Result of a request; an error if it is not carried out."""
 
     severity: Severity
     code: Code
-    message: str  # one sentence for people
-    request: str = ''  # its name
-    figures: Mapping[str, float] = field(default_factory=dict)  # what the sentence is about
+    message: str  # one sentence
+    request: str = ''  # name of the request
+    figures: Mapping[str, float] = field(default_factory=dict)  # values behind the message
 
 
 @dataclass(frozen=True)
 class Send:
-    """A command to send now: a flux density in T that a joint's coil has from a stamp in ns on."""
+    """A command to send now: from a timestamp in ns on, a flux density in T for a joint's coil."""
 
     joint: str
     stamp: int
@@ -135,36 +135,36 @@ class Send:
 
 @dataclass(frozen=True)
 class PlanChanged:
-    """A preview of what is planned, wherever the level of a joint changes."""
+    """A preview of the plan, with a sample at each change of level of any joint."""
 
-    stamps: tuple[int, ...]  # in ns, increasing; of a long plan the beginning
-    # By joint, for each stamp: stretch, rate in 1/s and flux density in T from then on.
+    stamps: tuple[int, ...]  # in ns, increasing; only the start of a long plan
+    # By joint, for each timestamp: stretch, rate in 1/s, and flux density in T from then on.
     samples: Mapping[str, Sequence[tuple[float, float, float]]]
 
 
 @dataclass(frozen=True)
 class StatusChanged:
-    """A new verdict, or a step in the progress."""
+    """A new verdict or a change in the progress."""
 
     verdict: Verdict
     progress: Progress
     each: Mapping[str, Progress]
     plan: int  # accepted requests so far
     late: int  # late commands
-    replanned: int  # plans made anew
-    findings: Mapping[str, Finding] = field(default_factory=dict)  # at the newest setpoint judged
-    worst: Finding | None = None  # of the last request
-    watching: bool = False  # whether setpoints that have begun are still to be judged
-    unheard: str = ''  # why nobody carries out commands; empty where somebody does
-    unseen: str = ''  # of which joint samples have ceased; empty for none
-    measuring: bool = False  # whether samples have come lately
-    # What each joint's position is called.
+    replanned: int  # number of replannings
+    findings: Mapping[str, Finding] = field(default_factory=dict)  # newest, by joint
+    worst: Finding | None = None  # worst finding of the last request
+    watching: bool = False  # whether started setpoints are still to be judged
+    unheard: str = ''  # why commands are not carried out; empty if they are
+    unseen: str = ''  # joint whose samples have stopped; empty for none
+    measuring: bool = False  # whether there are recent samples
+    # Name of each joint's position coordinate.
     coordinates: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Note:
-    """A sentence for the log."""
+    """A message for the log."""
 
     severity: Severity
     message: str
@@ -172,13 +172,13 @@ class Note:
 
 @dataclass(frozen=True)
 class EstimateChanged:
-    """What samples say of a joint."""
+    """An estimate of a joint from samples."""
 
     time: int  # in ns
     joint: str
-    severity: Severity  # WARN where parameters are not those given, or samples not trusted
+    severity: Severity  # WARN if parameters differ from the given ones or samples are not trusted
     message: str
-    values: Mapping[str, object]  # in SI, with deviations and given values, and counters
+    values: Mapping[str, object]  # in SI, with standard deviations, given values and counters
 
 
 Output = Send | PlanChanged | StatusChanged | Note | EstimateChanged

@@ -1,22 +1,21 @@
-"""Reports that would come too often."""
+"""Limit the rate of reports."""
 
 from time import monotonic
 
 
 class Seldom:
     """
-    Says at most once a second that it is time to report something again.
+    Permits a report at most once a second.
 
-    A logger's own throttle looks for the place in the code that it is called from before it
-    decides, which takes up to a millisecond: too long for what may come a thousand times a
-    second.
+    The throttle of a logger first determines its calling location in the code, which takes up to a
+    millisecond. This is too slow for events that may occur a thousand times a second.
     """
 
     def __init__(self) -> None:
         self._next = 0.0
 
     def __call__(self) -> bool:
-        """Return whether it is time."""
+        """Return whether a report is due."""
         now = monotonic()
         if now < self._next:
             return False

@@ -1,11 +1,11 @@
-"""Samples that came before and do not come any more."""
+"""Detect that samples have stopped."""
 
 from dataclasses import dataclass
 
 from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.model.units import NANOSECONDS
 
-# How long samples may stay away: in ns by the steady clock, and in intervals between them.
+# Longest gap between samples: in ns by the steady clock, and in sampling intervals.
 _PATIENCE, _INTERVALS = 2 * NANOSECONDS, 3
 
 
@@ -14,17 +14,17 @@ class _Joint:
     """The newest sample of a joint; times in ns."""
 
     stamp: int
-    came: int  # by the steady clock
-    time: int  # the same by the clock of the timestamps, which may stand still
-    interval: int  # to the sample looked at before
+    came: int  # time of arrival by the steady clock
+    time: int  # time of arrival by the clock of the timestamps, which may be paused
+    interval: int  # from the previous sample
     silent: bool = False
 
 
 class Silence:
     """
-    Notices that samples cease while somebody is still there who publishes them.
+    Detects that samples stop while their publisher still exists.
 
-    A publisher that ends in order is gone at once.
+    A publisher that ends normally disappears at once.
     """
 
     def __init__(self, surroundings: Surroundings) -> None:
@@ -32,11 +32,11 @@ class Silence:
         self._joints: dict[str, _Joint] = {}
 
     def restart(self) -> None:
-        """Forget all samples."""
+        """Discard all samples."""
         self._joints.clear()
 
     def heard(self, joint: str, stamp: int) -> None:
-        """Take in that a sample has come that is the newest of a joint."""
+        """Record the timestamp of the newest sample of a joint."""
         before = self._joints.get(joint)
         self._joints[joint] = _Joint(
             stamp, self._around.steady(), self._around.clock(),
@@ -44,7 +44,7 @@ class Silence:
 
     @property
     def words(self) -> str:
-        """Of which joint no samples come any more, in a sentence; empty for none."""
+        """The joint whose samples have stopped, in a sentence; empty for none."""
         steady, now = self._around.steady(), self._around.clock()
         for name, joint in self._joints.items():
             if not joint.silent and steady - joint.came > _PATIENCE and (

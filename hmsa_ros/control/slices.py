@@ -1,4 +1,4 @@
-"""Requests that are planned in slices, so that commands and requests are served in between."""
+"""Plan requests in slices, so that commands and other requests are served in between."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,46 +12,46 @@ from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Planner
 from hmsa_ros.planning.timeline import Draft
 
-#: Tells the time of the stamps in ns.
+#: Returns the time in ns of the clock of timestamps.
 Clock = Callable[[], int]
 #: Pauses after each bounded piece; returns drafts by joint and the time in ns they are for.
 Drafting = Steps[tuple[Mapping[str, Draft], int]]
-# What is done with drafts by joint before they are taken.
+# Processes drafts by joint before they are adopted.
 Then = Callable[[Mapping[str, Draft]], Mapping[str, Draft]]
-#: How long work goes on before commands and requests are served again, in ns.
+#: Duration of a slice in ns, after which commands and requests are served.
 SLICE = 4_000_000
-# Points of a trajectory that are read between two pauses.
+# Number of trajectory points that are read between two pauses.
 _READ = 100
-# How much longer than estimated or measured planning may take the next time.
+# Factor by which planning may take longer next time than estimated or measured.
 _MARGIN = 3
-# How many times as long it takes until the first commands have gone out.
+# Factor of the planning time until the first commands are sent.
 _READY = 1.5
 
 
 @dataclass(eq=False)
 class Work:
-    """A request, or a plan to be made anew, that is being worked out."""
+    """A request or a replanning in progress."""
 
-    joints: frozenset[str]  # whose plans it changes
+    joints: frozenset[str]  # joints whose plans it changes
     steps: Drafting
-    request: Request | None = None  # None for a plan that is made anew
-    number: int = field(default_factory=count().__next__)  # grows from one to the next
-    corrects: bool = False  # from samples
-    spent: int = 0  # time in ns
+    request: Request | None = None  # None for a replanning
+    number: int = field(default_factory=count().__next__)  # increases with each work
+    corrects: bool = False  # whether it is a correction from samples
+    spent: int = 0  # CPU time in ns
 
     @property
     def postponed(self) -> bool:
-        """Whether a running plan goes on until a stamp before this one begins."""
+        """Whether the present plan continues until a timestamp at which this one begins."""
         return isinstance(self.request, Trajectory) and self.request.stamp is not None
 
     def replaces(self, others: Iterable['Work']) -> bool:
-        """Return whether it makes no difference to its plans that others are planned later."""
+        """Return whether its plans do not depend on others being planned before."""
         return not self.postponed and all(
             x.joints <= self.joints or x.joints.isdisjoint(self.joints) for x in others)
 
 
 def work_on(request: Request, group: PlannerGroup, clock: Clock, then: Then) -> Work:
-    """Return the work that a request of joints of a group makes; see `in_time`."""
+    """Return the work of planning a request for joints of a group; see `in_time`."""
     names = group.planners if isinstance(request, Stop) else request.joints
     planners = [group.planners[x] for x in names]
     if isinstance(request, Trajectory):
@@ -68,7 +68,7 @@ def work_on(request: Request, group: PlannerGroup, clock: Clock, then: Then) -> 
 def anew(
         name: str, planner: Planner, make: Callable[[int], Steps[Draft | None]], clock: Clock, *,
         corrects: bool = False) -> Work:
-    """Return the work of making a joint's plan anew; without a draft it stays."""
+    """Return the work of replanning a joint; without a draft its plan is kept."""
     def steps(now: int) -> Steps[Mapping[str, Draft]]:
         draft = yield from make(now)
         return {} if draft is None else {name: draft}
@@ -90,7 +90,7 @@ def _trajectory(
         lambda now: group.draft_request(
             points, request.stamp, now, raw=request.raw, path=request.path is not None),
         planners, clock,
-        # The work of a path is not in proportion to its points.
+        # The work of a path is not proportional to its number of points.
         1 if request.path is not None else request.count * len(request.joints), then))
 
 
@@ -98,10 +98,10 @@ def in_time(
         make: Callable[[int], Steps[Mapping[str, Draft]]], planners: Sequence[Planner],
         clock: Clock, size: int = 1, then: Then = dict) -> Drafting:
     """
-    Return drafts, and the time in ns they are for, which has not come yet when they are ready.
+    Return drafts and the time in ns they are for, which has not passed when they are ready.
 
-    If what is going to happen to the joints changes meanwhile, it begins anew. The size is about
-    how many pauses it makes. What is done with drafts `then` belongs to the work.
+    Planning restarts if the plans of the joints change meanwhile. ``size`` is the approximate
+    number of pauses. The work includes the function ``then`` of the drafts.
     """
     lead = planners[0].options.lead_time
     later = 0
@@ -118,7 +118,7 @@ def in_time(
                 break
             spent = clock() - began
             if 2 * spent > lead + 2 * later and spent * size > (lead + later) * done:
-                # It will not be ready in time.
+                # The drafts will not be ready in time.
                 later = max(_MARGIN * spent * size // done, 2 * later)
                 break
             if revisions != [x.revision for x in planners]:

@@ -1,4 +1,4 @@
-"""What a planner at work asks of whoever drives it."""
+"""Information that a planner at work requests from its caller."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -15,30 +15,30 @@ class Seen(NamedTuple):
     stretch: float
     rate: float  # in 1/s
     flux_density: float  # in T
-    lag: int | None = None  # how old it was when it came, in ns; None where one clock tells both
-    came: int = 0  # when it came, in ns by the steady clock
+    lag: int | None = None  # age at arrival in ns; None if all nodes share a clock
+    came: int = 0  # time of arrival, in ns by the steady clock
 
 
 @dataclass
 class Surroundings:
     """
-    Answers of whoever drives a planner; times in ns.
+    Queries to the caller of a planner; times in ns.
 
-    The first request waits for samples, if somebody may give them, and for whoever carries out
-    commands.
+    The first request waits for samples, if a publisher may provide them, and for a subscriber that
+    carries out commands.
     """
 
-    clock: Clock  #: time of the stamps and of `hmsa_ros.control.planner.PlannerRuntime.tick`
-    steady: Clock = monotonic_ns  #: what timeouts and the length of a slice are measured by
-    #: Whether one clock tells the times of all nodes, as simulated time does.
+    clock: Clock  #: clock of the timestamps and of `hmsa_ros.control.planner.PlannerRuntime.tick`
+    steady: Clock = monotonic_ns  #: clock of timeouts and slices
+    #: Whether all nodes share one clock, such as simulated time.
     one_clock: Callable[[], bool] = bool
-    #: Whether somebody may give samples.
+    #: Whether there may be a publisher of samples.
     observable: Callable[[], bool] = lambda: True
-    #: Why nobody carries out commands; empty where somebody does.
+    #: Why commands are not carried out; empty if they are.
     unheard: Callable[[], str] = str
     #: Whether a joint has a device that reports.
     found: Callable[[str], bool] = lambda joint: True
-    #: Identifiers of who reports applied levels of a joint.
+    #: Identifiers of the publishers of applied levels of a joint.
     reporters: Callable[[str], frozenset[bytes]] = lambda joint: frozenset()
-    #: The newest samples by joint, if there are new ones: requests are held against them.
+    #: New samples by joint, which requests are checked against.
     glance: Callable[[], Iterable[tuple[str, Seen]]] = tuple

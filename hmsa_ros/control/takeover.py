@@ -1,4 +1,4 @@
-"""The state in force, as samples show it before the first command and before later ones."""
+"""The actual state of the joints, from samples before the first and before later requests."""
 
 from collections.abc import Callable, Iterable, Mapping
 import math
@@ -11,51 +11,52 @@ from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.planner import Planner
 
-# How long ago, in ns by the steady clock, a sample may have come to show where a joint is.
+# Largest age of a sample that shows where a joint is, in ns by the steady clock.
 _RECENT = 2 * NANOSECONDS
-# Samples that are older, in ns, are not the newest there are.
+# Samples older than this, in ns, are not the newest available.
 _OLDEST = 60 * NANOSECONDS
-# Times that are further apart, in ns, are of clocks that began at different times.
+# Times that differ by more, in ns, come from clocks with different epochs.
 _ANOTHER_CLOCK = 100_000_000 * NANOSECONDS
-# How far a sample may be off the prediction: a stretch, a share of the way from rest without a
-# field, and a share of the step while the joint moves and after it. A wrong model is off by less.
+# Tolerated deviation of a sample from the prediction: a stretch, a fraction of the distance from
+# rest without a field, and a fraction of the step during and after a move. A wrong model deviates
+# by less.
 _LEAST, _WAY, _MOVING, _ARRIVED = 0.03, 0.5, 0.6, 0.25
-# Units of time after an arrival until which a joint counts as moving.
+# Time scales after an arrival until which a joint counts as moving.
 _QUIET = 20.0
 
 
 class Takeover:
-    """Waits for samples of the joints before the first request, and goes on from them."""
+    """Wait for samples of the joints before the first request, and start from them."""
 
     def __init__(
             self, planners: Mapping[str, Planner], surroundings: Surroundings, receipts: Receipts,
             newest: Mapping[str, tuple[int, float]], followed: Callable[[str], bool],
             note: Callable[[str], None]) -> None:
         """
-        Begin without knowing where joints are.
+        Begin with unknown positions.
 
-        The newest change of each joint has its stamp in ns and its level in T; a joint that
-        feedback has ``followed`` is left to it.
+        ``newest`` contains timestamp in ns and level in T of the newest change of each joint. A
+        joint that feedback has ``followed`` is left to feedback.
         """
         self._planners, self._around, self._receipts = planners, surroundings, receipts
         self._newest, self._followed, self._note = newest, followed, note
         self._until: int | None = None
-        # Whether it is known where the joints are, or they are taken to rest.
+        # Whether the positions of the joints are known, or assumed at rest.
         self.engaged = False
         # The newest sample of each joint.
         self._samples: dict[str, Seen] = {}
-        # Joints to look at before they are planned for, and those that are not where predicted.
+        # Joints to check before they are planned for, and those that may not be where predicted.
         self._unsure: set[str] = set()
         self._doubted: set[str] = set()
         self._look_until: int | None = None
 
     @property
     def waiting(self) -> bool:
-        """Whether samples are waited for."""
+        """Whether it is waiting for samples."""
         return self._until is not None or self._look_until is not None
 
     def begin(self, settings: Settings) -> None:
-        """Wait for samples, if there is somebody to give them or nobody is found yet at all."""
+        """Wait for samples if there is a publisher of them, or if discovery is not complete."""
         if self.engaged or self._until is not None:
             return
         if settings.takeover_timeout and (self._around.observable() or self._around.unheard()):
@@ -64,7 +65,7 @@ class Takeover:
             self.engaged = True
 
     def observe(self, joint: str, seen: Seen) -> None:
-        """Take in a sample; one of another joint, with a gap or out of order does not count."""
+        """Record a sample; ignore unknown joints, NaN values and samples out of order."""
         if joint not in self._planners or not math.isfinite(
                 seen.stretch + seen.rate + seen.flux_density):
             return
@@ -73,22 +74,22 @@ class Takeover:
             self._samples[joint] = seen._replace(came=steady)
 
     def drop(self) -> None:
-        """Wait for nothing, and forget the samples."""
+        """Stop waiting, and discard the samples."""
         self._until = self._look_until = None
         self._samples.clear()
         self._unsure.clear()
         self._doubted.clear()
 
     def clock_set(self, by: int) -> None:
-        """Take in that the clock was set ahead by some ns: samples of before are no older."""
+        """Shift samples by the ns that the clock was set ahead, so that they do not age."""
         self._samples = {
             name: x._replace(stamp=x.stamp + by) for name, x in self._samples.items()}
 
     def go_on(self, settings: Settings) -> None:
         """
-        Go on from the samples there are, once there is nothing more to wait for.
+        Start from the samples available, once there is nothing more to wait for.
 
-        Samples of another clock are a `RefusedError`.
+        Raises `RefusedError` for samples of another clock.
         """
         if self._until is None:
             return
@@ -103,7 +104,7 @@ class Takeover:
             elif (over and seen.came >= self._until - settings.takeover_timeout
                   or abs(now - seen.stamp) > _ANOTHER_CLOCK):
                 self._check_age(name, seen, settings)
-                # Old indeed, and still the newest there is.
+                # It is old, but the newest available.
                 samples[name] = seen
         if not over and (len(samples) < len(self._planners) or self._around.unheard()):
             return
@@ -118,7 +119,7 @@ class Takeover:
                     'it began (initial_stretch)')
 
     def _take(self, name: str, seen: Seen, *, keep: bool = False) -> bool:
-        """Have a joint go on from a sample, with its setpoints if they are kept; say if it can."""
+        """Start a joint from a sample; return whether it can. ``keep`` retains its setpoints."""
         level = self._newest.get(name)
         try:
             self._planners[name].take_over(
@@ -132,14 +133,14 @@ class Takeover:
     # -- clocks --------------------------------------------------------------------------------
 
     def _check_age(self, name: str, seen: Seen, settings: Settings) -> None:
-        """Refuse a sample that is older or newer than it can be by our clock."""
+        """Refuse a sample that is older or newer than possible by the planner's clock."""
         if seen.lag is None and abs(self._around.clock() - seen.stamp) <= _ANOTHER_CLOCK:
             return
         lag = self._around.clock() - seen.stamp if seen.lag is None else seen.lag
         known, most = self._receipts.lag(name), settings.takeover_max_age
         agrees = known is not None and abs(known) <= most
         if abs(lag) <= most or 0 < lag <= _OLDEST and agrees:
-            # In time, or the clocks agree and it is the sample that is late.
+            # It is in time, or the clocks agree and the sample itself is delayed.
             return
         raise RefusedError(
             Code.CLOCKS_DIFFER,
@@ -165,28 +166,28 @@ class Takeover:
     # -- before later requests -----------------------------------------------------------------
 
     def check(self, joints: Iterable[str]) -> None:
-        """Hold joints against their samples before they are planned for again."""
+        """Compare joints with their samples before they are planned for again."""
         self._unsure |= {*joints} & self._planners.keys()
 
     def doubt(self, joint: str) -> None:
-        """Plan for a joint from a sample next: it may not be where it is predicted."""
+        """Have a joint planned from a sample next, since it may not be where predicted."""
         self._doubted.add(joint)
         self._unsure.add(joint)
 
     def look(self, settings: Settings, *, keep: bool) -> bool:
         """
-        Hold joints that are checked against what samples show; return False to wait for some.
+        Compare the joints to be checked with their samples; return False to wait for a sample.
 
-        One that is not where it is predicted goes on from its sample, with the setpoints ahead if
-        they are kept. Where samples came and do not any more, or are of another clock, it is a
-        `RefusedError`.
+        A joint that is not where predicted continues from its sample, and ``keep`` retains its
+        remaining setpoints. Raises `RefusedError` if samples have stopped or come from another
+        clock.
         """
         for name in sorted(self._unsure):
             if name not in self._doubted and self._followed(name):
                 continue
             seen = self._samples.get(name)
             if seen is None or not self._around.observable():
-                # Nobody shows where it is: as predicted.
+                # No sample shows the position: use the prediction.
                 continue
             new = self._look_until is not None and (
                 seen.came > self._look_until - settings.takeover_timeout)
@@ -201,7 +202,7 @@ class Takeover:
         return True
 
     def _is_over(self, name: str, seen: Seen, settings: Settings) -> bool:
-        """Wait for another sample; say when that has been vain, or refuse to go on without."""
+        """Wait for a new sample; return True after a vain wait, or refuse to continue without."""
         steady = self._around.steady()
         if self._look_until is None:
             self._look_until = steady + settings.takeover_timeout
@@ -218,13 +219,13 @@ class Takeover:
             'repair the sensor, or end its publisher')
 
     def _settle(self, keep: str = '') -> None:
-        """Wait for nothing more, and doubt nothing but a joint of which nothing is known."""
+        """Stop waiting, and keep doubting only a joint of which nothing is known."""
         self._look_until = None
         self._unsure.clear()
         self._doubted &= {keep}
 
     def _compare(self, name: str, seen: Seen, settings: Settings, *, keep: bool) -> None:
-        """Go on from a sample where the prediction of its time cannot be."""
+        """Continue from a sample if it contradicts the prediction for its time."""
         self._check_age(name, seen, settings)
         self._check_ahead(name, seen)
         planner = self._planners[name]
@@ -239,7 +240,7 @@ class Takeover:
 
 
 def _tolerance(planner: Planner, time: int, predicted: float) -> float:
-    """Return how far a stretch may be off what is predicted of a time in ns."""
+    """Return the tolerated deviation of a stretch from its prediction at a time in ns."""
     plan, rest = planner.plan, planner.model.actuator.rest
     found = planner.segment(time)
     if found is None:

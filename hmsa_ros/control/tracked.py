@@ -1,4 +1,4 @@
-"""One joint that feedback looks at: what samples say of it, and what plans make of that."""
+"""One joint under feedback: its estimate, and how plans use it."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, InitVar, replace
@@ -23,34 +23,34 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.planner import Believed, Planner
 from hmsa_ros.planning.timeline import Model, Plan
 
-# Levels before those of the samples that count: the field of a coil that lags remembers them.
+# Earlier levels that still affect the samples: the field of a coil with lag depends on them.
 _BEFORE = 8
-# A sample may lie ahead of the clock by this share of the unit of time, since clocks differ.
+# Fraction of the time scale by which a sample may be ahead of the clock, since clocks differ.
 _AHEAD = 0.1
-# States further ahead than so many units of time are those of rest.
+# Time scales ahead from which the predicted state is that at rest.
 _FAR = 100.0
-# How often samples are taken into account while a joint moves, at least and in units of its time,
-# and while it rests, in ns.
+# Intervals between updates: at most these ns and this many time scales while a joint moves, and
+# these ns while it rests.
 _UPDATE, _OFTEN, RESTING = 20_000_000, 0.45, 200_000_000
-# How many times as seldom where a joint rings, and units of time after its last change of level
-# from which on it does, and from which on it rests.
+# Factor of the interval while a joint rings, and the time scales after its last change of level
+# from which it rings, and from which it rests.
 _SELDOM, _RINGING, _QUIET = 4, 3.0, 24.0
-# Samples of a natural period that are looked at, and how many fewer at rest.
+# Samples used per natural period, and the factor by which there are fewer at rest.
 _DENSE, _SPARSE = 40, 10
-# Units of time from one choice of the parameters to plan with to the next.
+# Time scales between two choices of the parameters to plan with.
 _CHOICE = 3.0
-# Units of time after an arrival that show it.
+# Time scales after an arrival that show whether it succeeded.
 _LOOK = 3.0
-# A field is another one than commanded from this share on, or this share of the unit of load, and
-# so many units of time and time constants of the coil after a change.
+# Tolerance of the measured field: this fraction of its value or of the unit of load, and this many
+# time scales and coil time constants after a change.
 _OFF, _LEAST, _FOLLOWED = 0.05, 0.01, 3.0
-# Share by which a level that took effect may be rounded.
+# Fraction by which the report of an applied level may be rounded.
 _ROUNDED = 0.01
 
 
 @dataclass(eq=False)
 class Joint:
-    """What is known of one joint; times in ns."""
+    """State of one joint under feedback; times in ns."""
 
     name: str
     planner: Planner
@@ -64,33 +64,33 @@ class Joint:
     moves: Moves = field(default_factory=Moves)  # those of the plan in force
     latest: Estimate | None = None
     newest: int = 0  # time of the newest sample
-    next_sample: int = 0  # time from which on another one is of use
-    next_update: int = 0  # when to look at samples
-    not_before: int = 0  # so that looks take a share of the time only
-    next_tell: int = 0  # when to tell the estimate
+    next_sample: int = 0  # time from which another sample is useful
+    next_update: int = 0  # time of the next update
+    not_before: int = 0  # earliest time of an update, which limits the CPU time
+    next_report: int = 0  # when to publish the estimate
     next_choice: int = 0  # when to choose the parameters to plan with
-    used: Model | None = None  # what was chosen; None for what the planner has
+    used: Model | None = None  # chosen model; None for that of the planner
     choosing: Iterator[None] | None = None  # the choice under way
-    chosen: bool = False  # whether that was made since the latest estimate
-    waits: int = 0  # arrival of a move that takes longer, so that it can be corrected
-    next_path: int = 0  # from when on a path is looked at again
-    planning: int = 0  # how long planning one took
-    after: float = 0.0  # what a correction that has been worked out is expected to leave
-    amplitude: float = 0.0  # largest of the vibration since the last arrival
-    fresh: bool = False  # whether there are samples that have not been looked at
-    looking: Iterator[None] | None = None  # the look at them under way
-    spent: int = 0  # on that
-    audits: list[Hold] = field(default_factory=list)  # setpoints to be looked at after one
-    ready: int = 0  # how many of these follow it now
-    auditing: Iterator[None] | None = None  # the look at the first of them
-    lost: str = ''  # why the field is not as commanded; empty where it is
-    largest: float = math.inf  # level in T that took effect where a larger one was commanded
-    news: bool = False  # whether the latest estimate has not been held against the plan yet
-    # Samples that came during a look: stamp, stretch, and when.
+    chosen: bool = False  # whether a choice was made since the latest estimate
+    waits: int = 0  # arrival of a move slowed down to be corrected
+    next_path: int = 0  # when to check a path again
+    planning: int = 0  # how long planning a path took
+    after: float = 0.0  # predicted error of a drafted correction
+    amplitude: float = 0.0  # largest vibration since the last arrival
+    fresh: bool = False  # whether there are unprocessed samples
+    looking: Iterator[None] | None = None  # the update under way
+    spent: int = 0  # time spent on the update
+    audits: list[Hold] = field(default_factory=list)  # setpoints to be audited after an update
+    ready: int = 0  # number of audits to do now
+    auditing: Iterator[None] | None = None  # the audit under way
+    lost: str = ''  # why the field is not as commanded; empty if it is
+    largest: float = math.inf  # level in T at which the amplifier saturated
+    news: bool = False  # whether the latest estimate awaits comparison with the plan
+    # Samples that arrived during an update: timestamp, stretch, and time of arrival.
     _waiting: list[tuple[int, float, int]] = field(default_factory=list)
-    _setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place of what is under way
-    _sensor: tuple[Estimate, Sensor] | None = None  # what was found of it, by which estimate
-    _measured: bool = False  # whether the field is
+    _setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place under way
+    _sensor: tuple[Estimate, Sensor] | None = None  # estimate, and its sensor
+    _measured: bool = False  # whether the field is measured
 
     def __post_init__(self, begun: int) -> None:
         given, settings = self.given, self.settings
@@ -104,23 +104,23 @@ class Joint:
 
     @property
     def unit(self) -> float:
-        """Unit of time in s, as given."""
+        """Given time scale in s."""
         return float(self.estimator.prior.values['time_unit'])
 
     @property
     def adapts(self) -> bool:
-        """Whether plans use what is learnt."""
+        """Whether plans use the estimate."""
         return self.settings.feedback == 'adapt'
 
     @property
     def tolerance(self) -> float:
-        """Share of its step that a move may be expected to leave without taking longer."""
+        """Predicted error, as a fraction of the step, up to which a move is not slowed down."""
         cautious = self.adapts and self.settings.feedback_cautious
         return self.settings.feedback_tolerance if cautious else math.inf
 
     @property
     def acting(self) -> Estimate | None:
-        """The latest estimate if it is to be acted upon: a whole move has shown that it fits."""
+        """The latest estimate if it is to be used: a whole move has shown that it fits."""
         latest = self.latest
         return latest if latest is not None and latest.trusted and self.trust.acts else None
 
@@ -128,37 +128,37 @@ class Joint:
 
     @property
     def next_look(self) -> int:
-        """When to look at samples, a time in ns; one that an audit follows is due at once."""
+        """Time in ns of the next update; it is due at once if audits wait."""
         return max(self.not_before, 0 if self.audits else self.next_update)
 
     @property
     def interval(self) -> int:
-        """How long after a look the next one is due."""
+        """Time in ns from one update to the next."""
         if self._still(_QUIET * self.given.units.time):
             return RESTING
         return min(_UPDATE, round(_OFTEN * self.unit * NANOSECONDS)) * (
             _SELDOM if self._still(_RINGING * self.unit) else 1)
 
     def _still(self, span: float) -> bool:
-        """Return whether no level has changed for a span in s."""
+        """Return whether no level has changed for a duration in s."""
         last = self.planner.plan.levels[-1].stamp
         return self.newest > last + round(span * NANOSECONDS)
 
     def wants(self, stamp: int) -> bool:
-        """Return whether a sample with a stamp is not too near to the one before."""
+        """Return whether a timestamp is far enough from the previous sample's."""
         return not self.newest <= stamp < self.next_sample
 
     def add(self, stamp: int, stretch: float, flux_density: float, now: int) -> None:
         """
-        Take in stretch and field in T measured at a stamp, which come at a time.
+        Add stretch and field in T measured at a timestamp, which arrive at a time.
 
-        Samples come in any order.
+        Samples may arrive in any order.
         """
         if not self.wants(stamp):
             return
         lost = self.lost = self._off(stamp, flux_density)
         if lost and self.trust.why != lost and self.trust.doubt(lost, now, at_once=True):
-            # What was learnt is forgotten, and the look under way ends.
+            # The estimate is discarded, and the update under way ends.
             self.estimator.restart()
             self.latest, self.news = None, True
             self.looked()
@@ -184,7 +184,7 @@ class Joint:
             self.estimator.sample(stamp, stretch)
 
     def applied(self, stamp: int, flux_density: float) -> None:
-        """Take in that a level in T has taken effect at a stamp, before the plan does."""
+        """Record that a level in T has taken effect, before the plan does."""
         wanted = self.planner.plan.level(stamp).flux_density
         if abs(flux_density) > self.largest:
             self.largest = math.inf
@@ -192,7 +192,7 @@ class Joint:
             self.largest = abs(flux_density)
 
     def _off(self, stamp: int, field: float) -> str:
-        """Return why the field at a time is not known to be the commanded one; else empty."""
+        """Return why the field may differ from the commanded one; empty if it does not."""
         if math.isnan(field):
             return (
                 'the field is not reported any more, and may not be the one commanded'
@@ -213,14 +213,14 @@ class Joint:
     # -- looks at them -------------------------------------------------------------------------
 
     def _take_levels(self, until: int) -> None:
-        """Have the estimator know the levels of the plan that count until a time."""
+        """Pass the levels of the plan that matter until a time to the estimator."""
         plan = self.planner.plan
         first = max(plan.place(self.estimator.since) - _BEFORE, 0)
         self.estimator.set_levels([
             (x.stamp, x.flux_density) for x in plan.levels[first:plan.place(until) + 1]])
 
     def update(self, now: int, doing: Doing) -> Awaited[None]:
-        """Take samples into account that have come, and find what is believed of a time."""
+        """Update the estimate with new samples, and predict the state at a time."""
         plan = self.planner.plan
         self.fresh = False
         self._take_levels(max(now, self.newest))
@@ -231,7 +231,7 @@ class Joint:
         self._note_start(plan, now)
         trouble = screening.trouble if found is None else found.trouble
         if screening.lost > before and not trust.acts:
-            # Others that came with them have fitted again.
+            # Later samples of the same update have fitted again.
             trouble = trouble or screening.last_trouble
         if trust.doubt(trouble, now) if trouble else found is not None and trust.fits(
                 plan, self.unit, self.estimator, now):
@@ -243,14 +243,14 @@ class Joint:
         self.latest, self.news = found, True
 
     def looked(self) -> None:
-        """End the look under way, and take in the samples that came meanwhile."""
+        """End the update under way, and add the samples that arrived during it."""
         self.looking = None
         for sample in self._waiting:
             self._take(*sample)
         self._waiting.clear()
 
     def _note_start(self, plan: Plan, now: int) -> None:
-        """Remember where the joint was before the setpoint under way at a time."""
+        """Store the position of the joint before the setpoint that is under way at a time."""
         place, before = plan.under_way(now), self._setpoint
         self._setpoint = plan.number, place
         if self._setpoint == before:
@@ -261,7 +261,7 @@ class Joint:
             self.start = plan.levels[0].stretch if self.latest is None else self.latest.stretch
 
     def _look_at_vibration(self, plan: Plan, found: Estimate) -> None:
-        """Keep the largest amplitude since the last arrival."""
+        """Update the largest amplitude since the last arrival."""
         place = plan.under_way(found.time)
         segment = plan.segments[place] if place >= 0 else None
         if segment is None or segment.arrival is None or found.time < segment.arrival:
@@ -276,12 +276,12 @@ class Joint:
     # -- what plans begin from -----------------------------------------------------------------
 
     def predicted(self, time: int) -> Estimate | None:
-        """Return what is believed of a time under the plan in force by now."""
+        """Return the estimate for a time under the plan in force."""
         self._take_levels(time)
         return self.estimator.predict(time)
 
     def state(self, time: int) -> Estimate | None:
-        """Return what plans may begin from at a time; None where predictions count."""
+        """Return the initial state of plans at a time; None if the plan's prediction applies."""
         latest = self.acting
         if latest is None or not self.adapts or (
                 time - latest.time > _FAR * latest.values['time_unit'] * NANOSECONDS):
@@ -289,24 +289,25 @@ class Joint:
         return self.predicted(time)
 
     def foreseen(self, time: int) -> Estimate | None:
-        """Return what moves are corrected from at a time; cautious ones before samples."""
+        """Return the state for slowing down moves; a cautious joint has one before any sample."""
         if self.latest is not None or math.isinf(self.tolerance):
             return self.state(time)
         return self.predicted(time)
 
     def adapted(self, model: Model | None = None) -> bool:
-        """Return whether plans, or one by a model, use parameters that were learnt."""
+        """Return whether a model, by default that of the plans, uses learned parameters."""
         return (model or self.planner.model) != self.given
 
     def believed(self, time: int) -> Believed | None:
-        """Return what `hmsa_ros.planning.planner.Planner` is to believe of a time."""
+        """Return the state for `hmsa_ros.planning.planner.Planner` to plan from at a time."""
         try:
             found = self.state(time) if self.adapted() else None
         except HmsaError:
             return None
         if found is None:
             return None
-        # What the model in use does not know shifts its rest: a plan keeps to its own stretches.
+        # Effects missing in the model shift its equilibrium: a plan uses the stretches of its
+        # model.
         level, model = self.planner.plan.levels[-1].flux_density, self.planner.model
         at = rest(found.values, (), level)
         if at is None:
@@ -317,7 +318,7 @@ class Joint:
 
     @property
     def sensor(self) -> Sensor:
-        """What was found of the sensor; one as given where nothing was."""
+        """The sensor as estimated; as given where there is no estimate."""
         found = self.acting
         if found is None:
             return Sensor()
@@ -328,7 +329,7 @@ class Joint:
     # -- what plans are made with --------------------------------------------------------------
 
     def learnt(self, model: Model) -> Model:
-        """Return a model with what is known better by now, or was when samples fitted last."""
+        """Return a model updated by the estimate, or by the last confirmed parameters."""
         if self.acting is not None:
             return learnt_model(model, self.acting, self.planner.plan.levels[-1].stretch)
         confirmed = self.trust.confirmed
@@ -336,8 +337,9 @@ class Joint:
             confirmed.actuator, replace(model.options, **confirmed.others))
 
     def may_choose(self, latest: Estimate) -> bool:
-        """Return whether the parameters to plan with are to be chosen by an estimate."""
-        # A plan that other parameters take over on the way begins from what it does not know.
+        """Return whether an estimate may be used to choose the parameters to plan with."""
+        # A plan with changed parameters begins from an unknown state, so moves are not
+        # interrupted.
         return not self.chosen and bool(self.planner.plan.segments) and (
             latest.time < self.waits
             or latest.time >= self.next_choice and self.shown(latest.time))
@@ -350,7 +352,7 @@ class Joint:
         return place >= 0 and time >= (plan.segments[place].arrival or 0) + look
 
     def choose(self, latest: Estimate, doing: Doing) -> Awaited[None]:
-        """Plan with what is learnt, once that is clearly better, or while a move waits for it."""
+        """Adopt learned parameters once clearly better, or while a move waits for them."""
         used, segments = self.used or self.planner.model, self.planner.plan.segments
         model, waits = used, latest.time < self.waits
         if differs(used, latest):
@@ -371,7 +373,7 @@ class Joint:
     # -- words ---------------------------------------------------------------------------------
 
     def words(self, now: int) -> str:
-        """Say in a sentence without its stop what is wrong at a time."""
+        """Return the problem at a time, in a sentence without full stop."""
         trust = self.trust
         why = trust.why or self.estimator.screening.trouble
         if trust.ended:
@@ -393,7 +395,7 @@ class Joint:
             self.start, self.amplitude, use if self.adapts else '')
 
     def figures(self) -> dict[str, object]:
-        """Return parameters in SI, with deviations and given values, and counters."""
+        """Return parameters in SI, with standard deviations and given values, and counters."""
         prior, screening = self.estimator.prior.values, self.estimator.screening
         found = self.latest
         values: dict[str, object] = {'trusted': found is not None and found.trusted}
@@ -415,5 +417,5 @@ class Joint:
 
 
 def _updated(estimator: Estimator, now: int) -> tuple[Estimator, Estimate | None]:
-    """Return an estimator with its samples taken into account, and what it believes of a time."""
+    """Return an estimator updated with its samples, and its estimate for a time."""
     return estimator, estimator.update(now)

@@ -1,41 +1,41 @@
-"""When an estimate is acted upon, and which parameters plans use where it is not."""
+"""When an estimate is used, and which parameters plans use otherwise."""
 
 from hmsa_ros.estimation import Estimator
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.timeline import Model, Plan
 
-# So many updates in a row whose samples do not fit call for a new beginning.
+# Number of successive updates with samples that do not fit until the estimator restarts.
 _PERSISTENT = 3
-# Units of time of a motion, and samples of it, that have to fit before an estimate counts.
+# Time scales of motion, and samples of it, that must fit before an estimate is used.
 _SHOWN, _FEWEST = 6.0, 10
-# Share of the samples of a move that may be rejected.
+# Fraction of the samples of a move that may be rejected.
 _REJECTED = 0.1
-# What a move may leave, as a share of its step, that confirms the parameters it was planned with.
+# Largest error, as a fraction of the step, that confirms the parameters of a move.
 _CONFIRMS = 0.02
 
 
 class Trust:
     """
-    Follows how samples of one joint fit.
+    Track how well the samples of one joint fit.
 
-    An estimate counts once a whole move has fitted, or at once if asked for. Where samples do not
-    fit, plans use the parameters that a move has confirmed last, or those given; where that lasts,
-    the estimator begins anew.
+    An estimate is used once a whole move has fitted, or ``at_once`` if requested. While samples do
+    not fit, plans use the parameters that a move confirmed last, or the given ones. If the misfit
+    persists, the estimator restarts.
     """
 
     def __init__(self, begin: int, *, at_once: bool) -> None:
-        # That a move was planned with which arrived as measured.
+        # Model of the last move that arrived, as measured.
         self.confirmed: Model | None = None
-        self.beginnings = 0  # new ones
+        self.beginnings = 0  # number of restarts
         self.acts = at_once
-        self.why = ''  # for which samples are not trusted; empty where they are
-        self.ended = False  # whether moves got worse by what was learnt
+        self.why = ''  # why samples are not trusted; empty if they are
+        self.ended = False  # whether learned parameters made moves worse
         self._begin, self._doubts, self._rejected = begin, 0, 0
-        # Estimates that moves had shown to fit, and which did not after all; moves still to fit.
+        # Number of estimates that fitted a move and failed later; number of moves still to fit.
         self._failures, self._moves = 0, 1
 
     def doubt(self, why: str, now: int, *, at_once: bool = False) -> bool:
-        """Take in that samples do not fit at a time in ns; return whether to begin anew."""
+        """Record that samples do not fit at a time in ns; return whether to restart."""
         if self.ended:
             return False
         self.why = why
@@ -44,7 +44,7 @@ class Trust:
             return False
         self._failures += self.acts
         if self._failures > 1:
-            # Each time more has to be shown.
+            # Each restart requires more fitting moves.
             self.confirmed = None
         self.beginnings += 1
         self.acts, self._begin, self._doubts = False, now, 0
@@ -52,8 +52,8 @@ class Trust:
         return True
 
     def fits(self, plan: Plan, unit: float, estimator: Estimator, now: int) -> bool:
-        """Take in that samples fit at a time in ns; return as `doubt`, since too few may fit."""
-        # The unit of time is in s.
+        """Record that samples fit at a time in ns; return whether to restart, if too few fit."""
+        # The time scale is in s.
         self._doubts = 0
         if self.ended:
             return False
@@ -73,19 +73,19 @@ class Trust:
         return False
 
     def confirm(self, model: Model, left: float) -> None:
-        """Take in what a move planned with a model has left, as a share of its step."""
+        """Record the error of a move planned with a model, as a fraction of its step."""
         if self.acts and left < _CONFIRMS:
             self.confirmed = model
 
     def end(self, why: str) -> None:
-        """Take in that moves get worse by what is learnt: there is no feedback any more."""
+        """End feedback, since learned parameters make moves worse."""
         if not self.why:
-            # Samples fit, and what they have confirmed is no better.
+            # The samples fit, so the parameters that they confirmed are no better.
             self.confirmed = None
         self.why, self.ended, self.acts = why, True, False
 
     @property
     def parameters(self) -> str:
-        """Say which parameters plans use where samples do not fit."""
+        """The parameters that plans use while samples do not fit, in words."""
         return 'the parameters given' if self.confirmed is None else (
             'the parameters that samples confirmed last')

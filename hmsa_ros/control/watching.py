@@ -1,4 +1,4 @@
-"""The setpoints of a request as they were requested, and what samples show of each."""
+"""The setpoints of a request as requested, and the findings from samples of each."""
 
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,7 +21,7 @@ from hmsa_ros.model.law import critical_zeta
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.timeline import Plan, PlannedSegment
 
-# How long ago a sample may have come for samples to be expected, by the steady clock.
+# Largest age of the newest sample for further samples to be expected, by the steady clock.
 _RECENT = 10_000_000_000
 _LEFT_OUT = 'commands came late, and there was no time left for it'
 _UNDONE = 'its commands were not sent in time, or took no effect'
@@ -30,64 +30,64 @@ _STOPPED = 'the joint came to rest instead'
 
 @dataclass
 class _Joint:
-    """The setpoints of a joint as they were requested, and what was found of them."""
+    """The setpoints of a joint as requested, and their findings."""
 
-    name: str  # empty where there is one
-    doing: Doing  # does the judging
-    asked: Plan  # as it was accepted
-    plan: Plan  # as it is now
-    request: int  # its number in the group
-    goal: GoalTolerances | None = None  # what counts as having arrived at the last setpoint
+    name: str  # empty if there is only one
+    doing: Doing  # executes the judging
+    asked: Plan  # plan as accepted
+    plan: Plan  # plan now
+    request: int  # number of the request in the group
+    goal: GoalTolerances | None = None  # tolerances at the last setpoint
     following: int = 0  # number, from 0, of the next setpoint to watch
-    left: Sequence[int] = field(init=False)  # numbers that no new plan has left out
-    holds: list[Hold] = field(default_factory=list)  # the last one stays when it is over
-    news: list[Finding] = field(default_factory=list)  # of setpoints that need no samples
-    corrected: bool = False  # whether the plan that is to come corrects the one in force
-    needed: bool = False  # whether the plan was made anew in need
+    left: Sequence[int] = field(init=False)  # numbers of setpoints that are still planned
+    holds: list[Hold] = field(default_factory=list)  # the last one stays after it is over
+    news: list[Finding] = field(default_factory=list)  # findings that need no samples
+    corrected: bool = False  # whether the next plan is a correction from samples
+    needed: bool = False  # whether the plan was replanned after a deviation
     newest: Finding | None = None
-    closed: Finding | None = None  # the worst of the setpoints that are over
+    closed: Finding | None = None  # worst finding of the setpoints that are over
 
     def __post_init__(self) -> None:
         self.left = range(self.count)
 
     @property
     def count(self) -> int:
-        """How many setpoints were requested."""
+        """Number of setpoints requested."""
         return len(self.asked.segments) - self.asked.kept
 
     @property
     def begins(self) -> int | None:
-        """Time in ns at which the next setpoint to watch begins; None for none."""
+        """Time in ns at which the next setpoint to watch begins; None if there is none."""
         if self.following >= self.count:
             return None
         return self.asked.segments[self.asked.kept + self.following].since
 
     @property
     def open(self) -> bool:
-        """Whether setpoints that have begun are still to be judged."""
-        return bool(self.news) or any(not x.over or x.untold for x in self.holds)
+        """Whether setpoints that have started are still to be judged."""
+        return bool(self.news) or any(not x.over or x.unreported for x in self.holds)
 
     @property
     def worst(self) -> Finding | None:
         return worst(x for x in (self.closed, *(y.found for y in self.holds)) if x is not None)
 
     def close(self, found: Finding | None) -> None:
-        """Take in what was found of a setpoint that is over."""
+        """Record the finding of a setpoint that is over."""
         self.closed = worst(x for x in (self.closed, found) if x is not None)
 
     def segment(self, number: int) -> PlannedSegment | None:
-        """Return a setpoint as it is planned now; None for one that was left out."""
+        """Return a setpoint as planned now; None if it was left out."""
         place = bisect_left(self.left, number)
         if place == len(self.left) or self.left[place] != number:
             return None
-        # All plans reach to the last setpoint.
+        # All plans end with the last setpoint.
         back = len(self.left) - place
         return self.plan.segments[-back] if back <= len(self.plan.segments) else None
 
     def leave_out(self, plan: Plan, now: int) -> Sequence[int]:
-        """Go over to a plan that was made anew, and return the numbers that it leaves out."""
+        """Adopt a new plan, and return the numbers of the setpoints that it leaves out."""
         before, after = self.plan.segments, plan.segments
-        # What is over stays as it is.
+        # Finished setpoints stay as they are.
         place = max(self.plan.under_way(now), 0)
         while place < min(len(before), len(after)) and before[place] is after[place]:
             place += 1
@@ -99,12 +99,12 @@ class _Joint:
         return gone
 
     def undone(self) -> set[int]:
-        """Return the numbers of the setpoints that have begun and were not carried out."""
+        """Return the numbers of the setpoints that have started and were not carried out."""
         return {x for x in range(self.following)
                 if (one := self.segment(x)) is not None and not one.carried_out}
 
     def stop(self, plan: Plan) -> None:
-        """Take in that a joint came to rest in place of the rest of a request."""
+        """Record that a joint came to rest instead of completing a request."""
         self.plan = plan
         for hold in self.holds:
             hold.miss(_STOPPED)
@@ -112,7 +112,7 @@ class _Joint:
         self.following = self.count
 
     def change(self, plan: Plan, now: int) -> None:
-        """Go over to a plan that was made anew; what it leaves out is missed."""
+        """Adopt a new plan; the setpoints that it leaves out are missed."""
         self.needed |= not self.corrected
         self.corrected = False
         begun = {x.setpoint.number - 1: x for x in self.holds}
@@ -126,7 +126,7 @@ class _Joint:
         self._miss(sorted(self.undone() - undone - begun.keys()), _UNDONE)
 
     def _miss(self, numbers: Iterable[int], reason: str) -> None:
-        """Take in that setpoints are missed, none of which samples were gathered of."""
+        """Record as missed setpoints that have no samples."""
         self.news += [missed(self._setpoint(x), reason) for x in numbers]
 
     def open_next(self) -> None:
@@ -137,23 +137,23 @@ class _Joint:
         for hold in self.holds:
             if hold.over:
                 self.close(hold.found)
-        self.holds = [x for x in self.holds if not x.over or x.untold]
+        self.holds = [x for x in self.holds if not x.over or x.unreported]
         self.holds.append(self._hold(number))
 
     def begin_anew(self) -> None:
-        """Gather samples anew of setpoints that are not over, since all times are others."""
+        """Restart gathering samples of unfinished setpoints, since all times have changed."""
         self.holds = [
             x if x.over else self._hold(x.setpoint.number - 1) for x in self.holds]
 
     def _hold(self, number: int) -> Hold:
-        """Return what gathers samples of a setpoint."""
+        """Return a new hold for a setpoint."""
         setpoint = self._setpoint(number)
         hold = Hold(setpoint, self.goal if setpoint.held else None, self.doing)
         self._keep_up(hold)
         return hold
 
     def _keep_up(self, hold: Hold) -> None:
-        """Have a setpoint judged from when it is reached by the plan in force."""
+        """Have a setpoint judged from its arrival in the plan in force."""
         segment = self.segment(hold.setpoint.number - 1)
         if segment is None:
             hold.miss(_LEFT_OUT)
@@ -165,7 +165,7 @@ class _Joint:
             hold.miss('its time ended before the move to it')
 
     def _setpoint(self, number: int) -> Setpoint:
-        """Return a setpoint as it was requested."""
+        """Return a setpoint as requested."""
         asked, place, last = self.asked, self.asked.kept + number, number + 1 == self.count
         segment = asked.segments[place]
         level = asked.level(segment.begin if segment.arrival is None else segment.arrival)
@@ -181,36 +181,36 @@ class _Joint:
 
 
 class Watch:
-    """Looks at samples of each setpoint as it was requested, and judges them."""
+    """Gather samples of each setpoint as requested, and judge them."""
 
     def __init__(
             self, group: PlannerGroup, surroundings: Surroundings, feedback: Feedback) -> None:
         self._group, self._around, self._feedback = group, surroundings, feedback
-        #: By joint, what counts as having arrived at the end of the newest request.
+        #: Goal tolerances of the newest request, by joint.
         self.goals: Mapping[str, GoalTolerances] = {}
         self._joints: dict[str, _Joint] = {}
-        # Reading a clock for each sample of each joint would take longer than all else.
+        # Cached, since reading a clock for each sample of each joint would dominate the time.
         self._now = 0
         self._heard: int | None = None
-        # Time in ns at which the next setpoint begins: its samples may come before the next tick.
+        # Begin of the next setpoint in ns: its samples may arrive before the next tick.
         self._opens: int | None = None
         self.restart()
 
     def restart(self) -> None:
-        """Forget everything; what is planned by now is not judged."""
+        """Discard all findings; what is planned so far is not judged."""
         self._opens = None
         for name, planner in self._group.planners.items():
             plan = planner.plan
             self._begin(name, replace(plan, kept=len(plan.segments)), plan)
 
     def _begin(self, name: str, asked: Plan, plan: Plan) -> None:
-        """Watch the setpoints of a joint that were asked for."""
+        """Watch the requested setpoints of a joint."""
         self._joints[name] = _Joint(
             name if len(self._group.planners) > 1 else '', self._feedback.do, asked, plan,
             self._group.number, self.goals.get(name))
 
     def clock_set(self, by: int) -> None:
-        """Take in that the clock was set ahead by some ns, and all plans with it."""
+        """Shift all times by the ns that the clock was set ahead."""
         for name, joint in self._joints.items():
             joint.asked = joint.asked.shifted(by)
             joint.plan = self._group.planners[name].plan
@@ -225,7 +225,7 @@ class Watch:
 
     @property
     def open(self) -> bool:
-        """Whether setpoints that hold have not been judged yet."""
+        """Whether started setpoints are still to be judged."""
         return any(x.open for x in self._joints.values())
 
     @property
@@ -235,36 +235,36 @@ class Watch:
 
     @property
     def measuring(self) -> bool:
-        """Whether samples have come lately."""
+        """Whether there are recent samples."""
         return self._heard is not None and self._around.steady() - self._heard < _RECENT
 
     @property
     def findings(self) -> dict[str, Finding]:
-        """Return the newest finding of each joint, where there is one."""
+        """The newest finding of each joint that has one."""
         return {
             name: x.newest for name, x in self._joints.items() if x.newest is not None}
 
     @property
     def worst(self) -> Finding | None:
-        """Return the worst that was found of the newest request."""
+        """The worst finding of the newest request."""
         return worst(x.worst for x in self._asked() if x.worst is not None)
 
     def wake(self, now: int) -> int | None:
-        """Return when to judge next, a time in ns; None for never, 0 for now."""
+        """Return the time in ns at which to judge next; None for never, 0 for now."""
         times = [0 for x in self._joints.values() if x.news]
         times += [
             y.wake(now)
-            for x in self._joints.values() for y in x.holds if not y.over or y.untold]
+            for x in self._joints.values() for y in x.holds if not y.over or y.unreported]
         return min(times, default=None)
 
     # -- setpoints -----------------------------------------------------------------------------
 
     def corrected(self, name: str) -> None:
-        """Take in that the plan of a joint has been corrected, and not made anew in need."""
+        """Record that the next plan of a joint is a correction, not a replanning in need."""
         self._joints[name].corrected = True
 
     def follow(self, now: int) -> None:
-        """Watch the setpoints that have begun by a time in ns, as they were requested."""
+        """Watch the setpoints that have started by a time in ns, as requested."""
         for name, planner in self._group.planners.items():
             joint, plan = self._joints[name], planner.plan
             if plan.number == joint.plan.number:
@@ -277,7 +277,7 @@ class Watch:
         self._open_until(now)
 
     def _open_until(self, time: int) -> None:
-        """Watch the setpoints that begin by a time in ns."""
+        """Watch the setpoints that start by a time in ns."""
         for joint in self._joints.values():
             while joint.begins is not None and joint.begins <= time:
                 joint.open_next()
@@ -287,7 +287,7 @@ class Watch:
     # -- samples -------------------------------------------------------------------------------
 
     def wants(self, stamp: int) -> bool:
-        """Return whether a sample of a time in ns is of use for one of the joints."""
+        """Return whether a sample with a timestamp in ns is needed for any joint."""
         steady, wanted = self._around.steady(), False
         self._heard = steady
         if self._opens is not None and stamp >= self._opens:
@@ -298,7 +298,7 @@ class Watch:
         return wanted
 
     def add(self, name: str, stamp: int, stretch: float) -> None:
-        """Take in a stretch measured at a stamp in ns; samples may come in any order."""
+        """Add a stretch measured at a timestamp in ns; samples may arrive in any order."""
         if name not in self._joints:
             return
         if stamp > self._now:
@@ -310,9 +310,9 @@ class Watch:
             self, now: int, tolerances: Tolerances, until: int, *,
             observable: bool) -> Finding | None:
         """
-        Judge one setpoint, if one can be judged by a time in ns and changes what is known.
+        Judge one setpoint that is due at a time in ns; return its finding if it is new.
 
-        None is begun after a steady time in ns.
+        No judging begins after the steady time ``until`` in ns.
         """
         self._now = now
         for name, joint in self._joints.items():

@@ -1,8 +1,8 @@
 """
-What plans are expected to leave, where commands take effect late.
+Predict the error of plans if commands take effect late.
 
 Late commands leave vibration, and so does a new plan whose commands are late again. Both are
-simulated with commands to come as late as those before, in several ways that this may happen.
+simulated in several scenarios, in which future commands are as late as the previous ones.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,39 +20,39 @@ from hmsa_ros.model.simulation import sampled
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.timeline import Draft, Plan, PlannedLevel
 
-#: A step that is smaller counts as this one.
+#: Smaller steps are replaced by this one.
 LEAST_STEP = 0.1
-#: Residual vibration from peak to peak, as a share of the step, from which on it counts.
+#: Peak-to-peak residual vibration, as a fraction of the step, from which it matters.
 SHARE = 5e-3
-# How much less a new plan is to leave, beyond so many deviations over the ways, and how much it
-# may leave itself: one that misses by a whole step is left to chance. After an exception: which
-# share of what is there it may leave then, which share of the gain it may leave more in one way,
-# and which share of what is there, once no more will be known.
+# Required gain of a new plan, beyond this many standard deviations over the scenarios, and the
+# largest error it may leave: one of a whole step is left to chance. After an exception: the
+# fraction of the present error that it may leave, the fraction of the gain by which one scenario
+# may be worse, and the fraction of the present error once no more information will come.
 _GAIN, _SURE, _MOST, _LITTLE, _RISK, _CLEARLY = 5e-3, 3.0, 1.0, 0.35, 0.2, 0.5
-# What stands for a motion that cannot be predicted.
+# Stands for the error of a motion that cannot be predicted.
 _LOST = 1e3
-# Setpoints that are looked at, how far ahead the next one may begin, units of time that may be
-# simulated, and ways in which commands may be late.
+# Setpoints considered, how far ahead the next one may begin, time scales that may be simulated,
+# and number of scenarios.
 _SETPOINTS, _NEAR, _LONGEST, _WAYS = 2, 50.0, 2000.0, 16
 
 
 @dataclass(frozen=True)
 class Aim:
-    """A setpoint that is to be arrived at; times in ns."""
+    """A setpoint to be reached; times in ns."""
 
     stretch: float
     step: float  #: of stretch, at least `LEAST_STEP`
     arrival: int
-    end: int | None  #: when the next setpoint begins; None for never
+    end: int | None  #: begin of the next setpoint; None if there is none
 
 
 def step_of(plan: Plan, place: int) -> float:
-    """Return the step of a setpoint of a plan by its place; small ones count as larger."""
+    """Return the step of a setpoint by its place in a plan, at least `LEAST_STEP`."""
     return LEAST_STEP if place < 0 else max(plan.step(place), LEAST_STEP)
 
 
 def aims(plan: Plan, now: int) -> list[Aim]:
-    """Return the setpoint of a plan that is under way at a time in ns, and the next ones."""
+    """Return the setpoint that is under way at a time in ns, and the next ones."""
     found: list[Aim] = []
     unit = plan.levels[-1].model.units.time * NANOSECONDS
     first = max(plan.under_way(now), 0)
@@ -72,10 +72,10 @@ def expected(
         start: PlannedLevel, levels: Sequence[PlannedLevel], wanted: Sequence[Aim],
         lateness: Lateness) -> NDArray[np.float64]:
     """
-    Return how far from rest at its aims an actuator may be, in sum over them, in several ways.
+    Return the predicted error summed over the aims, for each of several scenarios of lateness.
 
-    That is the vibration from peak to peak, and twice the distance, as a share of the step. It
-    starts in the state of a level, and the others follow.
+    The error is the peak-to-peak vibration plus twice the distance from the aim, as a fraction of
+    the step. The simulation starts in the state of ``start``; ``levels`` follow.
     """
     levels = [x for x in levels if wanted[-1].end is None or x.stamp <= wanted[-1].end]
     span = start.model.time(max(wanted[-1].arrival - start.stamp, 0)) + 1.0
@@ -88,7 +88,7 @@ def expected(
 def _left(
         start: PlannedLevel, levels: Sequence[PlannedLevel], stamps: NDArray[np.int64],
         wanted: Sequence[Aim]) -> float:
-    """Return what is left where levels take effect at times in ns."""
+    """Return the predicted error if the levels take effect at times in ns."""
     model, begin = start.model, start.stamp
     times = np.maximum.accumulate(np.maximum(stamps, begin)).tolist()
     looks = list(_looks(levels, times, wanted, begin))
@@ -96,7 +96,7 @@ def _left(
     course = [Level(0.0, model.load(start.flux_density)), *(
         Level(model.time(x - begin), model.load(level.flux_density))
         for x, level in zip(times, levels, strict=True) if x < end)]
-    # Of commands that come at once the last one counts.
+    # Of levels that take effect simultaneously, only the last one counts.
     course = [one for one, other in pairwise([*course, Level(math.inf, 0.0)])
               if one.time < other.time]
     state = start.at(begin)
@@ -114,7 +114,7 @@ def _left(
 def _looks(
         levels: Sequence[PlannedLevel], times: Sequence[int], wanted: Sequence[Aim],
         begin: int) -> Iterator[int]:
-    """Yield times in ns at which to look: the last level is in force, and the next is not."""
+    """Yield times in ns to evaluate: the last level is in force, and the next is not."""
     look = begin
     for aim in wanted:
         own = sum(aim.end is None or x.stamp < aim.end for x in levels)
@@ -127,18 +127,18 @@ def _looks(
 def compared(
         plan: Plan, start: PlannedLevel, levels: Sequence[PlannedLevel], draft: Draft,
         lateness: Lateness) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return what a plan leaves from a start on, by `expected`, and what a draft in its place."""
+    """Return the predicted errors of a plan from a start on, and of a draft in its place."""
     first = max(plan.under_way(draft.begin), 0)
     kept = first if draft.resumed is None else draft.resumed + draft.missed
     wanted = []
     for place, aim in enumerate(aims(plan, draft.begin), first):
-        # As late as the later of the two arrives; what a draft leaves, at its end.
+        # At the later arrival of the two; an aim that the draft leaves out, at its end.
         own = draft.segments[place - kept] if 0 <= place - kept < len(draft.segments) else None
         arrival = own.arrival if own is not None else (
             aim.end if draft.resumed is not None and place >= draft.resumed else None)
         wanted.append(replace(aim, arrival=max(aim.arrival, arrival or aim.arrival)))
     anew = [*(x for x in levels if x.stamp < draft.begin), *draft.levels]
-    # What a draft leaves out, beyond what is looked at, is missed by a step each.
+    # Each setpoint that the draft leaves out, beyond those considered, is missed by a step.
     out = max(len(plan.segments) - first - len(wanted), 0) if draft.resumed is None else 0
     return (
         expected(start, levels, wanted, lateness),
@@ -149,11 +149,11 @@ def worthwhile(
         before: NDArray[np.float64], after: NDArray[np.float64], *, news: bool,
         unsure: bool) -> bool:
     """
-    Return whether to take a draft, by what is left without it and with it in several ways.
+    Return whether to adopt a draft, given the errors without and with it in each scenario.
 
-    It must do no harm in any way, or by chance in one that was not tried. Where the newest command
-    was an exception (``unsure``), a little is allowed; once there will be no ``news`` in time, it
-    is enough that much less is left.
+    The draft must not increase the error in any scenario, nor by chance in an untested one. If the
+    newest command was an exception (``unsure``), a small increase is allowed. Without further
+    ``news`` in time, a much smaller mean error is enough.
     """
     gain = before - after
     mean, harm = float(gain.mean()), float(-gain.min())

@@ -86,7 +86,7 @@ class DeviceJoint:
         self._commanded = node.commanded
         self._of_me = '' if len(names) == 1 else f'joint {self.name}: '
         self._crowded = False
-        self._tell_refused, self._tell_late = Seldom(), Seldom()
+        self._refused_due, self._late_due = Seldom(), Seldom()
         self.received = self.refused = self.refused_source = 0
         self.late = self.latest = self.failed = 0
         self._applied, self._received = (
@@ -134,7 +134,7 @@ class DeviceJoint:
         if notice.kind == Kind.LATE:
             self.late += 1
             self.latest = max(self.latest, notice.late)
-            if self._tell_late():
+            if self._late_due():
                 logger.warning(text)
         elif notice.kind == Kind.REFUSED:
             self._refuse(notice.text)
@@ -208,7 +208,7 @@ class DeviceJoint:
 
     def _refuse(self, why: str) -> None:
         self.refused += 1
-        if self._tell_refused():
+        if self._refused_due():
             stays = _STAYS[self.refuses == conversions.INTERLOCK]
             self._node.get_logger().error(f'{self._of_me}command refused, {stays}: {why}')
 

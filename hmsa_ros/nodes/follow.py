@@ -66,9 +66,9 @@ class FollowJointTrajectory:
         """Serve goals for a runtime from now on."""
         self._runtime, self._goals = runtime, Goals(runtime, self._outcomes.__setitem__)
 
-    def tell(self, status: StatusChanged) -> None:
+    def update(self, status: StatusChanged) -> None:
         """Take in what the planner says."""
-        self._goals.tell(status)
+        self._goals.update(status)
 
     # -- goals ---------------------------------------------------------------------------------
 

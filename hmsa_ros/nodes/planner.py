@@ -332,7 +332,7 @@ class PlannerNode(ManagedNode):
             case records.StatusChanged():
                 self._status.publish(conversions.to_planner_status(output))
                 if self._action is not None:
-                    self._action.tell(output)
+                    self._action.update(output)
                 self._targets.show(self.now(), {
                     name: float(x.stretch) if x.stretch else None
                     for name, x in output.each.items()})
