@@ -45,7 +45,7 @@ class SimulatedDevice(Protocol):
 
 class Loop:
     """
-    Runs a controller and a device.
+    Run a controller and a device.
 
     Parameters
     ----------

@@ -5,7 +5,7 @@ from time import monotonic
 
 class Seldom:
     """
-    Permits a report at most once a second.
+    Permit a report at most once a second.
 
     The throttle of a logger first determines its calling location in the code, which takes up to a
     millisecond. This is too slow for events that may occur a thousand times a second.

@@ -22,7 +22,7 @@ class _Joint:
 
 class Silence:
     """
-    Detects that samples stop while their publisher still exists.
+    Detect that samples stop while their publisher still exists.
 
     A publisher that ends normally disappears at once.
     """

@@ -1,4 +1,4 @@
-"""Who is to receive what is sent, and whether they are all there."""
+"""Required subscribers of published messages, and their presence."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -23,11 +23,12 @@ from hmsa_ros.nodes.service_call import ServiceCall
 
 class Audience:
     """
-    Subscribers of what a node sends; the node must be served while ``missing`` is asked.
+    Subscribers of a node's topics; the node must be spun while `missing` is polled.
 
-    Each of ``topics`` needs a subscriber. If ``nodes`` (full names) are given, it must be one of
-    these managed nodes, and active. A topic that is not sent raises `BadInputError`. A
-    ``recorder`` must be active too, and subscribe to what it is to record of the nodes.
+    Each of ``topics`` needs a subscriber. If ``nodes`` (full names) are given, the subscriber must
+    be one of these managed nodes, and active. A topic that is not published raises
+    `BadInputError`. A ``recorder`` must be active too, and subscribe to the topics of the nodes
+    that it is to record.
     """
 
     def __init__(
@@ -41,7 +42,7 @@ class Audience:
         self._node = node
         self._senders = senders
         self._topics = topics
-        # Managed nodes that have not said yet that they are active.
+        # Managed nodes that are not known to be active yet.
         self._inactive = {
             x: ServiceCall(node, GetState, f'{x}/get_state', GetState.Request())
             for x in (*nodes, *filter(None, [recorder]))}
@@ -54,7 +55,7 @@ class Audience:
             GetParameters.Request(names=Selection.parameters)) if recorder else None
 
     def missing(self) -> list[str]:
-        """Return in words who is not there yet, of those that must be."""
+        """Return descriptions of the required nodes and subscribers that are missing."""
         for name, call in [*self._inactive.items()]:
             answer = call.answer()
             if answer is not None and answer.current_state.id == State.PRIMARY_STATE_ACTIVE:
@@ -65,7 +66,7 @@ class Audience:
             *(f'recorder of {name}' for name in self._unrecorded())]
 
     def _unrecorded(self) -> list[str]:
-        """Return topics of the nodes that the recorder is to record and does not subscribe to."""
+        """Return topics of the nodes that the recorder selects but does not subscribe to."""
         if self._selection is None:
             return []
         if self._selects is None:
@@ -90,7 +91,7 @@ class Audience:
             and self._recorder not in endpoints.subscribers_of(self._node, x).values()]
 
     def _subscribed(self, topic: str) -> bool:
-        """Return whether somebody who counts subscribes to a topic."""
+        """Return whether a required node, or any node, subscribes to a topic."""
         sender = self._senders[topic]
         if not self._nodes:
             return bool(sender.get_subscription_count() > 0)
@@ -99,7 +100,7 @@ class Audience:
             for x in endpoints.subscribers_of(self._node, sender.topic_name).values())
 
     def found(self, also: Any) -> bool:
-        """Return whether all known subscribers hear us; ``also`` is one more publisher or None."""
+        """Return whether all known subscribers match; ``also`` is one more publisher or None."""
         senders = [*self._senders.values(), *([] if also is None else [also])]
         if any(x.get_subscription_count() < self._node.count_subscribers(x.topic_name)
                for x in senders):
@@ -110,30 +111,30 @@ class Audience:
 
 class Followers:
     """
-    How far samples on topics (full names) have come.
+    Progress of samples on topics (full names).
 
-    They are looked at only when somebody asks, so that they take no time from whoever plays.
+    Messages are read only on request, so that they do not delay the player.
     """
 
     def __init__(self, node: Node, names: Sequence[str]) -> None:
         self._subscriptions = {
             name: endpoints.listen(node, replace(topics.JOINT_STATES, name=name))
             for name in names}
-        # Stamps in ns of the last two samples.
+        # Timestamps in ns of the last two samples.
         self._stamps = dict.fromkeys(names, (0, 0))
 
     def behind(self, end: int) -> dict[str, int]:
-        """Return by topic how many ns its samples still lack to a time, of those that do."""
+        """Return by topic the time in ns that its samples are behind ``end``, if they are."""
         for name, subscription in self._subscriptions.items():
             while taken := subscription.take():
                 for x in taken[-2:]:
                     self._stamps[name] = self._stamps[name][1], stamp_of(x.data)
-        # The next sample may be due after the end only.
+        # The next sample may be due only after the end.
         return {name: end - last for name, (before, last) in self._stamps.items()
                 if not before or 2 * last - before <= end}
 
     @staticmethod
     def in_words(behind: Mapping[str, int]) -> str:
-        """Say what `behind` returned."""
+        """Return the result of `behind` in words."""
         return ', '.join(f'those of {name} end {lack * 1e-9:.3f} s too early'
                          for name, lack in behind.items())

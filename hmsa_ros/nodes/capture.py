@@ -1,9 +1,9 @@
 """
-Taking raw messages off subscriptions, fast and with all that is known of each.
+Take raw messages from subscriptions, fast and with their metadata.
 
-rclpy's own executors pass one message at a time and do not tell which publisher sent it. Here
-a thread of its own looks at several subscriptions and takes whatever has arrived in one go, with
-the publisher's identifier, so that a gap in its sequence numbers is a lost message.
+The executors of rclpy pass one message at a time, without its publisher. Here a separate thread
+polls several subscriptions and takes all messages that have arrived at once, with the publisher's
+identifier, so that a gap in its sequence numbers shows a lost message.
 """
 
 from bisect import bisect_right
@@ -24,17 +24,17 @@ from rclpy.type_support import check_is_valid_msg_type
 
 from hmsa_ros.errors import BadInputError
 
-# Taken from one subscription before the next has its turn.
+# Maximum number of messages taken from one subscription before the next.
 _BATCH = 2000
-# The thread rests this long after messages have arrived, and if none have: at high rates many are
-# taken at once. Stamps come from the middleware, so this does not blur them.
+# Sleep times of the thread after messages have arrived, and if none have: at high rates many are
+# taken at once. Timestamps come from the middleware and are not affected.
 _REST_SECONDS, _IDLE_SECONDS = 0.001, 0.005
-# A publisher of /clock that has been silent for so long gives way to another.
+# Time in ns without messages after which a publisher of /clock is replaced by another.
 _SILENCE_NS = 1_000_000_000
 
 
 class Taken(NamedTuple):
-    """A message as received: stamps in ns, sequence number, publisher's identifier, payload."""
+    """A received message: timestamps in ns, sequence number, publisher's identifier, payload."""
 
     source_ns: int
     received_ns: int
@@ -45,12 +45,12 @@ class Taken(NamedTuple):
 
 def decode(data: bytes, message_type: type[Any]) -> Any:
     """
-    Return the message of a class that a payload holds.
+    Return a payload as a message of a class.
 
     Raises
     ------
     BadInputError
-        If it holds none.
+        If the payload is not such a message.
 
     """
     try:
@@ -82,17 +82,17 @@ class _Info(ctypes.Structure):
         ('sequence', ctypes.c_uint64), ('reception_sequence', ctypes.c_uint64),
         ('implementation', ctypes.c_char_p), ('publisher', ctypes.c_ubyte * 16),
         ('from_intra_process', ctypes.c_bool),
-        # Room for what a later distribution may add at the end.
+        # Space for fields that later distributions may append.
         ('_reserve', ctypes.c_ubyte * 64)]
 
 
 class _Taker:
     """
-    Takes serialized messages by rcl's own function.
+    Take serialized messages with the function of rcl.
 
-    rclpy's binding leaves out the publisher's identifier, without which gaps cannot be told
-    where several publishers share a topic. The interpreter lock is kept: a take lasts about a
-    microsecond, giving the lock away and getting it back much longer.
+    The binding of rclpy omits the publisher's identifier, without which gaps cannot be detected if
+    several publishers share a topic. The global interpreter lock is held: a take lasts about a
+    microsecond, while releasing and acquiring the lock takes much longer.
     """
 
     def __init__(self) -> None:
@@ -111,7 +111,7 @@ class _Taker:
         self._take.restype = ctypes.c_int
 
     def take(self, pointer: int, limit: int) -> list[Taken]:
-        """Take up to some number of messages off the subscription at an address."""
+        """Take at most ``limit`` messages from the subscription at an address."""
         result: list[Taken] = []
         take, string_at, array, info = self._take, ctypes.string_at, self._array, self._info
         array_at, info_at = ctypes.addressof(array), ctypes.addressof(info)
@@ -126,7 +126,7 @@ _taker = cache(_Taker)
 
 
 class RawSubscription:
-    """A subscription that belongs to no executor and is read by ``take``."""
+    """A subscription without executor, read by `take`."""
 
     def __init__(
             self, node: Node, message_type: type[Any], topic: str, qos: QoSProfile) -> None:
@@ -136,7 +136,7 @@ class RawSubscription:
                 node.handle, message_type, topic, qos.get_c_qos_profile())
 
     def take(self, limit: int = _BATCH) -> list[Taken]:
-        """Take at most ``limit`` messages in order of arrival; none if there are none."""
+        """Take at most ``limit`` messages in order of arrival."""
         try:
             with self.handle:
                 return _taker().take(self.handle.pointer, limit)
@@ -145,7 +145,7 @@ class RawSubscription:
 
     @property
     def matched(self) -> bool:
-        """Whether it has found a publisher, whose messages it receives from then on."""
+        """Whether a publisher is matched, so that its messages are received."""
         try:
             with self.handle:
                 return bool(self.handle.get_publisher_count())
@@ -159,9 +159,10 @@ class RawSubscription:
 
 class Capture:
     """
-    A thread that takes messages off subscriptions and passes them on in batches.
+    A thread that takes messages from subscriptions and delivers them in batches.
 
-    ``deliver`` gets a list of (key, messages) a round, in the order of the subscriptions.
+    ``deliver`` is called with a list of (key, messages) for each round, in the order of the
+    subscriptions.
     """
 
     def __init__(self, deliver: Callable[[Sequence[tuple[Any, list[Taken]]]], None]) -> None:
@@ -177,26 +178,26 @@ class Capture:
         self._thread.start()
 
     def add(self, key: Any, subscription: RawSubscription) -> None:
-        """Take over a subscription: read it, pass its messages on with the key, destroy it."""
+        """Take over a subscription: read it, deliver its messages with the key, destroy it."""
         self._subscriptions.append((key, subscription))
 
     def replace(self, key: Any, subscription: RawSubscription) -> None:
-        """Read another subscription under a known key; what the old one holds is passed on."""
+        """Read another subscription under a known key; messages of the old one are delivered."""
         for i, (known, old) in enumerate(self._subscriptions):
             if known is key:
                 self._subscriptions[i] = key, subscription
                 self._leaving.append((key, old))
 
     def matched(self) -> list[Any]:
-        """Return the keys of the subscriptions that have found a publisher."""
+        """Return the keys of the subscriptions with a matched publisher."""
         return [key for key, x in self._subscriptions if x.matched]
 
     def take_again(self) -> list[tuple[Any, list[Taken]]]:
-        """Take all that has arrived since this round was taken; for ``deliver`` alone."""
+        """Take all messages that arrived since this round; only to be called from ``deliver``."""
         return self._round(sys.maxsize)
 
     def stop(self) -> None:
-        """Pass on what has arrived so far and end the thread."""
+        """Deliver the messages that have arrived, and end the thread."""
         self._stopping = True
         if self._thread.is_alive():
             self._thread.join()
@@ -223,8 +224,8 @@ class Capture:
         """
         Take once from each subscription.
 
-        The first is taken last: with /clock added first, every tick that came before a message
-        of this round is known when the message is stamped.
+        The first one is read last: if /clock was added first, every tick received before a message
+        of this round is known when the message gets its timestamp.
         """
         taken = [(key, x.take(limit)) for key, x in reversed([*self._subscriptions])]
         while self._leaving:
@@ -236,13 +237,13 @@ class Capture:
 
 class SimulatedTime:
     """
-    Finds the simulated time at which a message was received.
+    Find the simulated time at which a message was received.
 
     The time of a message is that of the last ``/clock`` message received before it, by the
-    stamps of the middleware, however late either is taken. Of several publishers of ``/clock``
-    the first one is followed until it falls silent: a time that goes to and fro between two
-    simulations is none. ``jumps`` counts how often time has jumped back, ``ignored`` the messages
-    of other publishers, and such as tell no time.
+    timestamps of the middleware, however late either is taken. Of several publishers of
+    ``/clock``, the first one is followed until it stops, because times that alternate between two
+    simulations are useless. ``jumps`` counts backward jumps of time, ``ignored`` the messages of
+    other publishers and those without a valid time.
     """
 
     def __init__(self) -> None:
@@ -254,11 +255,11 @@ class SimulatedTime:
 
     @property
     def started(self) -> bool:
-        """Return whether a ``/clock`` message has come."""
+        """Whether a ``/clock`` message has arrived."""
         return bool(self._times)
 
     def add(self, received_ns: int, time_ns: int, publisher: bytes = b'') -> int | None:
-        """Take in a ``/clock`` message (ns); return the time before if time jumped back."""
+        """Add a ``/clock`` message (ns); return the previous time if time jumped back."""
         before = self._times[-1] if self._times else time_ns
         if self._times and publisher != self._publisher \
                 and received_ns - self._received[-1] < _SILENCE_NS:
@@ -275,5 +276,5 @@ class SimulatedTime:
         return None
 
     def at(self, received_ns: int) -> int:
-        """Return the simulated time at a system time, in ns; before the first, the first."""
+        """Return simulated time at a system time, in ns; the first tick before there is one."""
         return self._times[max(0, bisect_right(self._received, received_ns) - 1)]

@@ -1,9 +1,9 @@
 """
-Messages read field by field from their serialized form, without ROS and its objects.
+Read messages field by field from their serialized form, without ROS message objects.
 
-rclpy makes objects of all points of a trajectory at once, which takes seconds and gigabytes for a
-million. Here the header is read first, so that a trajectory that is too long costs nothing, and
-the points when they are asked for.
+rclpy creates objects for all points of a trajectory at once. For 5 million points this takes
+seconds and gigabytes. Here the header is read first, so that rejecting an overlong trajectory
+costs nothing, and the points are read on demand.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,14 +18,14 @@ from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 
-# What a message begins with: the representation, and options of two bytes.
+# Length of the preamble: the representation identifier and two bytes of options.
 _PREAMBLE = 4
 _LITTLE = b'\x00\x01'
 _BIG = b'\x00\x00'
 
 
 class Cursor:
-    """Reads CDR, the form that messages have on the wire: everything aligned to its size."""
+    """Read CDR, the wire format of messages, in which each value is aligned to its size."""
 
     def __init__(self, data: bytes) -> None:
         if data[:2] not in (_LITTLE, _BIG) or len(data) < _PREAMBLE:
@@ -36,11 +36,11 @@ class Cursor:
 
     @property
     def left(self) -> int:
-        """Bytes that are left."""
+        """Number of bytes left."""
         return len(self._data) - self.place
 
     def _pass(self, size: int, alignment: int = 1) -> int:
-        """Return where some bytes begin, and go on behind them."""
+        """Return the aligned start of the next ``size`` bytes, and move behind them."""
         place = -(-self.place // alignment) * alignment
         if place + size > len(self._data):
             raise BadInputError('the message cannot be decoded: it ends too early')
@@ -48,7 +48,7 @@ class Cursor:
         return place
 
     def take(self, kind: str, count: int = 1) -> tuple[float, ...]:
-        """Return numbers of a kind of the module struct."""
+        """Return ``count`` numbers of a format character of the module struct."""
         if not count:
             return ()
         size = struct.calcsize(f'<{kind}')
@@ -56,11 +56,11 @@ class Cursor:
         return struct.unpack_from(f'{self._order}{count}{kind}', self._data, place)
 
     def count(self) -> int:
-        """Return the length of what follows."""
+        """Return the length of the following sequence or string."""
         return int(self.take('I')[0])
 
     def time(self) -> int:
-        """Return a stamp or a duration in ns."""
+        """Return a timestamp or a duration in ns."""
         seconds, = self.take('i')
         nanoseconds, = self.take('I')
         return int(seconds) * NANOSECONDS + int(nanoseconds)
@@ -73,19 +73,19 @@ class Cursor:
 
 
 def stamp_of(data: bytes) -> int:
-    """Return the stamp in ns of a serialized message that begins with a header, else 0."""
+    """Return the timestamp in ns of a serialized message that begins with a header, else 0."""
     try:
         return Cursor(data).time()
     except BadInputError:
         return 0
 
 
-# The least that a point takes: four lengths and a duration.
+# Minimum size of a point: four lengths and a duration.
 _LEAST_POINT = 24
-# More joints than any planner has.
+# Limit on the number of joints, above that of any planner.
 _MOST_JOINTS = 1000
 _FIELDS = ('positions', 'velocities', 'accelerations', 'effort')
-# What is read of points: the fields that all have to have, and what is expected of the others.
+# Required fields of the points, and the message about unexpected values in the others.
 _WANTED = {
     'positions': (
         ('positions',),
@@ -99,7 +99,7 @@ _WANTED = {
 
 def read_trajectory(data: bytes) -> Trajectory:
     """
-    Return a serialized JointTrajectory as a request, which reads its points when asked for.
+    Return a serialized JointTrajectory as a request that reads its points on demand.
 
     Raises
     ------
@@ -128,10 +128,10 @@ def read_trajectory(data: bytes) -> Trajectory:
 @dataclass(frozen=True)
 class _Points:
     """
-    Points behind a cursor, read anew each time that they are asked for.
+    Points at a cursor, read again for each iteration.
 
-    Each is stretches, or levels in T, and time from the start in ns. Of a path, each joint has
-    stretch, rate and acceleration, the latter NaN if it is not given.
+    Each contains stretches, or levels in T, and the time from the start in ns. Points of a path
+    contain stretch, rate and acceleration of each joint; an omitted acceleration is NaN.
     """
 
     cursor: Cursor
@@ -168,7 +168,7 @@ class _Points:
 
 
 def _sizes(cursor: Cursor) -> list[int]:
-    """Return how many numbers each field of the next point has; nothing if it is cut off."""
+    """Return the length of each field of the next point; an empty list if it is truncated."""
     try:
         ahead = copy(cursor)
         return [len(ahead.take('d', ahead.count())) for _ in _FIELDS]

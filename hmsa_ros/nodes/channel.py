@@ -1,4 +1,4 @@
-"""Topics of one joint of the planner: commands out, setpoints and news of the commands in."""
+"""Topics of one joint of the planner: outgoing commands, incoming setpoints and reports."""
 
 from collections.abc import Callable, Sequence
 
@@ -15,14 +15,14 @@ from hmsa_ros.nodes import conversions, endpoints
 
 
 class JointChannel:
-    """What belongs to one joint of a planner on the wire; ``serve`` follows each message."""
+    """Publishers and subscriptions of one joint; ``serve`` is called after each message."""
 
     def __init__(
             self, node: Node, joint: str, joints: Sequence[str], runtime: PlannerRuntime,
             serve: Callable[[], None], *, linked: bool = False) -> None:
-        """Create publisher and subscriptions; who is linked gives news of commands itself."""
+        """Create them; a linked device passes its reports on directly."""
         self._node, self._joint, self._runtime, self._serve = node, joint, runtime, serve
-        self._tell_ignored = Seldom()
+        self._ignored_due = Seldom()
         self._command = endpoints.publisher(
             node, topics.of_joint(topics.FLUX_DENSITY_COMMAND, joint, joints))
         endpoints.subscribe(
@@ -43,7 +43,7 @@ class JointChannel:
 
     @property
     def found(self) -> bool:
-        """Whether somebody carries out the commands and reports what takes effect."""
+        """Whether a device subscribes to the commands and reports applied levels."""
         return not self._applied or bool(
             self._command.get_subscription_count() and (
                 self._node.count_publishers(self._applied)
@@ -51,18 +51,18 @@ class JointChannel:
 
     @property
     def reporters(self) -> frozenset[bytes]:
-        """Identifiers of who reports what takes effect."""
+        """Identifiers of the publishers of applied levels."""
         return frozenset(
             endpoints.publishers_of(self._node, self._applied) if self._applied else ())
 
     def unheard(self) -> str:
-        """Return why nobody carries out the commands; empty where somebody does."""
+        """Return why commands are not carried out; empty if they are."""
         if not self._applied:
             return ''
         if not self._command.get_subscription_count():
             return f'no node subscribes to {self._command.topic_name}: start a plant or a driver'
         if not self._node.count_publishers(self._received):
-            # Who listens now gives no receipts.
+            # The present subscriber gives no receipts.
             self._runtime.devices.receipts.forget(self._joint)
         if not self._node.count_publishers(self._applied) and not self._node.count_publishers(
                 topics.JOINT_STATES.name):
@@ -88,6 +88,6 @@ class JointChannel:
         try:
             self._runtime.applied(self._joint, *conversions.from_command(message))
         except BadInputError as error:
-            if self._tell_ignored():
+            if self._ignored_due():
                 self._node.get_logger().error(f'update of joint {self._joint} ignored: {error}')
         self._serve()

@@ -1,9 +1,9 @@
 """
 Planner and plant, or driver, in one process, with one loop and no middleware between them.
 
-Both nodes are there with their names, topics, services and parameters. Commands go to the device,
-and samples to the planner, within the cycle in which they are made. What is published, judged and
-planned comes after it, while nothing else is due.
+Both nodes exist with their names, topics, services and parameters. Commands reach the device and
+samples reach the planner in the cycle in which they are created. Publishing, judging and planning
+follow while nothing else is due.
 """
 
 from collections import deque
@@ -25,12 +25,12 @@ from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 from hmsa_ros.nodes.runner import run
 
-# Time in ns that must be left of a period to publish one more message, and how many wait at most.
+# Time in ns that must remain of a period to publish one more message; limit on waiting messages.
 _ENOUGH, _CROWDED = 400_000, 50
 
 
 class LinkedPlanner(PlannerNode):
-    """A planner whose runtime a plant in the same process serves."""
+    """A planner linked to a device in the same process."""
 
     linked = True
 
@@ -43,17 +43,17 @@ class LinkedPlanner(PlannerNode):
 
     @property
     def drives_hardware(self) -> bool:
-        """Whether parameters for all nodes of the process name hardware."""
+        """Whether the parameters for all nodes of the process name hardware."""
         given = self._parameter_overrides
         return any(x in given and given[x].value for x in (HARDWARE.name, SHORT))
 
     def send(self) -> None:
-        """Give the plant the commands that are due."""
+        """Pass the commands that are due to the device."""
         if self._channels:
             self._take(self._runtime.send(self.now()))
 
     def serve(self, left: Callable[[], bool]) -> None:
-        """Do what is due, and publish a message at least, others while there is time left."""
+        """Do the work that is due; publish at least one message, and more while there is time."""
         self._serve()
         while self._waiting:
             self._publish(self._waiting.popleft())
@@ -61,17 +61,17 @@ class LinkedPlanner(PlannerNode):
                 return
 
     def serve_if_due(self) -> None:
-        """Do what is due, if there is anything."""
+        """Do the work that is due, if any."""
         wake = self._runtime.wake
         if wake is not None and wake <= self.now():
             self._serve()
 
     def take_change(self, joint: str, change: Change) -> None:
-        """Take in that a level has taken effect."""
+        """Record that a level has taken effect."""
         self._runtime.applied(joint, change.stamp, change.level)
 
     def take_sample(self, joints: Sequence[str], sample: Sample) -> None:
-        """Take in what was measured of all joints."""
+        """Process a sample of all joints."""
         self._seen = joints, sample
         if not self._runtime.looks_at(sample.time):
             return
@@ -79,7 +79,7 @@ class LinkedPlanner(PlannerNode):
             self._runtime.observed(name, sample.time, *values)
 
     def take_refusal(self, joint: str, refuses: str) -> None:
-        """Take in what keeps commands of a joint from being obeyed, as in a receipt."""
+        """Record why commands of a joint are rejected, as in a receipt."""
         self._runtime.cut_off(
             joint, in_force=bool(refuses), locked=refuses == conversions.INTERLOCK)
 
@@ -91,7 +91,7 @@ class LinkedPlanner(PlannerNode):
                 yield name, Seen(sample.time, stretch, rate, flux_density)
 
     def now(self) -> int:
-        """Return the time in ns, which a plant that leads it knows best."""
+        """Return the time in ns, from the plant if that publishes the clock."""
         time = None if self.plant is None or not self.simulated else self.plant.leading_time
         if time is None:
             return super().now()
@@ -112,7 +112,7 @@ class LinkedPlanner(PlannerNode):
         return 'the plant or driver of this process is not active: activate it'
 
     def cleanup(self) -> None:
-        """Publish what waits, and forget the plans."""
+        """Publish the waiting messages, and drop the plans."""
         self.serve(lambda: True)
         super().cleanup()
 
@@ -122,19 +122,19 @@ class LinkedPlanner(PlannerNode):
                 self.plant.command(output)
             self._waiting.append(output)
         if self.plant is not None and self.plant.leading_time is not None:
-            # Simulated time may run far until the cycle ends.
+            # Simulated time may advance far until the cycle ends.
             super()._take(self._waiting)
             self._waiting.clear()
 
 
 class Linked(DeviceNode):
-    """A device that a planner in the same process commands; begins a class of such nodes."""
+    """A device commanded by a planner in the same process; first base class of such nodes."""
 
     def __init__(self, planner: LinkedPlanner) -> None:
         self._planner = planner
         self.companion = planner.get_fully_qualified_name()
         self.cycles = Cycles(round(TICK_SECONDS * 1e9))
-        super().__init__()  # type: ignore[call-arg]  # that of the node it is linked to
+        super().__init__()  # type: ignore[call-arg]  # the constructor of the device node
         planner.plant = self
         self._of_loop = endpoints.publisher(self, topics.DIAGNOSTICS)
         self.keep(
@@ -142,19 +142,19 @@ class Linked(DeviceNode):
             self._of_loop)
 
     def command(self, command: Send) -> None:
-        """Obey a command of the planner."""
+        """Apply a command of the planner."""
         for joint in self._joints:
             if joint.name == command.joint:
                 joint.command(command.stamp, command.flux_density)
 
     def _cycle(self) -> None:
-        """Let time run and send what is due; then publish, hear others and serve the planner."""
+        """Advance the device and send commands; then publish, poll and serve the planner."""
         with self.cycles:
             if self._joints:
                 self._go_on()
             self._planner.send()
         if self._joints:
-            self._hear()
+            self._poll_commands()
             self._publish_news()
             for joint in self._joints:
                 self._planner.take_refusal(joint.name, joint.refuses)
@@ -170,7 +170,7 @@ class Linked(DeviceNode):
         super()._publish_sample(sample)
 
     def _report_loop(self) -> None:
-        """Publish how the loop keeps time; garbage is collected now, between two cycles."""
+        """Publish the timing of the loop; garbage is collected now, between two cycles."""
         gc.collect()
         severity, message, values = self.cycles.report()
         self._of_loop.publish(conversions.to_diagnostics(
@@ -178,29 +178,29 @@ class Linked(DeviceNode):
 
 
 class LinkedPlant(Linked, PlantNode):
-    """A plant that a planner in the same process commands."""
+    """A plant commanded by a planner in the same process."""
 
     def _sample(self) -> None:
         self._advance()
         if self.leading_time is not None:
-            # Simulated time may run far in one cycle, and the planner has to know each sample.
+            # Simulated time may advance far in one cycle, and the planner needs each sample.
             self._publish_news()
             self._planner.serve_if_due()
 
 
 class LinkedDriver(Linked, DriverNode):
-    """A driver of hardware that a planner in the same process commands."""
+    """A driver of hardware commanded by a planner in the same process."""
 
 
 def _each(joints: Sequence[str], sample: Sample) -> Iterator[tuple[str, float, float, float]]:
-    """Yield what was measured of each joint."""
+    """Yield name, stretch, rate and flux density of each joint."""
     return zip(
         joints, sample.stretch.tolist(), sample.rate.tolist(), sample.flux_density.tolist(),
         strict=True)
 
 
 def make() -> Sequence[Node]:
-    """Make planner and plant, or driver; from now on garbage is collected by the loop alone."""
+    """Create planner and plant, or driver; from now on only the loop collects garbage."""
     planner = LinkedPlanner()
     device = LinkedDriver(planner) if planner.drives_hardware else LinkedPlant(planner)
     gc.disable()

@@ -20,21 +20,21 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes.capture import decode
 
 if TYPE_CHECKING:
-    # It comes along with the planner, which a recorder has no use for.
+    # Imported with the planner, which a recorder does not need.
     from hmsa_ros.control.records import StatusChanged
 
-#: What a receipt says while commands of before a cut-off are refused.
+#: Contents of a receipt while commands from before a cut-off, or all commands, are rejected.
 CUT_OFF, INTERLOCK = 'cut_off', 'interlock'
 
 
 def to_time(nanoseconds: int) -> Time:
-    """Return a stamp as a message."""
+    """Return a timestamp as a message."""
     sec, nanosec = divmod(nanoseconds, NANOSECONDS)
     return Time(sec=sec, nanosec=nanosec)
 
 
 def from_time(stamp: Time | Duration) -> int:
-    """Return a stamp or a duration in ns."""
+    """Return a timestamp or a duration in ns."""
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
@@ -44,7 +44,7 @@ def to_clock(nanoseconds: int) -> Clock:
 
 
 def to_command(stamp: int, flux_density: float, frame: str) -> MagneticField:
-    """Return a command from a stamp on (ns), in T along z; x and y are zero, not unknown."""
+    """Return a command from a timestamp in ns on, in T along z; x and y are 0, not NaN."""
     message = MagneticField(header=Header(stamp=to_time(stamp), frame_id=frame))
     message.magnetic_field.z = flux_density
     return message
@@ -52,12 +52,12 @@ def to_command(stamp: int, flux_density: float, frame: str) -> MagneticField:
 
 def from_command(message: MagneticField) -> tuple[int, float]:
     """
-    Return stamp in ns (0 for immediately) and flux density in T of a command.
+    Return timestamp in ns (0 for immediately) and flux density in T of a command.
 
     Raises
     ------
     BadInputError
-        If the field is not finite, not along z, or stamped before the epoch.
+        If the field is not finite, is not along z, or has a timestamp before the epoch.
 
     """
     field = message.magnetic_field
@@ -73,9 +73,9 @@ def from_command(message: MagneticField) -> tuple[int, float]:
 
 def to_receipt(joint: str, time: int, command: int, refuses: str) -> TimeReference:
     """
-    Return that the newest command of a joint is one of a stamp, at a time; both in ns.
+    Return a receipt: timestamp of the newest command of a joint, and present time; both in ns.
 
-    It may refuse commands because of `CUT_OFF` or `INTERLOCK`.
+    ``refuses`` is `CUT_OFF` or `INTERLOCK` if commands are rejected, else empty.
     """
     return TimeReference(
         header=Header(stamp=to_time(time), frame_id=refuses),
@@ -87,11 +87,11 @@ def to_trajectory(
         stamp: int = 0, frame: str = '', raw: bool = False,
         path: bool = False) -> JointTrajectory:
     """
-    Return a request: stretches, of all joints or one a joint, each until a time from the start.
+    Return a request with setpoints: stretches, of all joints or for each, and end times.
 
-    Times are in ns. If raw, they are levels in T, each from a time on; on a path they are stretch,
-    rate (1/s) and acceleration (1/s^2) of all joints. The stamp is the start, 0 for now; the
-    planner's verdict repeats the frame.
+    Times are in ns from the start. If raw, setpoints are levels in T with the times from which
+    they apply; for a path, they are stretch, rate (1/s) and acceleration (1/s^2) of all joints.
+    The timestamp is the start, 0 for now. The planner's verdict repeats the frame.
     """
     names = [joints] if isinstance(joints, str) else list(joints)
     fields = ('positions', 'velocities', 'accelerations') if path else (
@@ -115,7 +115,7 @@ def to_duration(nanoseconds: int) -> Duration:
 def to_plan(
         stamps: Sequence[int],
         samples: Mapping[str, Sequence[tuple[float, float, float]]]) -> JointTrajectory:
-    """Return each joint's stretch, rate in 1/s and level in T, from stamps in ns on."""
+    """Return stretch, rate in 1/s and level in T of each joint, from timestamps in ns on."""
     start = stamps[0] if stamps else 0
     message = JointTrajectory(
         header=Header(stamp=to_time(start)), joint_names=list(samples))
@@ -128,7 +128,7 @@ def to_plan(
 
 
 def to_planner_status(status: 'StatusChanged') -> DiagnosticStatus:
-    """Return a planner's verdict and progress, those of each joint too if there are several."""
+    """Return a planner's verdict and progress, including those of each of several joints."""
     verdict, progress, each = status.verdict, status.progress, status.each
     values: dict[str, object] = {
         'code': verdict.code, 'request': verdict.request, 'plan': status.plan,
@@ -154,12 +154,12 @@ def to_planner_status(status: 'StatusChanged') -> DiagnosticStatus:
 
 def from_samples(data: bytes) -> Iterator[tuple[str, int, tuple[float, float, float]]]:
     """
-    Yield joint, stamp in ns, and stretch, rate in 1/s and flux density in T of samples.
+    Yield joint, timestamp in ns, and stretch, rate in 1/s and flux density in T of samples.
 
     Raises
     ------
     BadInputError
-        If the bytes are no JointState.
+        If the bytes are not a valid JointState.
 
     """
     message = decode(data, JointState)
@@ -172,7 +172,7 @@ def from_samples(data: bytes) -> Iterator[tuple[str, int, tuple[float, float, fl
 
 
 def of_joints(key: str, by_joint: Mapping[str, object]) -> dict[str, object]:
-    """Return a value of each joint by its key in a status, which names one of several."""
+    """Return values of joints by status key, which names the joint if there are several."""
     return {f'{name}.{key}' if len(by_joint) > 1 else key: x for name, x in by_joint.items()}
 
 
@@ -186,5 +186,5 @@ def to_status(
 
 
 def to_diagnostics(stamp: int, *statuses: DiagnosticStatus) -> DiagnosticArray:
-    """Return statuses as the message of /diagnostics, stamped in ns."""
+    """Return statuses as a message for /diagnostics, with a timestamp in ns."""
     return DiagnosticArray(header=Header(stamp=to_time(stamp)), status=list(statuses))

@@ -1,4 +1,4 @@
-"""What all nodes have that pass commands to a device and publish what comes of it."""
+"""Common base of the nodes that command a device and publish its reports."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -27,7 +27,7 @@ from hmsa_ros.nodes.outlet import Outlet
 from hmsa_ros.nodes.parameters import JointParameters, JOINTS
 from hmsa_ros.nodes.presence import Presence
 
-#: What a joint does when nobody commands it; each may have values of its own.
+#: Behaviour of a joint without commands; each joint may have its own values.
 FALLBACK = (
     ParameterSpec(
         'command_timeout', 1.0,
@@ -53,30 +53,29 @@ PUBLISH_SCALARS = ParameterSpec(
     'Whether to publish stretch and stretch_rate besides joint_states; auto: only for a '
     'single joint.', choices=('auto', 'always', 'never'))
 
-#: What all devices have besides.
+#: Further parameters common to all devices.
 COMMON = (JOINT, JOINTS, COMMAND_SOURCE, PUBLISH_SCALARS)
-#: How often the time is looked at.
+#: Period of the node's main loop in s.
 TICK_SECONDS = 0.001
-# What a refused command leaves in force, and what while none is obeyed.
+# State after a refused command, and while the interlock is open.
 _STAYS = ('the previous one stays in force', 'the coil is off')
-# Receipts of a joint, in ns: apart at least where commands come, and at most where none do.
+# Intervals of receipts of a joint in ns: the minimum with commands, the maximum without.
 _RECEIPTS, _SIGNS_OF_LIFE = 20_000_000, 200_000_000
 
 
 def fallback_from(values: Mapping[str, Any]) -> Fallback:
-    """Return what the values of `FALLBACK` describe."""
+    """Return the fallback described by the values of `FALLBACK`."""
     return Fallback(values['command_timeout'], values['safe_flux'], values['safe_ramp_rate'])
 
 
 class DeviceJoint:
     """
-    An actuator on the wire; it obeys commands while its node is active.
+    Topics of an actuator, which obeys commands while its node is active.
 
-    They come from any publisher or only from the first that was seen, and from a companion of the
-    node directly: what that publishes is passed over. ``received``, ``refused``,
-    ``refused_source``, ``late`` and ``failed`` count commands that came, were refused, for their
-    publisher too, or late, and how often the device failed; ``latest`` is the largest lateness in
-    ns.
+    Commands come from any publisher, or only from the first one. A companion of the node commands
+    directly, and its publications are ignored. ``received`` counts commands, ``refused`` those
+    refused, ``refused_source`` those refused because of their publisher, and ``late`` those that
+    were late; ``failed`` counts failures of the device. ``latest`` is the largest lateness in ns.
     """
 
     def __init__(self, node: 'DeviceNode', number: int) -> None:
@@ -92,11 +91,12 @@ class DeviceJoint:
         self._applied, self._received = (
             Outlet(endpoints.publisher(node, topics.of_joint(x, self.name, names)))
             for x in (topics.FLUX_DENSITY_APPLIED, topics.FLUX_DENSITY_RECEIVED))
-        # Stamp of the newest command, when it came if that was not told yet, both in ns; and when
-        # something was told by a clock that is never set.
-        self._newest, self._came, self._told = 0, 0, 0
+        # Timestamp of the newest command; its time of arrival in ns, 0 if a receipt was published;
+        # and the time of the last receipt by the steady clock.
+        self._newest, self._came, self._reported_at = 0, 0, 0
         self._topic = topics.of_joint(topics.FLUX_DENSITY_COMMAND, self.name, names)
-        # Publishers at the last look, and the one that is obeyed if only one is.
+        # Publishers at the last look, and the identifier of the one obeyed, or ignored as
+        # companion.
         self._publishers: dict[bytes, str] = {}
         self._first: bytes | None = None
         self._only_first = node.values[COMMAND_SOURCE.name] == 'first'
@@ -111,24 +111,24 @@ class DeviceJoint:
         self._applied.publish(conversions.to_command(change.stamp, change.level, ''))
 
     def publish_receipt(self) -> None:
-        """Publish which command came last, where that is news or nothing was said for long."""
+        """Publish the newest command, after a new command or a long interval."""
         steady = monotonic_ns()
-        if steady - self._told < (_RECEIPTS if self._came else _SIGNS_OF_LIFE):
+        if steady - self._reported_at < (_RECEIPTS if self._came else _SIGNS_OF_LIFE):
             return
         self._received.publish(conversions.to_receipt(
             self.name, self._came or self._node.now(), self._newest,
             self.refuses))
-        self._came, self._told = 0, steady
+        self._came, self._reported_at = 0, steady
 
     @property
     def refuses(self) -> str:
-        """What keeps commands from being obeyed, as in a receipt."""
+        """Reason why commands are rejected, as in a receipt."""
         if self._commanded.locked or self._node.away:
             return conversions.INTERLOCK
         return conversions.CUT_OFF if self._number in self._device.cut_offs else ''
 
     def log(self, notice: Notice) -> None:
-        """Count and log what the device has noticed."""
+        """Count and log a notice of the device."""
         logger = self._node.get_logger()
         text = f'{self._of_me}{notice.text}'
         if notice.kind == Kind.LATE:
@@ -152,7 +152,7 @@ class DeviceJoint:
         self._obey(lambda: conversions.from_command(message))
 
     def poll(self) -> None:
-        """Take the commands that have come, where the node's executor does not."""
+        """Process the commands that have arrived, if the executor does not."""
         if not isinstance(self._commands, RawSubscription):
             return
         for taken in self._commands.take():
@@ -161,7 +161,7 @@ class DeviceJoint:
                     decode(data, MagneticField)))
 
     def _obeys(self, publisher: bytes) -> bool:
-        """Return whether commands that a publisher sends on the topic are obeyed."""
+        """Return whether commands of a publisher on the topic are obeyed."""
         if companion := self._node.companion:
             if publisher not in self._publishers:
                 self._publishers = endpoints.publishers_of(self._node, self._topic.name)
@@ -183,7 +183,7 @@ class DeviceJoint:
         return False
 
     def close(self) -> None:
-        """Take no more commands."""
+        """Destroy the command subscription."""
         if isinstance(self._commands, RawSubscription):
             self._commands.destroy()
         elif self._commands is not None:
@@ -192,7 +192,7 @@ class DeviceJoint:
         self._commands = None
 
     def command(self, stamp: int, level: float) -> None:
-        """Obey a level in T from a stamp in ns on, from a planner in the same process."""
+        """Apply a level in T from a timestamp in ns on, from a planner in the same process."""
         self._obey(lambda: (stamp, level))
 
     def _obey(self, read: Callable[[], tuple[int, float]]) -> None:
@@ -213,7 +213,7 @@ class DeviceJoint:
             self._node.get_logger().error(f'{self._of_me}command refused, {stays}: {why}')
 
     def crowded(self) -> bool:
-        """Return whether several publishers command this joint, and log it once."""
+        """Return whether several publishers command this joint, and log that once."""
         count = self._node.count_publishers(self._topic.name)
         if count > 1 and not self._crowded:
             self._node.get_logger().warning(
@@ -225,18 +225,18 @@ class DeviceJoint:
 
 _STAMP = Struct('<iI')
 _NUMBER = Struct('<d')
-# Numbers to find the place of each field by: no name has their bytes.
+# Values to locate each field by: their bytes do not occur in names.
 _MARKS = {'position': math.pi, 'velocity': math.e, 'effort': math.tau}
-# Encapsulation, before the stamp of the header: plain CDR, little-endian.
+# Encapsulation before the timestamp of the header: plain CDR, little-endian.
 _PLAIN = b'\x00\x01\x00\x00'
 
 
 class SamplePublisher:
     """
-    Publishes joint_states, and stretch and stretch rate of each joint where that is wanted.
+    Publish joint_states, and stretch and stretch rate of each joint if requested.
 
-    rclpy converts a message at each publishing, which takes three times as long as to put the
-    numbers of a sample into one that is serialized already.
+    rclpy converts a message at each publishing. This takes three times as long as inserting the
+    numbers of a sample into a serialized message.
     """
 
     def __init__(self, node: Node, names: Sequence[str], *, scalars: bool) -> None:
@@ -260,7 +260,7 @@ class SamplePublisher:
                 self._places, (sample.stretch, sample.rate, sample.flux_density), strict=True):
             self._data[place] = values.tobytes()
         self._states.publish(bytes(self._data))
-        # None where only joint_states are wanted.
+        # Empty if only joint_states are published.
         for (of_stretch, of_rate), stretch, rate in zip(
                 self._scalars, sample.stretch.tolist(), sample.rate.tolist(), strict=False):
             of_stretch.publish(_PLAIN + _NUMBER.pack(stretch))
@@ -269,51 +269,51 @@ class SamplePublisher:
 
 class DeviceNode(ManagedNode):
     """
-    Publishes what comes of a device in ``on_tick``; ``_go_on`` of a subclass lets it go on.
+    Publish the reports of a device in ``on_tick``; ``_go_on`` of a subclass advances the device.
 
-    A planner in the same process may give its commands directly; ``companion`` is its full name,
-    and whoever links the two does what ``on_tick`` does.
+    A planner in the same process may command the device directly. ``companion`` is its full name,
+    and the linked node replaces ``on_tick``.
     """
 
     companion = ''
-    trouble = ''  # why no command is obeyed any more
-    away = ''  # why none is at present
+    trouble = ''  # why commands are permanently rejected
+    away = ''  # why commands are temporarily rejected
     values: JointParameters
     device: Any
     _joints: Sequence[DeviceJoint] = ()
     _rivals = ''
 
     def on_tick(self) -> None:
-        """Take in the commands that have come, do what is due, and publish what comes of it."""
-        self._hear()
+        """Process the commands that have arrived, advance the device, and publish its reports."""
+        self._poll_commands()
         self._go_on()
         self._publish_news()
 
-    def _hear(self) -> None:
+    def _poll_commands(self) -> None:
         for joint in self._joints:
             joint.poll()
 
     @abstractmethod
     def _go_on(self) -> None:
-        """Let the device go on to the present time."""
+        """Advance the device to the present time."""
 
     @property
     def commanded(self) -> Any:
-        """What takes commands, and says whether it is `locked`: the device, or its thread."""
+        """The receiver of commands, with the attribute `locked`: the device, or its thread."""
         return self.device
 
     @property
     def leading_time(self) -> int | None:
-        """Time in ns, if this device is the authority on it."""
+        """Time in ns, if this device publishes the clock."""
         return None
 
     def now(self) -> int:
-        """Return the time in ns that stamps of commands are held against."""
+        """Return the time in ns on the clock of command timestamps."""
         leading = self.leading_time
         return super().now() if leading is None else leading
 
     def _open(self, joint: type[DeviceJoint]) -> None:
-        """Create the topics of samples and joints, and look at the time from now on."""
+        """Create the topics of samples and joints, and start the loop."""
         scalars, names = self.values[PUBLISH_SCALARS.name], self.values.names
         self._samples = SamplePublisher(self, names, scalars=scalars == 'always' or (
             scalars == 'auto' and len(names) == 1))
@@ -328,7 +328,7 @@ class DeviceNode(ManagedNode):
         yield self._status_of_commands()
 
     def cleanup(self) -> None:
-        """Close the inputs that no executor serves."""
+        """Close the subscriptions that no executor serves."""
         for joint in self._joints:
             joint.close()
         if self._joints:
@@ -336,13 +336,13 @@ class DeviceNode(ManagedNode):
         self._joints = ()
 
     def close(self) -> None:
-        """End with the process."""
+        """Clean up at the end of the process."""
         self.cleanup()
 
-    # -- what is published ---------------------------------------------------------------------
+    # -- publications --------------------------------------------------------------------------
 
     def _publish_news(self) -> None:
-        """Publish what has come of the device since the last time."""
+        """Publish the reports of the device since the last call."""
         if self.active and not self.trouble and not self.companion:
             for joint in self._joints:
                 joint.publish_receipt()
@@ -360,7 +360,7 @@ class DeviceNode(ManagedNode):
         self._samples.publish(sample)
 
     def _find_rivals(self) -> str:
-        """Return that other devices have a joint of this one, and log it once."""
+        """Return a message if other devices control a joint of this one, and log it once."""
         self._presence.look()
         rivals = self._presence.devices(self.values.names)
         if rivals and rivals != self._rivals:
@@ -369,7 +369,7 @@ class DeviceNode(ManagedNode):
         return rivals
 
     def _status_of_commands(self, **values: object) -> DiagnosticStatus:
-        """Return how commands fare, with more values."""
+        """Return the status of the commands, with additional values."""
         joints = self._joints
         counts = {
             'late': sum(x.late for x in joints),

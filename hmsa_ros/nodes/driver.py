@@ -1,4 +1,4 @@
-"""Driver node: real hardware in the place of the plant, written to at the stamps of commands."""
+"""Driver node: writes timestamped commands to hardware, in place of the plant."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -29,10 +29,10 @@ from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.parameters import declare_joints, JointParameters
 from hmsa_ros.nodes.runner import run
 
-# How long hardware may take to start before that is said, in s.
+# Time in s after which slow start-up of hardware is reported.
 _PATIENCE = 5.0
 
-#: Parameters that each joint may have values of its own for.
+#: Parameters that may have a separate value for each joint.
 OWN = (
     ParameterSpec(
         'flux_density_limit', 0.5,
@@ -77,9 +77,9 @@ INTERLOCK = (
         'Longest silence of a publisher that closed a required ~/interlock.', 's', 0.01, 1e3),
 )
 
-# What begins like a setting of a class, and is none.
+# Parameters that look like settings of the hardware class but belong to the node.
 _NOT_ITS_OWN = (HARDWARE.name, TIMEOUT.name, RECONNECT.name)
-#: What a start value of `HARDWARE` may be called as well.
+#: Alternative name for a start value of `HARDWARE`.
 SHORT = 'hardware'
 
 PARAMETERS = (
@@ -97,7 +97,7 @@ PARAMETERS = (
 
 
 class DriverNode(DeviceNode):
-    """Passes commands to hardware, which a thread serves, and publishes what comes of it."""
+    """Pass commands to hardware in a separate thread, and publish results and samples."""
 
     device: HardwareDevice
     worker: HardwareWorker
@@ -106,18 +106,18 @@ class DriverNode(DeviceNode):
         super().__init__(topics.DRIVER)
         given = self._parameter_overrides
         if SHORT in given:
-            # A name that is a value and a namespace breaks ``ros2 param dump``.
+            # A name that is both a value and a namespace breaks ``ros2 param dump``.
             given.setdefault(HARDWARE.name, given.pop(SHORT))
         self.values = declare_joints(self, PARAMETERS, OWN)
         self._settings = {x: self._settings_of(x) for x in self.values.names}
         self.failure: HmsaError | None = None
         required, timeout = (self.values[x.name] for x in INTERLOCK)
-        # An open interlock is also open for a driver that is configured anew.
+        # An interlock that is open stays open when the driver is configured again.
         self._interlock = Interlock(required=required, timeout=round(timeout * NANOSECONDS))
         self.autostart()
 
     def _settings_of(self, joint: str) -> dict[str, Any]:
-        """Declare the parameters that a class of hardware takes itself; return their values."""
+        """Declare the parameters of a hardware class; return their values."""
         found = {}
         for prefix in ('hardware.', f'{joint}.hardware.'):
             for name, parameter in self._parameter_overrides.items():
@@ -135,7 +135,7 @@ class DriverNode(DeviceNode):
         Raises
         ------
         HmsaError
-            If parameters are out of range, there is no such hardware, or it does not obey.
+            If parameters are out of range, or the hardware does not exist or does not respond.
 
         """
         if self.simulated:
@@ -159,7 +159,7 @@ class DriverNode(DeviceNode):
 
     @property
     def commanded(self) -> HardwareWorker:
-        """What takes commands: the thread that serves the hardware."""
+        """The thread that serves the hardware, which receives the commands."""
         return self.worker
 
     def now(self) -> int:
@@ -171,7 +171,7 @@ class DriverNode(DeviceNode):
         self.worker.switch_off()
 
     def cleanup(self) -> None:
-        """Switch the coils off, and leave the hardware alone."""
+        """Switch the coils off, and release the hardware."""
         if self._joints:
             self.worker.close()
             self.failure = self.worker.failure
@@ -179,7 +179,7 @@ class DriverNode(DeviceNode):
         super().cleanup()
 
     def _mind_interlock(self) -> None:
-        """Take in what publishers say of the interlock, and pass on whether it is open."""
+        """Process messages about the interlock, and pass on whether it is open."""
         now = monotonic_ns()
         for taken in self._lock.take():
             try:
@@ -213,7 +213,7 @@ class DriverNode(DeviceNode):
             else:
                 self.trouble = trouble
                 for joint in self._joints:
-                    # Nobody takes commands any more, and planners can see that.
+                    # Commands are no longer received, which planners can detect.
                     joint.close()
             self._diagnose()
         if self.worker.failure is not None:
@@ -236,7 +236,7 @@ class DriverNode(DeviceNode):
 def _make_device(
         name: str, values: JointParameters,
         settings: Mapping[str, Mapping[str, Any]]) -> HardwareDevice:
-    """Return the device that parameters and the name of its hardware describe."""
+    """Return the device described by the parameters and the name of its hardware."""
     rate = values[PUBLISH_RATE.name]
     return HardwareDevice(
         [HardwareJoint(
@@ -248,7 +248,7 @@ def _make_device(
 
 
 def _described(device: HardwareDevice, values: JointParameters) -> str:
-    """Return what was found, in a line."""
+    """Return a description of the hardware in one line."""
     each = []
     for joint in device.coils:
         own, coil = values.of(joint.name), joint.instrument

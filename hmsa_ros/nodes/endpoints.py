@@ -1,4 +1,4 @@
-"""Topics and services (`hmsa_ros.interfaces.topics`) on a node of rclpy."""
+"""Topics and services of `hmsa_ros.interfaces.topics` on an rclpy node."""
 
 from collections.abc import Callable, Iterable
 from importlib import import_module
@@ -29,7 +29,7 @@ def interface_class(type_name: str) -> type[Any]:
     parts = type_name.split('/')
     try:
         package, folder, name = parts
-        # The name may come from anybody's bag: nothing but an interface is ever imported.
+        # The name may come from an untrusted bag: only interfaces are imported.
         if folder not in ('msg', 'srv', 'action') or not is_interface_package(package):
             raise ImportError(type_name)
         found: type[Any] = getattr(import_module(f'{package}.{folder}'), name)
@@ -41,7 +41,7 @@ def interface_class(type_name: str) -> type[Any]:
 
 
 def profile(quality: Quality) -> QoSProfile:
-    """Return a quality of service as rclpy has it."""
+    """Return a quality of service as a profile of rclpy."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST, depth=quality.depth,
         reliability=ReliabilityPolicy.RELIABLE if quality.reliable
@@ -51,12 +51,12 @@ def profile(quality: Quality) -> QoSProfile:
 
 
 def publishers_of(node: Node, topic: str) -> dict[bytes, str]:
-    """Return who publishes a topic: full names of nodes by identifiers, as in the graph."""
+    """Return the publishers of a topic in the graph: full node names by identifier."""
     return _names(node.get_publishers_info_by_topic(node.resolve_topic_name(topic)))
 
 
 def subscribers_of(node: Node, topic: str) -> dict[bytes, str]:
-    """Return who subscribes to a topic, as `publishers_of` does."""
+    """Return the subscribers of a topic, in the form of `publishers_of`."""
     return _names(node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic)))
 
 
@@ -66,7 +66,7 @@ def _names(endpoints: Iterable[Any]) -> dict[bytes, str]:
 
 
 def publisher(node: Node, topic: Topic, owner: str = '') -> Publisher:
-    """Return a node's publisher of a topic, or of another node's private topic."""
+    """Return a publisher of a topic, or of the private topic of an owner."""
     return node.create_publisher(
         interface_class(topic.type), from_outside(topic.name, owner), profile(topic.qos))
 
@@ -74,19 +74,19 @@ def publisher(node: Node, topic: Topic, owner: str = '') -> Publisher:
 def subscribe(
         node: Node, topic: Topic, take: Callable[..., Any], owner: str = '', *,
         raw: bool = False) -> Subscription:
-    """Have ``take`` called with each message, serialized if raw, of a topic (see `publisher`)."""
+    """Call ``take`` with each message of a topic (see `publisher`), serialized if raw."""
     return node.create_subscription(
         interface_class(topic.type), from_outside(topic.name, owner), take, profile(topic.qos),
         raw=raw)
 
 
 def listen(node: Node, topic: Topic, owner: str = '') -> RawSubscription:
-    """Return a subscription to a topic (see `publisher`) whose messages are asked for."""
+    """Return a subscription to a topic (see `publisher`) whose messages are polled."""
     return RawSubscription(
         node, interface_class(topic.type), from_outside(topic.name, owner), profile(topic.qos))
 
 
 def call(node: Node, service: Service, owner: str, request: Any) -> ServiceCall:
-    """Return a node's call of another node's service."""
+    """Return a call of another node's service."""
     return ServiceCall(
         node, interface_class(service.type), from_outside(service.name, owner), request)

@@ -1,4 +1,4 @@
-"""Fields of messages by their paths, such as ``pose.position.z`` or ``data[2]``."""
+"""Fields of messages by path, such as ``pose.position.z`` or ``data[2]``."""
 
 import re
 from typing import Any
@@ -8,7 +8,7 @@ import numpy as np
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import Array
 
-#: By type, the field that is meant unless another is named.
+#: Default field by type.
 USUAL = {
     'geometry_msgs/msg/PoseStamped': 'pose.position',
     'geometry_msgs/msg/PoseWithCovarianceStamped': 'pose.pose.position',
@@ -30,14 +30,14 @@ _STEP = re.compile(r'([a-z]\w*)((?:\[\d+\])*)$')
 
 def located(type_name: str, message: Any, path: str) -> tuple[str, list[str | int], Any]:
     """
-    Return a path, or the usual one for an empty one, its steps, and what is at their end.
+    Return a path, its steps, and the value at its end; an empty path is the default one.
 
-    That is what an empty message of the type has there, or the array before an index.
+    The value is that of an empty message of the type, or the array before an index.
 
     Raises
     ------
     BadInputError
-        If it is no path, or the message does not have it, as far as an empty one shows that.
+        If the path is invalid, or an empty message shows that the field does not exist.
 
     """
     path = path or USUAL.get(type_name, '')
@@ -56,7 +56,7 @@ def located(type_name: str, message: Any, path: str) -> tuple[str, list[str | in
     value = message
     for step in way:
         if isinstance(step, int):
-            # An empty message may have none of them.
+            # An array in an empty message may have no elements.
             break
         names = [*getattr(value, 'get_fields_and_field_types', dict)()]
         if step not in names:
@@ -69,11 +69,11 @@ def located(type_name: str, message: Any, path: str) -> tuple[str, list[str | in
 
 
 def is_point(value: Any) -> bool:
-    """Return whether it has three coordinates and no fourth one."""
+    """Return whether a value has exactly three coordinates."""
     return all(hasattr(value, x) for x in AXES) and not hasattr(value, 'w')
 
 
 def numbers(value: Any) -> Array:
-    """Return a number as an array of one, or a point or vector as one of three."""
+    """Return a number as an array of one element, or a point or vector as one of three."""
     return np.array(
         [getattr(value, x) for x in AXES] if is_point(value) else [value], dtype=float)

@@ -1,7 +1,7 @@
 """
-The action FollowJointTrajectory and the state that clients of a controller look at.
+The action FollowJointTrajectory, and the state that clients of a controller read.
 
-Only where the package control_msgs is installed; `hmsa_ros.control.goals` decides.
+Requires the package control_msgs. The logic is in `hmsa_ros.control.goals`.
 """
 
 from collections.abc import Callable
@@ -29,29 +29,29 @@ from hmsa_ros.nodes.cdr import read_trajectory
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.planning import path
 
-# Feedback and states a second, as from a joint_trajectory_controller.
+# Rate of feedback and states in Hz, as for a joint_trajectory_controller.
 _RATE = 20.0
-# The newest of some joints, each of which may have a publisher of its own.
+# Queue length for the newest samples of several joints, each with its own publisher.
 _NEWEST = 20
 
 
 class FollowJointTrajectory:
     """
-    Serves the action for a planner's node; ``serve`` passes on what the runtime says.
+    Serve the action for a planner's node; ``serve`` publishes the outputs of the runtime.
 
-    A goal is executed until the planner has judged it, without a coroutine that waits: executors
-    of rclpy would call that again and again.
+    A goal is executed until the planner has judged it. No coroutine waits for that, since the
+    executors of rclpy would poll it continuously.
     """
 
     def __init__(
             self, node: ManagedNode, runtime: PlannerRuntime, serve: Callable[[], None],
             action: Any, state: Any) -> None:
-        """Create the server, which stays as long as the node and rejects goals meanwhile."""
+        """Create the server, which exists as long as the node and rejects goals meanwhile."""
         self._node, self._serve, self._action, self._state = node, serve, action, state
         self._samples: RawSubscription | None = None
         self._accepted = ''
         self._handles: dict[str, ServerGoalHandle] = {}
-        # How goals ended whose clients have not been told yet.
+        # Results of goals that their clients have not received yet.
         self._outcomes: dict[str, Outcome] = {}
         self.begin(runtime)
         path.prepare()
@@ -67,7 +67,7 @@ class FollowJointTrajectory:
         self._runtime, self._goals = runtime, Goals(runtime, self._outcomes.__setitem__)
 
     def update(self, status: StatusChanged) -> None:
-        """Take in what the planner says."""
+        """Process a status of the planner."""
         self._goals.update(status)
 
     # -- goals ---------------------------------------------------------------------------------
@@ -121,7 +121,7 @@ class FollowJointTrajectory:
         self._pass_on()
 
     def _listen(self, *, wanted: bool) -> None:
-        """Take in samples while they are wanted."""
+        """Process samples while they are needed."""
         if wanted and self._samples is None:
             self._samples = endpoints.listen(self._node, topics.JOINT_STATES)
         if self._samples is None:
@@ -154,7 +154,7 @@ class FollowJointTrajectory:
             speed_scaling_factor=1.0))
 
     def _points(self, now: int, name: str = '') -> tuple[Any, ...]:
-        """Return names of joints, and where they are to be, where they are and the difference."""
+        """Return joint names, and desired, actual and error points."""
         found = self._goals.readings(now, name)
         desired, actual = np.moveaxis(np.array([*found.values()]), 1, 0)
         return [*found], *(
@@ -162,11 +162,11 @@ class FollowJointTrajectory:
             for x in (desired, actual, desired - actual))
 
     def _pass_on(self) -> None:
-        """Tell clients how their goals ended."""
+        """Send clients the results of their goals."""
         for name, outcome in self._outcomes.items():
             handle = self._handles.pop(name, None)
             if handle is None:
-                # The client was gone before the goal was accepted.
+                # The client had disappeared before the goal was accepted.
                 continue
             if outcome.state == 'succeeded':
                 handle.succeed()

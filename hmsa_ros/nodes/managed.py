@@ -2,7 +2,7 @@
 Managed nodes: configured, activated, deactivated and cleaned up, by themselves or from outside.
 
 The states and services are those of ROS 2 (``ros2 lifecycle``, launch). With the parameter
-``autostart``, which is true by default, a node configures and activates itself when it starts.
+``autostart``, true by default, a node configures and activates itself at startup.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -38,10 +38,10 @@ class ManagedNode(LifecycleNode):
     """
     Node with the states of a managed node.
 
-    A subclass declares its parameters in ``__init__``, has `configure`, `activate`,
-    `deactivate` and `cleanup` do the work, and calls `autostart` last. Each of the four may
-    raise `HmsaError`: the transition is refused and can be tried again. While ``active`` the node
-    acts; with ``finished`` it was shut down from outside and the process is to end.
+    A subclass declares its parameters in ``__init__``, implements `configure`, `activate`,
+    `deactivate` and `cleanup`, and calls `autostart` last. Each of the four may raise `HmsaError`:
+    the transition is refused and can be tried again. The node acts while ``active``. ``finished``
+    means that it was shut down from outside and the process is to end.
     """
 
     def __init__(self, name: str) -> None:
@@ -54,8 +54,8 @@ class ManagedNode(LifecycleNode):
         self._autostart: bool = declare(self, [AUTOSTART])[AUTOSTART.name]
         self._refusal: Exception | None = None
         self._kept: set[object] = set()
-        # rclpy lets an error out of its callback, and the process with it, if a transition is
-        # asked for that does not begin in the present state.
+        # If a requested transition does not start in the present state, rclpy raises an error from
+        # its callback, which would end the process.
         change = self._service_change_state.callback
 
         def change_state(request: Any, response: Any) -> Any:
@@ -71,7 +71,7 @@ class ManagedNode(LifecycleNode):
         self._service_change_state.callback = change_state
 
     def _guard_clock(self) -> None:
-        """Pass over time before zero, which rclpy raises on: anybody could end the node so."""
+        """Ignore times before zero, whose error in rclpy would end the node."""
         source = self._time_source
         take = source.clock_callback
 
@@ -83,7 +83,7 @@ class ManagedNode(LifecycleNode):
                     f'time {message.clock.sec} s on /clock skipped: expected at least 0',
                     throttle_duration_sec=1.0)
 
-        # For a subscription that is made later, when use_sim_time is set, and the one there is.
+        # For a subscription created later, when use_sim_time is set, and for the present one.
         source.clock_callback = take_carefully
         if source._clock_sub is not None:
             source._clock_sub.callback = take_carefully
@@ -94,15 +94,15 @@ class ManagedNode(LifecycleNode):
         label: str = self._state_machine.current_state[1]
         return label
 
-    # -- what a subclass uses ------------------------------------------------------------------
+    # -- for use by subclasses -----------------------------------------------------------------
 
     def every(self, seconds: float, act: Callable[[], None]) -> Timer:
-        """Do something periodically in steady time, as simulated time may run at any pace."""
+        """Call a function periodically in steady time, whatever the pace of simulated time."""
         return self.create_timer(
             seconds, act, clock=RclpyClock(clock_type=ClockType.STEADY_TIME))
 
     def offer(self, service: topics.Service, act: Callable[..., tuple[bool, str]]) -> None:
-        """Answer calls with success and message; ``act`` gets the data of a request with any."""
+        """Offer a service that returns success and message; ``act`` gets any request data."""
         def answer(request: Any, response: Any) -> Any:
             try:
                 response.success, response.message = (
@@ -115,7 +115,7 @@ class ManagedNode(LifecycleNode):
 
     def diagnose(
             self, report: Callable[[], Iterable[DiagnosticStatus]]) -> Callable[[], None]:
-        """Publish statuses once a second; return what publishes them at once."""
+        """Publish statuses once a second; return a function that publishes immediately."""
         publisher = Outlet(endpoints.publisher(self, topics.DIAGNOSTICS))
 
         def publish() -> None:
@@ -126,7 +126,7 @@ class ManagedNode(LifecycleNode):
         return publish
 
     def on_change(self, take: Callable[[Mapping[str, Any]], None]) -> None:
-        """Have values that are set, by name, taken together, or refused by `BadInputError`."""
+        """Call ``take`` with changed values by name; its `BadInputError` refuses them."""
         def change(parameters: Sequence[Parameter]) -> SetParametersResult:
             try:
                 take(checked(self, parameters))
@@ -138,7 +138,7 @@ class ManagedNode(LifecycleNode):
 
     def complain(self, sentence: str, failure: bool) -> None:
         """Log a failure or a warning."""
-        # On two lines: rclpy lets no line log with two severities.
+        # On two lines, because rclpy forbids two severities on one line.
         if failure:
             self.get_logger().error(sentence)
         else:
@@ -154,31 +154,31 @@ class ManagedNode(LifecycleNode):
         return int(self.get_clock().now().nanoseconds)
 
     def keep(self, *entities: object) -> None:
-        """Keep what was created when the node is cleaned up."""
+        """Exclude entities from destruction when the node is cleaned up."""
         self._kept |= {*entities}
 
-    # -- what a subclass does ------------------------------------------------------------------
+    # -- to be overridden by subclasses --------------------------------------------------------
 
     def configure(self) -> None:
-        """Create what the node works with; it does not act yet."""
+        """Create the node's entities; it does not act yet."""
 
     def activate(self) -> None:
-        """Begin to act."""
+        """Start to act."""
 
     def deactivate(self) -> None:
-        """Cease to act."""
+        """Stop acting."""
 
     def cleanup(self) -> None:
-        """Give back what is no publisher, subscription, service, client or timer."""
+        """Release everything except publishers, subscriptions, services, clients and timers."""
 
     def autostart(self) -> None:
         """
-        Refuse unknown parameters; configure and activate, if the parameter says so.
+        Refuse unknown parameters; configure and activate if the parameter requests it.
 
         Raises
         ------
         HmsaError
-            If the node refuses; it refuses the start then.
+            If the node refuses, which refuses the start.
 
         """
         check_names(self)
@@ -193,7 +193,7 @@ class ManagedNode(LifecycleNode):
     # -- transitions ---------------------------------------------------------------------------
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Configure; what a refused one has created is destroyed."""
+        """Configure; destroy what a refused attempt has created."""
         self._kept = self._entities()
         result = self._attempt('configure', self.configure)
         if result != TransitionCallbackReturn.SUCCESS:
@@ -213,14 +213,14 @@ class ManagedNode(LifecycleNode):
         return result
 
     def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Clean up: destroy what was created since the node was configured."""
+        """Clean up: destroy the entities created since the node was configured."""
         result = self._attempt('clean up', self.cleanup)
         if result == TransitionCallbackReturn.SUCCESS:
             self._destroy()
         return result
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Deactivate and clean up as far as it is needed, then end."""
+        """Deactivate and clean up as needed, then end."""
         if self.active:
             self.on_deactivate(state)
         if state.label != 'unconfigured':
@@ -229,10 +229,10 @@ class ManagedNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def _attempt(self, name: str, act: Callable[[], None]) -> TransitionCallbackReturn:
-        """Do what belongs to a transition; an error refuses it."""
+        """Execute a transition; an error refuses it."""
         try:
             act()
-        except Exception as error:  # rclpy would drop it without a word
+        except Exception as error:  # rclpy would discard it silently
             self._refusal = error
             if not isinstance(error, HmsaError) or not self._autostart:
                 self.get_logger().error(f'cannot {name}: {error}')
@@ -244,7 +244,7 @@ class ManagedNode(LifecycleNode):
                 *self.timers}
 
     def _destroy(self) -> None:
-        """Destroy what was not there before the node was configured."""
+        """Destroy the entities created since the node was configured."""
         for found, destroy in (
                 (self.timers, self.destroy_timer),
                 (self.subscriptions, self.destroy_subscription),
@@ -258,10 +258,10 @@ class ManagedNode(LifecycleNode):
 
 def silence(entity: Any) -> None:
     """
-    Have what is about to be destroyed do nothing any more.
+    Replace the callback of an entity that is about to be destroyed.
 
-    The executor holds events that came for it during the present callback, and serves them later:
-    a destroyed timer would act once more, and a destroyed service raise an error as it answers.
+    The executor stores events that arrived during the present callback, and handles them later: a
+    destroyed timer would fire again, and a destroyed service would raise an error on its response.
     """
     def nothing(*_: object) -> None:
         pass
@@ -274,11 +274,11 @@ def silence(entity: Any) -> None:
 
 class _CarefulParameterService(ParameterService):
     """
-    The parameter services of rclpy, which refuse what they cannot read.
+    The parameter services of rclpy, with invalid requests refused.
 
-    Those of rclpy raise an error on a value whose type does not exist, and with it end the
-    node: anybody in the domain could end it with one message. They list parameters that have no
-    value, and answer nothing at all where the value of one of them is asked for.
+    The original services raise an error on a value of unknown type and thereby end the node: any
+    participant in the domain could end it with one message. They list parameters without value,
+    and do not respond if the value of one of them is requested.
     """
 
     def _list_parameters_callback(self, request: Any, response: Any) -> Any:
@@ -296,7 +296,7 @@ class _CarefulParameterService(ParameterService):
         return response
 
     def _set_parameters_callback(self, request: Any, response: Any) -> Any:
-        # One at a time: what cannot be read is no reason to refuse the others.
+        # One at a time, so that an invalid value does not refuse the others.
         response.results = [
             self._set_parameters_atomically_callback(
                 SetParametersAtomically.Request(parameters=[x]),

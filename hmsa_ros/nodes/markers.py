@@ -1,18 +1,18 @@
 """
-The actuators as markers for a 3-D view.
+Markers of the actuators for a 3-D view.
 
-Each joint has a namespace of its own with fixed identifiers, so that a message replaces the one
-before. The plant shows what is, the planner where it is to go. Both place their joints alike:
-in rows along x, a new row along y after `ROW` of them, the origin in their middle.
+Each joint has a separate namespace with fixed identifiers, so that a message replaces the previous
+one. The plant shows the present state, the planner the targets. Both use the same layout: rows
+along x, a new row along y after `ROW` joints, the origin in the middle.
 
-A block keeps its volume: along the field, which is z, it measures 2 H times the stretch, across
-it 2 L over the square root of the stretch. The magnetisation moves with the material, so that
-the remanence in the deformed block is Br times the stretch. It and the applied field are arrows
-of one scale: as long as H for each Br, upwards where positive.
+The volume of a block is constant. Along the field, which is z, it measures 2 H times the stretch;
+across the field, 2 L over the square root of the stretch. The magnetisation moves with the
+material, so that the remanence of the deformed block is Br times the stretch. Remanence and
+applied field are arrows of the same scale: length H for a flux density of Br, upwards if positive.
 
-A beam lies along x, clamped at the end of smaller x, and bends towards z. The arrow of its
-magnetisation is along its middle and as long as half of it; that of the field is as long as the
-deflection of a beam that would not stiffen.
+A beam lies along x, is clamped at the end of smaller x, and bends towards z. The arrow of its
+magnetisation lies along its middle, with half its length. The arrow of the field is as long as the
+deflection of a beam without stiffening.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -42,18 +42,18 @@ from hmsa_ros.nodes.parameters import JointParameters
 
 #: Identifiers of a joint's markers, the same in every message.
 BLOCK, MAGNETISATION, FIELD, LABEL, TARGET = range(5)
-#: Joints side by side before the next row begins.
+#: Number of joints in a row.
 ROW = 8
-#: From block to block, in half lengths of the largest: a block pressed flat to half its
-#: thickness is 2.83 half lengths wide, and its field stands beside it.
+#: Distance of blocks in half lengths of the largest: a block compressed to half its thickness is
+#: 2.83 half lengths wide, and its field is drawn beside it.
 PITCH = 6.0
-#: From the middle of a block to its field, in half lengths.
+#: Distance from the middle of a block to its field, in half lengths.
 BESIDE = 2.0
-# Along a beam.
+# Number of cross-sections along a beam.
 _STATIONS = 17
 
-# By number the shape and its colour, of Okabe and Ito's palette: orange, blue, vermilion, grey,
-# sky blue. What is seen through is the material.
+# Shape and colour by identifier, from the palette of Okabe and Ito: orange, blue, vermilion, grey,
+# sky blue. Transparent shapes are the material.
 _LOOKS = {
     BLOCK: (Marker.CUBE, (0.90, 0.62, 0.00, 0.55)),
     MAGNETISATION: (Marker.ARROW, (0.00, 0.45, 0.70, 1.0)),
@@ -65,7 +65,7 @@ _LOOKS = {
 @dataclass(frozen=True)
 class Block:
     """
-    What stays the same of a joint while it moves.
+    Constant properties of a joint.
 
     Raises
     ------
@@ -74,14 +74,14 @@ class Block:
 
     """
 
-    joint: str  #: its name, the namespace of its markers
+    joint: str  #: name of the joint and namespace of its markers
     #: L and H in m, greater than 0
     half_length: float
     half_thickness: float
     remanence: float  #: Br in T, greater than 0
-    per_tesla: float = 1.0  #: length of the arrow of the field in m/T, of a voltage in m/V
+    per_tesla: float = 1.0  #: arrow length of the field in m/T, or of a voltage in m/V
     width: float = 0.0  #: width of a beam in m; 0 for a block
-    capacitance: bool = False  #: whether positions are capacitances, of what is not magnetised
+    capacitance: bool = False  #: whether positions are capacitance ratios, without magnetisation
 
     def __post_init__(self) -> None:
         if not self.joint:
@@ -101,7 +101,7 @@ class Block:
 
     def bent(self, deflection: float) -> list[tuple[float, float, float]]:
         """
-        Return triangles, corners in m, of a beam whose tip is deflected by a share of its length.
+        Return triangle corners in m of a beam, given its tip deflection over its length.
 
         The origin is the middle of the straight beam.
         """
@@ -109,7 +109,7 @@ class Block:
         angle = tangent(deflection, np.linspace(0.0, 1.0, _STATIONS))
         x, z = along - self.half_length, across
         normal = self.half_thickness * np.stack([-np.sin(angle), np.cos(angle)])
-        # Round the section: four corners at each station.
+        # Four corners of the cross-section at each station.
         rings = [[(float(x[i] + s * normal[0, i]), t * self.width / 2,
                    float(z[i] + s * normal[1, i]))
                   for s, t in ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))]
@@ -124,18 +124,18 @@ class Block:
         return points
 
     def thickness(self, position: float) -> float:
-        """Return the stretch along z at a position, itself unless that is a capacitance."""
+        """Return the stretch along z at a position, which may be a capacitance ratio."""
         return position ** -0.5 if self.capacitance else position
 
     def size(self, position: float) -> tuple[float, float, float]:
-        """Return 2 l, 2 l and 2 h in m at a position; the volume stays as it is."""
+        """Return 2 l, 2 l and 2 h in m at a position; the volume is constant."""
         stretch = self.thickness(position)
         side = 2.0 * self.half_length / math.sqrt(stretch)
         return side, side, 2.0 * self.half_thickness * stretch
 
 
 class State(NamedTuple):
-    """Stretch, or deflection of a beam, and flux density along z in T of a joint at a moment."""
+    """Stretch, or deflection of a beam, and flux density along z in T of a joint."""
 
     stretch: float
     flux_density: float
@@ -143,16 +143,16 @@ class State(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """Where and how large joints are shown."""
+    """Layout and scale of the joints."""
 
-    blocks: tuple[Block, ...]  #: one a joint, in the order of the parameter ``joints``
+    blocks: tuple[Block, ...]  #: one for each joint, in the order of ``joints``
     frame: str  #: frame of the markers
-    scale: float = 1.0  #: metres shown for a metre, greater than 0; 1 is true to size
-    #: seconds after which a viewer drops what was not sent again, 0 for never
+    scale: float = 1.0  #: metres shown per metre, greater than 0; 1 is true to size
+    #: seconds after which a viewer removes a marker that was not sent again, 0 for never
     lifetime: float = 0.0
 
     def places(self) -> list[tuple[float, float]]:
-        """Return x and y of the blocks in m before scaling; their middle is the origin."""
+        """Return x and y of the blocks in m before scaling, centred at the origin."""
         pitch = PITCH * max((block.half_length for block in self.blocks), default=0.0)
         count = len(self.blocks)
         columns, rows = min(count, ROW), -(-count // ROW)
@@ -162,13 +162,13 @@ class Scene:
             for number in range(count)]
 
     def states(self, stamp: int, states: Sequence[State]) -> MarkerArray:
-        """Return for each joint block, arrows and label; an unknown field's arrow is deleted."""
+        """Return block, arrows and label of each joint; an unknown field deletes its arrow."""
         return MarkerArray(markers=[
             marker for drawing, state in zip(self._drawings(stamp), states, strict=True)
             for marker in drawing.state(state)])
 
     def targets(self, stamp: int, stretches: Sequence[float | None]) -> MarkerArray:
-        """Return see-through blocks at their targets; None deletes a joint's marker."""
+        """Return transparent blocks at the targets; None deletes a joint's marker."""
         return MarkerArray(markers=[
             drawing.deleted(TARGET) if stretch is None else drawing.body(TARGET, stretch)
             for drawing, stretch in zip(self._drawings(stamp), stretches, strict=True)])
@@ -180,7 +180,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class _Drawing:
-    """Markers of one joint of a scene at a stamp in ns; x and y of its middle in m."""
+    """Markers of one joint of a scene at a timestamp in ns; x and y of its middle in m."""
 
     scene: Scene
     stamp: int
@@ -217,7 +217,7 @@ class _Drawing:
             number, pose=self._pose(0.0), scale=Vector3(x=size.x, y=size.y, z=size.z))
 
     def deleted(self, number: int) -> Marker:
-        """Return what deletes a marker."""
+        """Return a message that deletes a marker."""
         return self._marker(number, action=Marker.DELETE)
 
     def _along(self, deflection: float) -> Marker:
@@ -233,11 +233,11 @@ class _Drawing:
         return marker
 
     def _arrow(self, number: int, length: float, beside: float = 0.0) -> Marker:
-        """Return an arrow along z about the block's middle, downwards for a negative length."""
+        """Return an arrow along z around the block's middle, downwards for a negative length."""
         if length == 0.0:
-            # An arrow of no length has no direction, which viewers complain of.
+            # An arrow of zero length has no direction, which viewers report as an error.
             return self.deleted(number)
-        # Diameters of shaft and head, and the head's length, no longer than half the arrow.
+        # Diameters of shaft and head, and length of the head, at most half the arrow.
         thickness = 0.12 * self.block.half_length * self.scene.scale
         return self._marker(
             number, pose=Pose(orientation=Quaternion(w=1.0)),
@@ -271,13 +271,13 @@ MARKER_RATE = ParameterSpec(
     0.0, 1e3)
 MARKER_FRAME = ParameterSpec('frame_id', 'coil', 'Frame of the markers.')
 
-# A viewer drops what was not sent for this long, or for so many periods.
+# A viewer removes a marker that was not sent for this time, or for this number of periods.
 _LIFETIME_SECONDS = 2.0
 _LIFETIME_PERIODS = 10.0
 
 
 def scene_from(values: JointParameters, lifetime: float = 0.0) -> Scene:
-    """Return the scene of a node's joints, one block each; lifetime in s, 0 for ever."""
+    """Return the scene of a node's joints, one block each; lifetime in s, 0 for unlimited."""
     return Scene(
         tuple(Block.of(name, actuator_from(values.of(name))) for name in values.names),
         values[MARKER_FRAME.name], values[MARKER_SCALE.name], lifetime)
@@ -287,10 +287,9 @@ def show_states(
         node: ManagedNode, values: JointParameters, pace: float,
         states: Callable[[], tuple[int, Sequence[State]]]) -> None:
     """
-    Publish the joints as they are, with a stamp in ns, at ``marker_rate``, while somebody looks.
+    Publish the state of the joints at ``marker_rate``, with a timestamp in ns, if subscribed to.
 
-    ``pace`` is how many seconds of the node's time, in which lifetimes are counted, pass in a
-    second; 0 if it has no bound.
+    ``pace`` is the node's time, which lifetimes refer to, per second of real time; 0 if unlimited.
     """
     publisher = endpoints.publisher(node, topics.MARKERS)
     rate: float = values[MARKER_RATE.name]
@@ -303,12 +302,12 @@ def show_states(
         if publisher.get_subscription_count():
             publisher.publish(scene.states(*states()))
 
-    # The eye's time, whatever pace simulated time has.
+    # The period is in real time, whatever the pace of simulated time.
     node.every(1.0 / rate, show)
 
 
 class TargetMarkers:
-    """Publishes where the joints are to go, whenever that changes."""
+    """Publish the targets of the joints whenever they change."""
 
     def __init__(self, node: Node, values: JointParameters) -> None:
         self._publisher = endpoints.publisher(node, topics.MARKERS)
@@ -316,7 +315,7 @@ class TargetMarkers:
         self._shown: Any = None
 
     def show(self, stamp: int, stretches: Mapping[str, float | None]) -> None:
-        """Show targets (stamp in ns, stretches by joint, None for none) if they have changed."""
+        """Publish targets (timestamp in ns, stretches by joint, None for none) if they changed."""
         wanted = tuple(stretches.get(block.joint) for block in self._scene.blocks)
         if wanted != self._shown:
             self._shown = wanted

@@ -1,8 +1,8 @@
 """
-Publishing without Python's lock.
+Publish without holding Python's global lock.
 
-rclpy keeps the lock while the middleware sends. What hangs there, as a send to a host that is
-gone may, would keep all threads waiting, also the one that looks after a coil.
+rclpy holds the lock while the middleware sends. A send that blocks, for example to a host that has
+disappeared, would block all threads, including the one that serves a coil.
 """
 
 import ctypes
@@ -17,7 +17,7 @@ from hmsa_ros.nodes.capture import Buffer
 
 @cache
 def _function() -> Any:
-    """Return rcl's own function; a call by `ctypes.CDLL` gives Python's lock away meanwhile."""
+    """Return rcl's function; calls through `ctypes.CDLL` release Python's global lock."""
     found = ctypes.CDLL('librcl.so').rcl_publish_serialized_message
     found.argtypes = [ctypes.c_void_p] * 3
     found.restype = ctypes.c_int
@@ -25,7 +25,7 @@ def _function() -> Any:
 
 
 class Outlet:
-    """Publishes with a publisher of rclpy, from one thread, while others run."""
+    """Publish from one thread with a publisher of rclpy, while other threads run."""
 
     def __init__(self, publisher: Publisher) -> None:
         self._publisher = publisher
@@ -34,7 +34,7 @@ class Outlet:
         self._address = ctypes.byref(self._buffer)
 
     def publish(self, message: Any) -> None:
-        """Publish a message, or bytes that are one already."""
+        """Publish a message, or bytes of a serialized one."""
         data = message if isinstance(message, bytes) else serialize_message(message)
         self._buffer.buffer = ctypes.cast(ctypes.c_char_p(data), ctypes.c_void_p).value
         self._buffer.length = self._buffer.capacity = len(data)
@@ -42,5 +42,5 @@ class Outlet:
         with handle:
             failed = self._send(handle.pointer, self._address, None)
         if failed:
-            # rclpy's own way tells why.
+            # rclpy raises an error with the reason.
             self._publisher.publish(data)

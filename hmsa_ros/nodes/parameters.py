@@ -1,10 +1,10 @@
 """
 ROS parameters of a node, each declared from its `ParameterSpec`, for all joints or for one.
 
-The files under ``config/`` are held against them by a test. A parameter of the actuator is
-declared once for all joints. Where the parameter ``joints`` names them, each may have a value of
-its own beside it: ``left.actuator.remanence`` overrides ``actuator.remanence`` for the joint
-``left``, and is not set unless somebody sets it.
+A test compares the files under ``config/`` with them. A parameter of the actuator is declared once
+for all joints. If the parameter ``joints`` names them, each joint may override it:
+``left.actuator.remanence`` takes precedence over ``actuator.remanence`` for the joint ``left``. An
+override has no value until it is set.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -26,9 +26,9 @@ from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.actuator import completed
 from hmsa_ros.interfaces.parameters import FIXED, JOINT, LAW, ParameterSpec, present_name
 
-# What hmsa identify once wrote beside the rest.
+# Names written by earlier versions of hmsa identify.
 _ONCE = {'identification.verdict', 'identification.noise_std'}
-# What PyYAML takes for a text.
+# Numbers that PyYAML reads as text.
 _POWER = re.compile(r'[+-]?\d+e[+-]\d+')
 _DECLARED: WeakKeyDictionary[Node, dict[str, ParameterSpec]] = WeakKeyDictionary()
 
@@ -82,10 +82,10 @@ def type_of(spec: ParameterSpec) -> Parameter.Type:
 
 def typed(spec: ParameterSpec, given: Parameter) -> Parameter:
     """
-    Return what is given as a parameter of the type declared, or as it is if it cannot be one.
+    Return a given parameter with its declared type, or unchanged if it cannot be converted.
 
-    The tools of ROS guess the type from the text: that of an empty list is unknown, ``off`` is a
-    truth value, and 5e-05 a text.
+    The ROS tools infer the type from the text: an empty list has no type, ``off`` is a boolean,
+    and 5e-05 is a text.
     """
     value = given.value
     if type(spec.default) is float and isinstance(value, str) and _POWER.fullmatch(value):
@@ -101,7 +101,7 @@ def typed(spec: ParameterSpec, given: Parameter) -> Parameter:
 
 def declare_one(node: Node, spec: ParameterSpec, default: Any = None) -> Any:
     """
-    Declare a parameter with a default, or without one and then perhaps a value; return its value.
+    Declare a parameter and return its value; None if it has neither default nor value.
 
     Raises
     ------
@@ -118,14 +118,14 @@ def declare_one(node: Node, spec: ParameterSpec, default: Any = None) -> Any:
         value = overrides[spec.name].value if spec.name in overrides else default
         if value is not None:
             value = spec.taken(value)
-            # rclpy would take an empty list for one of bytes.
+            # rclpy would read an empty list as one of bytes.
             node._parameters[spec.name] = Parameter(spec.name, kind, value)
         return value
     try:
         value = node.declare_parameter(
             spec.name, kind if default is None else default, descriptor(spec)).value
     except ParameterException as error:
-        # rclpy's message does not name what was expected.
+        # The message of rclpy does not state the expected type.
         expected = type(spec.default).__name__
         if spec.minimum is not None or spec.maximum is not None:
             expected += f', {spec.range_text()}'
@@ -136,7 +136,7 @@ def declare_one(node: Node, spec: ParameterSpec, default: Any = None) -> Any:
 
 
 def _declared(node: Node) -> dict[str, ParameterSpec]:
-    """Return what is declared on a node by name; what is set later gets the types of these."""
+    """Return the declared parameters of a node by name, to which later values are converted."""
     if node not in _DECLARED:
         specs = _DECLARED[node] = {}
         node.add_pre_set_parameters_callback(lambda given: [
@@ -146,12 +146,12 @@ def _declared(node: Node) -> dict[str, ParameterSpec]:
 
 def checked(node: Node, given: Iterable[Parameter]) -> dict[str, Any]:
     """
-    Return what is set of a node's declared parameters, by name, as the node uses it.
+    Return given values of a node's declared parameters by name, as the node uses them.
 
     Raises
     ------
     BadInputError
-        If a value is of another type, out of range or not one of the choices.
+        If a value has the wrong type, is out of range or is not one of the choices.
 
     """
     specs = _declared(node)
@@ -159,9 +159,9 @@ def checked(node: Node, given: Iterable[Parameter]) -> dict[str, Any]:
 
 
 def from_files(node: Node, values: Mapping[str, Any], joint: str = '') -> Mapping[str, Any]:
-    """Return constants of the law out of a file which the start values name, by plain name."""
-    # As parameters they are recorded with the rest: a bag can be verified without the file. Of a
-    # joint, own values go before those for all; nothing is read where it has none.
+    """Return constants of the law, by plain name, from a file named by the start values."""
+    # As parameters, they are recorded with the others, and a bag can be verified without the file.
+    # Values of a joint take precedence; a joint without its own values reads no file.
     given = {spec.name: found.value for spec in LAW if (found := node._parameter_overrides.get(
         f'{joint}.{spec.name}' if joint else spec.name)) is not None}
     if joint and not given:
@@ -172,7 +172,7 @@ def from_files(node: Node, values: Mapping[str, Any], joint: str = '') -> Mappin
 
 
 def check_former_names(names: Iterable[str]) -> None:
-    """Refuse names that parameters had in earlier versions by `BadInputError`."""
+    """Raise `BadInputError` for parameter names of earlier versions."""
     for name in names:
         if (new := present_name(name)) != name:
             raise BadInputError(f'parameter {name} has been renamed: expected {new}')
@@ -180,18 +180,18 @@ def check_former_names(names: Iterable[str]) -> None:
 
 def check_names(node: Node) -> None:
     """
-    Refuse start values of parameters that a node, all of whose are declared, does not have.
+    Check that a node, which has declared all its parameters, has those with a start value.
 
     Raises
     ------
     BadInputError
-        If a name is unknown; the nearest one is suggested.
+        If a name is unknown; the closest one is suggested.
 
     """
     # Files may have sections for several nodes: names of other nodes of the package pass.
     unknown = [x for x in node._parameter_overrides
                if not node.has_parameter(x) and not x.startswith('qos_overrides.')
-               # Of the driver, which gives them to a laboratory's class.
+               # Parameters of the driver's hardware class.
                and 'hardware' not in x.split('.')[:2]]
     if not unknown:
         return
@@ -200,7 +200,7 @@ def check_names(node: Node) -> None:
     joints = node.get_parameter('joints').value or () if node.has_parameter('joints') else None
     for name in unknown:
         joint, _, rest = name.partition('.')
-        # A recorder has no parameter that would say which joints there are.
+        # A recorder has no parameter that lists the joints.
         if name in others or rest in others and (joints is None or joint in joints):
             continue
         near = difflib.get_close_matches(name, [*node._parameters, *others], 1, 0.0)
@@ -214,18 +214,18 @@ JOINTS = ParameterSpec(
     'Joint names, if there are several or if one has its own parameters, such as '
     'left.actuator.remanence; empty for the single joint named by joint.')
 
-# A token of a ROS name: the joint is a part of the names of its topics.
+# A token of a ROS name, since joint names are parts of topic names.
 _TOKEN = re.compile(r'[A-Za-z][A-Za-z0-9_]*')
 
 
 def joint_names(values: Mapping[str, Any]) -> tuple[str, ...]:
     """
-    Return the joints that ``joint`` and ``joints`` name: at least one, all different.
+    Return the joints named by ``joint`` and ``joints``: at least one, all different.
 
     Raises
     ------
     BadInputError
-        If a name cannot be a part of a topic's name, or is there twice.
+        If a name cannot be part of a topic name, or is repeated.
 
     """
     names = tuple(values[JOINTS.name])
@@ -243,7 +243,7 @@ def joint_names(values: Mapping[str, Any]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class JointParameters:
-    """Values of a node's parameters, for all joints and for each."""
+    """Values of a node's parameters, for all joints and for each one."""
 
     names: tuple[str, ...]  #: the joints
     values: Mapping[str, Any]  #: by full name; an override that is not set is missing
@@ -253,7 +253,7 @@ class JointParameters:
         return self.values[name]
 
     def of(self, joint: str) -> dict[str, Any]:
-        """Return the values of one joint by name, its own before those for all."""
+        """Return the values of one joint by name, where its own values take precedence."""
         found = {}
         for name, value in self.values.items():
             of, _, rest = name.partition('.')
@@ -263,12 +263,12 @@ class JointParameters:
 
     def each(self, make: Callable[[str, dict[str, Any]], Any]) -> dict[str, Any]:
         """
-        Return by joint what is made of its name and values.
+        Return the results of a function of name and values, by joint.
 
         Raises
         ------
         BadInputError
-            If one is refused; it names the joint where there are several.
+            If a joint's values are refused; the message names the joint if there are several.
 
         """
         found = {}
@@ -282,7 +282,7 @@ class JointParameters:
         return found
 
     def changed(self, given: Mapping[str, Any]) -> 'JointParameters':
-        """Return a copy with other values, by full name."""
+        """Return a copy with changed values, by full name."""
         return replace(self, values={**self.values, **given})
 
 
@@ -290,12 +290,12 @@ def declare_joints(
         node: Node, specs: Sequence[ParameterSpec],
         own: Sequence[ParameterSpec]) -> JointParameters:
     """
-    Declare parameters, those of ``own`` once more for each joint; return their values.
+    Declare parameters, those of ``own`` also for each joint; return their values.
 
     Raises
     ------
     BadInputError
-        If a value has the wrong type or is out of range, or a joint's name cannot be one.
+        If a value has the wrong type or is out of range, or a joint has an invalid name.
 
     """
     values = dict(declare(node, specs))

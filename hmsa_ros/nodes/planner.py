@@ -1,4 +1,4 @@
-"""Planner node: setpoints in, the shaped stream of stamped flux density commands out."""
+"""Planner node: converts setpoints into a shaped stream of timestamped flux density commands."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -39,34 +39,34 @@ if TYPE_CHECKING:
 
 PARAMETERS = SPECS
 
-# How often the runtime is served while something is due soon, and how seldom while nothing is;
-# simulated time may run at any pace, and is read often.
+# Periods of serving the runtime while work is due soon, and while none is; simulated time has any
+# pace and is read often.
 _POLL_NS = 2_000_000
 _LONGEST_POLL_NS = 100_000_000
-# Whoever publishes samples, reliably or not, is understood.
+# Matches publishers of samples with any reliability.
 _SAMPLES = replace(topics.JOINT_STATES, qos=topics.Quality(1000, reliable=False))
-# The newest of some joints, each of which may have a publisher of its own.
+# Queue for the newest samples of several joints, each with its own publisher.
 _NEWEST = replace(topics.JOINT_STATES, qos=topics.Quality(20, reliable=False))
-# How long samples are listened to after they were wanted last: a subscription takes time to match.
+# Time in ns that a subscription to samples is kept after use, since it takes time to match.
 _LINGER_NS = 2 * NANOSECONDS
-# How seldom they are read, and how many at once, before commands have their turn again. For an
-# executor to call for each of a thousand a second takes longer than reading it does.
+# Reading interval in ns, and number of samples read before commands are served again. A callback
+# of the executor takes longer than reading a sample.
 _READ_NS, _AT_ONCE = 10_000_000, 25
 
 
 class PlannerNode(ManagedNode):
-    """Connects `hmsa_ros.control.planner.PlannerRuntime` to topics, services and the clock."""
+    """Connect `hmsa_ros.control.planner.PlannerRuntime` to topics, services and the clock."""
 
-    #: Whether the device is in the same process: whoever links them serves the runtime.
+    #: Whether a linked device in the same process serves the runtime.
     linked = False
 
     def __init__(self) -> None:
         super().__init__(topics.PLANNER)
         self._settings = declare_joints(self, PARAMETERS, OWN)
         self._aside = Aside(self.get_logger().warning)
-        # The executor would keep an event for each message on /clock, without limit where the node
-        # cannot keep up with them. This subscription, read by `now`, keeps the newest alone. It is
-        # not for a node that has to take commands in before the time published after them.
+        # The executor would store an event for each message on /clock, without limit if the node
+        # cannot keep up. This subscription, read by `now`, only keeps the newest. It is unsuitable
+        # for a node that must process commands before the time published after them.
         self._ticks: RawSubscription | None = None
         self._time_source._subscribe_to_clock_topic = self._follow_clock
         if self.simulated:
@@ -117,8 +117,8 @@ class PlannerNode(ManagedNode):
         self.offer(topics.RESET_ESTIMATE, lambda: (True, self._runtime.feedback.reset()))
         self.offer(topics.SAVE_ESTIMATE, lambda: (
             True, self._runtime.feedback.save(by_joint=bool(self._settings['joints']))))
-        # Timers on simulated time fire once a /clock message at the most, and what is due is
-        # decided by the node's clock anyhow.
+        # Timers on simulated time fire at most once for each /clock message, and the node's clock
+        # decides what is due.
         self._poll = self.every(_POLL_NS / NANOSECONDS, self._serve)
         if self.linked:
             self._poll.cancel()
@@ -135,7 +135,7 @@ class PlannerNode(ManagedNode):
         self._serve()
 
     def _offer_action(self) -> 'FollowJointTrajectory | None':
-        """Return the server of the action, or None where its messages are not installed."""
+        """Return the action server, or None if its messages are not installed."""
         try:
             interfaces = [
                 endpoints.interface_class(x.type) for x in (topics.FOLLOW, topics.FOLLOW.state)]
@@ -143,22 +143,22 @@ class PlannerNode(ManagedNode):
             self.get_logger().info(
                 f'no action {topics.FOLLOW.name}: it needs the package control_msgs')
             return None
-        # Actions take time to load, for which others need not wait.
+        # Actions take time to import, and other nodes do not need them.
         from hmsa_ros.nodes.follow import FollowJointTrajectory
         return FollowJointTrajectory(self, self._runtime, self._serve, *interfaces)
 
     def activate(self) -> None:
-        """Take requests; the first of them reads the state in force."""
+        """Accept requests; the first one reads the actual state."""
         self._runtime.active = True
         self._serve()
 
     def deactivate(self) -> None:
-        """Come to rest, for which all commands are sent now, and send nothing more."""
+        """Come to rest, sending all commands for that now, and send nothing more."""
         self._runtime.deactivate()
         self._serve()
 
     def cleanup(self) -> None:
-        """Forget the plans."""
+        """Drop the plans."""
         self._aside.close()
         self._jump.unregister()
         self._presence.close()
@@ -170,7 +170,7 @@ class PlannerNode(ManagedNode):
         self._samples = self._newest = None
 
     def close(self) -> None:
-        """End the process that estimates."""
+        """End the estimation process."""
         self._aside.close()
 
     # -- in ------------------------------------------------------------------------------------
@@ -190,7 +190,7 @@ class PlannerNode(ManagedNode):
         return verdict.severity < records.Severity.ERROR, verdict.message
 
     def _read_samples(self) -> bool:
-        """Take in samples that have come, as far as they are of use; return if more may wait."""
+        """Process the samples that have arrived; return whether more may wait."""
         if self._samples is None:
             return False
         before, self._read = self._read, monotonic_ns()
@@ -200,9 +200,9 @@ class PlannerNode(ManagedNode):
         return len(samples) == _AT_ONCE
 
     def _take_sample(self, taken: Taken, after: int) -> None:
-        """Take in a sample that came after a steady time in ns."""
-        # Most of a thousand samples a second are of no use, and reading them takes time. Those of
-        # two plants are not of one actuator.
+        """Process a sample that arrived after a steady time in ns."""
+        # Most of a thousand samples a second are not needed, and decoding takes time. Samples of
+        # two plants do not belong to one actuator.
         if self._runtime.crowded or not self._runtime.looks_at(stamp_of(taken.data)):
             return
         try:
@@ -210,19 +210,19 @@ class PlannerNode(ManagedNode):
         except BadInputError as error:
             self.get_logger().error(f'sample ignored: {error}', throttle_duration_sec=1.0)
             return
-        # The clock may have been set since it came. It is read last, so that no pause in between
-        # makes a sample come before it was made.
+        # The clock may have been set since the sample arrived. It is read last, so that a pause in
+        # between cannot make a sample arrive before it was taken.
         ago = min(self._ago(taken), monotonic_ns() - after)
         came = self.now() - ago
         for name, stamp, values in samples:
             self._runtime.observed(name, stamp, *values, came=came)
 
     def _ago(self, taken: Taken) -> int:
-        """Return how long ago in ns a message came, by the node's clock."""
+        """Return the age of a received message in ns, by the node's clock."""
         return 0 if self._one_clock() else max(time_ns() - taken.received_ns, 0)
 
     def _glance(self) -> Iterator[tuple[str, Seen]]:
-        """Yield the newest samples, if there are new ones, without having to read them all."""
+        """Yield the newest samples, if any, without decoding all of them."""
         missing = set(self._channels)
         for taken in reversed([] if self._newest is None else self._newest.take()):
             if not missing:
@@ -235,21 +235,21 @@ class PlannerNode(ManagedNode):
                             None if self._one_clock() else self.now() - self._ago(taken) - stamp))
 
     def _one_clock(self) -> bool:
-        """Return whether one clock tells the times of all nodes."""
+        """Return whether all nodes share one clock."""
         return self.simulated
 
     def _observable(self) -> bool:
-        """Return whether somebody may give samples."""
+        """Return whether there may be a publisher of samples."""
         return bool(self.count_publishers(topics.JOINT_STATES.name))
 
     def _unheard(self) -> str:
-        """Return why nobody carries out commands; empty where somebody does."""
+        """Return why commands are not carried out; empty if they are."""
         return next(filter(None, (x.unheard() for x in self._channels.values())), '')
 
     # -- time ----------------------------------------------------------------------------------
 
     def now(self) -> int:
-        """Return the node's time in ns; that the clock was set is noted."""
+        """Return the node's time in ns; report if the clock was set."""
         if self.simulated:
             for taken in [] if self._ticks is None else self._ticks.take()[-1:]:
                 try:
@@ -259,7 +259,7 @@ class PlannerNode(ManagedNode):
                         f'message on /clock skipped: {error}', throttle_duration_sec=1.0)
             return super().now()
         before = monotonic_ns()
-        # What rclpy's clock reads then, without its objects.
+        # Equal to the time of rclpy's clock, without creating objects.
         now = time_ns()
         if by := self._steps.step(before, now, monotonic_ns()):
             self._runtime.clock_set(by)
@@ -274,9 +274,9 @@ class PlannerNode(ManagedNode):
             self._runtime.clock_set_back(-jump.delta.nanoseconds)
 
     def _serve(self) -> None:
-        """Publish what the runtime has to say, and note when to look again."""
+        """Publish the outputs of the runtime, and schedule the next call."""
         if not self._channels:
-            # Cleaned up; the loop of a controller goes on.
+            # Cleaned up, while the loop of a controller continues.
             return
         self._take(self._runtime.tick(self.now()))
         if not self.linked:
@@ -284,14 +284,14 @@ class PlannerNode(ManagedNode):
             self._pace(soon=self._read_samples())
 
     def _serve_soon(self) -> None:
-        """Serve within a period: news that may come in crowds are not served one by one."""
+        """Serve within a period, since frequent messages are not served one by one."""
         if self.simulated:
             self._serve()
         elif self._channels:
             self._pace()
 
     def _pace(self, *, soon: bool = False) -> None:
-        """Have the runtime served again when there is something to do next, or soon."""
+        """Schedule the next service of the runtime, when work is due or soon."""
         wake, longest = self._runtime.wake, _LONGEST_POLL_NS
         if self._samples is not None:
             longest = _POLL_NS if soon else _READ_NS
@@ -307,7 +307,7 @@ class PlannerNode(ManagedNode):
             self._poll.reset()
 
     def _listen(self) -> None:
-        """Subscribe to samples while they are wanted."""
+        """Subscribe to samples while they are needed."""
         wanted = self._runtime.wants_samples
         if wanted:
             self._listen_until = monotonic_ns() + _LINGER_NS
@@ -356,7 +356,7 @@ class PlannerNode(ManagedNode):
             f'{self.get_name()}: commands', ', '.join(self._channels), severity, message, values)
 
     def _crowd(self) -> str:
-        """Return of what there is more than one; empty if there is not."""
+        """Return a message if there are several planners, devices or clocks; else empty."""
         self._presence.look()
         rivals = self._presence.planners()
         crowd = rivals or self._presence.devices(self._settings.names)

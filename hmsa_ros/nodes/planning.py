@@ -1,4 +1,4 @@
-"""Parameters of the planner node, and what they mean for `hmsa_ros.planning`."""
+"""Parameters of the planner node, and their conversion for `hmsa_ros.planning`."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -32,7 +32,7 @@ _OPTIONS = Options()
 _SETTINGS = Settings()
 _changeable = partial(ParameterSpec, read_only=False)
 
-#: Parameters that a joint may have a value of its own for.
+#: Parameters that may have a separate value for each joint.
 OWN = (
     *(replace(x, read_only=x.name in shared.FIXED) for x in shared.BLOCK),
     shared.INITIAL_STRETCH,
@@ -183,12 +183,12 @@ SPECS = (
 
 def options_from(values: Mapping[str, Any]) -> Options:
     """
-    Return the planning options that the declared parameters of a joint describe.
+    Return the planning options described by the parameters of a joint.
 
     Raises
     ------
     BadInputError
-        If the limits of the flux density are not in order.
+        If the minimum flux density is not below the maximum.
 
     """
     least, largest = values['flux_density_min'], values['flux_density_max']
@@ -213,7 +213,7 @@ def _nanoseconds(seconds: float) -> int:
 
 
 def settings_from(values: JointParameters) -> Settings:
-    """Return how a runtime deals with time, as parameters for all joints say."""
+    """Return the settings of a runtime described by the parameters for all joints."""
     plain: dict[str, Any] = {x: values[x] for x in (
         'trajectory_mode', 'replan_late', 'after_cut_off', 'max_points', 'allow_partial_joints',
         'feedback', 'feedback_cautious', 'feedback_tolerance', 'feedback_trim', 'feedback_frozen',
@@ -236,13 +236,13 @@ def _free(values: JointParameters) -> tuple[str, ...]:
 
 
 def group_from(values: JointParameters) -> PlannerGroup:
-    """Return the planners that parameters describe, at rest; an impossible one is refused."""
+    """Return planners described by parameters, at rest; raise `BadInputError` if impossible."""
     planners = values.each(lambda _, own: Planner(
         planned_from(own), options_from(own), stretch=own['initial_stretch']))
     return PlannerGroup(planners, simultaneous=values['simultaneous_arrival'])
 
 
 def models_from(values: JointParameters, group: PlannerGroup) -> dict[str, Model]:
-    """Return by joint, all checked, under which models planners go on, which stay as they are."""
+    """Return the checked models that parameters describe, by joint; the planners do not change."""
     return values.each(lambda name, own: group.planners[name].checked_model(
         options_from(own), planned_from(own)))

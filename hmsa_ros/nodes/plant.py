@@ -1,4 +1,4 @@
-"""Plant node: simulated actuators, driven by stamped flux density commands."""
+"""Plant node: simulated actuators, driven by timestamped flux density commands."""
 
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -27,7 +27,7 @@ from hmsa_ros.nodes.markers import MARKER_FRAME, MARKER_RATE, MARKER_SCALE, show
 from hmsa_ros.nodes.parameters import declare_joints, JointParameters
 from hmsa_ros.nodes.runner import run
 
-#: Parameters that each joint may have values of its own for.
+#: Parameters that may have a separate value for each joint.
 OWN = (
     *shared.BLOCK,
     shared.INITIAL_STRETCH,
@@ -58,7 +58,7 @@ OWN = (
 
 
 class PlantJoint(DeviceJoint):
-    """A simulated actuator on the wire, which forces may disturb."""
+    """A simulated actuator, which forces may disturb."""
 
     _device: SimulatedDevice
 
@@ -78,7 +78,7 @@ class PlantJoint(DeviceJoint):
 
 
 def _joints_from(values: JointParameters) -> dict[str, SimulatedJoint]:
-    """Return the joints that the values of `OWN` describe: the block times the mismatch."""
+    """Return the joints that the values of `OWN` describe, including the mismatch."""
     def joint(_: str, own: Mapping[str, Any]) -> SimulatedJoint:
         actuator = planned_from(own)
         if own['reset_stretch']:
@@ -95,7 +95,7 @@ def _joints_from(values: JointParameters) -> dict[str, SimulatedJoint]:
 
 
 def _from_wrench(message: WrenchStamped) -> tuple[int, float]:
-    """Return stamp in ns and force along the field in N of a disturbance."""
+    """Return timestamp in ns and force along the field in N of a disturbance."""
     force, torque = message.wrench.force, message.wrench.torque
     if not math.isfinite(force.z):
         raise BadInputError(f'force.z is {force.z:g} N: expected a finite number')
@@ -147,13 +147,13 @@ PARAMETERS = (
     MARKER_SCALE,
 )
 
-# Of each tick, the share that samples may take; commands and services get the rest.
+# Time in ns of each tick for samples; the rest is for commands and services.
 _BUDGET_NS = 800_000
 _PAUSED_CLOCK_NS = 100_000_000
 
 
 class PlantNode(DeviceNode):
-    """Advances a `SimulatedDevice` along a clock and publishes what comes of it."""
+    """Advance a `SimulatedDevice` along a clock, and publish its samples and changes."""
 
     def __init__(self) -> None:
         super().__init__(topics.PLANT)
@@ -170,7 +170,7 @@ class PlantNode(DeviceNode):
         Raises
         ------
         BadInputError
-            If parameters do not go together.
+            If the parameters are inconsistent.
 
         """
         values = self.values
@@ -196,7 +196,7 @@ class PlantNode(DeviceNode):
         self._clock_published = 0
         self._measured = (start, monotonic_ns())
         self._clocks_warned = False
-        # Time in ns that it was behind the clock and left out, since the last report.
+        # Time in ns that was skipped because the plant fell behind, since the last report.
         self._fell = 0
 
         self._clock_publisher = (
@@ -208,27 +208,27 @@ class PlantNode(DeviceNode):
         self.offer(topics.SET_PAUSED, self._on_set_paused)
 
     def activate(self) -> None:
-        """Let time run, from where it is."""
+        """Let time run, from its present value."""
         self._pacer.set_paused(self._pacer.paused, self.device.time)
 
     def deactivate(self) -> None:
-        """Hold time; commands on their way are lost."""
+        """Stop time; pending commands are lost."""
         self.device.drop_commands()
 
     # -- time ----------------------------------------------------------------------------------
 
     @property
     def _standing(self) -> bool:
-        """Whether time does not run."""
+        """Whether time is stopped."""
         return self._pacer.paused or not self.active
 
     @property
     def leading_time(self) -> int | None:
-        """Simulated time in ns, if this plant is the authority on it."""
+        """Simulated time in ns, if this plant publishes the clock."""
         return self.device.time if self._joints and self._authority else None
 
     def _go_on(self) -> None:
-        """Let time run as far as it has come, at the real-time factor where the plant leads it."""
+        """Simulate up to the present time, scaled by the real-time factor if leading."""
         if not self._authority:
             self._follow()
             return
@@ -240,8 +240,8 @@ class PlantNode(DeviceNode):
         self._run(math.inf if self._pacer.unlimited else self._pacer.target(steady))
 
     def _follow(self) -> None:
-        """Advance to the node's clock: the wall clock, or somebody else's /clock."""
-        # The wall clock is what rclpy's reads then, without its objects.
+        """Advance to the node's clock: the wall clock, or a /clock of another node."""
+        # Equal to the wall clock of rclpy, without creating objects.
         now = self.now() if self.simulated else time_ns()
         if now == 0:
             return
@@ -262,7 +262,7 @@ class PlantNode(DeviceNode):
             self._run(now)
 
     def _run(self, target: float) -> None:
-        """Simulate up to a time in ns, as far as a tick reaches."""
+        """Simulate up to a time in ns, for at most the duration of a tick."""
         begin = monotonic_ns()
         while self.device.next_sample <= target and monotonic_ns() - begin < _BUDGET_NS:
             self._sample()
@@ -275,10 +275,10 @@ class PlantNode(DeviceNode):
         self.device.advance(self.device.next_sample)
         self._publish_clock(monotonic_ns())
 
-    # -- what else is published ----------------------------------------------------------------
+    # -- other publications --------------------------------------------------------------------
 
     def _states(self) -> tuple[int, list[State]]:
-        """Return the time and what the joints do, for who looks."""
+        """Return time and state of the joints, for viewers."""
         device = self.device
         return device.time, [State(*x) for x in zip(
             device.stretch.tolist(), device.flux_density.tolist(), strict=True)]
@@ -310,7 +310,7 @@ class PlantNode(DeviceNode):
             return False, 'the plant is running: expected it paused (~/set_paused)'
         if not self.active:
             return False, f'the plant is {self.state}: expected it active'
-        self._hear()
+        self._poll_commands()
         for _ in range(self.values['step_count']):
             before = self.device.time
             while self.device.time == before:

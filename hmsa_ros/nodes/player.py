@@ -1,14 +1,14 @@
 """
-Player: sends the messages of a bag again, at the spacing they were recorded with.
+Player: publishes the messages of a bag with their recorded spacing.
 
-The node's executor serves services and parameters. A thread sends: each message at its own
-place on an absolute schedule, so that no delay adds up. A second thread reads ahead.
+The node's executor serves services and parameters. A thread publishes each message at its time on
+an absolute schedule, so that delays do not accumulate. A second thread reads ahead.
 
-Commands move things. Topics that carry them (see `hmsa_ros.nodes.selection`) are left out unless
-they are asked for by name, in ``play.topics_to_filter`` or ``play.allow_commands``.
+Commands cause motion. Topics with commands (see `hmsa_ros.nodes.selection`) are omitted unless
+they are selected by name, in ``play.topics_to_filter`` or ``play.allow_commands``.
 
-As a managed node it opens the bag and offers its topics when it is configured, plays while it is
-active, and gives both up when it is cleaned up.
+As a managed node, it opens the bag and creates its publishers when it is configured, plays while
+it is active, and releases both when it is cleaned up.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -40,11 +40,11 @@ from hmsa_ros.nodes.selection import Filter
 from hmsa_ros.nodes.senders import create_senders, latched
 
 _POLL_SECONDS = 0.02
-# Reliable messages that found the receiver's queue full are sent again when a heartbeat of
-# Fast DDS asks for them, with other profiles than ours every 3 s: the wait at the end has to
-# last for several, in slices.
+# Reliable messages that found the receiver's queue full are sent again when a heartbeat of Fast
+# DDS requests them, every 3 s with profiles other than ours. The wait at the end has to last for
+# several heartbeats, in slices.
 _ACKNOWLEDGED_SECONDS = 0.5
-# What a builtin_interfaces/Time can hold.
+# Limit of builtin_interfaces/Time.
 _LATEST_CLOCK = 2**31 * 10**9
 
 PARAMETERS = (
@@ -119,7 +119,7 @@ PARAMETERS = (
 
 
 class Player(ManagedNode):
-    """ROS 2 node that plays a bag; ``failure`` says why playing ended early."""
+    """ROS 2 node that plays a bag; ``failure`` contains the reason for an early end."""
 
     def __init__(self) -> None:
         super().__init__(topics.PLAYER)
@@ -135,12 +135,12 @@ class Player(ManagedNode):
 
     def configure(self) -> None:
         """
-        Open the bag, offer its topics, and wait.
+        Open the bag, create its publishers, and wait.
 
         Raises
         ------
         BadInputError
-            If a parameter or the bag cannot be used.
+            If a parameter or the bag is invalid.
 
         """
         values = self._values
@@ -150,8 +150,8 @@ class Player(ManagedNode):
                 'for example -p storage.uri:=run1')
         self._reader = BagReader(
             values['storage.uri'], max_chunk_size=values['storage.max_chunk_size'])
-        self._problems_told = 0
-        self._tell_problems()
+        self._problems_reported = 0
+        self._report_problems()
         self._excerpt = self._choose_excerpt()
         self._clock_out = self._offer_clock()
         self._senders = create_senders(
@@ -169,7 +169,7 @@ class Player(ManagedNode):
                 'parameter play.wait_for_samples needs a /clock from the player: set '
                 'play.clock_publish_frequency')
         self._followers = Followers(self, followers)
-        # While inactive it is paused.
+        # While inactive, it is paused.
         self._resumes = not values['play.start_paused']
         self._transport = Transport(
             self._excerpt.start, self.get_parameter('play.rate').value)
@@ -191,7 +191,7 @@ class Player(ManagedNode):
         self._transport.set_paused(True)
 
     def cleanup(self) -> None:
-        """End playing."""
+        """Stop playing."""
         self.close()
         self.finished = False
 
@@ -202,7 +202,7 @@ class Player(ManagedNode):
             self._thread.join()
             self._thread = None
 
-    # What is played --------------------------------------------------------------------------
+    # Selection of the messages ---------------------------------------------------------------
 
     def _names(self, parameter: str) -> tuple[str, ...]:
         """Return the full names of topics or nodes in a parameter."""
@@ -211,7 +211,7 @@ class Player(ManagedNode):
                      for name in ([given] if isinstance(given, str) else given) if name)
 
     def _choose_excerpt(self) -> Excerpt:
-        """Return what is played of the bag."""
+        """Return the part of the bag to play."""
         first, last = self._reader.start_time or 0, self._reader.end_time
         start = first + duration_from(self._values, 'play.start_offset')
         length = duration_from(self._values, 'play.playback_duration')
@@ -220,7 +220,7 @@ class Player(ManagedNode):
                        self._values['play.read_ahead_queue_size'])
 
     def _offer_clock(self) -> ClockOut | None:
-        """Return the clock if it is wanted, and send the first time."""
+        """Return the clock if requested, and publish its first time."""
         frequency = self._values['play.clock_publish_frequency']
         on_publish = self._values['play.clock_publish_on_topic_publish']
         self._clock_publisher: Any = None
@@ -231,7 +231,7 @@ class Player(ManagedNode):
             raise BadInputError(
                 f'{self._reader.path} reaches to {latest * 1e-9:.0f} s: expected less than '
                 f'{_LATEST_CLOCK // 10**9} s for /clock')
-        # First of all, so that nodes that wait for it can get ready.
+        # Published first, so that nodes that wait for it can get ready.
         self._clock_publisher = endpoints.publisher(self, topics.CLOCK_TOPIC)
         self._send_clock(self._excerpt.start)
         return ClockOut(self._send_clock, frequency, on_publish)
@@ -239,18 +239,17 @@ class Player(ManagedNode):
     def _send_clock(self, when: int) -> None:
         self._clock_publisher.publish(to_clock(when))
 
-    def _tell_problems(self) -> None:
-        """Log what could not be read of the bag, each once."""
-        for problem in self._reader.problems[self._problems_told:]:
+    def _report_problems(self) -> None:
+        """Log each part of the bag that could not be read, once."""
+        for problem in self._reader.problems[self._problems_reported:]:
             self.get_logger().warning(problem)
-        self._problems_told = len(self._reader.problems)
+        self._problems_reported = len(self._reader.problems)
 
     # Sending, in the player's thread ---------------------------------------------------------
 
     def _run(self, transport: Transport) -> None:
-        """Play, then have the process end."""
-        # Before all ordinary processes, where the system grants that; exact timing on a busy
-        # machine is not to be had otherwise.
+        """Play, then end the process."""
+        # Real-time priority, if the system grants it: precise timing on a busy machine needs it.
         priority = self._values['play.realtime_priority']
         if priority:
             with contextlib.suppress(OSError):
@@ -275,11 +274,11 @@ class Player(ManagedNode):
             self.finished = True
 
     def _wait_for_audience(self, transport: Transport) -> None:
-        """Wait until who is to receive the messages is there."""
+        """Wait until the required subscribers are present."""
         begin = next_clock = time.monotonic()
         timeout = self._values['play.wait_for_subscribers_timeout']
-        # Discovery may take three seconds, the period at which participants announce
-        # themselves; who has not been found by then is not there.
+        # Discovery may take three seconds, the period of participant announcements. Later
+        # subscribers are not waited for.
         settled = begin + self._values['play.discovery_time']
         while not transport.rest(_POLL_SECONDS):
             now = time.monotonic()
@@ -296,11 +295,11 @@ class Player(ManagedNode):
                     'play.wait_for_recorder')
 
     def _wait_for_followers(self, transport: Transport) -> None:
-        """Wait while nodes that follow the clock come nearer to the time it shows now."""
+        """Wait while nodes that follow the clock get closer to its present time."""
         limit = duration_from(self._values, 'play.wait_acked_timeout') * 1e-9
         behind, since = self._followers.behind(self._excerpt.end), time.monotonic()
         while limit >= 0.0 and behind and not transport.rest(_POLL_SECONDS):
-            # It may be lost on its way.
+            # The message may be lost.
             self._send_clock(self._excerpt.end)
             now = self._followers.behind(self._excerpt.end)
             if now != behind:
@@ -312,8 +311,8 @@ class Player(ManagedNode):
                 break
 
     def _finish(self, transport: Transport) -> None:
-        """Wait for reliable subscribers and say what was sent."""
-        self._tell_problems()
+        """Wait for acknowledgements, and report the number of messages."""
+        self._report_problems()
         limit = duration_from(self._values, 'play.wait_acked_timeout')
         waiting = list(self._senders.values()) if limit >= 0 else []
         end = time.monotonic() + limit * 1e-9
@@ -355,15 +354,15 @@ class Player(ManagedNode):
         return sent, 'sent' if sent else 'there is no next message'
 
     def _on_stop(self) -> tuple[bool, str]:
-        """End playing, and with it the process."""
-        # After this answer has left: the end of the process would overtake it.
+        """Stop playing, and end the process."""
+        # Delayed until this response is sent, since the process would end before.
         self.every(0.1, self._transport.stop)
         return True, 'stopped'
 
     def _take_parameters(self, given: Mapping[str, Any]) -> None:
-        """Take a new rate, or a time to go on from."""
+        """Adopt a new rate, or jump to another time."""
         if self._transport.stopped:
-            # A rate set when nothing is played is that of the next time.
+            # A rate set while stopped applies to the next run.
             return
         seek, length = given.get('play.seek', -1.0), self._excerpt.end - self._excerpt.first
         if seek > length * 1e-9:
@@ -390,6 +389,6 @@ class Player(ManagedNode):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the player with the command line's arguments; return the exit status."""
-    # Reading ahead must not hold up sending for the usual 5 ms.
+    # Reading ahead must not delay publishing by the default 5 ms.
     sys.setswitchinterval(0.0005)
     return run(Player, args)

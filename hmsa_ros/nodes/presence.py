@@ -1,10 +1,10 @@
 """
-Who else plays the part of a planner or of a device: two of either are one too many.
+Detect other planners or devices: there must be only one of each.
 
-A process that was killed stays in the graph for some 20 s. So a publisher counts only while its
-process is heard: each node of the package publishes on /diagnostics once a second, and of others
-the samples are heard. Publishers are told apart by their identifiers (GIDs), whose first part is
-that of the process.
+A process that was killed stays in the graph for about 20 s. A publisher is therefore counted only
+while its process is active: each node of the package publishes on /diagnostics once a second, and
+other processes are detected by their samples. Publishers are distinguished by their identifiers
+(GIDs), whose first part is that of the process.
 """
 
 from collections.abc import Iterable, Sequence
@@ -23,15 +23,15 @@ from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.capture import RawSubscription, Taken
 from hmsa_ros.nodes.conversions import from_samples
 
-#: How long a process that was heard counts as running, in s.
+#: Time in s after its last message during which a process counts as running.
 LATELY_SECONDS = 2.5
 _PROCESS_BYTES = 12
-# Samples looked at a second; of a publisher that sends fewer than others some are among them.
+# Samples read per second; the queue also contains some of a publisher with a lower rate.
 _SAMPLES = replace(topics.JOINT_STATES, qos=topics.Quality(100, reliable=False))
 
 
 def several(what: str, nodes: Sequence[str]) -> str:
-    """Return that there are several planners, plants or the like; empty for fewer than two."""
+    """Return a message if there are several planners, plants or the like; else empty."""
     if len(nodes) < 2:
         return ''
     left = 'one' if len(nodes) == 2 else 'all but one'
@@ -40,21 +40,21 @@ def several(what: str, nodes: Sequence[str]) -> str:
 
 class Presence:
     """
-    Finds from a node which publishers of topics are running; to be asked once a second.
+    Find the running publishers of topics; to be called once a second.
 
-    ``samples`` are listened to only where somebody beside the devices needs them too.
+    With ``samples``, publishers of samples that send no diagnostics are detected too.
     """
 
     def __init__(self, node: Node, *, samples: bool = True) -> None:
         self._node, self._of_samples = node, samples
         self._diagnostics = endpoints.listen(node, topics.DIAGNOSTICS)
         self._samples: RawSubscription | None = None
-        # When processes, and publishers of samples of a joint, were last heard, in system time.
+        # Last message of processes, and of publishers of samples of a joint, in system time.
         self._heard: dict[bytes, int] = {}
         self._sampled: dict[tuple[str, bytes], int] = {}
 
     def look(self) -> None:
-        """Take in what has arrived."""
+        """Process the messages that have arrived."""
         self._note(self._diagnostics.take())
         states = topics.JOINT_STATES.name
         if not self._of_samples:
@@ -63,7 +63,7 @@ class Presence:
             self._samples = endpoints.listen(self._node, _SAMPLES)
         elif self._samples is not None:
             self._note(taken := self._samples.take())
-            # The newest of each publisher: reading all would take long.
+            # Only the newest message of each publisher, since reading all would take long.
             for one in {x.publisher: x for x in taken}.values():
                 with suppress(BadInputError):
                     for joint, _, (stretch, *_) in from_samples(one.data):
@@ -71,7 +71,7 @@ class Presence:
                             self._sampled[joint, one.publisher] = one.received_ns
 
     def devices(self, joints: Sequence[str]) -> str:
-        """Return that several plants or drivers run of one of a node's joints; empty for none."""
+        """Return a message if several plants or drivers run for one of the joints; else empty."""
         for joint in joints:
             what = f'plants or drivers of joint {joint}'
             applied = topics.of_joint(topics.FLUX_DENSITY_APPLIED, joint, joints).name
@@ -82,17 +82,17 @@ class Presence:
         return ''
 
     def planners(self, owner: str = '') -> str:
-        """Return that several planners run under this node's name, or the owner's; or nothing."""
+        """Return a message if several planners run under this node's or the owner's name."""
         return several('planners', self._running(topics.from_outside(topics.STATUS.name, owner)))
 
     def crowded(self, joints: Sequence[str], owner: str) -> bool:
-        """Return whether the graph, killed processes included, has several of anything."""
+        """Return whether the graph, including killed processes, has several of anything."""
         return any(len(self._publishers(x)) > 1 for x in (
             topics.from_outside(topics.STATUS.name, owner), topics.JOINT_STATES.name,
             *(topics.of_joint(topics.FLUX_DENSITY_APPLIED, x, joints).name for x in joints)))
 
     def close(self) -> None:
-        """Listen no more."""
+        """Destroy the subscriptions."""
         self._diagnostics.destroy()
         if self._samples is not None:
             self._samples.destroy()
@@ -102,7 +102,7 @@ class Presence:
             self._heard[one.publisher[:_PROCESS_BYTES]] = one.received_ns
 
     def _running(self, topic: str) -> list[str]:
-        """Return the nodes that publish a topic and whose processes are heard."""
+        """Return the nodes that publish a topic and whose processes are active."""
         return [node for gid, node in self._publishers(topic).items()
                 if _lately(self._heard.get(gid[:_PROCESS_BYTES], 0))]
 
@@ -110,7 +110,7 @@ class Presence:
         try:
             return endpoints.publishers_of(self._node, topic)
         except rclpy_implementation.RCLError:
-            # Joints that messages name may have any name.
+            # Joint names in messages are arbitrary and may not be valid in a topic.
             return {}
 
 

@@ -1,4 +1,4 @@
-"""Quality of service between rclpy and what a bag stores."""
+"""Convert quality of service between rclpy and bags."""
 
 from collections.abc import Iterable, Sequence
 
@@ -9,15 +9,15 @@ from hmsa_ros.bag.qos import Qos
 from hmsa_ros.interfaces.topics import Quality
 from hmsa_ros.nodes import endpoints
 
-# Depth of a republished topic whose recorded depth is unknown, as it is where publishers are
-# discovered over DDS.
+# Depth of a republished topic whose recorded depth is unknown, as for publishers discovered over
+# DDS.
 PUBLISHER_DEPTH = 1000
-# Recorded depths are believed up to here: the middleware sets memory aside for them.
+# Limit on recorded depths, since the middleware allocates memory for them.
 MAX_DEPTH = 100_000
 
 
 def stored(profile: QoSProfile) -> Qos:
-    """Return a profile of `Node.get_publishers_info_by_topic` as a bag stores it."""
+    """Return a profile of `Node.get_publishers_info_by_topic` in the form stored in a bag."""
     return Qos(
         profile.history.name.lower(), profile.depth, profile.reliability.name.lower(),
         profile.durability.name.lower(), profile.deadline.nanoseconds,
@@ -27,7 +27,7 @@ def stored(profile: QoSProfile) -> Qos:
 
 
 def subscription(offered: Iterable[Qos], depth: int) -> QoSProfile:
-    """Return the strongest profile that receives from all of one or more publishers."""
+    """Return the strongest profile that is compatible with all given publishers."""
     profiles = list(offered)
     reliable = all(profile.reliability == 'reliable' for profile in profiles)
     latched = all(profile.durability == 'transient_local' for profile in profiles)
@@ -35,10 +35,10 @@ def subscription(offered: Iterable[Qos], depth: int) -> QoSProfile:
 
 
 def publisher(recorded: Sequence[Qos]) -> QoSProfile:
-    """Return the profile that serves every subscriber that the recorded publishers served."""
-    # Reliable if any was, transient local if any was. The depth is the recorded one. Where it is
-    # unknown a latched topic keeps one message a recorded publisher, so that who comes late gets
-    # what it would have got.
+    """Return a profile that serves every subscriber that the recorded publishers served."""
+    # Reliable if any publisher was, transient local if any was. The depth is the recorded one. If
+    # that is unknown, a latched topic keeps one message for each recorded publisher, so that a
+    # late subscriber receives the same messages.
     latched = any(profile.durability == 'transient_local' for profile in recorded)
     reliable = not recorded or any(
         profile.reliability in ('reliable', 'system_default') for profile in recorded)
@@ -48,7 +48,7 @@ def publisher(recorded: Sequence[Qos]) -> QoSProfile:
         reliable, latched))
     alike = set(recorded)
     if len(alike) == 1:
-        # Deadlines and the like only mean something if all publishers agreed on them.
+        # Deadline, lifespan and liveliness apply only if all publishers agreed on them.
         only = alike.pop()
         profile.deadline = Duration(nanoseconds=only.deadline_ns)
         profile.lifespan = Duration(nanoseconds=only.lifespan_ns)

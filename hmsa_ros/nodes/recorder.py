@@ -1,10 +1,10 @@
 """
-Recorder: writes topics to a bag, counts what is lost, and says so.
+Recorder: writes topics to a bag, and counts and reports lost messages.
 
-The node's own executor serves discovery, services and diagnostics. Messages take another way:
-`Capture` takes them off their subscriptions in a thread, `Recording` writes them in another.
+The node's own executor serves discovery, services and diagnostics. Messages bypass it: `Capture`
+takes them from their subscriptions in a thread, `Recording` writes them in another.
 
-As a managed node it opens the bag when it is configured, records while it is active, and closes
+As a managed node, it opens the bag when it is configured, records while it is active, and closes
 the bag when it is cleaned up.
 """
 
@@ -97,9 +97,9 @@ PARAMETERS = (
         'any namespace.'),
 )
 
-# Between being told to end and the last look at what has come.
+# Time from the request to end until the last messages are taken.
 _LINGER_SECONDS = 0.1
-# Nodes whose parameters are requested.
+# Limit on the number of nodes whose parameters are requested.
 _MAX_NODES = 256
 
 # Topics with setpoints, by the last part of their names.
@@ -109,7 +109,7 @@ _SETPOINTS = {
 
 
 class Recorder(ManagedNode):
-    """ROS 2 node that records to the bag in ``folder``; ``failure`` says why recording failed."""
+    """ROS 2 node that records to the bag in ``folder``; ``failure`` contains a fatal error."""
 
     def __init__(self) -> None:
         super().__init__(topics.RECORDER)
@@ -122,13 +122,13 @@ class Recorder(ManagedNode):
         """Open the bag and start receiving."""
         values = self._parameters_in
         selection = Selection.of(values, self._full_name)
-        # While inactive it is paused anyway.
+        # While inactive, it is paused anyway.
         self._paused: bool = values['record.start_paused']
         self._sim_time = SimulatedTime() if self.simulated else None
         self._experiment: dict[str, str] = {'hmsa_ros.version': __version__}
         self._setpoints = SetpointLog()
         self._setpoint_topics: set[str] = set()
-        # Topics of which a publisher was found at the last look, and nodes whose parameters are
+        # Number of topics with a publisher at the last look, and of nodes whose parameters are
         # stored.
         self._matched = self._known = 0
         limits = Limits(
@@ -158,7 +158,7 @@ class Recorder(ManagedNode):
         self.offer(topics.SPLIT_BAGFILE, lambda: (True, self._recording.split()))
         self.offer(topics.SNAPSHOT, lambda: (True, self._recording.snapshot()))
         for topic in _SETPOINTS.values():
-            # From the start, so that the first one is not missed; others when they are found.
+            # From the start, so that the first setpoint is not missed; further topics when found.
             self._follow_setpoints(topic, self._full_name(
                 topics.from_outside(topic.name, topics.PLANNER)))
         self._followed: dict[str, RemoteParameters] = {}
@@ -171,7 +171,7 @@ class Recorder(ManagedNode):
 
     @property
     def _pausing(self) -> bool:
-        """Whether what comes is not recorded."""
+        """Whether incoming messages are not recorded."""
         return self._paused or not self.active
 
     def _full_name(self, name: str) -> str:
@@ -200,16 +200,16 @@ class Recorder(ManagedNode):
         self._matched = sum(isinstance(x, RecordedTopic) for x in self._capture.matched())
         self._known = sum(x.known for x in self._followed.values())
         if (self._matched, self._known) != before:
-            # At once: somebody may wait for it.
+            # Immediately, since a process may be waiting for it.
             self._diagnose()
 
     def _find_nodes(self) -> None:
-        """Look for nodes whose parameters are to be stored."""
+        """Find nodes whose parameters are to be stored."""
         wanted = self._parameters_in['experiment.nodes']
         bare = {name for name in wanted if '/' not in name}
         full = {self._full_name(name) for name in wanted if '/' in name}
-        # By their services. The names of nodes come on a topic of their own, and what is published
-        # on it by several at the same time may get lost (ros2/rmw_fastrtps#792).
+        # Identified by their services: node names are published on a separate topic, where
+        # simultaneous messages may get lost (ros2/rmw_fastrtps#792).
         for service, _ in self.get_service_names_and_types():
             node, _, last = service.rpartition('/')
             if last == 'list_parameters' and (
@@ -218,7 +218,7 @@ class Recorder(ManagedNode):
                 self._followed[node] = RemoteParameters(self, node)
 
     def _follow_setpoints(self, topic: topics.Topic, name: str) -> None:
-        """Store the setpoints that are sent on a topic."""
+        """Store the setpoints published on a topic."""
         if name not in self._setpoint_topics:
             self._setpoint_topics.add(name)
             endpoints.subscribe(
@@ -226,7 +226,7 @@ class Recorder(ManagedNode):
                     name, self.now(), message))
 
     def _deliver(self, taken: Sequence[tuple[Any, list[Taken]]]) -> None:
-        """Stamp, count and pass on what has been received."""
+        """Add timestamps to received messages, count them and pass them on."""
         if self._sim_time is not None:
             taken = self._follow(self._sim_time, taken)
         for key, messages in taken:
@@ -235,7 +235,7 @@ class Recorder(ManagedNode):
     def _follow(
             self, clock: SimulatedTime,
             taken: Sequence[tuple[Any, list[Taken]]]) -> list[tuple[Any, list[Taken]]]:
-        """Take the clock's messages out of others, and in those that came before it jumped."""
+        """Separate and apply clock messages, and record messages from before a jump back."""
         ticks = [x for key, messages in taken if key is clock for x in messages]
         rest = [x for x in taken if x[0] is not clock]
         for message in ticks:
@@ -249,8 +249,8 @@ class Recorder(ManagedNode):
             before = clock.add(message.received_ns, now, message.publisher)
             if before is None:
                 continue
-            # What came before the jump belongs to the file so far, also what came while this
-            # round was taken, or was too much for it.
+            # Messages from before the jump belong to the present file, including those that
+            # arrived during this round or exceeded its limit.
             for key, messages in self._capture.take_again():
                 if key is clock:
                     ticks += messages
@@ -259,7 +259,7 @@ class Recorder(ManagedNode):
             earlier, rest = _parted(rest, message.received_ns)
             for key, messages in earlier:
                 self._take_in(key, messages)
-            # A simulation began anew, or a bag is played in a loop.
+            # A simulation restarted, or a bag is played in a loop.
             self.get_logger().warning(
                 f'simulated time jumped back from {before * 1e-9:.3f} s to {now * 1e-9:.3f} s: '
                 'recording continues in a new file')
@@ -268,14 +268,14 @@ class Recorder(ManagedNode):
         return rest
 
     def _take_in(self, topic: RecordedTopic, messages: list[Taken]) -> None:
-        """Count gaps and hand the messages to the writer."""
+        """Count gaps, and pass the messages to the writer."""
         batch, size = topic.take(
             messages, None if self._sim_time is None else self._sim_time.at, paused=self._pausing)
         if batch:
             self._recording.put(batch, size)
 
     def _note(self, values: Mapping[str, str]) -> None:
-        """Store something about the experiment."""
+        """Store information about the experiment."""
         new = {key: value for key, value in values.items()
                if self._experiment.get(key) != value}
         if new:
@@ -303,11 +303,11 @@ class Recorder(ManagedNode):
         return lost_by_topic(missed, status.overflowed, status.dropped)
 
     def _before(self) -> dict[str, int]:
-        """Return how many messages were sent before the recorder was matched, by topic."""
+        """Return by topic the number of messages sent before the recorder was matched."""
         return {topic.name: topic.before for topic in list(self._recorded.topics.values())}
 
     def _lost_note(self, lost: Mapping[str, int]) -> dict[str, str]:
-        """Return what is not in the bag of every topic as it is stored."""
+        """Return the numbers of missing messages by topic in their stored form."""
         return {
             'lost': json.dumps({**dict.fromkeys(list(self._recorded.topics), 0), **lost}),
             'sent_before': json.dumps(self._before())}
@@ -316,7 +316,7 @@ class Recorder(ManagedNode):
         status = self._recording.status()
         lost = self._lost(status)
         self._note(self._setpoints.news())
-        # In the bag at once, so that it is known after a crash too.
+        # Written immediately, so that it is known after a crash too.
         self._note(self._lost_note(lost))
         state = ('inactive' if not self.active else 'paused' if self._paused
                  else 'waiting for /clock'
@@ -351,7 +351,7 @@ class Recorder(ManagedNode):
         if self._closed:
             return
         self._closed = True
-        # What was sent before and got lost on the way comes again meanwhile.
+        # Meanwhile, lost messages from before are sent again.
         time.sleep(_LINGER_SECONDS)
         self._capture.stop()
         self._note(self._setpoints.news())
@@ -378,7 +378,7 @@ class Recorder(ManagedNode):
 def _parted(
         taken: Sequence[tuple[Any, list[Taken]]],
         moment: int) -> tuple[list[tuple[Any, list[Taken]]], list[tuple[Any, list[Taken]]]]:
-    """Part what was received before a moment from the rest."""
+    """Split messages at a moment of reception in ns."""
     earlier, rest = [], []
     for key, messages in taken:
         count = bisect_left(messages, moment, key=lambda message: message.received_ns)

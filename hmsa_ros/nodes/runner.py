@@ -1,7 +1,7 @@
 """
-Life of a node process: start, spin, end cleanly on SIGINT and SIGTERM.
+Life cycle of a node process: start, spin, end cleanly on SIGINT and SIGTERM.
 
-One place for what every node's ``main`` does, so that a node file holds wiring only.
+All nodes share this implementation of ``main``.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,13 +23,13 @@ from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, complain, HmsaError
 from hmsa_ros.nodes.visitor import start_ros
 
-# EventsExecutor.spin() without a time limit busy-loops and delivers nothing on this rclpy
-# (7.1); waiting for a future that never completes, a slice at a time, behaves as documented.
+# On this rclpy (7.1), EventsExecutor.spin() without a time limit busy-loops and delivers nothing.
+# Waiting in slices for a future that never completes works as documented.
 _SLICE_SECONDS = 0.1
 
 
 def spin(nodes: Sequence[Node], ending: Callable[[], bool]) -> None:
-    """Serve the callbacks of nodes until ``ending`` says so or their context is shut down."""
+    """Serve callbacks of nodes until ``ending`` returns true or their context is shut down."""
     context = nodes[0].context
     executor = EventsExecutor(context=context)
     for node in nodes:
@@ -47,9 +47,9 @@ def spin(nodes: Sequence[Node], ending: Callable[[], bool]) -> None:
 def run(
         factory: Callable[[], Node | Sequence[Node]], args: Sequence[str] | None = None) -> int:
     """Run one node or several as a process; return 0, 1 for a failure, or 2 for bad parameters."""
-    # The factory may raise errors, which refuse the start. A node's method ``close`` is called
-    # before it is destroyed; an error in its attribute ``failure`` makes the run a failed one, and
-    # a true attribute ``finished`` ends it.
+    # Errors of the factory refuse the start. The method ``close`` of a node is called before the
+    # node is destroyed. An error in its attribute ``failure`` makes the run fail, and a true
+    # attribute ``finished`` ends it.
     ENDING.note()
     arguments = list(sys.argv[1:] if args is None else args)
     nodes: Sequence[Node] = ()
@@ -76,23 +76,23 @@ def run(
 
 
 def _avoid_pauses() -> None:
-    """Do now what would keep commands waiting for tens of milliseconds later."""
-    # rclpy asks for the module of whoever logs something. The first time all modules are looked
-    # up, which takes 30 ms and more, and would be when a command is late.
+    """Do work now that would delay commands by tens of milliseconds later."""
+    # The first log message makes rclpy look up all modules, which takes 30 ms or more. That would
+    # happen when a command is late.
     inspect.getmodule(inspect.currentframe())
-    # The libraries bring 140,000 objects along. A full collection of garbage looks at them all for
-    # 40 ms, and Python makes it so seldom that garbage and spare tuples pile up until then.
+    # The libraries create 140,000 objects. A full garbage collection visits all of them in 40 ms.
+    # Python runs it so rarely that garbage and spare tuples accumulate.
     gc.collect()
     gc.freeze()
-    # With nothing left to look at: tells Python that a full collection is cheap from now on.
+    # With nothing left to visit, this makes Python treat full collections as cheap.
     gc.collect()
 
 
 def _initialise(arguments: Sequence[str]) -> None:
-    """Start rclpy, and refuse arguments that it or nobody understands."""
+    """Start rclpy, and refuse unknown arguments."""
     if os.environ.get('NO_COLOR') and not os.environ.get('RCUTILS_COLORIZED_OUTPUT'):
         os.environ['RCUTILS_COLORIZED_OUTPUT'] = '0'
-    # What rcl says of bad arguments is in its error too, which is printed below in one line.
+    # The error of rcl also contains its log message, and is printed below in one line.
     set_logger_level('rcl', LoggingSeverity.FATAL)
     try:
         start_ros(['hmsa', *arguments])

@@ -1,4 +1,4 @@
-"""Which topics are recorded, and which are played."""
+"""Selection of the topics to record, and of those to play."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,20 +15,20 @@ def _last(name: str) -> str:
     return name.rsplit('/', 1)[-1]
 
 
-#: Last part of the names of topics that make something move.
+#: Last part of the names of topics that cause motion.
 COMMAND_TOPICS = frozenset(_last(topic.name) for topic in (
     topics.FLUX_DENSITY_COMMAND, topics.JOINT_TRAJECTORY, topics.SETPOINT))
-# Types that drive a coil or a planner, whatever the topic is called, but for reports.
+# Types that drive a coil or a planner, whatever the name of the topic, except for reports.
 _COMMAND_TYPES = frozenset((topics.FLUX_DENSITY_COMMAND.type, topics.JOINT_TRAJECTORY.type))
 _REPORTS = frozenset(_last(topic.name) for topic in (
     topics.FLUX_DENSITY_APPLIED, topics.PLAN))
-# A full name, as rcl validates it; the middleware adds three characters to the length.
+# Full name as validated by rcl; the middleware adds three characters to the length.
 _FULL_NAME = re.compile(r'(?:/[A-Za-z_][A-Za-z0-9_]*)+')
 _LONGEST_NAME = 247
 
 
 def is_full_name(name: str) -> bool:
-    """Return whether ROS takes a name for the same topic; rclpy would cut one at a NUL byte."""
+    """Return whether a name is a valid full name; rclpy would truncate one at a NUL byte."""
     return len(name) <= _LONGEST_NAME and _FULL_NAME.fullmatch(name) is not None
 
 
@@ -39,7 +39,7 @@ class _Choice:
     exclude_topics: tuple[str, ...] = ()
     exclude_regex: str = ''
 
-    #: Parameters of the expressions.
+    #: Names of the parameters with the expressions.
     expressions: ClassVar[tuple[str, str]]
 
     def __post_init__(self) -> None:
@@ -59,24 +59,24 @@ class _Choice:
 
 @dataclass(frozen=True)
 class Selection(_Choice):
-    """Which topics to record, by full names or expressions; all that are not hidden if asked."""
+    """Topics to record, by full names or expressions; all that are not hidden on request."""
 
     all_topics: bool = False
     expressions = ('record.regex', 'record.exclude_regex')
-    #: Parameters of a recorder that `of` takes.
+    #: Parameters of a recorder that `of` reads.
     parameters: ClassVar[tuple[str, ...]] = (
         'record.topics', 'record.regex', 'record.exclude_topics', 'record.exclude_regex',
         'record.all_topics')
 
     @classmethod
     def of(cls, values: Mapping[str, Any], full_name: Callable[[str], str]) -> 'Selection':
-        """Return what a recorder with these parameters selects; names are made full ones."""
+        """Return the selection described by a recorder's parameters; names become full names."""
         topics, regex, excluded, exclude_regex, all_topics = (values[x] for x in cls.parameters)
         return cls(tuple(map(full_name, topics)), regex, tuple(map(full_name, excluded)),
                    exclude_regex, all_topics)
 
     def wants(self, topic: str) -> bool:
-        """Return whether to record a topic; one in ``topics`` is, unless it is excluded."""
+        """Return whether to record a topic; those in ``topics`` are, unless excluded."""
         if self._excludes(topic):
             return False
         if topic in self.topics:
@@ -90,13 +90,13 @@ class Selection(_Choice):
 
 @dataclass(frozen=True)
 class Filter(_Choice):
-    """Which topics to send, by full names or expressions, and commands that may be sent too."""
+    """Topics to play, by full names or expressions, and commands that are permitted."""
 
     allow_commands: tuple[str, ...] = ()
     expressions = ('play.regex_to_filter', 'play.exclude_regex_to_filter')
 
     def passes(self, topic: str) -> bool:
-        """Return whether to send a topic, commands apart; exclusion comes first."""
+        """Return whether a topic is selected, commands aside; exclusion takes precedence."""
         if self._excludes(topic):
             return False
         if topic in self.topics or topic in self.allow_commands:
@@ -106,7 +106,7 @@ class Filter(_Choice):
         return not self.topics
 
     def withholds(self, topic: str, resolved: str, type_name: str) -> bool:
-        """Return whether a topic, resolved to be sent, is a command not asked for by name."""
+        """Return whether a topic, resolved for publishing, is a command not selected by name."""
         if topic in self.topics or topic in self.allow_commands:
             return False
         return (_last(topic) in COMMAND_TOPICS or _last(resolved) in COMMAND_TOPICS

@@ -1,4 +1,4 @@
-"""Publishers of what a bag holds. A bag may come from anybody."""
+"""Publishers for the contents of a bag, which may be of unknown origin."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -12,21 +12,21 @@ from hmsa_ros.nodes.endpoints import interface_class
 from hmsa_ros.nodes.qos import publisher
 from hmsa_ros.nodes.selection import Filter, is_full_name
 
-#: A publisher takes 1.5 ms and 35 kB.
+#: Limit on the number of publishers, each of which takes 1.5 ms and 35 kB.
 MOST_TOPICS = 1000
-#: Topics named in a sentence or in the log; of the others only the number is.
+#: Number of topics named in a message; the others are only counted.
 NAMED_AT_MOST = 20
 
 
 def create_senders(
         node: Node, reader: BagReader, selection: Filter, *, own_clock: bool) -> dict[str, Any]:
     """
-    Return a publisher for each wanted topic of a bag; the log says what is left out and why.
+    Return a publisher for each selected topic of a bag; log omitted topics with the reason.
 
     Raises
     ------
     BadInputError
-        If more than `MOST_TOPICS` are wanted.
+        If more than `MOST_TOPICS` are selected.
 
     """
     held = reader.topics
@@ -36,32 +36,32 @@ def create_senders(
             f'{reader.path} has {len(chosen)} topics to send: expected at most {MOST_TOPICS}; '
             'name those wanted in play.topics_to_filter')
     result: dict[str, Any] = {}
-    told = []
+    reports = []
     for name in chosen:
         reason = _left_out(node, selection, name, held[name], own_clock)
         try:
             if not reason:
                 result[name] = node.create_publisher(
                     interface_class(held[name].type), name, publisher(held[name].profiles))
-        except Exception as error:  # a quality of service that no publisher can have
+        except Exception as error:  # an invalid quality of service
             reason = f'it cannot be published ({" ".join(str(error).split())})'
         if reason:
-            told.append(f'topic {name} is left out: {reason}')
-    if len(told) > NAMED_AT_MOST:
-        told[NAMED_AT_MOST:] = [f'{len(told) - NAMED_AT_MOST} more topics are left out']
+            reports.append(f'topic {name} is left out: {reason}')
+    if len(reports) > NAMED_AT_MOST:
+        reports[NAMED_AT_MOST:] = [f'{len(reports) - NAMED_AT_MOST} more topics are left out']
     missing = [x for x in (*selection.topics, *selection.allow_commands) if x not in held]
     if missing:
-        told.append(
+        reports.append(
             f'the bag has no topic {", ".join(missing)}; it has '
             f'{listed(held, NAMED_AT_MOST) or "none"}')
-    for sentence in told:
+    for sentence in reports:
         node.get_logger().warning(printable(sentence))
     return result
 
 
 def _left_out(
         node: Node, selection: Filter, name: str, info: Topic, own_clock: bool) -> str:
-    """Return why a topic that passes the filter is not sent, empty if it is."""
+    """Return why a topic that passes the filter is not played; empty if it is."""
     if not is_full_name(name):
         return 'it cannot be published, its name is not a valid ROS name'
     resolved = node.resolve_topic_name(name)
@@ -80,7 +80,7 @@ def _left_out(
 
 
 def latched(reader: BagReader, topics: Iterable[str]) -> dict[str, int]:
-    """Return how many messages a late subscriber gets, of those topics that are latched."""
+    """Return the number of messages that a late subscriber receives from each latched topic."""
     profiles = {name: reader.topics[name].profiles for name in topics}
     return {name: publisher(x).depth for name, x in profiles.items()
             if any(profile.durability == 'transient_local' for profile in x)}

@@ -1,4 +1,4 @@
-"""Sense node: publishes the stretch that sensors of other packages see, as joint_states."""
+"""Sense node: publishes stretch measured by sensors of other packages as joint_states."""
 
 from collections.abc import Callable, Iterable
 import dataclasses
@@ -28,30 +28,30 @@ from hmsa_ros.nodes.runner import run
 
 def reader(type_name: str, kind: type[Any], path: str, element: str) -> Callable[[Any], Any]:
     """
-    Return what takes timestamp and reading out of a message.
+    Return a function that extracts timestamp and reading from a message.
 
     Parameters
     ----------
     type_name : str
         Such as ``'geometry_msgs/msg/PoseStamped'``.
     kind : type
-        The class of the messages.
+        Class of the messages.
     path : str
-        Of the field, such as ``'pose.position.z'`` or ``'data[2]'``; a point or a vector is read
-        whole. Empty: the one in `fields.USUAL`.
+        Path of the field, such as ``'pose.position.z'`` or ``'data[2]'``; a point or a vector is
+        read as a whole. Empty for the default in `fields.USUAL`.
     element : str
-        Name of the joint or of the frame, for messages of several.
+        Name of the joint or frame, for messages that contain several.
 
     Returns
     -------
     callable
         Returns the header's timestamp (None without a header) and the reading as an array of one
-        or three numbers; None where the message does not contain the element.
+        or three numbers; None if the message does not contain the element.
 
     Raises
     ------
     BadInputError
-        If there is no such field, it is no number, or an element is needed or not.
+        If the field does not exist or is not a number, or if an element is missing or superfluous.
 
     """
     find = _FIND.get(type_name)
@@ -87,20 +87,20 @@ def _of_joint(message: Any, element: str) -> tuple[Any, int | None]:
 
 
 def _of_frame(message: Any, element: str) -> tuple[Any, None]:
-    # The newest of several.
+    # The newest of several transforms.
     found = [x for x in message.transforms if x.child_frame_id == element]
     return found[-1] if found else None, None
 
 
-# What finds an element in messages that contain several.
+# Functions that find an element in messages that contain several.
 _FIND: dict[str, Callable[[Any, str], tuple[Any, int | None]]] = {
     'sensor_msgs/msg/JointState': _of_joint, 'tf2_msgs/msg/TFMessage': _of_frame}
 
 
-# How often publishers of an unknown type are looked for, in s, and without a reading from when on
-# that is reported, in ns.
+# Interval in s at which a publisher of unknown type is looked up, and time in ns without a reading
+# after which that is reported.
 _LOOK_SECONDS, _SILENT = 0.2, 2 * NANOSECONDS
-# Whatever a sensor offers is taken: a best-effort subscription fits both.
+# A best-effort subscription matches any sensor.
 _QUALITY = topics.Quality(1000, reliable=False)
 
 _DEFAULT = SensorScale()
@@ -144,7 +144,7 @@ PARAMETERS = (
 
 
 class SenseNode(ManagedNode):
-    """Converts readings of any message into stretch."""
+    """Convert readings in messages of any type into stretch."""
 
     def __init__(self) -> None:
         super().__init__(topics.SENSE)
@@ -158,7 +158,7 @@ class SenseNode(ManagedNode):
         Raises
         ------
         HmsaError
-            If a parameter is wrong.
+            If a parameter is invalid.
 
         """
         values = self._values
@@ -189,7 +189,7 @@ class SenseNode(ManagedNode):
         return str(expand_topic_name(name, self.get_name(), self.get_namespace()))
 
     def _look(self) -> None:
-        """Take the type of the sensor from who publishes it."""
+        """Adopt the type of the sensor's publisher."""
         if self._type or self._trouble:
             return
         types = dict(self.get_topic_names_and_types()).get(self._topic)
@@ -210,7 +210,7 @@ class SenseNode(ManagedNode):
             partial(self._take, makes(values['element']))]}
         if values['reference.topic'] or values['reference.element']:
             read = makes(values['reference.element'] or values['element'])
-            # Of one message the reference comes first.
+            # If one message contains both, the reference is processed first.
             each.setdefault(self._reference, []).insert(0, partial(
                 self._pass_on, read, lambda stamp, reading, now: take(stamp, reading)))
         for name, takes in each.items():
@@ -225,7 +225,7 @@ class SenseNode(ManagedNode):
     def _pass_on(
             self, read: Callable[[Any], Any], take: Callable[[int, Array, int], None],
             message: Any) -> None:
-        """Take a message in, at the time in its header or now."""
+        """Process a message with the time of its header, or now."""
         try:
             found = read(message)
         except (IndexError, TypeError, ValueError) as error:

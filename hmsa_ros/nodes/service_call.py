@@ -1,4 +1,4 @@
-"""A call of a service whose answer may be lost, without waiting."""
+"""A non-blocking service call that tolerates a lost response."""
 
 from collections.abc import Callable, Iterable
 import json
@@ -15,12 +15,12 @@ from hmsa_ros.bag.experiment import parameter_key
 
 class ServiceCall:
     """
-    One request to a service, sent again while no answer comes.
+    One request to a service, repeated until there is a response.
 
-    A server answers a client that it has just discovered before the way back is known to all: the
-    answer is lost then, and its client would wait for ever; some ways back stay lost. So it is
-    sent again by a client of its own each time, and a request must do no harm when it is carried
-    out twice. An answer counts as lost after ``timeout`` in s; meanwhile the node must be served.
+    A server may respond to a client that it has just discovered before the return path is
+    established. The response is then lost, and some return paths never recover. The request is
+    therefore repeated with a new client each time, and must be harmless when executed twice. A
+    response counts as lost after ``timeout`` in s. The node must be spun meanwhile.
     """
 
     def __init__(
@@ -31,7 +31,7 @@ class ServiceCall:
         self._request = request
         self._timeout = timeout
         self._sent = 0.0
-        # Clients with the answers that they wait for; all but the last may only be late.
+        # Clients with their futures; responses to all but the last one are overdue.
         self._asked: list[tuple[Any, Any]] = []
 
     @property
@@ -42,7 +42,7 @@ class ServiceCall:
         return bool(self._asked[-1][0].service_is_ready())
 
     def answer(self) -> Any:
-        """Return the response, or None as long as there is none; send what is due."""
+        """Return the response, or None if there is none yet; send the request when due."""
         for client, future in self._asked:
             if future is not None and future.done() and (response := future.result()) is not None:
                 self._destroy_all_but(client)
@@ -50,7 +50,7 @@ class ServiceCall:
         ready = self.ready
         client, future = self._asked[-1]
         if not ready:
-            # Whoever was asked is gone: the next server is asked from the beginning.
+            # The server has disappeared: start again with the next one.
             self._asked[-1] = client, None
         elif future is None:
             self._asked[-1] = client, client.call_async(self._request)
@@ -60,7 +60,7 @@ class ServiceCall:
         return None
 
     def close(self) -> None:
-        """Destroy what the call holds; it cannot be used any more."""
+        """Destroy the clients; the call cannot be used again."""
         self._destroy_all_but(None)
 
     def _destroy_all_but(self, kept: Any) -> None:
@@ -76,7 +76,7 @@ _SERVICES = {
 
 
 class RemoteParameters:
-    """The parameters of a node, requested once it is there and again when it comes back."""
+    """Parameters of a node, requested when it is available and again when it comes back."""
 
     def __init__(self, node: Node, name: str) -> None:
         self._node = node
@@ -84,13 +84,13 @@ class RemoteParameters:
         self._server = node.create_client(ListParameters, f'{name}/list_parameters')
         self._names: list[str] = []
         self._call: ServiceCall | None = None
-        #: Whether they were given, and the node is still there.
+        #: Whether the parameters were received, and the node is still available.
         self.known = False
 
     def poll(self, note: Callable[[dict[str, str]], None]) -> None:
-        """Take the next step towards the node's parameters, for ``note`` as custom data."""
+        """Do the next step; ``note`` is called with the parameters as custom data."""
         if not self._server.service_is_ready():
-            # Asked again when it comes back, perhaps with other parameters.
+            # Requested again when the node comes back, perhaps with other parameters.
             self._ask(None)
             self.known = False
         elif self.known:
@@ -103,7 +103,7 @@ class RemoteParameters:
             self._names = list(answer.result.names)
             self._ask(GetParameterTypes, names=self._names)
         elif hasattr(answer, 'types'):
-            # A joint may have none of its own: rclpy gives none at all where one has no value.
+            # Overrides of a joint may be unset: rclpy returns nothing at all if one has no value.
             self._names = [x for x, kind in zip(self._names, answer.types, strict=False)
                            if kind != ParameterType.PARAMETER_NOT_SET]
             self._ask(GetParameters, names=self._names)
@@ -113,7 +113,7 @@ class RemoteParameters:
             note(self.texts(zip(self._names, answer.values, strict=False)))
 
     def _ask(self, kind: Any, **request: Any) -> None:
-        """Call the service of a kind in place of the last one; none for None."""
+        """Call the service of a kind instead of the previous one; none for None."""
         if self._call is not None:
             self._call.close()
         self._call = None if kind is None else ServiceCall(

@@ -1,4 +1,4 @@
-"""The recorder's subscriptions: found topics, with the quality of service they ask for."""
+"""Subscriptions of the recorder, with a quality of service that matches the publishers."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -16,15 +16,15 @@ from hmsa_ros.nodes.endpoints import interface_class
 from hmsa_ros.nodes.qos import stored, subscription
 from hmsa_ros.nodes.selection import Selection
 
-# One look in so many asks for the publishers of every topic, changed in number or not.
+# Every so many looks, all publishers are looked up, even if their number has not changed.
 _FULL_LOOK = 10
 
 
 class Subscriptions:
     """
-    Subscribes to the topics that are wanted, and keeps them in ``topics``.
+    Subscribe to the selected topics, and list them in ``topics``.
 
-    ``depth`` is how many messages of a topic the middleware keeps.
+    ``depth`` is the queue size of a subscription.
     """
 
     def __init__(
@@ -37,36 +37,36 @@ class Subscriptions:
         self._capture = capture
         self._depth = depth
         self._refused: set[str] = set()
-        self._said_ready = False
+        self._reported_ready = False
         self._looks = 0
 
     @property
     def wanted_count(self) -> int:
-        """Return how many topics are waited for, as far as it is known."""
+        """Return the number of topics to record, as far as it is known."""
         missing = [name for name in self._selection.topics if name not in self.topics]
         return len(self.topics) + len(missing)
 
     def silent(self) -> list[str]:
-        """Return the topics, subscribed to or asked for by name, of which nothing was received."""
+        """Return the topics, subscribed to or selected by name, without any message so far."""
         heard = {name for name, topic in self.topics.items() if topic.received}
         return sorted({*self._selection.topics, *self.topics} - heard)
 
     def look(self, found: Iterable[tuple[str, Sequence[str]]]) -> None:
-        """Subscribe to what is new of the topics found, with their types."""
+        """Subscribe to the new topics among those found, given with their types."""
         self._looks += 1
         for name, types in found:
             if self._selection.wants(name):
                 self._look_at(name, types)
-        if not self._said_ready and self._selection.topics \
+        if not self._reported_ready and self._selection.topics \
                 and self.wanted_count == len(self.topics):
-            self._said_ready = True
+            self._reported_ready = True
             self._node.get_logger().info(
                 f'ready: subscribed to all {len(self._selection.topics)} topics')
 
     def _look_at(self, name: str, types: Sequence[str]) -> None:
-        """Subscribe to a topic, or again if its publishers ask for it."""
+        """Subscribe to a topic, or again if its publishers require it."""
         known = self.topics.get(name)
-        # Asking who they are takes five times as long as how many.
+        # Looking up the publishers takes five times as long as counting them.
         count = self._node.count_publishers(name)
         if known is not None and count == known.publishers and self._looks % _FULL_LOOK:
             return
@@ -78,7 +78,7 @@ class Subscriptions:
             return
         offered = tuple(sorted((stored(info.qos_profile) for info in infos), key=repr))
         if known is not None and not Counter(offered) - Counter(known.offered):
-            return  # nobody is new; who has left does not change what was recorded
+            return  # no new publisher; one that left changes nothing
         type_name = known.type if known is not None else infos[0].topic_type
         if len(types) > 1 and known is None:
             self._warn(f'topic {name} has the types {", ".join(types)}: {type_name} is recorded')
@@ -112,7 +112,7 @@ class Subscriptions:
     def _describe(
             self, name: str, type_name: str, offered: tuple[Qos, ...],
             hashes: Iterable[str]) -> Topic:
-        """Return what the bag stores of a topic."""
+        """Return the description of a topic for the bag."""
         try:
             encoding, definition = message_definition(type_name)
         except BagError as error:

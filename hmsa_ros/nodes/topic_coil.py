@@ -1,7 +1,7 @@
 """
-Coils that another node serves: levels as numbers, array elements or vectors on its topic.
+Coils served by another node: levels as numbers, array elements or vectors on its topic.
 
-The joints of a driver may share a message. Vectors that share a field add up.
+The joints of a driver may share a message. Vectors in the same field are added.
 """
 
 from array import array
@@ -21,22 +21,22 @@ from hmsa_ros.nodes import endpoints, fields
 from hmsa_ros.nodes.conversions import to_time
 from hmsa_ros.nodes.visitor import leave, visit
 
-# In s: waiting for a subscriber at the start, between looks, and for the last message's receipt.
+# In s: wait for a subscriber at the start, interval of checks, wait for the last acknowledgement.
 _PATIENCE, _LOOK, _LAST = 8.0, 0.02, 0.3
-# By how much the length of a direction may differ from 1, and how long an array may be.
+# Tolerance of the length of a direction, and maximum length of an array.
 _ROUNDED, _LONGEST = 1e-3, 4096
 
 
 class TopicError(HmsaError):
-    """A topic that no node subscribes to."""
+    """A topic without subscriber."""
 
 
 class _Topic:
-    """A topic whose subscriber is waited for, and what the joints put into its message."""
+    """A topic whose subscriber is awaited, and the fields of its joints in one message."""
 
     def __init__(self, name: str, type_name: str) -> None:
         own = f'topic_coil_{uuid4().hex[:8]}'
-        # The name that a process is given is its driver's.
+        # Without the remapping, a name given to the process would apply to this node too.
         self._node = visit(
             own, '', start_parameter_services=False, enable_rosout=False,
             cli_args=['--ros-args', '-r', f'__node:={own}'])
@@ -62,7 +62,7 @@ class _Topic:
 
     @property
     def heard(self) -> bool:
-        """Whether a subscriber is there."""
+        """Whether there is a subscriber."""
         return self._publisher is not None and bool(self._publisher.get_subscription_count())
 
     def _require_subscriber(self) -> None:
@@ -73,7 +73,7 @@ class _Topic:
                 'with ros2 topic info --verbose')
 
     def publish(self, now: int) -> None:
-        """Publish what all joints have put in, at a time in ns."""
+        """Publish the levels of all joints at a time in ns."""
         self._require_subscriber()
         message = self.kind()
         for field in self.fields.values():
@@ -83,37 +83,37 @@ class _Topic:
         self._publisher.publish(message)
 
     def close(self) -> None:
-        """End once the last message has come."""
+        """Close after the last message is acknowledged."""
         if self.heard:
             self._publisher.wait_for_all_acked(Duration(seconds=_LAST))
         leave(self._node)
 
 
-# The topics in use, by their names and types as given.
+# Topics in use, by name and type as given.
 _SHARED: dict[tuple[str, str], _Topic] = {}
 
 
 class Field:
     """
-    A part of the messages on a topic, as the source of a coil.
+    A field in the messages of a topic, as the source of a coil.
 
     Parameters
     ----------
     joint : str
-        Whose coil it is.
+        Joint of the coil.
     topic, type_name : str
         The topic, and the type of its messages; empty for that of its subscriber.
     path : str
-        Of a number, an element of an array or a vector; empty for the one in `fields.USUAL`.
+        Path of a number, an array element or a vector; empty for the default in `fields.USUAL`.
     direction : sequence of float
-        Of a vector: x, y and z of a unit vector; empty for z.
+        x, y and z of a unit vector, for a vector; empty for z.
     size : int
-        Length of an array, 0 to 4096; it is longer if a joint's element lies beyond it.
+        Length of an array, 0 to 4096; extended to include the elements of all joints.
 
     Raises
     ------
     BadInputError
-        If a value is out of range, or messages have no such field.
+        If a value is out of range, or the messages have no such field.
     TopicError
         If no node subscribes.
 
@@ -144,7 +144,7 @@ class Field:
         self._topic.fields[joint] = self
 
     def _find(self, path: str, direction: Any) -> None:
-        """Find the field, a number or a vector, in messages on the topic."""
+        """Find the field, a number or a vector, in messages of the topic."""
         type_name = self._topic.type
         path, way, end = fields.located(type_name, self._topic.kind(), path)
         self.way, last = way, way[-1]
@@ -183,19 +183,19 @@ class Field:
             setattr(point, name, getattr(point, name) + self._level * x)
 
     def write(self, level: float, now: int) -> None:
-        """Publish a level in the unit of the topic, with other joints', at a time in ns."""
+        """Publish a level in the unit of the topic, with all others, at a time in ns."""
         self._level = level
         self._topic.publish(now)
 
     def close(self) -> None:
-        """Leave the topic."""
+        """Remove the field; close a topic without fields."""
         if self._topic.fields.pop(self._joint, None) is not None and not self._topic.fields:
             del _SHARED[self._key]
             self._topic.close()
 
 
 def _unit(direction: Any, *, number: bool) -> tuple[float, ...]:
-    """Return the direction of a vector with length 1, or none for a number."""
+    """Return the direction of a vector, normalised, or an empty tuple for a number."""
     try:
         given = [*direction]
     except TypeError:
@@ -217,14 +217,14 @@ def _unit(direction: Any, *, number: bool) -> tuple[float, ...]:
 
 
 class TopicCoil(Assembly):
-    """A field of a topic and its coil, as ``hardware:=topic``."""
+    """A coil driven through a field of a topic, for ``hardware:=topic``."""
 
     def __init__(
             self, joint: str, topic: Any = '', field: Any = '', direction: Any = (),
             size: Any = 0, **settings: Any) -> None:
         kind = settings.pop('type', '')
         if not settings.get('coil.file'):
-            # A topic in tesla.
+            # Levels on the topic are in tesla.
             settings.setdefault('coil.tesla_per_ampere', 1.0)
         coil, scale = parts(settings)
         super().__init__(Field(joint, topic, kind, field, direction, size), coil, scale)

@@ -1,4 +1,4 @@
-"""Start of ROS in a process, and nodes of commands that look at a running system for a while."""
+"""Start of ROS in a process, and temporary nodes of commands that inspect a running system."""
 
 from collections.abc import Callable, Sequence
 import re
@@ -19,19 +19,19 @@ from hmsa_ros.middleware import prepare_middleware
 from hmsa_ros.nodes.service_call import ServiceCall
 
 T = TypeVar('T')
-#: At most so long callbacks are waited for at a time, in s.
+#: Maximum time in s of one wait for callbacks.
 SLICE_SECONDS = 0.05
 
 
 def start_ros(
         arguments: Sequence[str] | None = None, context: rclpy.Context | None = None) -> None:
     """
-    Start rclpy, which answers no signals.
+    Start rclpy without signal handlers.
 
     Raises
     ------
     BadInputError
-        If its log cannot be written.
+        If the log cannot be written.
 
     """
     prepare_middleware()
@@ -49,12 +49,12 @@ def start_ros(
 
 def visit(name: str, namespace: str, **options: Any) -> Node:
     """
-    Create a node, its name made unique, with a context of its own; Ctrl-C stays Python's.
+    Create a node with a unique name and its own context; Python handles Ctrl-C.
 
     Raises
     ------
     BadInputError
-        If there can be no such namespace, or ROS does not start.
+        If the namespace is invalid, or ROS does not start.
 
     """
     try:
@@ -68,7 +68,7 @@ def visit(name: str, namespace: str, **options: Any) -> Node:
 
 
 class Visitor:
-    """A node of `visit` that waits for up to ``timeout`` s; a context manager."""
+    """A node of `visit` with a default timeout in s; a context manager."""
 
     def __init__(self, name: str, namespace: str, timeout: float) -> None:
         self._timeout = timeout
@@ -88,14 +88,14 @@ class Visitor:
             each: Callable[[], None] | None = None, timeout: float | None = None,
             time: Callable[[], float] = monotonic) -> None:
         """
-        Serve callbacks, and call ``each`` about 20 times a second, until a condition holds.
+        Serve callbacks, and call ``each`` about 20 times a second, until a condition is true.
 
         Raises
         ------
         HmsaError
-            If it does not come true within a timeout in s, by default its own, of ``time``.
+            If it does not become true within a timeout in s of ``time``, by default the visitor's.
         KeyboardInterrupt
-            If a signal that was noted asks for the end.
+            If a signal requested the end.
 
         """
         timeout = self._timeout if timeout is None else timeout
@@ -110,7 +110,7 @@ class Visitor:
 
     def ask(
             self, call: ServiceCall, failure: str, each: Callable[[], None] | None = None) -> Any:
-        """Return the response to a call; raise `HmsaError` where none comes (see `spin_until`)."""
+        """Return the response to a call; raise `HmsaError` after a timeout (see `spin_until`)."""
         answers: list[Any] = []
 
         def answered() -> bool:
@@ -125,6 +125,6 @@ class Visitor:
 
 
 def leave(node: Node) -> None:
-    """Take a node of `visit` off the graph."""
+    """Destroy a node of `visit` and its context."""
     node.destroy_node()
     rclpy.try_shutdown(context=node.context)
