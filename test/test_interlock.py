@@ -26,7 +26,7 @@ A, B, C = b'a', b'b', b'c'
 def opened(lock, now, *said, here=(A, B, C)):
     """Return whether an interlock is open after what publishers say at a time in ms."""
     for publisher, closed in said:
-        lock.hear(publisher, now * MS, closed=closed, present=lambda: here)
+        lock.receive(publisher, now * MS, closed=closed, present=lambda: here)
     return bool(lock.look(now * MS))
 
 

@@ -214,7 +214,7 @@ def _typed(current: float) -> float:
 
 def _probe(name: str) -> 'Callable[[float], float]':
     """Return what reads a probe, some times; `BadInputError` if there is none."""
-    from hmsa_ros.device.hardware import told
+    from hmsa_ros.device.hardware import described
 
     probe = _made(name, '--probe')
 
@@ -222,7 +222,7 @@ def _probe(name: str) -> 'Callable[[float], float]':
         try:
             values = [float(probe.read()) for _ in range(_READINGS)]
         except BaseException as error:
-            raise HmsaError(f'{name}.read raised {told(error)}') from error
+            raise HmsaError(f'{name}.read raised {described(error)}') from error
         return sum(values) / len(values)
 
     return read
@@ -230,15 +230,15 @@ def _probe(name: str) -> 'Callable[[float], float]':
 
 def _made(name: str, option: str) -> Any:
     """Return a probe or gauge that answers; `BadInputError` if there is none."""
-    from hmsa_ros.device.hardware import imported, told
+    from hmsa_ros.device.hardware import described, imported
 
     try:
         found = imported(name)()
         found.read()
     except BaseException as error:  # whatever a laboratory's module raises
         raise BadInputError(
-            f'{option} {name} does not start ({told(error)}): expected MODULE:NAME that, called '
-            'without arguments, returns an object with the method read') from error
+            f'{option} {name} does not start ({described(error)}): expected MODULE:NAME that, '
+            'called without arguments, returns an object with the method read') from error
     return found
 
 

@@ -1,8 +1,8 @@
 """
-What moves actuators: the simulated plant, and drivers of real hardware.
+Devices that move actuators: the simulated plant, and drivers of real hardware.
 
-A `Device` takes stamped levels and is advanced to a time by whoever drives it. It knows no ROS,
-and has no threads and no clock. The parts of a class of hardware are here too.
+A `Device` accepts timestamped levels and is advanced to a time by its caller. It does not depend
+on ROS, and has neither threads nor a clock. The parts for hardware classes are also here.
 """
 
 from hmsa_ros.device.assembly import Assembly, CoilModel, parts, SensorScale

@@ -1,4 +1,4 @@
-// The firmware of hmsa_board/, for the host: its state is a bytearray.
+// The firmware of hmsa_board/ on the host; its state is a bytearray.
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 
@@ -10,7 +10,7 @@ namespace {
 
 using hmsa::Board;
 
-// The board in a bytearray that is an argument; nullptr with an exception if it is none.
+// Return the board in a bytearray argument; nullptr with an exception if it is invalid.
 Board *board_in(PyObject *state) {
     if (!PyByteArray_Check(state) || PyByteArray_GET_SIZE(state) != sizeof(Board)) {
         PyErr_SetString(PyExc_TypeError, "expected what make has returned");
@@ -99,16 +99,16 @@ PyObject *due(PyObject *, PyObject *state) {
 }
 
 PyMethodDef methods[] = {
-    {"make", make, METH_VARARGS, "make(limit, resolution): the state of a board that has booted."},
-    {"receive", receive, METH_VARARGS, "receive(state, bytes, now): what it answers at once."},
-    {"advance", advance, METH_VARARGS, "advance(state, now): the level that it puts out."},
-    {"sample", sample, METH_VARARGS, "sample(state, time, reading): have it keep a sample."},
-    {"warm", warm, METH_VARARGS, "warm(state, temperature): have it know that of its coil."},
-    {"due", due, METH_O, "due(state): when to advance it next, -1 for never."},
+    {"make", make, METH_VARARGS, "make(limit, resolution): Return the state of a booted board."},
+    {"receive", receive, METH_VARARGS, "receive(state, bytes, now): Return its immediate answer."},
+    {"advance", advance, METH_VARARGS, "advance(state, now): Return its output level."},
+    {"sample", sample, METH_VARARGS, "sample(state, time, reading): Store a sample."},
+    {"warm", warm, METH_VARARGS, "warm(state, temperature): Set the coil temperature."},
+    {"due", due, METH_O, "due(state): Return the time of the next advance, or -1."},
     {nullptr, nullptr, 0, nullptr}};
 
 PyModuleDef module = {
-    PyModuleDef_HEAD_INIT, "_board", "The firmware of the serial board, on the host.", -1, methods,
+    PyModuleDef_HEAD_INIT, "_board", "The firmware of the serial board on the host.", -1, methods,
     nullptr, nullptr, nullptr, nullptr};
 
 }  // namespace

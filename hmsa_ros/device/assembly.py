@@ -1,8 +1,9 @@
 """
-Hardware out of three parts: a source of current or voltage, a coil, and a sensor.
+Hardware assembled from a source of current or voltage, a coil, and a sensor.
 
-A source has the members of `Hardware` in amperes (or volts) in place of tesla, and a sensor those
-of ``read``, in any unit of length or signal. The assembly converts; all else is passed through.
+A source has the members of `Hardware`, with amperes (or volts) instead of tesla. A sensor has
+``read``, in any unit of length or signal. The assembly converts units and passes other members
+through.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,9 +23,9 @@ from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.units import NANOSECONDS
 
-# A coil that was too warm must cool to this share of its limit before it is used again.
+# Fraction of its limit to which a coil that was too warm must cool.
 _COOL = 0.9
-# The share of its saturation that a coil can reach.
+# Largest usable fraction of the saturation.
 _SATURATED = 0.99
 _MEMBERS = ('open', 'clock', 'capacity', 'description', 'arm', 'disarm', 'temperature')
 
@@ -32,9 +33,9 @@ _MEMBERS = ('open', 'clock', 'capacity', 'description', 'arm', 'disarm', 'temper
 @dataclass(frozen=True)
 class CoilModel:
     """
-    Flux density of a coil over the current (or the voltage) of its source, and its limits.
+    Flux density of a coil as a function of the current (or voltage) of its source, with limits.
 
-    Either ``tesla_per_ampere``, with a ``saturation`` or without, or a ``file``.
+    Either ``tesla_per_ampere``, with or without ``saturation``, or a ``file`` is required.
 
     Raises
     ------
@@ -43,15 +44,15 @@ class CoilModel:
 
     """
 
-    #: at small currents, in T/A or T/V; negative where the leads are swapped
+    #: coil constant at small currents, in T/A or T/V; negative if the leads are swapped
     tesla_per_ampere: float = math.nan
     #: flux density B_s in T of ``B_s tanh(tesla_per_ampere I / B_s)``
     saturation: float = math.inf
-    file: str = ''  #: CSV with the columns current (A) and flux_density (T), rising, through 0
+    file: str = ''  #: CSV with increasing columns current (A) and flux_density (T), through 0
     limit: float = math.inf  #: largest current in A
     rms: float = math.inf  #: largest effective current in A ...
     rms_time: float = 10.0  #: ... over this time in s, the thermal time constant of the coil
-    #: of an iron core whose hysteresis is compensated: see `IronCore`; empty for none
+    #: iron core whose hysteresis is compensated, see `IronCore`; empty for none
     play_widths: Sequence[float] = ()
     play_weights: Sequence[float] = ()
     _table: tuple[Array, Array] | None = field(default=None, init=False, repr=False, compare=False)
@@ -68,7 +69,7 @@ class CoilModel:
                 'density in T at 1 A (1 V) of the source, or coil.file')
 
     def compensation(self) -> Compensation | None:
-        """Return what undoes the hysteresis of the core, if it is to be."""
+        """Return a new compensation of the core's hysteresis, if configured."""
         if not (len(self.play_widths) or len(self.play_weights)):
             return None
         return Compensation(IronCore(self.play_widths, self.play_weights))
@@ -82,7 +83,7 @@ class CoilModel:
             self.saturation * math.tanh(linear / self.saturation))
 
     def current(self, level: float) -> float:
-        """Return the current in A for a flux density in T, or the largest one there is."""
+        """Return the current in A for a flux density in T, limited to the reachable range."""
         if self._table is not None:
             current, flux = self._table
             way = 1 if flux[-1] > flux[0] else -1
@@ -93,7 +94,7 @@ class CoilModel:
         return level / self.tesla_per_ampere
 
     def within(self, limit: float) -> tuple[float | None, float, float]:
-        """Return the largest level in T within a current, and the least and largest T/A there."""
+        """Return the largest level in T within a current limit, and the range of T/A there."""
         most = min(limit, self.limit)
         if self._table is not None:
             most = min(most, -self._table[0][0], self._table[0][-1])
@@ -124,7 +125,7 @@ def _table_in(path: Path) -> tuple[Array, Array]:
 @dataclass(frozen=True)
 class SensorScale:
     """
-    What a sensor's reading means: ``stretch = (gain reading + offset) / rest_length``.
+    Scale of a sensor: ``stretch = (gain reading + offset) / rest_length``.
 
     Raises
     ------
@@ -133,10 +134,10 @@ class SensorScale:
 
     """
 
-    gain: float = 1.0  #: length per unit of the reading; negative where the reading falls
+    gain: float = 1.0  #: length per unit of the reading; negative if the reading decreases
     offset: float = 0.0  #: length at reading 0
-    rest_length: float = 1.0  #: of the actuator without a field, in the unit of the above
-    latency: float = 0.0  #: time in s by which the timestamps of the readings are too late
+    rest_length: float = 1.0  #: length of the actuator without a field, in the same unit
+    latency: float = 0.0  #: lateness in s of the timestamps of the readings
 
     def __post_init__(self) -> None:
         for x in fields(self):
@@ -145,7 +146,7 @@ class SensorScale:
             raise BadInputError('sensor.gain is 0: expected another number')
 
     def stretch(self, reading: float) -> float:
-        """Return the stretch at a reading."""
+        """Return the stretch for a reading."""
         return (self.gain * reading + self.offset) / self.rest_length
 
     @property
@@ -156,12 +157,12 @@ class SensorScale:
 
 def require(name: str, value: Any, *, positive: bool = False) -> None:
     """
-    Refuse a setting that is no number, or not above 0.
+    Check that a setting is a number, and above 0 if required.
 
     Raises
     ------
     BadInputError
-        If it is refused.
+        If it is not.
 
     """
     if not is_number(value, finite=not positive) or (positive and not value > 0.0):
@@ -171,12 +172,12 @@ def require(name: str, value: Any, *, positive: bool = False) -> None:
 
 def parts(settings: Mapping[str, Any]) -> tuple[CoilModel, SensorScale]:
     """
-    Return what the settings ``coil.*`` and ``sensor.*`` describe.
+    Return the coil and the scale described by the settings ``coil.*`` and ``sensor.*``.
 
     Raises
     ------
     BadInputError
-        If there is no such setting, or a value is out of range.
+        If a setting does not exist, or a value is out of range.
 
     """
     kinds: dict[str, Any] = {'coil': CoilModel, 'sensor': SensorScale}
@@ -200,7 +201,7 @@ class _Heat:
         self._since = monotonic()
 
     def set(self, current: float) -> None:
-        """Take in that a current flows from now on."""
+        """Record the present current."""
         self._pass()
         self._current = current
 
@@ -212,12 +213,12 @@ class _Heat:
 
     def check(self, current: float | None = None) -> None:
         """
-        Refuse a current in A, or the present one, where the coil is too warm for it.
+        Refuse a current in A, by default the present one, if the coil is too warm for it.
 
         Raises
         ------
         StateLostError
-            If it is.
+            If the coil is too warm.
 
         """
         self._pass()
@@ -238,13 +239,13 @@ class Assembly:
     Parameters
     ----------
     source : object
-        Has the members of `Hardware` but ``read``, in A (V) in place of T.
+        Has the members of `Hardware` except ``read``, in A (V) instead of T.
     coil : CoilModel
-        What the currents mean.
+        Conversion of the currents.
     scale : SensorScale
-        What the readings mean.
+        Conversion of the readings.
     sensor : object, optional
-        Has ``read``; by default the source, if it has that. Its times are of the source's clock.
+        Has ``read``; by default the source, if it has that. Its times are on the source's clock.
 
     """
 
@@ -270,7 +271,7 @@ class Assembly:
             self.applied: Callable[..., Any] = self._applied
 
     def write(self, level: float, now: int) -> tuple[Any, Any]:
-        """Set the coil to a level in T; return when, and the level really set."""
+        """Set the coil to a level in T; return its time, and the actual level."""
         current = self._current(now, level, off=not level)
         self._heat.check(current)
         answer = self.source.write(current, now)
@@ -284,7 +285,7 @@ class Assembly:
             level if self._core is None else self._core.ask(stamp, level, off=off))
 
     def _level(self, stamp: int, current: float) -> float:
-        """Return the level in T that was asked for where a current in A is set by a stamp."""
+        """Return the requested level in T for a current in A that is set by a timestamp."""
         level = self.coil.flux_density(current)
         return level if self._core is None else self._core.field_of(
             stamp, level, 2.0 * (self.resolution or 1e-9 * abs(level)))
@@ -315,6 +316,6 @@ class Assembly:
             for x in readings(self.sensor.read(now))]
 
     def close(self) -> None:
-        """End with both parts."""
+        """Close source and sensor."""
         for part in {id(x): x for x in (self.source, self.sensor)}.values():
             getattr(part, 'close', lambda: None)()

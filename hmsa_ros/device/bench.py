@@ -1,4 +1,4 @@
-"""A coil and its sensor on the bench: levels handed over, and what comes of them."""
+"""A coil and its sensor on the bench: levels to apply, and their results."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -19,28 +19,28 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.units import NANOSECONDS
 
-# In s: how far ahead levels are handed over, between signs of life, silence after which the coil
-# is cut off, the longest start, and how long whoever waits sleeps.
+# In s: lead time of levels, interval of heartbeats, silence after which the coil is cut off, limit
+# for the start, and sleeping time of a waiting loop.
 LEAD, _BEAT, SILENCE, _START, _LOOK = 0.1, 0.05, 1.0, 10.0, 2e-3
-# How often a level that has not been set is waited for.
+# Number of further waits for a level that has not been set.
 _PATIENCE = 10
 
 
 class Seen(NamedTuple):
-    """What came of a phase."""
+    """Results of a phase."""
 
     changes: list[Change]
     samples: list[Sample]
     asked: list[tuple[int, float]]
 
     def joined(self, more: 'Seen') -> 'Seen':
-        """Return this phase and a later one as one."""
+        """Return the results of this phase and a later one together."""
         return Seen(
             self.changes + more.changes, self.samples + more.samples, self.asked + more.asked)
 
     @property
     def stretch(self) -> Array:
-        """Stretch of the samples that have one."""
+        """Stretch of the samples, without NaN."""
         found = np.array([x.stretch[0] for x in self.samples])
         finite: Array = found[np.isfinite(found)]
         return finite
@@ -48,22 +48,22 @@ class Seen(NamedTuple):
 
 class Bench:
     """
-    Hardware of one joint, and a commander that repeats the last level as a planner does.
+    Hardware of one joint, with a commander that repeats the last level as a planner does.
 
-    A context manager: the coil is off at the end, however that comes.
+    A context manager: the coil is off at the end in any case.
 
     Parameters
     ----------
     name : str
-        ``MODULE:NAME``, or one that is shipped.
+        ``MODULE:NAME``, or a class shipped with the package.
     settings : mapping
-        Its keyword arguments.
+        Keyword arguments of the class.
     limit : float
         Largest flux density in T.
     rate : float
-        Rate in Hz at which it is read; 0 for never.
+        Sampling rate in Hz; 0 for no samples.
     joint : str
-        Name it is called with.
+        Joint name passed to the class.
     calls : Calls, optional
         Limits and times the calls of hardware.
 
@@ -78,9 +78,9 @@ class Bench:
             self, name: str, settings: Mapping[str, Any], limit: float, rate: float,
             joint: str = 'actuator', calls: Calls | None = None) -> None:
         self.name = name
-        #: How late in s the host wakes whoever sleeps.
+        #: Oversleeping of the host in s, for each wait.
         self.slept: list[float] = []
-        #: Whether signs of life are given.
+        #: Whether heartbeats are sent.
         self.beats = True
         self.worker = HardwareWorker(lambda: HardwareDevice(
             [HardwareJoint(load(name, joint, settings), limit, Fallback(SILENCE, 'zero'))],
@@ -89,7 +89,7 @@ class Bench:
             raise HmsaError(
                 f'the hardware has not started within {_START:g} s, or its first write not '
                 'returned: expected one that does')
-        # The newest command, which is repeated as a sign of life.
+        # The newest command, which is repeated as a heartbeat.
         self._newest, self._turn = (0, 0.0), Lock()
         self._over = Event()
         self._beating = Thread(target=self._beat, name='beat', daemon=True)
@@ -105,19 +105,19 @@ class Bench:
 
     @property
     def coil(self) -> Coil:
-        """What is known of the coil."""
+        """The coil of the joint."""
         return self.worker.device.coils[0]
 
     def _beat(self) -> None:
         while not self._over.wait(_BEAT):
-            # What has failed refuses all.
+            # Failed hardware refuses all commands.
             with self._turn, suppress(BadInputError):
                 if self.beats:
                     self.worker.receive(0, *self._newest)
             self.worker.look_after()
 
     def run(self, seconds: float, levels: Sequence[float] = ()) -> Seen:
-        """Let time pass, with levels in T spread over it; the last one stays."""
+        """Wait, with levels in T spread over the time; the last one stays."""
         begin, apart = time_ns() + round(LEAD * NANOSECONDS), seconds / max(len(levels), 1)
         asked = [(begin + round(i * apart * NANOSECONDS), x) for i, x in enumerate(levels)]
         with self._turn:
@@ -131,7 +131,7 @@ class Bench:
         return Seen(self.worker.device.changes(), self.worker.device.samples(), asked)
 
     def hold(self, seconds: float, levels: Sequence[float]) -> Seen:
-        """Run, longer where the last level comes late; raise `HmsaError` if it fails."""
+        """Run until the last level is set; raise `HmsaError` if that fails."""
         seen = self.run(seconds, levels)
         for _ in range(_PATIENCE):
             if failure := self.worker.failure or self.worker.trouble:
@@ -145,7 +145,7 @@ class Bench:
 
 
 def matched(seen: Seen) -> list[tuple[Change, tuple[int, float]]]:
-    """Return which change belongs to which level asked for: the first one in its time."""
+    """Return pairs of change and requested level: the first change in the level's time."""
     found, changes = [], list(seen.changes)
     for i, (stamp, level) in enumerate(seen.asked):
         until = seen.asked[i + 1][0] if i + 1 < len(seen.asked) else math.inf

@@ -1,4 +1,4 @@
-"""What readings of a field probe say of a coil: its constant, saturation, table and hysteresis."""
+"""Coil properties from readings of a field probe: constant, saturation, table and hysteresis."""
 
 from dataclasses import dataclass
 import math
@@ -11,41 +11,41 @@ from scipy.special import stdtrit
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import Array
 
-# Readings that a fit needs at the least.
+# Minimum number of readings for a fit.
 _FEWEST = 4
-# Share of the range that a model may miss where scatter does not explain it, and a saturation that
-# the readings do not show, in units of the largest field.
+# Fraction of the range by which a model may deviate beyond the hysteresis; saturation, in units of
+# the range, from which it is not significant.
 _MISSES, _FAR = 0.005, 20.0
-# Levels that demagnetise a core.
+# Number of levels that demagnetise a core.
 _DECAY = 12
-# Currents closer than this share of their range are one.
+# Currents closer than this fraction of their range count as equal.
 _SAME = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class CoilCalibration:
     """
-    A coil as a field probe has seen it.
+    A coil as measured with a field probe.
 
     Attributes
     ----------
     tesla_per_ampere, std : float
-        At small currents, and the standard deviation.
+        Coil constant at small currents, and its standard deviation.
     interval : (float, float)
-        95 % interval of it.
+        95 % interval of the coil constant.
     saturation : float
-        B_s in T of ``B_s tanh(tesla_per_ampere I / B_s)``; infinite where it does not show.
+        B_s in T of ``B_s tanh(tesla_per_ampere I / B_s)``; infinite if not significant.
     offset : float
         Reading in T without a current.
     misses : float
-        Largest distance of a mean reading from the model, as a share of the range.
+        Largest deviation of a mean reading from the model, as a fraction of the range.
     hysteresis : float
-        Largest distance of the mean readings at one current while it rises and while it falls, as
-        a share of the range; NaN where no current was approached from both sides.
+        Largest difference of the mean readings at one current between rising and falling current,
+        as a fraction of the range; NaN if no current was approached from both sides.
     current, flux_density : ndarray, shape (m,)
-        Mean readings less the offset at each current, by current.
+        Distinct currents in ascending order, and the mean reading at each minus the offset.
     model : str
-        What to use: ``number``, ``saturation`` or ``table``.
+        Recommended model: ``number``, ``saturation`` or ``table``.
 
     """
 
@@ -61,14 +61,14 @@ class CoilCalibration:
     model: str
 
     def settings(self, table: str) -> dict[str, Any]:
-        """Return the settings ``hardware.coil.*`` of a driver; a table is in a file."""
+        """Return a driver's settings ``hardware.coil.*``; ``table`` is the file of a table."""
         if self.model == 'table':
             return {'hardware.coil.file': table}
         return {'hardware.coil.tesla_per_ampere': self.tesla_per_ampere} | (
             {'hardware.coil.saturation': self.saturation} if self.model == 'saturation' else {})
 
     def curve(self, current: Array) -> Array:
-        """Return the flux density in T at currents in A by the model, without offset."""
+        """Return the flux density in T of the model at currents in A, without offset."""
         return np.interp(current, self.current, self.flux_density) if self.model == 'table' else (
             _model(current, self.tesla_per_ampere, 0.0, self.saturation))
 
@@ -80,19 +80,19 @@ def calibrate_coil(current: Array, flux_density: Array) -> CoilCalibration:
     Parameters
     ----------
     current : ndarray, shape (n,)
-        Current in A (or voltage in V) of the source at each reading, in the order of the readings.
+        Current in A (or voltage in V) of the source at each reading, in chronological order.
     flux_density : ndarray, shape (n,)
-        Reading in T, with any offset of the probe.
+        Reading in T, including any offset of the probe.
 
     Returns
     -------
     CoilCalibration
-        With the simplest model that the readings allow.
+        With the simplest model that fits the readings.
 
     Raises
     ------
     BadInputError
-        If there are too few currents, or the readings do not follow them.
+        If there are too few currents, or the readings do not depend on them.
 
     """
     if not np.all(np.isfinite(current) & np.isfinite(flux_density)):
@@ -124,7 +124,7 @@ def calibrate_coil(current: Array, flux_density: Array) -> CoilCalibration:
             'probe and its direction')
     misses = float(np.max(np.abs(mean - _model(at, *values)))) / span
     half = float(stdtrit(len(current) - len(values), 0.975)) * deviation
-    # Both branches of a loop miss a curve in their middle by half of the hysteresis.
+    # Both branches of a loop deviate from a middle curve by half of the hysteresis.
     allowed = _MISSES + 0.5 * (0.0 if math.isnan(hysteresis) else hysteresis)
     model = 'table' if misses > allowed else 'saturation' if saturates else 'number'
     return CoilCalibration(
@@ -140,7 +140,7 @@ def _model(current: Array, slope: float, offset: float, saturation: float = math
 
 
 def _fit(current: Array, flux_density: Array, *, saturating: bool) -> tuple[Array, float, Array]:
-    """Return slope, offset and, with saturation, B_s; the slope's deviation; and residuals."""
+    """Return slope, offset and any B_s; standard deviation of the slope; and residuals."""
     slope, offset = np.polyfit(current, flux_density, 1)
     start = [slope, offset, 2.0 * np.max(np.abs(flux_density - offset))][:3 if saturating else 2]
     values, covariance = curve_fit(
@@ -150,11 +150,11 @@ def _fit(current: Array, flux_density: Array, *, saturating: bool) -> tuple[Arra
 
 
 def branch_means(current: Array, flux_density: Array) -> tuple[Array, Array, float]:
-    """Return currents, mean readings at each, and the hysteresis as a share of the range."""
+    """Return currents, mean readings at each, and hysteresis as a fraction of the range."""
     size = float(np.ptp(current))
     places = np.round(current / size / _SAME).astype(np.int64)
     before = np.concatenate([[np.nan], current[:-1]])
-    # Of readings at one current, the first says from which side it was approached.
+    # The first of several readings at one current shows from which side it was approached.
     side = np.sign(current - before)
     for i in range(1, len(side)):
         if places[i] == places[i - 1]:
@@ -180,5 +180,5 @@ def loop(largest: float, steps: int) -> list[float]:
 
 
 def decay(largest: float) -> list[float]:
-    """Return levels that demagnetise a core: to both sides, ever smaller, and 0."""
+    """Return levels that demagnetise a core: of alternating sign and decreasing size, then 0."""
     return [largest * (1.0 - i / _DECAY) * (-1.0)**i for i in range(_DECAY)] + [0.0]

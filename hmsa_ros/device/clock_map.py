@@ -1,9 +1,9 @@
 """
-The clock of a device against that of its host, from questions that go to and fro.
+Mapping between the clocks of a device and its host, from round-trip queries.
 
-A question that came back fast says most: its answer was given somewhere between both times. Rate
-and offset are a regression over such answers, as Klipper's ``clocksync`` does; the prior of the
-rate keeps the first seconds from following the noise of single answers.
+The shorter a round trip, the more precise the comparison: the device answered at some time between
+both host times. Rate and offset are determined by regression, as in Klipper's ``clocksync``. A
+prior for the rate keeps the first seconds from following the noise of single answers.
 """
 
 from collections import deque
@@ -14,18 +14,18 @@ import numpy as np
 
 from hmsa_ros.model.units import NANOSECONDS
 
-# Answers that are kept, and how many are asked for at once at the start.
+# Number of answers stored, and number of initial queries.
 _KEPT, ENOUGH = 64, 8
-# Standard deviation of the rate of a clock that nothing is known of: 100 ppm.
+# Standard deviation of the rate of an unknown clock: 100 ppm.
 _RATE_STD = 1e-4
-# Answers that took longer than so many of the shortest say too little.
+# Answers that took longer than this multiple of the shortest are ignored.
 _SLOW = 3.0
-# Answers in a row that cannot be of the clock that is known, before it counts as another one.
+# Number of successive answers inconsistent with the known clock until a new one is assumed.
 _STRANGE = 3
 
 
 class _Answer(NamedTuple):
-    """The clock of the device, and half a question's duration, in ns since the first answer."""
+    """Host and device times, and half the duration of a query, in ns since the first answer."""
 
     host: int
     device: int
@@ -34,16 +34,16 @@ class _Answer(NamedTuple):
 
 class ClockMap:
     """
-    Times of a host, and of a device whose clock has another beginning and rate.
+    Conversion between times of a host and of a device whose clock differs in epoch and rate.
 
-    ``drift`` is the rate of the device's clock against the host's, less 1.
+    ``drift`` is the rate of the device's clock relative to the host's, minus 1.
     """
 
     def __init__(self) -> None:
         self._answers: deque[_Answer] = deque(maxlen=_KEPT)
         self._origin = 0, 0
         self._strange = 0
-        # Device time less host time is offset + drift (host - centre), about the centre in ns.
+        # Device time minus host time is offset + drift (host - centre), all in ns.
         self._centre = self._offset = self.drift = 0.0
         self._offset_std = self._rate_std = math.inf
 
@@ -54,14 +54,14 @@ class ClockMap:
         Parameters
         ----------
         before, after : int
-            Times of the host in ns before the question and after the answer.
+            Host times in ns before the query and after the answer.
         device : int
-            Time of the device in the answer, in ns.
+            Device time in the answer, in ns.
 
         Returns
         -------
         bool
-            Whether it is still the same clock, and not one that began anew, as after a reboot.
+            Whether it is still the same clock; False if it restarted, as after a reboot.
 
         """
         if not self._answers:
@@ -80,18 +80,18 @@ class ClockMap:
         return True
 
     def _error(self, host: float) -> float:
-        """Return a bound of the error at a time since the first answer: two deviations."""
+        """Return a bound of the error, two standard deviations, at a time since the origin."""
         return 2.0 * math.hypot(self._offset_std, self._rate_std * (host - self._centre))
 
     def _fit(self) -> None:
-        """Fit rate and offset, each answer weighed by its duration."""
+        """Fit rate and offset, with each answer weighted by its duration."""
         shortest = min(x.half for x in self._answers)
         used = np.array([x for x in self._answers if x.half <= _SLOW * shortest], dtype=float)
         host, device, half = used.T
-        # The time of an answer is anywhere between the two of the host.
+        # The device time is uniformly distributed between the two host times.
         weights = 3.0 / half**2
         self._centre = float(np.average(host, weights=weights))
-        # The delays of one line are alike: their mean does not shrink with their number.
+        # Delays of one line are correlated: averaging does not reduce their mean.
         self._offset_std = shortest / math.sqrt(3.0)
         since, apart = host - self._centre, device - host
         precision = float(weights @ since**2) + _RATE_STD**-2
@@ -102,24 +102,24 @@ class ClockMap:
 
     @property
     def error(self) -> float:
-        """Bound of the error in s at the newest answer; infinite before the first."""
+        """Bound of the error in s at the newest answer; infinite before the first one."""
         if not self._answers:
             return math.inf
         return self._error(self._answers[-1].host) / NANOSECONDS
 
     def host_set(self, by: int) -> None:
-        """Take in that the clock of the host was set ahead by some ns."""
+        """Shift host times by the ns that the host's clock was set ahead."""
         host, device = self._origin
         self._origin = host + by, device
 
     def to_device(self, host: int) -> int:
-        """Return the time of the device in ns at one of the host."""
+        """Return the device time in ns for a host time."""
         begin, clock = self._origin
         since = host - begin
         return clock + since + round(self._offset + self.drift * (since - self._centre))
 
     def to_host(self, device: int) -> int:
-        """Return the time of the host in ns at one of the device."""
+        """Return the host time in ns for a device time."""
         begin, clock = self._origin
         since = device - clock
         apart = (self._offset + self.drift * (since - self._centre)) / (1.0 + self.drift)

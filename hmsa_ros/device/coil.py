@@ -1,4 +1,4 @@
-"""A coil that a driver serves: levels ahead, handed over and in force, and its temperature."""
+"""A driver's coil: its pending, scheduled and applied levels, and its temperature."""
 
 from bisect import bisect_right
 from collections import deque
@@ -14,13 +14,13 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.schedule import CommandSchedule
 from hmsa_ros.model.units import NANOSECONDS
 
-# Of the levels that took effect last, which tell at what level an older sample was taken.
+# Number of recent levels stored to determine the level at the time of an older sample.
 _REMEMBERED = 64
-# In ns: between questions for the time and temperature of a device, and for what it has applied.
+# In ns: intervals of queries for time and temperature of a device, and for applied levels.
 _ASK, _POLL = NANOSECONDS // 4, NANOSECONDS // 200
-# By how many degrees a coil that was too warm must be below its limit.
+# Degrees below the limit to which a coil that was too warm must cool.
 _COOLER = 5.0
-# A level is not written again where the next one is due within so many of the longest writes.
+# A heartbeat is omitted if the next level is due within this multiple of the longest write.
 _ROOM = 2.0
 
 
@@ -32,16 +32,16 @@ class HardwareJoint:
     Raises
     ------
     BadInputError
-        If the limit is out of range.
+        If a limit is out of range.
 
     """
 
-    hardware: Hardware  #: what writes and reads
-    limit: float  #: largest level in T, above 0; what exceeds it is refused
-    #: what to do after a silence
+    hardware: Hardware  #: amplifier and sensor
+    limit: float  #: largest level in T, above 0; larger ones are refused
+    #: reaction to silence
     fallback: Fallback = field(default_factory=lambda: Fallback(safe_flux='zero'))
-    name: str = 'actuator'  #: for sentences
-    #: of the coil in degrees Celsius, above 0; it is off while it is warmer
+    name: str = 'actuator'  #: for messages
+    #: limit of the coil in degrees Celsius, above 0; the coil is off while it is warmer
     temperature_limit: float = math.inf
 
     def __post_init__(self) -> None:
@@ -54,29 +54,29 @@ class HardwareJoint:
 
 class Coil(GuardedJoint):
     """
-    What is known of a coil; NaN where a level in T is not known.
+    State of a coil; an unknown level in T is NaN.
 
     All times are in ns.
 
     Parameters
     ----------
     number : int
-        Of its joint.
+        Number of its joint.
     joint : HardwareJoint
-        What writes and reads; the limit of the hardware counts if it is smaller.
+        Amplifier and sensor; a smaller limit of the hardware takes precedence.
     calls : Calls
         Limits and times the calls of hardware.
     clock : callable
-        Returns the time of this host in ns.
+        Returns the host time in ns.
     notices, changes : deque
-        What gets what there is to log, and the levels that took effect.
+        Receive the notices to log, and the levels that took effect.
 
     Raises
     ------
     BadInputError
-        If the hardware is not as `Hardware` says, or has no temperature to be limited.
+        If the hardware does not conform to `Hardware`, or lacks a temperature to limit.
     HardwareError
-        If it does not answer what time it has.
+        If its clock cannot be read.
 
     """
 
@@ -93,12 +93,12 @@ class Coil(GuardedJoint):
                 f'{self.instrument.name} reports no temperature: expected 0 for no limit, or a '
                 'class with temperature()')
         self.temperature = math.nan
-        self.too_warm = ''  # why the coil is to be off
+        self.too_warm = ''  # why the coil must be off
         self.limit = min(joint.limit, self.instrument.limit or math.inf)
         self.tolerance = self.instrument.tolerance(self.limit)
-        self._heard = False  # whether there was a sign of life since the last look
+        self._heard = False  # whether there was a command or heartbeat since the last look
         self._armed = False
-        # The newest level that was asked for, and the one really in force.
+        # The newest requested level, and the actual one.
         self.asked = self.level = math.nan
         self.saturated = self.lost = 0
         self._history: deque[tuple[int, float]] = deque(maxlen=_REMEMBERED)
@@ -108,18 +108,18 @@ class Coil(GuardedJoint):
         self._synchronise()
 
     def _clear(self) -> None:
-        """Forget what is ahead: the level is to be 0."""
+        """Drop all pending levels, with 0 as the present one."""
         self._schedule = CommandSchedule(0.0)
-        self._wanted = False  # whether it was to be on since then
-        self._repeat = False  # whether a sign of life is to be passed on
-        # What the device keeps, and what of it is due and not yet said to be applied.
+        self._wanted = False  # whether a level other than 0 was commanded since then
+        self._repeat = False  # whether to pass on a heartbeat
+        # Levels stored by the device, and those due but not reported as applied.
         self._handed: deque[tuple[int, float]] = deque()
         self._awaited: deque[tuple[int, float]] = deque()
-        # From when on what it keeps is not what is ahead.
+        # Time from which the stored levels differ from the pending ones.
         self._changed: int | None = None
 
     def clock_set(self, by: int) -> None:
-        """Take in that the clock of this host was set ahead by some ns."""
+        """Shift all times by the ns that the host's clock was set ahead."""
         self.pass_over(by)
         self._schedule.shift(by)
         self._history, self._handed, self._awaited = (
@@ -135,7 +135,7 @@ class Coil(GuardedJoint):
     # -- commands ------------------------------------------------------------------------------
 
     def receive(self, stamp: int, level: float, now: int) -> None:
-        """Take a level in T from a stamp on, unless it is one of before a cut-off."""
+        """Accept a level in T from a timestamp on, unless it is rejected after a cut-off."""
         if self.refuses(stamp, level, now, self._schedule.current):
             return
         self._heard = True
@@ -146,29 +146,29 @@ class Coil(GuardedJoint):
             self.note_late(now - stamp)
 
     def _insert(self, stamp: int, level: float) -> bool:
-        """Take a level in T from a stamp on; return whether anything is different."""
+        """Add a level in T from a timestamp on; return whether the schedule changes."""
         changed = self._schedule.insert(stamp, level)
         if changed and self.instrument.keeps_levels:
             self._changed = stamp if self._changed is None else min(stamp, self._changed)
         return changed
 
     def look(self, now: int) -> None:
-        """Have the watchdog look at what has come."""
+        """Update the watchdog with the commands that have arrived."""
         if self._heard:
             self.feed(now)
             self._heard = False
         for stamp, level in self.watch(now, now, self._schedule.current):
             self._insert(stamp, level)
 
-    # -- what is due ---------------------------------------------------------------------------
+    # -- work that is due ----------------------------------------------------------------------
 
     @property
     def next_level(self) -> int | None:
-        """When the next level is to be written; None if there is none."""
+        """Time of the next level to write; None if there is none."""
         return None if self.instrument.keeps_levels else self._schedule.next_stamp
 
     def due(self, now: int) -> int | None:
-        """Return when to `advance` it next; None for not before a command comes."""
+        """Return the time of the next `advance`; None if it is not needed before a command."""
         times = [self.watch_due, self._schedule.next_stamp, self._next_question]
         if self.instrument.keeps_levels:
             times.append(now + _POLL if self._awaited else None)
@@ -178,12 +178,12 @@ class Coil(GuardedJoint):
 
     def advance(self, now: int) -> None:
         """
-        Write what is due, or have the device keep it.
+        Write levels that are due, or schedule them on the device.
 
         Raises
         ------
         HardwareError
-            If a call fails, or the device does not say what it has applied.
+            If a call fails, or the device does not report applied levels.
 
         """
         self.look(now)
@@ -199,7 +199,7 @@ class Coil(GuardedJoint):
         self._schedule.apply_until(now)
         self._see_applied(now)
         level = self._schedule.current
-        # Whether it is in force, or on its way.
+        # Compared with the level in force or about to be.
         if level != (self._awaited[-1][1] if self._awaited else self.asked):
             self._write(level, now)
         self._hand_over(now)
@@ -215,19 +215,19 @@ class Coil(GuardedJoint):
             raise StateLostError(self.too_warm)
 
     def _has_room(self, now: int) -> bool:
-        """Return whether there is time to write before the next level, which will do as well."""
+        """Return whether a heartbeat fits in before the next level, which replaces it."""
         ahead = self.next_level
         longest = max(self._calls.longest.values(), default=0.0)
         return ahead is None or ahead - now > _ROOM * longest * NANOSECONDS
 
     def read(self, now: int) -> list[tuple[int, float, float]]:
         """
-        Return time, stretch and rate of what is new.
+        Return time, stretch and rate of new readings.
 
         Raises
         ------
         HardwareError
-            If it fails.
+            If a call fails.
 
         """
         try:
@@ -240,7 +240,7 @@ class Coil(GuardedJoint):
     # -- levels ahead --------------------------------------------------------------------------
 
     def _hand_over(self, now: int) -> None:
-        """Have the device keep what has changed of the levels ahead."""
+        """Schedule changed levels on the device."""
         if self._changed is None or self._changed <= now and not self._schedule.next_stamp:
             self._changed = None
             return
@@ -249,7 +249,7 @@ class Coil(GuardedJoint):
         capacity = self.instrument.capacity
         levels = self._schedule.ahead(since)
         if not levels or levels[0][0] > since:
-            # What it has from here on goes, too.
+            # This also drops the device's levels from here on.
             levels.insert(0, (since, self._schedule.at(since)))
         room = len(levels) if capacity is None else max(capacity - len(kept), 0)
         if room or not self._handed or len(kept) < len(self._handed):
@@ -260,7 +260,7 @@ class Coil(GuardedJoint):
         self._changed = levels[0][0] if levels else None
 
     def _see_applied(self, now: int) -> None:
-        """Take in what the device has applied by now."""
+        """Process the levels that the device has applied by now."""
         due = []
         while self._handed and self._handed[0][0] <= now:
             due.append(self._handed.popleft())
@@ -270,7 +270,7 @@ class Coil(GuardedJoint):
             return
         self._awaited.extend(due)
         for when, level in self.instrument.applied(now) if self._awaited else ():
-            # A device that is slow to answer has gone on meanwhile.
+            # A slow device may have applied further levels meanwhile.
             queue = self._awaited or self._handed
             stamp, asked = queue.popleft() if queue else (when, level)
             self._schedule.apply_until(stamp)
@@ -291,7 +291,7 @@ class Coil(GuardedJoint):
 
     def put(self, level: float, now: int) -> None:
         """
-        Write a level; what is ahead is forgotten.
+        Write a level, and drop pending ones.
 
         Raises
         ------
@@ -306,14 +306,14 @@ class Coil(GuardedJoint):
             self.lose(error, now)
 
     def _write(self, level: float, now: int) -> None:
-        """Write a level; raise StateLostError if that is lost."""
+        """Write a level; raise StateLostError if the hardware has lost its state."""
         try:
             when, really = self.instrument.write(level, now)
         except HardwareError:
             self.set(now, math.nan, math.nan)
             raise
         self._took_effect(when, level, really)
-        # What the device kept is dropped.
+        # This drops the levels stored by the device.
         self._handed.clear()
         self._awaited.clear()
         if self.instrument.keeps_levels:
@@ -321,7 +321,7 @@ class Coil(GuardedJoint):
         self._repeat = False
 
     def _took_effect(self, when: int, asked: float, really: float) -> None:
-        """Take in the level that hardware has set in place of the one asked for."""
+        """Record the actual level that hardware has set for a requested one."""
         if abs(really - asked) > self.tolerance:
             self.saturated += 1
             if self.saturated == 1:
@@ -333,7 +333,7 @@ class Coil(GuardedJoint):
         self.set(when, asked, really)
 
     def set(self, when: int, asked: float, level: float) -> None:
-        """Note the requested level, and the one in force from a time on; NaN if unknown."""
+        """Record the requested level, and the actual one from a time on; NaN if unknown."""
         known = not math.isnan(level)
         if asked != self.asked and (known or not math.isnan(self.level)) or (
                 abs(level - self.level) > self.tolerance):
@@ -344,7 +344,7 @@ class Coil(GuardedJoint):
 
     def lose(self, error: StateLostError, now: int) -> None:
         """
-        Take in that hardware has lost its state.
+        Handle a loss of the hardware's state.
 
         Raises
         ------
@@ -373,7 +373,7 @@ class Coil(GuardedJoint):
 
     def lock(self, now: int) -> None:
         """
-        Switch off, or ramp down; then 0 T comes first.
+        Switch off, or ramp down; afterwards 0 T must be commanded first.
 
         Raises
         ------
@@ -386,12 +386,12 @@ class Coil(GuardedJoint):
         self.cut_off(now, zero_first=True)
         if left:
             self.ramp_down(now, left)
-        # That drops what the device keeps, too.
+        # This also drops the levels stored by the device.
         self.put(left, now)
 
     def disarm(self) -> None:
         """
-        Have the device disarmed, if it is armed.
+        Disarm the device, if it is armed.
 
         Raises
         ------
@@ -404,7 +404,7 @@ class Coil(GuardedJoint):
             self.instrument.disarm()
 
     def switch_off(self, now: int) -> str:
-        """Switch off; return why it could not be, in words."""
+        """Switch off; return the reason of a failure in words."""
         try:
             self.put(0.0, now)
             if self.instrument.off(self.level, self.limit):
@@ -419,26 +419,26 @@ class Coil(GuardedJoint):
     # -- the device's clock and temperature ----------------------------------------------------
 
     def _synchronise(self) -> None:
-        """Learn the time of the device anew, where it has a clock."""
+        """Compare clocks anew, if the device has one, and read the temperature."""
         self.instrument.synchronise(self._clock)
-        self._feel()
+        self._check_temperature()
         if self.instrument.clock_map is not None or self.instrument.has('temperature'):
             self._next_question = self._clock() + _ASK
 
-    def _feel(self) -> None:
-        """See whether the coil is too warm, or was and is not yet cool enough."""
+    def _check_temperature(self) -> None:
+        """Read the temperature, and decide whether the coil is too warm, with hysteresis."""
         self.temperature = self.instrument.temperature()
         limit = self._hottest - (_COOLER if self.too_warm else 0.0)
-        # One that is not known is none to go on with.
+        # An unknown temperature counts as too warm.
         self.too_warm = '' if self._hottest == math.inf or self.temperature <= limit else (
             f'the coil is at {self.temperature:.1f} degrees Celsius: expected at most '
             f'{limit:g} (temperature_limit {self._hottest:g}); let it cool')
 
     def _ask(self, now: int) -> bool:
-        """Ask for time and temperature if that is due; return whether the clock is the same."""
-        # Sooner than planned where the clock of the host was set back.
+        """Query time and temperature if due; return whether the clock is the same."""
+        # Also due if the host's clock was set back.
         if self._next_question is None or now < self._next_question <= now + _ASK:
             return True
         self._next_question = now + _ASK
-        self._feel()
+        self._check_temperature()
         return self.instrument.ask_clock(self._clock)

@@ -1,8 +1,7 @@
 """
-Whether a class of hardware does what a driver needs, tried at small levels.
+Check at small levels whether a class of hardware meets the requirements of a driver.
 
-The trial drives it as a driver does, on a `Bench`, and judges by what it returned and by
-what its sensor saw.
+The trial operates it like a driver, on a `Bench`, and evaluates its return values and its sensor.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,24 +24,24 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.units import NANOSECONDS
 
-# In s: a phase of the trial, and how long an end may take.
+# In s: duration of a phase of the trial, and limit for an end.
 _PHASE, _END = 0.6, 3.0
-# Levels that are timed, the time between them in s, and how often the host may spoil that.
+# Number of timed levels, the time between them in s, and attempts if the host disturbs the timing.
 _TIMED, _APART, _TRIES = 30, 0.03, 4
-# Limits: of a call in s, of the lateness of the median level in s, of the age of a sample in s, of
-# the error of a clock in s, of samples that repeat the one before.
+# Limits: of a call in s, of the median lateness of a level in s, of the error of a clock in s, and
+# of the fraction of samples that repeat the previous one.
 _CALL, _LATE, _CLOCK, _REPEATED = 0.02, 2e-3, 1e-3, 0.6
-# Of a coil after levels that are small, in degrees Celsius.
+# Temperature limit of a coil after small levels, in degrees Celsius.
 _HOTTEST = 150.0
-# The share of calls that must keep their limit.
+# Fraction of calls that must keep their limit.
 _MOST = 0.95
-# How many deviations of its mean a response must be to be seen, and the share of it that must lie
-# between rest and either level for 0 T to count as off.
+# Standard deviations of its mean from which a response is significant, and minimum fraction of the
+# response between rest and either level for 0 T to count as off.
 _SEEN, _DISTINCT = 6.0, 0.1
 
 
 class Check(NamedTuple):
-    """One property: whether hardware has it, by a figure that must not exceed a limit."""
+    """One property of hardware: whether a figure keeps its limit."""
 
     name: str
     passed: bool
@@ -53,7 +52,7 @@ class Check(NamedTuple):
 
 
 class Conformance(NamedTuple):
-    """What a trial has shown: checks, what could not be tried and why, and durations in s."""
+    """Results of a trial: checks, reasons for skipped checks, and durations in s."""
 
     name: str
     checks: tuple[Check, ...]
@@ -66,14 +65,14 @@ class Conformance(NamedTuple):
         return all(x.passed for x in self.checks)
 
     def as_json(self) -> dict[str, object]:
-        """Return it for JSON."""
+        """Return the results for JSON."""
         return {
             'passed': self.passed, 'checks': [x._asdict() for x in self.checks],
             'untried': list(self.untried)}
 
 
 class _TimedCalls(Calls):
-    """Notes how long each call takes, and has reading fail once it is to."""
+    """Record the duration of each call, and make reading fail on request."""
 
     def __init__(self) -> None:
         super().__init__(1.0)
@@ -99,15 +98,15 @@ class Trial:
     Parameters
     ----------
     name : str
-        Of what makes it, as MODULE:NAME.
+        MODULE:NAME of the class or function that creates the hardware.
     joint : str
-        Name it is called with.
+        Joint name passed to it.
     settings : mapping
         Its keyword arguments.
     level : float
         Largest flux density in T that is set.
     rate : float
-        Rate in Hz at which it is read, 1 to 10,000.
+        Sampling rate in Hz, 1 to 10,000.
 
     Raises
     ------
@@ -128,9 +127,9 @@ class Trial:
         self._checks: list[Check] = []
         self._untried: list[str] = []
         self._calls = _TimedCalls()
-        # Mean stretch at rest, and how far off a level is at least, where the sensor shows it.
+        # Mean stretch at rest, and smallest response to a level, if the sensor shows it.
         self._rest = self._apart = math.nan
-        # Of a level, in T.
+        # Tolerance of a level in T.
         self._tolerance = 1e-3 * level
 
     def run(self, progress: Callable[[str, float], None]) -> Conformance:
@@ -150,7 +149,7 @@ class Trial:
         Raises
         ------
         BadInputError
-            If there is no such hardware, or it does not start.
+            If the hardware does not exist, or does not start.
         HmsaError
             If it fails at the first levels.
 
@@ -196,7 +195,7 @@ class Trial:
             self.name, self._settings, self._level, self._rate, self._joint, self._calls)
 
     def _timed(self, bench: Bench) -> Seen:
-        """Time a series of levels: again, a few times, where the host slept through one."""
+        """Time a series of levels, repeated a few times if the host overslept."""
         for _ in range(_TRIES):
             bench.slept.clear()
             seen = bench.hold(_TIMED * _APART, [
@@ -279,7 +278,7 @@ class Trial:
             'polarity', -apart, '', 0.0,
             f'{self._level:g} T lengthens the actuator by {apart / 2:.3g} of its length',
             'turn the leads of the coil, or the sign of the sensor')
-        # What 0 T moves as much as a level is never off.
+        # If 0 T responds like a level, the coil is never off.
         near = min(abs(means[1] - means[0]), abs(means[2] - means[0]))
         self._rest, self._apart = means[0], near if near > _DISTINCT * abs(apart) else 0.0
 
@@ -296,7 +295,7 @@ class Trial:
             f'without commands the coil was off after {after:.3g} s', 'write(0.0) must be obeyed')
 
     def _off(self) -> bool | None:
-        """Return whether the sensor of new hardware sees rest; None if it cannot tell."""
+        """Return whether the sensor of new hardware shows rest; None if undetermined."""
         if math.isnan(self._apart):
             return None
         instrument = Instrument(
@@ -355,24 +354,24 @@ class Trial:
     # -- calls ---------------------------------------------------------------------------------
 
     def _check_calls(self, durations: Mapping[str, Array], host: Sequence[float]) -> None:
-        # A busy host takes its time from any call.
+        # A busy host slows down every call.
         busy = float(np.quantile(host, _MOST))
         for name, found in durations.items():
             self._note(
                 f'{name}_time', max(float(np.quantile(found, _MOST)) - busy, 0.0), 's',
-                # What waits at the end delays no level.
+                # Waiting at the end delays no level.
                 _END if name == 'close' else _CALL,
                 f'{name} takes {np.median(found) * 1e3:.3g} ms (at most {found.max() * 1e3:.3g})',
                 'give calls a time limit of their own; nothing else is written meanwhile')
 
 
 def _lateness(seen: Seen) -> list[float]:
-    """Return how much after their time levels took effect, in s."""
+    """Return the lateness of levels in s."""
     return [(x.stamp - stamp) / NANOSECONDS for x, (stamp, _) in matched(seen)]
 
 
 def _serve(name: str, joint: str, settings: str, level: str, rate: str) -> int:
-    """Keep a level, as a driver does, until SIGTERM comes."""
+    """Hold a level, as a driver does, until SIGTERM."""
     ended = Event()
     signal.signal(signal.SIGTERM, lambda *_: ended.set())
     with Bench(name, json.loads(settings), float(level), float(rate), joint) as bench:

@@ -1,4 +1,4 @@
-"""Real hardware as a device: levels written at their stamps, a watchdog, and samples."""
+"""Real hardware as a device: levels written at their timestamps, a watchdog, and samples."""
 
 from collections.abc import Callable, Sequence
 import math
@@ -17,27 +17,27 @@ from hmsa_ros.timekeeping import clock_set_words
 
 class HardwareDevice(Device):
     """
-    Real actuators; their coils are not known to be off before `switch_off`.
+    Real actuators; their coils may be on until `switch_off`.
 
     Parameters
     ----------
     joints : sequence of HardwareJoint
         At least one.
     time : int
-        Time at the start in ns.
+        Initial time in ns.
     period : int
-        Between samples, in ns; 0 for none.
+        Sampling period in ns; 0 for no samples.
     calls : Calls
         Limits and times the calls of hardware.
     clock : callable
-        Returns the time in ns, as ``time`` is; for hardware with a clock of its own.
+        Returns the time in ns, on the clock of ``time``; for hardware with its own clock.
 
     Raises
     ------
     BadInputError
-        If hardware is not as `Hardware` says.
+        If the hardware does not conform to `Hardware`.
     HardwareError
-        If it does not answer what time it has.
+        If its clock cannot be read.
 
     """
 
@@ -54,17 +54,17 @@ class HardwareDevice(Device):
 
     @property
     def time(self) -> int:
-        """Time in ns that it has been advanced to."""
+        """Time in ns that the device has been advanced to."""
         return self._time
 
     @property
     def next_level(self) -> int | None:
-        """Stamp of the next level, in ns; None if there is none ahead."""
+        """Timestamp of the next level in ns; None if there is none."""
         return min((x.next_level for x in self.coils if x.next_level is not None), default=None)
 
     @property
     def due(self) -> int | None:
-        """When to advance it next, in ns; None for not before a command comes."""
+        """Time in ns of the next work; None if there is none until a command arrives."""
         times = [x.due(self._time) for x in self.coils]
         if self._period:
             times.append(self._next_sample)
@@ -72,13 +72,13 @@ class HardwareDevice(Device):
 
     @property
     def counts(self) -> dict[str, int]:
-        """How often a level was not reached, and hardware lost its state."""
+        """Number of levels that were not reached, and of state losses of the hardware."""
         return {'saturated': sum(x.saturated for x in self.coils),
                 'state_lost': sum(x.lost for x in self.coils)}
 
     @property
     def facts(self) -> dict[str, str]:
-        """What is known of clocks, temperatures and calls, in words by name."""
+        """State of clocks, temperatures and calls, as texts by name."""
         found: dict[str, str] = {}
         for x in self.coils:
             if (known := x.instrument.clock_map) is not None:
@@ -91,21 +91,21 @@ class HardwareDevice(Device):
 
     @property
     def too_warm(self) -> str:
-        """Which coils are too warm, in words; empty if none is."""
+        """The coils that are too warm, in words; empty if there is none."""
         return '; '.join(f'joint {x.name}: {x.too_warm}' for x in self.coils if x.too_warm)
 
     # -- commands ------------------------------------------------------------------------------
 
     def check(self, joint: int, stamp: int, level: float) -> None:
         """
-        Refuse a level in T beyond the limit, a stamp in ns of another clock, and any while locked.
+        Refuse levels in T beyond the limit, timestamps in ns of another clock, and locked joints.
 
-        A coil that is too warm takes 0 T only.
+        A coil that is too warm accepts only 0 T.
 
         Raises
         ------
         BadInputError
-            If it is.
+            If the level is refused.
 
         """
         limit = self.coils[joint].limit
@@ -120,19 +120,20 @@ class HardwareDevice(Device):
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
         """
-        Take a level in T that applies from a stamp in ns on; a past one, or 0, at once.
+        Accept a level in T that applies from a timestamp in ns on; immediately if past or 0.
 
         Raises
         ------
         BadInputError
-            If the level is beyond the limit, the stamp of another clock, or the interlock open.
+            If the level is beyond the limit, its timestamp of another clock, or the interlock
+            open.
 
         """
         self.check(joint, stamp, level)
         self.coils[joint].receive(stamp, level, self._time)
 
-    def hear(self, joint: int, stamp: int, level: float, now: int) -> None:
-        """Take a level that came at a time in ns (see `receive`), after any silence before it."""
+    def receive_at(self, joint: int, stamp: int, level: float, now: int) -> None:
+        """Accept a level that arrived at a time in ns (see `receive`); run the watchdog first."""
         self._pass_to(now)
         self.coils[joint].look(now)
         self.receive(joint, stamp, level)
@@ -140,10 +141,10 @@ class HardwareDevice(Device):
 
     def lock(self, why: str, time: int) -> None:
         """
-        Switch all coils off at a time in ns, or ramp them down, and refuse commands from then on.
+        Switch off all coils at a time in ns, or ramp them down, and refuse commands from then on.
 
-        Afterwards a joint obeys 0 T first: what was under way does not go on. An empty reason
-        ends it.
+        Afterwards, a joint must first receive 0 T, so that earlier motion does not continue. An
+        empty reason ends the lock.
 
         Raises
         ------
@@ -167,7 +168,7 @@ class HardwareDevice(Device):
         self._time = time
 
     def clock_set(self, by: int) -> None:
-        """Take in that the clock was set ahead by some ns: all that is ahead stays as far away."""
+        """Shift all future times by the ns that the clock was set ahead."""
         self._time += by
         self._next_sample += by
         for coil in self.coils:
@@ -176,7 +177,7 @@ class HardwareDevice(Device):
 
     def advance(self, time: int) -> None:
         """
-        Write what is due at a time in ns, which is now, and read if that is due.
+        Write levels due at a time in ns, which is now, and read if due.
 
         Raises
         ------
@@ -194,7 +195,7 @@ class HardwareDevice(Device):
             self._read()
 
     def _read(self) -> None:
-        """Take what is new; readings of several joints with one stamp are one sample."""
+        """Add new samples; readings of several joints with the same timestamp form one sample."""
         found: dict[int, Array] = {}
         for coil in self.coils:
             for stamp, *values in coil.read(self._time):
@@ -207,17 +208,17 @@ class HardwareDevice(Device):
     # -- the end -------------------------------------------------------------------------------
 
     def switch_off(self, time: int) -> str:
-        """Switch all coils off at a time in ns; return what could not be, in words."""
+        """Switch off all coils at a time in ns; return the failures in words."""
         self._pass_to(time)
         return '; '.join(filter(None, [x.switch_off(time) for x in self.coils]))
 
     def open(self) -> None:
-        """Have the hardware connect again, where it can."""
+        """Reconnect the hardware, if it supports that."""
         for x in self.coils:
             x.instrument.open()
 
     def close(self) -> str:
-        """Have the hardware end; return what has gone wrong, in words."""
+        """Close the hardware; return the failures in words."""
         wrong = []
         for x in self.coils:
             try:

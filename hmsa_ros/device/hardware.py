@@ -1,4 +1,4 @@
-"""Hardware as a laboratory writes it: found by its name, and called with care."""
+"""Hardware classes of a laboratory: loading by name, and checked calls."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -22,62 +22,63 @@ from hmsa_ros.model.units import NANOSECONDS
 
 T = TypeVar('T')
 
-#: Hardware of this package, by the short names that `load` takes, too.
+#: Hardware of this package, by the short names that `load` also accepts.
 SHIPPED = {
     'serial_board': 'hmsa_ros.device.serial_board:SerialBoard',
     'scpi_supply': 'hmsa_ros.device.scpi_supply:ScpiSupply',
     'topic': 'hmsa_ros.nodes.topic_coil:TopicCoil'}
-# What its methods take; all but the first two are optional.
+# Arguments of the methods; all methods except the first two are optional.
 _TAKES: dict[str, tuple[str, ...]] = {
     'write': ('level', 'now'), 'read': ('now',), 'open': (), 'close': (),
     'schedule': ('levels',), 'applied': (), 'clock': (), 'arm': (), 'disarm': (),
     'temperature': ()}
 OPTIONAL = tuple(_TAKES)[2:]
-# In ns from now, besides the longest call: what cannot be the time of anything that has happened.
+# Largest plausible difference in ns, beyond the longest call, between an event and now.
 _ABSURD = 10 * NANOSECONDS
-# Of one call that yields its answer piece by piece, which may never end.
+# Limit on the items of one answer that is an iterator, which may be endless.
 _MOST_PIECES = 100_000
-# In s, the most that counts of the time between two looks at a call.
+# Largest counted time in s between two checks of a call.
 _UNSEEN = 0.1
-# A call that blocks lets Python run, or the process ends so many s after its time.
+# Grace time in s: a blocking call must release Python's global lock by then, or the process ends.
 _GRACE = 1.5
-# Of the limit: less than this is rounding where the hardware names no resolution, and no field
-# that a coil is left on with.
+# Fractions of the limit: rounding of hardware without a stated resolution, and the largest field
+# of a coil that counts as off.
 _ROUNDING, _OFF = 1e-6, 0.01
 
 
 class Hardware(Protocol):
-    """A coil's amplifier, and the sensor of its actuator; all calls must be quick."""
+    """A coil's amplifier and the sensor of its actuator; all calls must be short."""
 
-    # It may have `limit` (T), `resolution` (T), `slew` (T/s), `description`, for the log at the
-    # start, `open()`, which connects again, and `close()` too. All calls come from one thread,
-    # also that of the class, unless one blocks.
+    # Optional members are `limit` (T), `resolution` (T), `slew` (T/s), `description` for the log
+    # at startup, `open()`, which reconnects, and `close()`. All calls, including that of the
+    # class, come from one thread, unless a call blocks.
     #
-    # What keeps time itself has `schedule(levels)`, which takes [(stamp, level), ...] ahead and
-    # replaces all that it has at or after the first stamp (an empty list is a sign of life), at
-    # most `capacity` of them at a time; `write` drops what is ahead. With `applied()`, it returns
-    # [(stamp, level), ...] that have taken effect since it was last called.
+    # Hardware that applies levels at their times has `schedule(levels)`. It accepts a list
+    # [(stamp, level), ...] of future levels, at most `capacity` at a time, which replaces all
+    # stored levels at or after the first timestamp; an empty list is a heartbeat. `write` drops
+    # stored levels. With `applied()`, it returns the [(stamp, level), ...] that have taken effect
+    # since the last call.
     #
-    # `arm()` comes before the first level but 0 T, and `disarm()` once the coil is off at the end,
-    # on deactivation, and while an interlock is open.
+    # `arm()` is called before the first level other than 0 T, and `disarm()` once the coil is off
+    # at the end, on deactivation, and while an interlock is open.
     #
-    # `temperature()` returns that of the coil in degrees Celsius, NaN if it is not known.
+    # `temperature()` returns the coil temperature in degrees Celsius, NaN if unknown.
     #
-    # With `clock()`, its own time in ns, all times that it takes and returns are of that clock.
+    # With `clock()`, which returns its time in ns, all times passed and returned are on its clock.
 
     def write(self, level: float, now: int) -> int | tuple[int, float] | None:
         """
         Set the coil to a level in T at a time in ns.
 
-        Return when that took effect, that and the level really set, or None for ``now``.
+        Return the time of effect, that time and the actual level, or None for ``now``.
         """
 
     def read(self, now: int) -> Any:
-        """Return stretch, rate in 1/s and stamp in ns, or a list of those; see `Reading`."""
+        """Return stretch, rate in 1/s and timestamp in ns, or a list of those; see `Reading`."""
 
 
 class Reading(NamedTuple):
-    """What a sensor saw; NaN is not measured, and None is the time of the call."""
+    """A reading of a sensor; NaN: not measured, timestamp None: time of the call."""
 
     stretch: float
     rate: float = math.nan
@@ -85,25 +86,25 @@ class Reading(NamedTuple):
 
 
 class HardwareError(HmsaError):
-    """Hardware that raised an error, or answered what cannot be used."""
+    """Hardware that raised an error, or returned an invalid answer."""
 
 
-def told(error: BaseException) -> str:
-    """Return an exception for a sentence."""
+def described(error: BaseException) -> str:
+    """Return a description of an exception for a message."""
     name = type(error).__name__
     try:
         text = str(error)
-    except BaseException as another:  # of an exception that cannot be written either
+    except BaseException as another:  # the text of an exception may fail too
         text = f'no text, since {type(another).__name__} was raised meanwhile'
-    # The sentences of this package are short enough.
+    # Messages of this package are short enough.
     shown = text if isinstance(error, HmsaError) else excerpt(text)
     return f'{name}: {shown}' if text else name
 
 
 def imported(text: str) -> Any:
-    """Return what ``'MODULE:NAME'`` names; the module may be in the working directory."""
+    """Return the object named ``'MODULE:NAME'``; the module may be in the working directory."""
     if os.getcwd() not in sys.path:
-        # The script of a command has its own folder there instead.
+        # For the script of a command, sys.path contains the folder of the script instead.
         sys.path.append(os.getcwd())
     module, _, name = text.partition(':')
     return getattr(import_module(module), name)
@@ -111,14 +112,14 @@ def imported(text: str) -> Any:
 
 def load(text: str, joint: str, settings: Mapping[str, Any]) -> Hardware:
     """
-    Return the hardware of a joint by its name, ``'MODULE:NAME'`` or one of `SHIPPED`.
+    Create the hardware of a joint by its name, ``'MODULE:NAME'`` or one of `SHIPPED`.
 
-    Settings are its keyword arguments.
+    The settings are its keyword arguments.
 
     Raises
     ------
     BadInputError
-        If there is no such thing, or it fails.
+        If it does not exist, or fails.
 
     """
     path = SHIPPED.get(text, text)
@@ -128,10 +129,10 @@ def load(text: str, joint: str, settings: Mapping[str, Any]) -> Hardware:
             f'as in hardware:=my_lab:Coil, or {", ".join(SHIPPED)}')
     try:
         make = imported(path)
-    except BaseException as error:  # whatever a laboratory's module raises, sys.exit too
+    except BaseException as error:  # any error of the module, including sys.exit
         raise BadInputError(
-            f'hardware {text!r} cannot be loaded ({told(error)}): expected a module that Python '
-            'finds, or in the working directory, with that name in it') from error
+            f'hardware {text!r} cannot be loaded ({described(error)}): expected a module that '
+            'Python finds, or in the working directory, with that name in it') from error
     try:
         found: Hardware = make(joint, **settings)
     except HmsaError as error:
@@ -141,8 +142,8 @@ def load(text: str, joint: str, settings: Mapping[str, Any]) -> Hardware:
         takes = ' and the settings ' + ', '.join(
             f'hardware.{x}' for x in settings) if settings else ''
         raise BadInputError(
-            f'hardware {text!r} of joint {joint} does not start ({told(error)}): expected it to '
-            f'take the name of a joint{takes}') from error
+            f'hardware {text!r} of joint {joint} does not start ({described(error)}): expected it '
+            f'to take the name of a joint{takes}') from error
     if not all(callable(getattr(found, x, None)) for x in ('write', 'read')):
         raise BadInputError(
             f'hardware {text!r} made a {type(found).__name__}: expected something with the '
@@ -159,14 +160,14 @@ def _last_words(name: str, seconds: float) -> bytes:
 
 class Calls:
     """
-    What is called, one at a time, and for how long; ``longest`` has the longest time in s.
+    Call hardware, one call at a time, with limits; ``longest`` contains the longest times in s.
 
     Parameters
     ----------
     limit : float
-        Time in s that a call may take.
+        Time limit of a call in s.
     deadline : Deadline, optional
-        Ends the process if a call lets no Python run for that time and some more.
+        Ends the process if a call blocks Python for that time and a grace time.
 
     """
 
@@ -175,21 +176,21 @@ class Calls:
         self.longest: dict[str, float] = {}
         self._deadline = deadline
         self._armed = False
-        # Name of the call under way, in a tuple of its own for each.
+        # Name of the call under way, in a new tuple for each call.
         self._begun: tuple[str] | None = None
-        # The call that was under way when `overdue` was last asked, when that was, and for how
-        # long it has been since.
+        # The call under way at the last check by `overdue`, the time of that check, and the
+        # counted duration of the call.
         self._seen: tuple[str] | None = None
         self._looked = self._waited = 0.0
 
     def make_ready(self) -> None:
-        """Do what takes some microseconds before a call."""
+        """Arm the deadline before a call, since that takes some microseconds."""
         if self._deadline is not None and not self._armed:
             self._deadline.set(self.limit + _GRACE)
             self._armed = True
 
     def __call__(self, name: str, act: Callable[[], Any]) -> Any:
-        """Call a method of hardware; ``name`` is its name for a sentence."""
+        """Call a method of hardware; ``name`` is its name in messages."""
         self.make_ready()
         if self._deadline is not None:
             self._deadline.say(_last_words(name, self.limit + _GRACE))
@@ -203,28 +204,29 @@ class Calls:
             self.longest[name] = max(self.longest.get(name, 0.0), monotonic() - begun)
 
     def relax(self) -> None:
-        """Take back `make_ready`: no call is under way."""
+        """Disarm the deadline while no call is under way."""
         if self._deadline is not None and self._armed:
             self._deadline.set(0.0)
             self._armed = False
 
     def give_up(self, seconds: float) -> None:
-        """End the process after some seconds, unless the call returns that hangs."""
+        """End the process after some seconds, unless the blocked call returns."""
         if self._deadline is not None:
             self._deadline.say(encoded('the driver hangs while it ends'))
             self._deadline.set(seconds)
 
     @property
     def current(self) -> str:
-        """Name of the call that is under way; empty if none is."""
+        """Name of the call under way; empty if there is none."""
         begun = self._begun
         return '' if begun is None else begun[0]
 
     def overdue(self) -> str:
         """
-        Return the name of the call that takes too long; empty if none does.
+        Return the name of a call that exceeds its limit; empty if there is none.
 
-        To be asked often: time in which nobody asks counts little, as that of a stopped process.
+        It must be called often: time between two checks is only counted in part, since the process
+        may have been stopped.
         """
         begun, now = self._begun, monotonic()
         passed, self._looked = min(now - self._looked, _UNSEEN), now
@@ -235,15 +237,15 @@ class Calls:
 
 class Instrument:
     """
-    The hardware of a joint, with what it returns checked, and ``name`` for sentences.
+    The hardware of a joint, with checked return values, and ``name`` for messages.
 
-    Its calls raise `HardwareError` where they fail, or answer what cannot be used, and
-    `StateLostError` where the hardware says so.
+    Its calls raise `HardwareError` if they fail or return an invalid answer, and `StateLostError`
+    if the hardware raises it.
 
     Raises
     ------
     BadInputError
-        If it is not as `Hardware` says.
+        If the hardware does not conform to `Hardware`.
 
     """
 
@@ -255,7 +257,7 @@ class Instrument:
         for method, arguments in _TAKES.items():
             try:
                 inspect.signature(getattr(hardware, method, lambda *_: 0)).bind(*arguments)
-            except ValueError:  # of something that is no Python
+            except ValueError:  # not a Python function
                 pass
             except TypeError as error:
                 raise BadInputError(
@@ -263,50 +265,50 @@ class Instrument:
                     f'{method}({", ".join(arguments)})') from error
         self.limit, self.resolution, self.slew, capacity = (
             self._number(x) for x in ('limit', 'resolution', 'slew', 'capacity'))
-        #: How many levels it takes ahead; None for any number.
+        #: Number of levels that it can store; None for unlimited.
         self.capacity = None if capacity is None else int(capacity)
-        #: Whether it takes levels ahead.
+        #: Whether it stores future levels.
         self.keeps_levels = self.has('schedule')
-        #: What was found, in its words.
+        #: Description given by the hardware.
         self.description = str(getattr(hardware, 'description', '') or '')
-        #: The device's clock against that of this host; None where there is one clock.
+        #: Mapping from the host's clock to the device's; None if both share one clock.
         self.clock_map = ClockMap() if self.has('clock') else None
-        # Stamps of ours, in the device's clock as it was known when they were handed over.
+        # Device times of scheduled host timestamps, by the mapping at the time of scheduling.
         self._handed: dict[int, int] = {}
 
     def _number(self, name: str) -> float | None:
         try:
             value = getattr(self.hardware, name, None)
-        except BaseException as error:  # of a property
-            raise BadInputError(f'{self.name}.{name} raised {told(error)}') from error
+        except BaseException as error:  # error of a property
+            raise BadInputError(f'{self.name}.{name} raised {described(error)}') from error
         if value is not None and not (is_number(value) and value > 0.0):
             raise BadInputError(
                 f'{self.name}.{name} is {excerpt(value)}: expected a number above 0, or None')
         return None if value is None else float(value)
 
     def has(self, method: str) -> bool:
-        """Return whether it has a method."""
+        """Return whether the hardware has a method."""
         return method in self._methods
 
     def tolerance(self, limit: float) -> float:
-        """Return which difference in T between levels asked and set is none."""
+        """Return the tolerated difference in T between requested and actual levels."""
         return max(self.resolution or 0.0, _ROUNDING * limit)
 
     def off(self, level: float, limit: float) -> bool:
-        """Return whether a coil with a level in T is off."""
+        """Return whether a coil with a level in T counts as off."""
         return abs(level) <= max(self.resolution or 0.0, _OFF * limit)
 
     # -- calls ---------------------------------------------------------------------------------
 
     def _call(self, method: str, *arguments: object) -> Any:
-        """Call a method, and return its answer; do nothing without one that is optional."""
+        """Call a method, and return its answer; do nothing if an optional method is missing."""
         if not self.has(method):
             return None
         name = self._names[method]
 
         def act() -> Any:
             answer = getattr(self.hardware, method)(*arguments)
-            # What is yielded is waited for and fails as the call itself does.
+            # An iterator is consumed within the call, including its time limit and errors.
             return answer if not isinstance(answer, Iterator) else [
                 *islice(answer, _MOST_PIECES + 1)]
 
@@ -314,13 +316,13 @@ class Instrument:
             return self._calls(name, act)
         except StateLostError:
             raise
-        except BaseException as error:  # whatever a laboratory's code raises, sys.exit too
-            raise HardwareError(f'{name} raised {told(error)}') from error
+        except BaseException as error:  # any error of the laboratory's code, including sys.exit
+            raise HardwareError(f'{name} raised {described(error)}') from error
 
     def _ask(
             self, method: str, *arguments: object, take: Callable[[Any], T],
             wrong: Callable[[str], HardwareError]) -> T:
-        """Return what `take` makes of an answer; it raises TypeError or ValueError for none."""
+        """Return an answer converted by `take`; its TypeError or ValueError means invalid."""
         answer = self._call(method, *arguments)
         try:
             return take(answer)
@@ -328,7 +330,7 @@ class Instrument:
             raise wrong(f'{self._names[method]} returned {excerpt(answer)}') from error
 
     def write(self, level: float, now: int) -> tuple[int, float]:
-        """Set a level in T at a time in ns; return when it took effect, and the one really set."""
+        """Set a level in T at a time in ns; return its time of effect, and the actual level."""
         return self._ask(
             'write', level, self._theirs(now), take=lambda x: self._written(x, level, now),
             wrong=lambda what: HardwareError(
@@ -336,16 +338,16 @@ class Instrument:
                 'the level really set in T, or None'))
 
     def _theirs(self, time: int) -> int:
-        """Return a time in ns as the hardware counts it."""
+        """Return a host time in ns on the hardware's clock."""
         return time if self.clock_map is None else self.clock_map.to_device(time)
 
     def _ours(self, time: Any) -> int:
-        """Return a time in ns of the hardware as one of this host."""
+        """Return a hardware time in ns on the host's clock."""
         whole = int(_number(time))
         return whole if self.clock_map is None else self.clock_map.to_host(whole)
 
     def _happened(self, time: Any, now: int) -> int:
-        """Return when a level took effect, as a time in ns of this host."""
+        """Return the host time in ns of an event; raise ValueError if implausible."""
         found = self._ours(time)
         if abs(found - now) > _ABSURD + self._calls.limit * NANOSECONDS:
             raise ValueError
@@ -357,7 +359,7 @@ class Instrument:
         return now if when is None else self._happened(when, now), float(_number(really))
 
     def read(self, now: int) -> list[Reading]:
-        """Return what is new at a time in ns."""
+        """Return the new readings at a time in ns."""
         return self._ask(
             'read', self._theirs(now), take=lambda x: [self._stamped(y, now) for y in readings(x)],
             wrong=lambda what: HardwareError(
@@ -374,17 +376,17 @@ class Instrument:
         return found._replace(stamp=stamp)
 
     def schedule(self, levels: Sequence[tuple[int, float]]) -> None:
-        """Have it keep levels in T from stamps in ns on; they replace all from the first on."""
+        """Schedule levels in T from timestamps in ns on, replacing all from the first one on."""
         begin = levels[0][0] if levels else math.inf
         known, self._handed = self._handed, {
             x: y for x, y in self._handed.items() if begin - _ABSURD < x < begin or not levels}
         for stamp, _ in levels:
-            # What replaces a level has its time, though the clock is known better by now.
+            # A replaced level keeps its device time, even if the clock mapping has improved.
             self._handed[stamp] = known.get(stamp) or self._theirs(stamp)
         self._call('schedule', [(self._handed[x], y) for x, y in levels])
 
     def applied(self, now: int) -> list[tuple[int, float]]:
-        """Return stamps in ns and levels in T that have taken effect since the last call."""
+        """Return timestamps in ns and levels in T that have taken effect since the last call."""
         return self._ask(
             'applied',
             take=lambda answer: [(self._happened(x, now), float(_number(y))) for x, y in answer],
@@ -392,7 +394,7 @@ class Instrument:
                 f'{what}: expected a list of (timestamp in ns, level in T)'))
 
     def synchronise(self, clock: Callable[[], int]) -> None:
-        """Learn its time anew, where it has a clock, by that of this host in ns."""
+        """Compare clocks anew, if the hardware has one; ``clock`` returns the host time in ns."""
         self._handed.clear()
         if self.clock_map is not None:
             self.clock_map = ClockMap()
@@ -400,7 +402,7 @@ class Instrument:
                 self.ask_clock(clock)
 
     def ask_clock(self, clock: Callable[[], int]) -> bool:
-        """Compare its clock with that of this host, in ns; return whether it is still the same."""
+        """Compare the clocks once; return whether the hardware's clock is still the same."""
         if self.clock_map is None:
             return True
         before = clock()
@@ -410,33 +412,33 @@ class Instrument:
         return self.clock_map.add(before, answer, clock())
 
     def temperature(self) -> float:
-        """Return the temperature of its coil in degrees Celsius; NaN if it is not known."""
+        """Return the coil temperature in degrees Celsius; NaN if unknown."""
         return math.nan if not self.has('temperature') else self._ask(
             'temperature', take=lambda x: float(_number(x, finite=False)),
             wrong=lambda what: HardwareError(
                 f'{what}: expected degrees Celsius, NaN if they are not known'))
 
     def arm(self) -> None:
-        """Have it made ready for levels, where it can."""
+        """Prepare the hardware for levels, if it supports that."""
         self._call('arm')
 
     def disarm(self) -> None:
-        """Undo `arm`, where it can."""
+        """Undo `arm`, if supported."""
         with suppress(StateLostError):
             self._call('disarm')
 
     def open(self) -> None:
-        """Connect again, where it can; an error is passed over, as the next `write` shows."""
+        """Reconnect, if supported; errors are ignored, since the next `write` shows them."""
         with suppress(HardwareError, StateLostError):
             self._call('open')
 
     def close(self) -> None:
-        """End with it, where it can."""
+        """Close the hardware, if supported."""
         with suppress(StateLostError):
             self._call('close')
 
     def cut(self, now: int) -> bool:
-        """Write 0 past the call that blocks, at a time in ns; return whether that is done."""
+        """Write 0 at a time in ns, bypassing a blocked call; return whether that succeeded."""
         try:
             self._written(self.hardware.write(0.0, self._theirs(now)), 0.0, now)
         except BaseException:
@@ -447,19 +449,19 @@ class Instrument:
         return True
 
     def drop(self) -> None:
-        """Close it past the call that blocks."""
+        """Close the hardware, bypassing a blocked call."""
         with suppress(BaseException):
             getattr(self.hardware, 'close', lambda: None)()
 
 
 def readings(answer: Any) -> list[Reading]:
     """
-    Return the readings in the answer of a ``read``.
+    Return the readings in an answer of ``read``.
 
     Raises
     ------
     TypeError, ValueError
-        If there are none in it.
+        If it contains none.
 
     """
     if isinstance(answer, (str, bytes)):
@@ -480,17 +482,17 @@ def _reading(stretch: Any, rate: Any = None, stamp: Any = None) -> Reading:
 
 
 def _number(value: Any, *, finite: bool = True) -> Any:
-    """Return a real number; raise TypeError for anything else."""
+    """Return a real number; raise TypeError for any other value."""
     if not is_number(value, finite=finite):
         raise TypeError
     return value
 
 
 def is_number(value: Any, *, finite: bool = True) -> bool:
-    """Return whether a value is a real number, and finite where it must be."""
+    """Return whether a value is a real number, and finite if required."""
     if type(value) is bool or not isinstance(value, Real):
         return False
     try:
         return math.isfinite(value) or not finite
-    except OverflowError:  # a whole number that no float can be
+    except OverflowError:  # an integer beyond the range of floats
         return False

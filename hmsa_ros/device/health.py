@@ -1,4 +1,4 @@
-"""Whether a device is well driven: the verdict on its commands, and on how often it is sampled."""
+"""Status of a device: its commands, its hardware, and its sampling rate."""
 
 from collections.abc import Sequence
 import math
@@ -7,7 +7,7 @@ from hmsa_ros.errors import listed
 from hmsa_ros.model.parameters import ActuatorParameters
 
 _OK, _WARN, _ERROR = 0, 1, 2
-# Below, peaks of a vibration lie between samples.
+# With fewer samples per period, peaks of a vibration are missed.
 _SAMPLES_A_PERIOD = 10.0
 
 
@@ -16,10 +16,10 @@ def judge_commands(
         silent: Sequence[str] = (), crowded: Sequence[str] = (),
         rivals: str = '') -> tuple[int, str]:
     """
-    Return the verdict for /diagnostics: level (0 OK, 1 WARN, 2 ERROR) and message.
+    Return the status for /diagnostics: level (0 OK, 1 WARN, 2 ERROR) and message.
 
-    Of counts, of the joints that nobody (``silent``) or several (``crowded``) command, and of what
-    other devices there are (``rivals``).
+    It depends on counts, on the joints without commands (``silent``) or with several publishers
+    (``crowded``), and on other devices (``rivals``).
     """
     refused += refused_source
     return _verdict(
@@ -32,7 +32,7 @@ def judge_commands(
 
 
 def judge_hardware(trouble: str, *, saturated: int, state_lost: int) -> tuple[int, str]:
-    """Return the verdict on hardware, of what keeps a coil off and of counts."""
+    """Return the status of hardware from an error and counts."""
     return (_ERROR, trouble) if trouble else _verdict(
         'hardware obeys',
         (_WARN, f'{saturated} levels not reached: the amplifier is saturated'
@@ -41,23 +41,23 @@ def judge_hardware(trouble: str, *, saturated: int, state_lost: int) -> tuple[in
 
 
 def _verdict(fine: str, *notes: tuple[int, str]) -> tuple[int, str]:
-    """Return the worst level of what there is to say, and all of it."""
-    said = [x for x in notes if x[1]]
-    return max((x for x, _ in said), default=_OK), '; '.join(x for _, x in said) or fine
+    """Return the worst level of the notes, and all their messages."""
+    present = [x for x in notes if x[1]]
+    return max((x for x, _ in present), default=_OK), '; '.join(x for _, x in present) or fine
 
 
 def judge_interlock(why: str) -> tuple[int, str]:
-    """Return the verdict on an interlock, of why it is open."""
+    """Return the status of an interlock from the reason why it is open."""
     return (_ERROR, f'open: {why}') if why else (_OK, 'closed')
 
 
 def enough_samples(actuator: ActuatorParameters) -> float:
-    """Return the least sample rate in Hz that shows the actuator's small vibration about rest."""
+    """Return the smallest sampling rate in Hz that resolves the actuator's small vibration."""
     return _SAMPLES_A_PERIOD / actuator.period
 
 
 def too_few_samples(actuator: ActuatorParameters, rate: float) -> str:
-    """Return a warning if a sample rate in Hz is too low for an actuator, or nothing."""
+    """Return a warning if a sampling rate in Hz is too low for an actuator; else empty."""
     enough = enough_samples(actuator)
     if rate >= enough:
         return ''

@@ -1,55 +1,56 @@
-"""An interlock: who has opened it, and who has to keep it closed."""
+"""An interlock that publishers open and close."""
 
 from collections.abc import Callable, Collection
 
 from hmsa_ros.model.units import NANOSECONDS
 
-# Once open, it stays open so long, in ns: planners have heard of it then, or send nothing more.
+# Minimum time open in ns, for planners to receive that state or to stop sending.
 _LEAST = NANOSECONDS
 
 
 class Interlock:
     """
-    Follows who says that a coil may be on; times in ns are of a clock that is never set.
+    Combine the messages of publishers about an interlock; times in ns by a steady clock.
 
-    It is open while a publisher has said so last. Where it is ``required``, it is also open before
-    one has closed it, and after one has been silent for longer than ``timeout``. A publisher that
-    has left takes nothing back: one that closes it anew, and has not said so before, does.
+    It is open while the last message of any publisher opens it. If ``required``, it is also open
+    until a publisher closes it, and after a publisher has been silent for longer than ``timeout``.
+    An opening by a publisher that has left remains in force until another publisher newly closes
+    the interlock.
     """
 
     def __init__(self, *, required: bool, timeout: int) -> None:
         self.required, self._timeout = required, timeout
-        # Whether each publisher has closed it, and when it said so.
-        self._said: dict[bytes, tuple[bool, int]] = {}
+        # State and time of the last message of each publisher.
+        self._messages: dict[bytes, tuple[bool, int]] = {}
         self._until = 0
-        self.why = ''  #: it is open; empty while it is closed
+        self.why = ''  #: reason why it is open; empty while it is closed
         self.openings = 0
 
-    def hear(
+    def receive(
             self, publisher: bytes, now: int, *, closed: bool,
             present: Callable[[], Collection[bytes]]) -> None:
-        """Take in what a publisher says; ``present`` returns those that have not left."""
-        anew = closed and not self._said.get(publisher, (False, 0))[0]
-        self._said[publisher] = closed, now
-        if anew and not all(x for x, _ in self._said.values()):
+        """Process a message of a publisher; ``present`` returns those that have not left."""
+        anew = closed and not self._messages.get(publisher, (False, 0))[0]
+        self._messages[publisher] = closed, now
+        if anew and not all(x for x, _ in self._messages.values()):
             here = present()
-            self._said = {x: said for x, said in self._said.items() if said[0] or x in here}
+            self._messages = {x: y for x, y in self._messages.items() if y[0] or x in here}
         if not closed:
-            # Also where it is taken back before anybody looks.
+            # Also if it is closed again before the next look.
             self._open('a publisher has opened it', now)
 
     def look(self, now: int) -> str:
         """Return why it is open; empty if it is closed."""
         if self.required:
-            for publisher, (closed, when) in self._said.items():
+            for publisher, (closed, when) in self._messages.items():
                 if closed and now - when > self._timeout:
-                    self._said[publisher] = False, when
+                    self._messages[publisher] = False, when
                     self._open(
                         f'a publisher that closed it has been silent for more than '
                         f'{self._timeout / NANOSECONDS:g} s', now)
-            if not self._said:
+            if not self._messages:
                 self._open('no publisher has closed it', now)
-        if all(x for x, _ in self._said.values()) and now >= self._until:
+        if all(x for x, _ in self._messages.values()) and now >= self._until:
             self.why = ''
         return self.why
 

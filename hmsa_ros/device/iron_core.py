@@ -1,10 +1,10 @@
 """
-The hysteresis of an iron core, and the levels that undo it.
+Hysteresis of an iron core, and its compensation.
 
 The model is that of Prandtl and Ishlinskii with generalised play operators, whose envelope is the
 curve of the coil (Al Janaideh, Rakheja and Su 2011, doi:10.1109/TMECH.2010.2052366). Its inverse
-is exact (Kuhnen 2003, doi:10.3166/ejc.9.407-418): the field is a rising, piecewise linear function
-of the level, given what the plays remember.
+is exact (Kuhnen 2003, doi:10.3166/ejc.9.407-418): for a given state of the plays, the field is an
+increasing, piecewise linear function of the level.
 """
 
 from bisect import bisect_right
@@ -17,31 +17,32 @@ import numpy as np
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import Array
 
-# Levels that are remembered, so that later ones can take the place of some, and by how much in ns
-# a device rounds their times.
+# Number of levels stored, so that later ones can replace some of them, and rounding in ns of their
+# times by a device.
 _REMEMBERED, _ROUNDED = 1024, 100_000
-# Widths for each level of a quarter of a staircase, and the share of the range that is one level.
+# Widths for each level of a quarter of a staircase, and fraction of the range below which levels
+# are equal.
 _FINE, _SAME = 2, 1e-6
-# Weights that are none, as a share of the first one.
+# Negligible weight, as a fraction of the first one.
 _LEAST = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class IronCore:
     """
-    Plays of an iron core.
+    Play operators of an iron core.
 
     Parameters
     ----------
     widths : sequence of float
-        By how much in T the level goes before a play follows; the first one is 0, others rise.
+        Change of the level in T before a play follows; increasing from 0.
     weights : sequence of float
-        Of the plays in the field; at least 0, the first one above 0.
+        Weights of the plays in the field; at least 0, the first one above 0.
 
     Raises
     ------
     BadInputError
-        If they are not so.
+        If they do not meet these conditions.
 
     """
 
@@ -65,23 +66,23 @@ class IronCore:
         object.__setattr__(self, '_arrays', (widths, weights))
 
     def moved(self, plays: Array, level: float) -> Array:
-        """Return what plays, shape (n,), remember after a level in T."""
+        """Return the state of plays, shape (n,), after a level in T."""
         widths, _ = self._arrays
         found: Array = np.clip(plays, level - widths, level + widths)
         return found
 
     def field(self, plays: Array) -> float:
-        """Return the field in T."""
+        """Return the field in T for a state of the plays."""
         return float(self._arrays[1] @ plays)
 
     def needed(self, plays: Array, flux: float) -> float:
-        """Return the level in T whose field is the one given, in T."""
+        """Return the level in T that gives a field in T."""
         widths, weights = self._arrays
         turns = np.sort(np.concatenate([plays - widths, plays + widths]))
         fields = np.array([self.field(self.moved(plays, x)) for x in turns])
         if fields[0] < flux < fields[-1]:
             return float(np.interp(flux, fields, turns))
-        # Beyond, all plays follow.
+        # Outside, all plays follow.
         end = 0 if flux <= fields[0] else -1
         return float(turns[end] + (flux - fields[end]) / np.sum(weights))
 
@@ -95,9 +96,9 @@ class _Step(NamedTuple):
 
 class Compensation:
     """
-    What a core remembers of its levels, some of which lie ahead; times in ns.
+    State of a core after each of its levels, including pending ones; times in ns.
 
-    The core is taken to be demagnetised at the start.
+    The core is assumed demagnetised initially.
     """
 
     def __init__(self, core: IronCore) -> None:
@@ -105,7 +106,7 @@ class Compensation:
         self._steps = [_Step(-2**63, 0.0, 0.0, np.zeros(len(core.widths)))]
 
     def ask(self, stamp: int, field: float, *, off: bool = False) -> float:
-        """Return the level in T for a field in T from a stamp on; all later ones are dropped."""
+        """Return the level in T for a field in T from a timestamp on; later levels are dropped."""
         keep = max(bisect_right(self._steps, stamp - 1, key=lambda x: x.stamp), 1)
         self._steps = self._steps[max(keep - _REMEMBERED, 0):keep]
         plays = self._steps[-1].plays
@@ -114,9 +115,9 @@ class Compensation:
         return level
 
     def field_of(self, stamp: int, level: float, tolerance: float) -> float:
-        """Return the field in T that was asked for with a level, which took effect by a stamp."""
+        """Return the requested field in T for a level that took effect by a timestamp."""
         until = max(bisect_right(self._steps, stamp + _ROUNDED, key=lambda x: x.stamp), 1)
-        # One that came late can have taken effect after the time of the next.
+        # A late level may take effect after the time of the next one.
         past = self._steps[:until]
         step = next((x for x in reversed(past) if abs(x.level - level) <= tolerance), past[-1])
         return step.field + level - step.level
@@ -124,26 +125,26 @@ class Compensation:
 
 def fit_core(level: Array, field: Array) -> tuple[IronCore, float]:
     """
-    Find the core that a staircase of levels shows.
+    Fit a core to a staircase of levels.
 
     Parameters
     ----------
     level, field : ndarray, shape (n,)
-        Levels in T in their order, such as up to a largest one, down to its negative and back, and
-        the field in T that was read at each; what was before the largest one does not count.
+        Levels in T in chronological order, such as up to a maximum, down to its negative and back,
+        and the reading of the field in T at each; readings before the maximum are ignored.
 
     Returns
     -------
     (IronCore, float)
-        And the largest distance of a reading from it, as a share of the range.
+        The core, and the largest deviation of a reading from it, as a fraction of the range.
 
     Raises
     ------
     BadInputError
-        If the levels do not go to both sides, or the field does not rise with them.
+        If the levels do not have both signs, or the field does not increase with them.
 
     """
-    from scipy.optimize import nnls  # a driver needs no SciPy
+    from scipy.optimize import nnls  # not needed by a driver
 
     largest = float(np.max(np.abs(level))) if len(level) else 0.0
     first = int(np.argmax(level)) if len(level) else 0

@@ -1,4 +1,4 @@
-"""Lines to instruments: the ports of pyserial, and simulated ones."""
+"""Lines to instruments: pyserial ports, and simulated ones."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -9,17 +9,17 @@ from typing import Any
 
 from hmsa_ros.errors import BadInputError, HmsaError
 
-#: The port that is a simulated instrument; what follows a colon is given to it.
+#: Port of a simulated instrument, which receives the text after a colon.
 SIMULATED = 'sim'
 
 
 class OnLine:
     """
-    What speaks over a line that is opened when it is used, and again once it was lost.
+    Base of instruments on a line, which is opened on use and reopened after a loss.
 
-    A class has the ``error`` that reports a lost line, the longest time in s of an attempt and of
-    a write as ``times``, and ``simulate``, which makes a simulated instrument of what follows
-    the colon of `SIMULATED`.
+    A subclass defines the ``error`` raised for a lost line, the time limits in s of an attempt and
+    of a write as ``times``, and ``simulate``, which creates a simulated instrument from the text
+    after the colon of `SIMULATED`.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class OnLine:
         self._port, self._baud = port, int(baud)
 
     def _open(self) -> Any:
-        """Return a line, as of `serial.Serial`; raise `BadInputError` if none is to be had."""
+        """Return an open port, as `serial.Serial`; raise `BadInputError` if there is none."""
         port = self._port
         if not isinstance(port, str) or not port:
             raise BadInputError(
@@ -58,14 +58,14 @@ class OnLine:
             port, self._baud, timeout=self.times[0], write_timeout=self.times[1], exclusive=True)
 
     def _use(self, act: Callable[[], Any]) -> Any:
-        """Do something with the line; return None if it takes nothing in time."""
+        """Call a function with an open line; return None if a write times out."""
         try:
             if self._line is None:
                 self._line = self._open()
             return act()
         except HmsaError:
             raise
-        except Exception as error:  # whatever a port that is gone raises
+        except Exception as error:  # a lost port may raise any error
             if isinstance(error, getattr(
                     sys.modules.get('serial'), 'SerialTimeoutException', ())):
                 return None
@@ -76,7 +76,7 @@ class OnLine:
                 'that no other program uses it') from error
 
     def _lines(self, request: bytes) -> Iterator[bytes]:
-        """Send a request; yield the lines that come, and what is left when an attempt is over."""
+        """Send a request; yield the received lines, then the rest at the end of an attempt."""
         self._line.reset_input_buffer()
         self._line.write(request)
         text, until = b'', monotonic() + self.times[0]
@@ -87,7 +87,7 @@ class OnLine:
         yield text
 
     def close(self, last_words: bytes = b'') -> None:
-        """Leave the line."""
+        """Close the line, after writing ``last_words``."""
         line, self._line = self._line, None
         if line is not None:
             try:
@@ -99,9 +99,9 @@ class OnLine:
 
 class SimulatedLine:
     """
-    What a host reads from a simulated instrument, by the members of a port of pyserial it needs.
+    The host side of a simulated instrument, with the required members of a pyserial port.
 
-    A subclass has ``write``, which may add to ``_answer``, and ``close``.
+    A subclass defines ``write``, which may append to ``_answer``, and ``close``.
     """
 
     def __init__(self) -> None:
@@ -109,7 +109,7 @@ class SimulatedLine:
 
     @property
     def in_waiting(self) -> int:
-        """How many bytes there are to be read."""
+        """Number of bytes available."""
         return len(self._answer)
 
     def read(self, size: int) -> bytes:
@@ -118,5 +118,5 @@ class SimulatedLine:
         return found
 
     def reset_input_buffer(self) -> None:
-        """Drop what has not been read."""
+        """Discard unread bytes."""
         self._answer = b''

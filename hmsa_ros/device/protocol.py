@@ -1,4 +1,4 @@
-"""What a device answers, and what hardware may raise."""
+"""Records returned by a device, and an exception for hardware."""
 
 from enum import Enum
 from typing import NamedTuple
@@ -8,14 +8,14 @@ from hmsa_ros.model.equations import Array
 
 class StateLostError(Exception):
     """
-    Raised by ``write`` or ``read`` of hardware that has lost its state, as a rebooted board has.
+    Raised by ``write`` or ``read`` of hardware that has lost its state, such as a rebooted board.
 
-    Its coil is off then, and whatever was commanded is forgotten.
+    Its coil is off then, and all earlier commands are discarded.
     """
 
 
 class Change(NamedTuple):
-    """A level in T that took effect on a joint, at a time in ns; NaN where it is not known."""
+    """A level in T that took effect on a joint at a time in ns; NaN if unknown."""
 
     joint: int
     stamp: int
@@ -23,7 +23,7 @@ class Change(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """Measurement of all joints: time in ns, stretch, rate in 1/s and flux density in T."""
+    """Sample of all joints: time in ns, stretch, rate in 1/s and flux density in T."""
 
     time: int
     stretch: Array
@@ -32,7 +32,7 @@ class Sample(NamedTuple):
 
 
 class Kind(Enum):
-    """What a notice is about."""
+    """Subject of a notice."""
 
     LATE = 'late'
     SILENT = 'silent'
@@ -45,7 +45,7 @@ class Kind(Enum):
 
 
 class Notice(NamedTuple):
-    """Something to log, as a sentence; ``late`` is a lateness in ns."""
+    """A message to log; ``late`` is a lateness in ns."""
 
     kind: Kind
     joint: int

@@ -1,4 +1,4 @@
-"""A bench supply as a source of current, by SCPI on a serial line or raw TCP, and its twin."""
+"""A bench supply as a current source, with SCPI over a serial line or TCP, and its simulation."""
 
 from collections import deque
 import math
@@ -13,7 +13,7 @@ from hmsa_ros.errors import HmsaError
 
 
 class SimulatedSupply(SimulatedLine):
-    """A bipolar supply of 10 A and its line."""
+    """A simulated bipolar supply of 10 A with its line."""
 
     limit, step = 10.0, 10.0 / 2**15
 
@@ -23,12 +23,12 @@ class SimulatedSupply(SimulatedLine):
         self._text = ''
 
     def restart(self) -> None:
-        """Switch it on: as a source of voltage, with its output off."""
+        """Power up: as a voltage source, with its output off."""
         self.current, self.on, self.mode = 0.0, False, 'VOLT'
         self._errors: deque[str] = deque()
 
     def _obey(self, command: str) -> str | None:
-        """Carry a command out; return its answer, if it has one."""
+        """Execute a command; return its answer, if any."""
         verb, _, value = command.strip().lstrip(':').upper().partition(' ')
         if verb == '*IDN?':
             return 'hmsa_ros, simulated supply, 0, 1'
@@ -64,7 +64,7 @@ class SimulatedSupply(SimulatedLine):
     # -- the port ------------------------------------------------------------------------------
 
     def write(self, text: bytes) -> None:
-        """Take bytes from the host."""
+        """Receive bytes from the host."""
         *lines, self._text = (self._text + text.decode('ascii', 'replace')).split('\n')
         for line in lines:
             answers = [x for x in map(self._obey, line.split(';')) if x is not None]
@@ -72,15 +72,15 @@ class SimulatedSupply(SimulatedLine):
                 self._answer += f'{";".join(answers)}\n'.encode()
 
     def close(self) -> None:
-        """Leave the line."""
+        """Close the line."""
 
 
-# In s: an attempt, and a request.
+# Time limits in s of an attempt and of a request.
 _ATTEMPT, _PATIENCE = 0.2, 0.5
-# Steps that the output of a supply has at least.
+# Minimum number of output steps of a supply.
 _STEPS = 4096
 _NUMBER = r'([-+]?[\d.]+(?:[eE][-+]?\d+)?)'
-# Of the current, whether the output is on, and the oldest error.
+# Current, state of the output, and oldest error.
 _STATE = re.compile(rf'{_NUMBER};\s*(0|1|ON|OFF);\s*([-+]?\d+),?\s*(.*)')
 
 
@@ -90,21 +90,21 @@ class SupplyError(HmsaError):
 
 class Supply(OnLine):
     """
-    The supply as the source of a current in A.
+    The supply as a source of current in A.
 
-    It must take several commands in a line, as IEEE 488.2 has it: each level is confirmed by the
-    current that is set, by the state of the output, and by the error queue, in one exchange.
+    It must accept several commands in a line, as in IEEE 488.2. Each level is confirmed in one
+    exchange by the set current, the state of the output and the error queue.
 
     Parameters
     ----------
     port : str
-        As of `OnLine`: ``socket://host:port`` for TCP.
+        As in `OnLine`; ``socket://host:port`` for TCP.
     baud : int
         Bits per second of a serial port.
     voltage : float
         Voltage limit in V; infinite for that of the supply.
     resolution : float, optional
-        Step of the current in A; default a 4096th of the largest.
+        Step of the current in A; by default the largest current divided by 4096.
 
     Raises
     ------
@@ -129,7 +129,7 @@ class Supply(OnLine):
         self.resolution = self.limit / _STEPS if resolution is None else resolution
 
     def open(self) -> None:
-        """Connect (again), and put it in the mode of a current source, at 0 A."""
+        """Connect or reconnect, and select the current-source mode at 0 A."""
         self.close()
         self.description = self._ask('*CLS;*IDN?', re.compile('(.+)'))[0].strip()
         limit = '' if self._voltage == math.inf else f'VOLT {self._voltage:g};:'
@@ -137,19 +137,19 @@ class Supply(OnLine):
         self.limit = float(self._ask('CURR? MAX', re.compile(_NUMBER))[0])
 
     def close(self, last_words: bytes = b'OUTP OFF\n') -> None:
-        """Switch the output off, and leave the line."""
+        """Switch the output off, and close the line."""
         super().close(last_words)
 
     def write(self, current: float, now: int) -> tuple[int, float]:
         """
-        Set a current in A; return when, about the middle of the exchange, and the one set.
+        Set a current in A; return its time, halfway through the exchange, and the actual one.
 
         Raises
         ------
         SupplyError
             If the supply does not answer, or refuses.
         StateLostError
-            If its output was off; it is on again, at 0 A.
+            If its output was off; it is now on, at 0 A.
 
         """
         begun = monotonic_ns()
@@ -160,7 +160,7 @@ class Supply(OnLine):
         return now + (monotonic_ns() - begun) // 2, level
 
     def _set(self, text: str) -> tuple[float, bool]:
-        """Carry a command out; return the current that is set, and whether the output is on."""
+        """Execute a command; return the set current, and whether the output is on."""
         level, on, number, why = self._ask(f'{text};:CURR?;:OUTP?;:SYST:ERR?', _STATE)
         if int(number):
             raise SupplyError(
@@ -169,7 +169,7 @@ class Supply(OnLine):
         return float(level), on in ('1', 'ON')
 
     def _ask(self, text: str, expected: 're.Pattern[str]') -> tuple[str, ...]:
-        """Return the parts of an answer; ask again where it is not as expected."""
+        """Return the parts of an answer; repeat the request if the answer is unexpected."""
         until, answer, request = monotonic() + _PATIENCE, '', f'{text}\n'.encode()
         while True:
             found = self._use(lambda: next(self._lines(request)))
@@ -183,7 +183,7 @@ class Supply(OnLine):
 
 
 class ScpiSupply(Assembly):
-    """A bench supply and its coil, as ``hardware:=scpi_supply``."""
+    """A bench supply and its coil, for ``hardware:=scpi_supply``."""
 
     def __init__(
             self, joint: str, port: Any = '', baud: int = 9600, voltage: float = math.inf,

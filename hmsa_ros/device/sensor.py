@@ -1,4 +1,4 @@
-"""What is measured of the state of several actuators: bias, gain, noise and transport delay."""
+"""Samples of the state of several actuators, with bias, gain, noise and transport delay."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -16,12 +16,12 @@ T = TypeVar('T')
 
 class Transport(Generic[T]):
     """
-    Things on their way, all of which take the same time in ns.
+    Items in transit with a constant delay in ns.
 
     Raises
     ------
     BadInputError
-        If that is negative.
+        If the delay is negative.
 
     """
 
@@ -32,26 +32,26 @@ class Transport(Generic[T]):
         self._moving: deque[tuple[int, T]] = deque()
 
     def send(self, now: int, thing: T) -> None:
-        """Send something at a time in ns, not before what was sent last."""
+        """Send an item at a time in ns, not before the previous one."""
         self._moving.append((now + self.delay, thing))
 
     def arrived(self, now: int) -> Iterator[tuple[int, T]]:
-        """Yield what has arrived by a time in ns, and when; each once."""
+        """Yield arrival time and item for each item that has arrived by a time in ns."""
         while self._moving and self._moving[0][0] <= now:
             yield self._moving.popleft()
 
     def clear(self) -> None:
-        """Lose what is on its way."""
+        """Discard the items in transit."""
         self._moving.clear()
 
 
 @dataclass(frozen=True)
 class SensorErrors:
     """
-    How what is measured of one actuator differs from the truth.
+    Errors of the samples of one actuator.
 
-    The measured stretch is the bias plus the gain times the true one; the measured rate, which
-    is its derivative, has the gain alone.
+    The measured stretch is the bias plus the gain times the true stretch. The measured rate, its
+    derivative, is only affected by the gain.
 
     Raises
     ------
@@ -80,7 +80,7 @@ class SensorErrors:
 
 
 class Sensor:
-    """Measures with errors, drawn from a seed, and answers some ns later."""
+    """Take samples with errors from a seeded generator, delayed by some ns."""
 
     def __init__(
             self, errors: Sequence[SensorErrors], delay: int = 0, seed: int = 0) -> None:
@@ -94,11 +94,11 @@ class Sensor:
         self._transport: Transport[Sample] = Transport(delay)
 
     def forget(self) -> None:
-        """Drop what is on its way."""
+        """Discard the samples in transit."""
         self._transport.clear()
 
     def measure(self, sample: Sample) -> Iterator[Sample]:
-        """Take a sample of the true state; yield the measurements that have arrived by now."""
+        """Add a sample of the true state; yield the measured samples that have arrived by now."""
         if not self._exact:
             stretch = self._bias + self._gain * sample.stretch
             rate = self._gain * sample.rate

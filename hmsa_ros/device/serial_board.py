@@ -1,8 +1,8 @@
 """
-A board on a serial line that applies levels at their times itself, and samples a sensor.
+A board on a serial line that applies levels at their times, and samples a sensor.
 
-``hmsa_board/board.hpp`` is its firmware and describes the protocol. Every request may be sent
-again: a line that was lost or damaged costs an attempt.
+``hmsa_board/board.hpp`` is its firmware and describes the protocol. Every request may be repeated:
+a lost or damaged line costs one attempt.
 """
 
 from binascii import crc_hqx
@@ -19,18 +19,18 @@ from hmsa_ros.device.protocol import StateLostError
 from hmsa_ros.errors import HmsaError
 
 _VERSION = 1
-# Levels, readings and times are whole numbers of millionths.
+# Levels, readings and times are integer multiples of 1e-6 of their unit.
 _MILLION = 1e6
-# In s: an attempt, a request, and the first one, since a port that is opened restarts some boards.
+# In s: an attempt, a request, and the first request, since opening a port restarts some boards.
 _ATTEMPT, _PATIENCE, _BOOT = 0.04, 0.4, 4.0
-# Levels that the board has room for beyond those that it says it has: its clock and ours differ.
+# Reserve in the board's queue of levels, since its clock differs from the host's.
 _SPARE = 2
-# Values in a whole answer, and as many of them as the board can have kept.
+# Values in a full answer, and the limit on answers, above the capacity of the board.
 _PER_ANSWER, _ANSWERS = 7, 20
 
 
 class BoardError(HmsaError):
-    """A board that does not answer, or not as it should."""
+    """A board that does not answer, or answers incorrectly."""
 
 
 class _Answer(NamedTuple):
@@ -46,16 +46,16 @@ def framed(text: str) -> bytes:
 
 class Board(OnLine):
     """
-    The board as the source of a current (or voltage) in A, and as a sensor.
+    The board as a source of current (or voltage) in A, and as a sensor.
 
-    When its line is closed, it switches off after the time of its watchdog, if it is not off.
+    When its line is closed, a board that is on switches off after its watchdog time.
 
     Parameters
     ----------
     port : str
-        As of `OnLine`; ``sim:FILE`` writes the true motion of a simulated board.
+        As in `OnLine`; ``sim:FILE`` writes the true motion of a simulated board.
     baud : int
-        Bits per second; of no effect on USB.
+        Bits per second; without effect on USB.
     watchdog : float
         Time in s without a request after which the board switches off.
 
@@ -73,7 +73,7 @@ class Board(OnLine):
     @staticmethod
     def simulate(rest: str) -> Any:
         """Return a simulated board (see `OnLine`)."""
-        from hmsa_ros.device.simulated_board import SimulatedBoard  # others need no simulation
+        from hmsa_ros.device.simulated_board import SimulatedBoard  # only if simulated
 
         return SimulatedBoard(rest)
 
@@ -89,15 +89,15 @@ class Board(OnLine):
             self.temperature: Callable[[], float] = self._temperature
 
     def _temperature(self) -> float:
-        """Return that of the coil in degrees Celsius."""
+        """Return the temperature of the coil in degrees Celsius."""
         return self._ask('C', count=1)[0] / _MILLION
 
     def open(self) -> None:
-        """Connect again, without a board that restarts if its port is still open."""
+        """Connect again, without waiting for a restart of the board."""
         self._begin(_PATIENCE)
 
     def _begin(self, patience: float) -> None:
-        """Begin a session, and see whether that before has been lost."""
+        """Begin a session, and detect whether the previous one was lost."""
         known, self._session = self._session, 1 + randbelow(2**31 - 1)
         try:
             version, *values, before = self._ask(
@@ -122,7 +122,7 @@ class Board(OnLine):
     def _ask(
             self, verb: str, *values: int, patience: float | None = None,
             count: int = 0) -> list[int]:
-        """Return at least so many values that the board answers; ask again where it does not."""
+        """Return at least ``count`` values of the board's answer; repeat the request if needed."""
         patience = _PATIENCE if patience is None else patience
         until = monotonic() + patience
         answer: _Answer | None = None
@@ -152,40 +152,40 @@ class Board(OnLine):
         answers = (_read(x, self._number) for x in self._lines(b'\n' + framed(request)))
         return next((x for x in answers if x is not None), None)
 
-    # -- what hardware has ---------------------------------------------------------------------
+    # -- members of hardware -------------------------------------------------------------------
 
     def clock(self) -> int:
         """Return the time of the board in ns."""
         return 1000 * self._ask('T', count=1)[0]
 
     def write(self, current: float, now: int) -> tuple[int, float]:
-        """Put a current in A out now; return when, and the one that is put out."""
+        """Output a current in A now; return its time in ns and the actual current."""
         when, level, events = self._ask('W', round(current * _MILLION), count=3)
-        # What was ahead is dropped, and what took effect before is past.
+        # Pending levels are dropped, and earlier events are skipped.
         self._seen[0] = events
         return 1000 * when, level / _MILLION
 
     def schedule(self, levels: Sequence[tuple[int, float]]) -> None:
-        """Have the board put currents in A out at its times in ns."""
+        """Schedule currents in A at times in ns of the board."""
         for stamp, current in levels:
             self._ask('S', round(stamp / 1000), round(current * _MILLION))
         if not levels:
             self._ask('K')
 
     def applied(self) -> list[tuple[int, float]]:
-        """Return times in ns and currents in A that took effect."""
+        """Return times in ns and values of the currents in A that took effect."""
         return [(when, level) for level, when in self._new('A', 0)]
 
     def read(self, now: int) -> list[tuple[float, float, int]]:
-        """Return new readings, no rate, and their times in ns."""
+        """Return new readings, without rate, and their times in ns."""
         return [(reading, math.nan, when) for reading, when in self._new('M', 1)]
 
     def _new(self, verb: str, series: int) -> list[tuple[float, int]]:
-        """Return values and their times in ns that have come since this was last asked."""
+        """Return values and their times in ns since the last call."""
         found: list[tuple[float, int]] = []
         for _ in range(_ANSWERS):
             first, *values = self._ask(verb, self._seen[series] + 1, count=1)
-            # Each time is given since the one before.
+            # Times are differences from the previous one.
             found += [(value / _MILLION, 1000 * when) for when, value in zip(
                 accumulate(values[::2]), values[1::2], strict=True)]
             if values:
@@ -196,7 +196,7 @@ class Board(OnLine):
 
 
 def _read(line: bytes, number: int) -> _Answer | None:
-    """Return what a line answers to a request; None if it is damaged, or answers another."""
+    """Return the answer to a request in a line; None if it is damaged or for another request."""
     try:
         text = line.decode('ascii').rpartition('*')[0]
         if framed(text) != line + b'\n':
@@ -209,7 +209,7 @@ def _read(line: bytes, number: int) -> _Answer | None:
 
 
 class SerialBoard(Assembly):
-    """A serial board, its coil and its sensor, as ``hardware:=serial_board``."""
+    """A serial board with its coil and its sensor, for ``hardware:=serial_board``."""
 
     def __init__(
             self, joint: str, port: Any = '', baud: int = 1_000_000, watchdog: float = 0.5,

@@ -1,4 +1,4 @@
-"""The simulated plant as a device: what it does, and when."""
+"""The simulated plant as a device."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,13 +11,13 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.simulation import too_large
 from hmsa_ros.model.units import NANOSECONDS
 
-# A gap of the clock that is not simulated through but skipped.
+# Gap of the clock above which time is skipped instead of simulated.
 _LARGEST_GAP_NS = 5 * NANOSECONDS
 
 
 @dataclass(frozen=True)
 class SimulatedJoint:
-    """A simulated actuator, what its watchdog does, and how it is measured."""
+    """A simulated actuator with its watchdog and sensor."""
 
     setup: Setup
     fallback: Fallback = field(default_factory=Fallback)
@@ -28,20 +28,20 @@ class SimulatedDevice(Device):
     """
     Simulated actuators.
 
-    Commands take effect exactly at their stamps, inside the integration.
+    Commands take effect exactly at their timestamps, within the integration.
 
     Parameters
     ----------
     joints : sequence of SimulatedJoint
         At least one.
     period : int
-        Between samples, in ns, at least 1; they lie on a grid from time zero.
+        Sampling period in ns, at least 1; samples lie on a grid from time zero.
     time : int
-        Time at the start in ns; its state is the first sample (`next_sample`).
+        Initial time in ns; the initial state is the first sample (`next_sample`).
     command_delay, measurement_delay : int
         Transport delays of commands and samples in ns, at least 0.
     seed : int
-        Of the sensor's noise.
+        Seed of the sensor noise.
 
     """
 
@@ -58,11 +58,11 @@ class SimulatedDevice(Device):
         self._transit: Transport[tuple[int, int, float]] = Transport(command_delay)
         self._changes += [Change(i, time, self.level(i)) for i in range(len(joints))]
 
-    # -- what there is to see ------------------------------------------------------------------
+    # -- state ---------------------------------------------------------------------------------
 
     @property
     def time(self) -> int:
-        """Time in ns that the state belongs to."""
+        """Time of the state in ns."""
         return self._actuators.time
 
     @property
@@ -72,7 +72,7 @@ class SimulatedDevice(Device):
 
     @property
     def coordinates(self) -> list[str]:
-        """What the position of each joint is called."""
+        """Name of the position coordinate of each joint."""
         return [x.actuator.coordinate.name for x in self._actuators.setups]
 
     @property
@@ -82,7 +82,7 @@ class SimulatedDevice(Device):
 
     @property
     def setups(self) -> tuple[Setup, ...]:
-        """What each joint consists of."""
+        """Setup of each joint."""
         return self._actuators.setups
 
     @property
@@ -95,15 +95,15 @@ class SimulatedDevice(Device):
         return self._actuators.schedules[joint].current
 
     def changes(self) -> list[Change]:
-        """Return which levels took effect."""
+        """Return the levels that took effect since the last call."""
         self._changes += [Change(*x) for x in self._actuators.changes]
         self._actuators.changes.clear()
         return super().changes()
 
-    # -- what drives it ------------------------------------------------------------------------
+    # -- inputs --------------------------------------------------------------------------------
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
-        """Have a command in T take effect at its stamp in ns (0 for now), or its delay later."""
+        """Apply a command in T at its timestamp in ns (0 for now), or after its delay."""
         self._check_clock(stamp)
         if self._transit.delay:
             self._actuators.setups[joint].check_level(level)
@@ -112,7 +112,7 @@ class SimulatedDevice(Device):
             self._obey(joint, stamp, level)
 
     def push(self, joint: int, stamp: int, force: float) -> None:
-        """Have a force in N act along the field on a joint from a stamp in ns on, 0 for now."""
+        """Apply a force in N along the field to a joint from a timestamp in ns on, 0 for now."""
         self._actuators.force(joint, stamp or self.time, force)
 
     def _obey(self, joint: int, stamp: int, level: float) -> None:
@@ -128,7 +128,7 @@ class SimulatedDevice(Device):
     # -- time ----------------------------------------------------------------------------------
 
     def advance(self, time: int) -> None:
-        """Simulate up to a time in ns and take the samples on the way."""
+        """Simulate up to a time in ns, and take the samples that are due."""
         while self.next_sample <= time:
             self._run(self.next_sample)
             self.next_sample += self.period
@@ -140,7 +140,7 @@ class SimulatedDevice(Device):
             self._run(time)
 
     def _run(self, time: int) -> None:
-        """Simulate, with what is known of commands and of silence by then."""
+        """Simulate to a time, with the commands and watchdogs that act before it."""
         for known, command in self._transit.arrived(time):
             self._integrate(known)
             self._obey(*command)
@@ -150,7 +150,7 @@ class SimulatedDevice(Device):
         self._integrate(time)
 
     def _integrate(self, time: int) -> None:
-        """Advance all joints; those whose load is too large start again."""
+        """Advance all joints; those with an excessive load restart."""
         for i, reached in self._actuators.advance(time):
             self.guards[i].note(
                 Kind.FAILED, f'{too_large(reached, self.level(i))}; the joint starts again from '
@@ -158,9 +158,9 @@ class SimulatedDevice(Device):
             self.restart(i)
 
     def follow(self, now: int, *, standing: bool = False) -> int:
-        """Follow a clock (ns), or hold while ``standing``; return by how many ns it jumped."""
-        # A device that has not begun, one that is held, and one whose clock jumps goes on from the
-        # clock's time; where the clock has jumped back it starts again.
+        """Follow a clock (ns), or wait while ``standing``; return any clock jump in ns."""
+        # Before the first time, while standing and after a jump ahead, the device continues from
+        # the clock's time; after a jump back, it restarts.
         gap = now - self.time
         if self.time == 0:
             self._go_on_from(now)
@@ -180,21 +180,21 @@ class SimulatedDevice(Device):
 
     def _go_on_from(self, now: int) -> None:
         for guard in self.guards:
-            # Time that was not simulated is no silence.
+            # Time that was not simulated does not count as silence.
             guard.pass_over(now - self.time)
         self._actuators.time = now
         self.next_sample = -(-now // self.period) * self.period
 
-    # -- beginning anew ------------------------------------------------------------------------
+    # -- restart -------------------------------------------------------------------------------
 
     def restart(self, joint: int, stretch: float | None = None, rate: float = 0.0) -> None:
-        """Put a joint back to its initial or another state (rate in 1/s); time goes on."""
+        """Reset a joint to its initial or another state (rate in 1/s); time continues."""
         self._actuators.reset(joint, stretch, rate)
-        # A first command arms it again.
+        # The next command arms it again.
         self.guards[joint].stand_by()
         self.guards[joint].end_cut_off()
         self._sensor.forget()
 
     def drop_commands(self) -> None:
-        """Lose the commands on their way."""
+        """Discard the commands in transit."""
         self._transit.clear()

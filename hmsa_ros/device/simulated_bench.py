@@ -1,4 +1,4 @@
-"""A simulated coil, actuator, laser and field probe, late as real ones are; for guided runs."""
+"""A simulated coil, actuator, laser and field probe with realistic delays, for guided runs."""
 
 from collections import deque
 import math
@@ -10,7 +10,7 @@ from hmsa_ros.model.actuators import Setup
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.model.units import NANOSECONDS
 
-# In ns: between samples, and what a probe remembers of them.
+# Sampling period in ns, and number of samples stored for a probe.
 _PERIOD, _KEPT = 1_000_000, 100_000
 # Fields for `SimulatedProbe`, with their times in ns.
 _FIELDS: deque[tuple[float, float, int]] = deque(maxlen=_KEPT)
@@ -18,16 +18,16 @@ _FIELDS: deque[tuple[float, float, int]] = deque(maxlen=_KEPT)
 
 class SimulatedBench:
     """
-    Hardware that keeps levels until their times; times in s.
+    Hardware that applies scheduled levels; times in s.
 
     Parameters
     ----------
     joint : str
-        Its name.
+        Joint name.
     transport, lag, latency : float
-        Delay and first-order lag of the field, and by how much timestamps of samples are late.
+        Delay and first-order lag of the field, and lateness of the timestamps of samples.
     noise : float
-        Standard deviation of the stretch of a sample.
+        Standard deviation of a stretch sample.
 
     """
 
@@ -45,7 +45,7 @@ class SimulatedBench:
         _FIELDS.clear()
 
     def schedule(self, levels: list[tuple[int, float]]) -> None:
-        """Keep levels."""
+        """Schedule levels."""
         for stamp, level in levels:
             self._device.receive(0, stamp + self._transport, level)
 
@@ -66,5 +66,5 @@ class SimulatedProbe:
     """A probe in the coil of the simulated bench."""
 
     def read(self) -> list[tuple[float, float, int]]:
-        """Return field in T, nothing, and time in ns of what was seen since the last call."""
+        """Return field in T, NaN, and time in ns of each sample since the last call."""
         return [_FIELDS.popleft() for _ in range(len(_FIELDS))]

@@ -1,4 +1,4 @@
-"""The twin of a serial board: its firmware before a simulated coil, actuator and laser."""
+"""A simulated serial board: its firmware with a simulated coil, actuator and laser."""
 
 from collections.abc import Callable
 import math
@@ -13,27 +13,27 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.model.simulation import ActuatorSimulation
 
-#: What a driver of it needs to be given: T/A, and the length of the block in mm.
+#: Settings for its driver: T/A, and the length of the block in mm.
 TESLA_PER_AMPERE, REST_LENGTH = 0.05, 20.0
-# In uA.
+# Limit and resolution in uA.
 _LIMIT, _RESOLUTION = 10_000_000, 100
-# In us of its clock.
+# Sampling period in us of its clock.
 _PERIOD = 1000
-_NOISE = 1e-3  # in mm
+_NOISE = 1e-3  # standard deviation in mm
 
 
 class SimulatedBoard(SimulatedLine):
     """
     A board and its serial line.
 
-    Time passes when it is asked: the firmware applies each level exactly when it is due.
+    It is simulated on access: the firmware applies each level exactly when it is due.
 
     Parameters
     ----------
     truth : str
-        File for the true motion, as a CSV; empty for none.
+        CSV file for the true motion; empty for none.
     clock : callable
-        Returns the time of the host in ns.
+        Returns the host time in ns.
 
     Raises
     ------
@@ -42,9 +42,9 @@ class SimulatedBoard(SimulatedLine):
 
     """
 
-    #: by how much its clock is fast, and the field of the coil
+    #: relative error of its clock, which is fast, and constant of the coil in T/A
     fast, tesla_per_ampere = 40e-6, TESLA_PER_AMPERE
-    #: of the coil in degrees Celsius; NaN is not measured
+    #: temperature of the coil in degrees Celsius; NaN if not measured
     temperature = math.nan
 
     def __init__(self, truth: str = '', clock: Callable[[], int] = monotonic_ns) -> None:
@@ -70,21 +70,21 @@ class SimulatedBoard(SimulatedLine):
         return ActuatorSimulation(paper_actuator(), time=0)
 
     def restart(self) -> None:
-        """Boot: the coil is off, and its clock begins at 0."""
+        """Boot: the coil is off, and the clock starts at 0."""
         self._board = _board.make(_LIMIT, _RESOLUTION)
         self._booted = self._clock()
         self._next_sample = self._now = 0
 
     def _host(self, time: int) -> int:
-        """Return the time in ns since the beginning at one in us of its clock."""
+        """Return the host time in ns since the start for a board time in us."""
         return self._booted - self._begun + round(1000 * time / (1.0 + self.fast))
 
     def advance(self) -> int:
-        """Have it do what is due by now; return the time of its clock in us."""
+        """Do the work due by now; return the board time in us."""
         now = math.floor((self._clock() - self._booted) * (1.0 + self.fast) / 1000)
         while True:
             due = _board.due(self._board)
-            # A level that came late is applied when it has come.
+            # A late level is applied on arrival.
             time = min(self._next_sample, now if due < 0 else max(due, self._now), now)
             self._now = time
             level = _board.advance(self._board, time)
@@ -109,13 +109,13 @@ class SimulatedBoard(SimulatedLine):
     # -- the port ------------------------------------------------------------------------------
 
     def write(self, text: bytes) -> None:
-        """Take bytes from the host."""
+        """Receive bytes from the host."""
         if not math.isnan(self.temperature):
             _board.warm(self._board, round(1e6 * self.temperature))
         self._answer += _board.receive(self._board, text, self.advance())
 
     def close(self) -> None:
-        """Leave the line, and complete the file."""
+        """Close the line, and complete the file."""
         self.advance()
         if self._truth is not None:
             self._truth.close()

@@ -1,4 +1,4 @@
-"""What a slow staircase of levels says of an actuator and its sensor."""
+"""Evaluation of a slow staircase of levels: static response of an actuator, and its sensor."""
 
 from dataclasses import dataclass
 import math
@@ -10,9 +10,9 @@ from hmsa_ros.device.calibration import branch_means
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import Array
 
-# Rows that a table of the law needs.
+# Minimum number of rows of a table of the law.
 _FEWEST = 6
-# Lengths of a gauge that a straight line must be told from.
+# Minimum number of different lengths for a straight line.
 _LENGTHS = 3
 
 
@@ -24,12 +24,12 @@ class Statics:
     Attributes
     ----------
     level, stretch : ndarray, shape (m,)
-        Levels in T, and the stretch that they hold, by stretch; 1 without a field.
+        Levels in T, and the stretch that they hold, in ascending order; 1 without a field.
     rest : float
-        Stretch that the sensor has shown without a field.
+        Stretch reported by the sensor without a field.
     apart : float
-        Largest distance of the stretches at one level that was approached from both sides, as a
-        share of the range; NaN where none was.
+        Largest difference of the stretches at one level that was approached from both sides, as a
+        fraction of the range; NaN if there was none.
 
     """
 
@@ -41,22 +41,22 @@ class Statics:
 
 def statics(level: Array, stretch: Array) -> Statics:
     """
-    Take a staircase together.
+    Evaluate a staircase.
 
     Parameters
     ----------
     level, stretch : ndarray, shape (n,)
-        Levels in T in the order in which they were held, and the stretch shown at each.
+        Levels in T in chronological order, and the measured stretch at each.
 
     Returns
     -------
     Statics
-        With rising stretches.
+        With increasing stretches.
 
     Raises
     ------
     BadInputError
-        If there are too few levels, or the stretch does not rise with them.
+        If there are too few levels, or the stretch does not increase with them.
 
     """
     if not np.all(np.isfinite(level) & np.isfinite(stretch)):
@@ -81,7 +81,7 @@ def statics(level: Array, stretch: Array) -> Statics:
 
 
 def scale_at_rest(scale: SensorScale, rest: float) -> SensorScale:
-    """Return the scale whose stretch is 1 where that of another shows ``rest``."""
+    """Return a scale with stretch 1 at the reading where the given one shows ``rest``."""
     return SensorScale(scale.gain, scale.offset, scale.rest_length * rest, scale.latency)
 
 
@@ -89,28 +89,28 @@ def scale_by_gauge(
         scale: SensorScale, level: Array, stretch: Array, length: Array
 ) -> tuple[SensorScale, float]:
     """
-    Calibrate a sensor by a gauge of the actuator's length.
+    Calibrate a sensor with a gauge of the actuator's length.
 
     Parameters
     ----------
     scale : SensorScale
-        By which the stretches were taken.
+        Scale of the measured stretches.
     level : ndarray, shape (n,)
         Levels in T.
     stretch : ndarray, shape (n,)
-        As shown.
+        Measured stretches.
     length : ndarray, shape (n,)
-        Of the gauge, in the unit of the rest length.
+        Lengths from the gauge, in the unit of the rest length.
 
     Returns
     -------
     (SensorScale, float)
-        And the largest distance of a length from it, as a share of their range.
+        The scale, and the largest deviation of a length from it, as a fraction of their range.
 
     Raises
     ------
     BadInputError
-        If the lengths do not follow the sensor.
+        If the lengths do not depend on the sensor.
 
     """
     span = float(np.ptp(length)) if np.all(np.isfinite(length)) else math.nan

@@ -1,4 +1,4 @@
-"""Devices, and what guards their joints: watchdogs, and what is refused after a cut-off."""
+"""Devices and guards of their joints: watchdogs, and rejected commands after a cut-off."""
 
 from abc import ABC, abstractmethod
 from collections import deque
@@ -13,22 +13,22 @@ from hmsa_ros.model.units import NANOSECONDS
 
 T = TypeVar('T')
 
-#: What to do: keep the last level, go to zero at once, or ramp to zero.
+#: Reactions to silence: keep the last level, go to zero immediately, or ramp to zero.
 SAFE_FLUX = ('hold', 'zero', 'ramp')
 _REASONS = {
     'hold': 'what is commanded stays (safe_flux hold)', 'zero': 'the field goes to zero',
     'ramp': 'the field ramps to zero'}
 _RAMP_STEP_NS = 1_000_000
-# Levels of before a cut-off that are remembered.
+# Number of levels from before a cut-off that are stored.
 _REMEMBERED = 8
-#: Times that are further apart, in ns, are of clocks that began at different times.
+#: Times that differ by more, in ns, come from clocks with different epochs.
 ANOTHER_CLOCK = 100_000_000 * NANOSECONDS
 
 
 @dataclass(frozen=True)
 class Fallback:
     """
-    What to do after a silence.
+    Reaction to silence.
 
     Raises
     ------
@@ -37,7 +37,7 @@ class Fallback:
 
     """
 
-    timeout: float = 1.0  #: longest silence in s; 0 for any
+    timeout: float = 1.0  #: longest silence in s; 0 for unlimited
     safe_flux: str = 'hold'  #: one of `SAFE_FLUX`
     ramp_rate: float = 1.0  #: of a ramp to zero, in T/s, above 0
 
@@ -53,45 +53,45 @@ class Fallback:
 
 class GuardedJoint:
     """
-    What a coil does when nobody commands it any more, and what is refused after it was cut off.
+    Guard of a coil: its watchdog, and the rejection of commands after a cut-off.
 
-    Its watchdog notices that commands and heartbeats have ceased, and commands the safe flux then.
-    It is armed by the first command, so that an actuator nobody has moved yet raises no alarm.
-    While the silence is too long it is ``tripped``; ``trips`` counts how often it was.
+    The watchdog detects that commands and heartbeats have stopped, and then commands the safe
+    flux. The first command arms it, so that an actuator without commands raises no alarm. During
+    an excessive silence it is ``tripped``; ``trips`` counts these silences.
 
-    After a cut-off, levels that were meant for before are refused. Whoever was out of reach
-    repeats its last level as soon as it is back, and what it sent in vain is sent again: either
-    would put the field on in one step that nobody has asked for.
+    After a cut-off, levels that were commanded before are rejected. A commander that was
+    disconnected repeats its last level as soon as it is back, and lost messages are sent again:
+    either would switch the field on in one unrequested step.
 
-    What there is to log is appended to ``notices``, with the ``number`` of the joint.
+    Notices to log are appended to ``notices``, with the ``number`` of the joint.
     """
 
     def __init__(self, number: int, fallback: Fallback, notices: deque[Notice]) -> None:
         self.number, self._fallback, self._notices = number, fallback, notices
         self._timeout = round(fallback.timeout * NANOSECONDS)
         self._last: int | None = None
-        # When it began, from which level, and how many of its levels were given.
+        # Begin and initial level of the ramp, and number of its levels already given.
         self._ramp: tuple[int, float] | None = None
         self._steps = 0
         self.tripped = False
         self.trips = 0
-        # What was commanded, and since when that is refused.
+        # Commanded levels, and the time of the cut-off since which they are rejected.
         self._before: deque[float] = deque(maxlen=_REMEMBERED)
         self._since: int | None = None
         self._zero_first = False
 
     def note(self, kind: Kind, text: str, late: int = 0) -> None:
-        """Note something to log; ``late`` is a lateness in ns."""
+        """Add a notice to log; ``late`` is a lateness in ns."""
         self._notices.append(Notice(kind, self.number, text, late))
 
     def note_late(self, late: int) -> None:
-        """Note that a command came some ns after its stamp."""
+        """Add a notice of a command that arrived some ns after its timestamp."""
         self.note(
             Kind.LATE, f'command arrived {late / 1e6:.3f} ms after the time it applies and was '
             'applied at once: raise lead_time of the planner', late)
 
     def pass_over(self, span: int) -> None:
-        """Leave out a span of time in ns, which was no silence."""
+        """Exclude a duration in ns from any silence."""
         if self._last is not None:
             self._last += span
         if self._ramp is not None:
@@ -104,11 +104,11 @@ class GuardedJoint:
 
     @property
     def ramps(self) -> bool:
-        """Whether the coil is to be ramped down rather than switched off."""
+        """Whether to ramp the coil down rather than switch it off."""
         return self._fallback.safe_flux == 'ramp'
 
     def feed(self, now: int) -> None:
-        """Take a sign of life at a time in ns."""
+        """Record a command or heartbeat at a time in ns."""
         if self.tripped:
             self.note(Kind.HEARD, 'commands have come back')
         self.tripped = False
@@ -116,7 +116,7 @@ class GuardedJoint:
         self._last = now
 
     def watch(self, now: int, until: int, level: float) -> Iterator[tuple[int, float]]:
-        """Yield stamps (ns) and levels (T) of the safe flux once commands have ceased."""
+        """Yield timestamps (ns) and levels (T) of the safe flux once commands have stopped."""
         if self._last is not None:
             self._last = min(self._last, now)
         if self._alarm is not None and now >= self._alarm:
@@ -144,18 +144,18 @@ class GuardedJoint:
                 return
 
     def ramp_down(self, now: int, level: float) -> None:
-        """Begin to ramp a level in T to zero at a time in ns."""
+        """Start to ramp a level in T to zero at a time in ns."""
         self._ramp, self._steps = (now, level), 0
 
     @property
     def watch_due(self) -> int | None:
-        """When to `watch` next, in ns; None if there is nothing to watch."""
+        """Time in ns of the next `watch`; None if there is nothing to watch."""
         return self._alarm if self._ramp is None else (
             self._ramp[0] + self._steps * _RAMP_STEP_NS)
 
     @property
     def _alarm(self) -> int | None:
-        """When the silence will be too long, in ns; None where none is."""
+        """Time in ns at which the silence becomes excessive; None if disarmed or tripped."""
         if self._last is None or self.tripped or self._timeout == 0:
             return None
         return self._last + self._timeout + 1
@@ -169,26 +169,26 @@ class GuardedJoint:
 
     @property
     def is_cut_off(self) -> bool:
-        """Whether levels of before are refused."""
+        """Whether levels from before a cut-off are rejected."""
         return self._since is not None
 
     def cut_off(self, now: int, *, zero_first: bool = False) -> None:
         """
-        Refuse what was commanded before a time in ns, if anything was.
+        Reject levels commanded before a time in ns, if there are any.
 
-        If zero comes first, anything but 0 T is refused, whatever was commanded before.
+        With ``zero_first``, reject all levels except 0 T, regardless of earlier commands.
         """
         if self._before or zero_first:
             self._since = now
             self._zero_first = self._zero_first or zero_first
 
     def end_cut_off(self) -> None:
-        """Forget it, and what was commanded."""
+        """End the rejection, and discard the stored levels."""
         self._since, self._zero_first = None, False
         self._before.clear()
 
     def refuses(self, stamp: int, level: float, now: int, current: float) -> bool:
-        """Return whether a level in T, other than the current one, is one of before a cut-off."""
+        """Return whether a level in T, other than the current one, is rejected after a cut-off."""
         if self._since is not None:
             why, ago = '', (now - self._since) / NANOSECONDS
             if self._zero_first and (level or current):
@@ -218,62 +218,61 @@ class Device(ABC):
     """
     Actuators with their amplifiers, sensors and watchdogs.
 
-    Whoever drives it says what time it is, and collects what came of it, also in another thread:
-    `changes`, `samples` and `notices` return what is new since they were last called, in the order
-    in which it happened.
+    The caller supplies the time and collects the results, also from another thread: `changes`,
+    `samples` and `notices` return new items since their last call in chronological order.
     """
 
-    guards: Sequence[GuardedJoint]  # of each joint
+    guards: Sequence[GuardedJoint]  # one for each joint
 
     def __init__(self) -> None:
         self._changes: deque[Change] = deque()
         self._samples: deque[Sample] = deque()
         self._notices: deque[Notice] = deque()
-        #: Why no command is obeyed; empty where they are.
+        #: Why commands are rejected; empty if they are accepted.
         self.locked = ''
 
     @property
     @abstractmethod
     def time(self) -> int:
-        """Time in ns that it has been advanced to."""
+        """Time in ns that the device has been advanced to."""
 
     @abstractmethod
     def receive(self, joint: int, stamp: int, level: float) -> None:
-        """Take a level in T from a stamp in ns on (0: now), which supersedes all from then on."""
+        """Accept a level in T from a timestamp in ns on (0: now); it replaces all later ones."""
 
     @abstractmethod
     def advance(self, time: int) -> None:
-        """Do what is due up to a time in ns."""
+        """Do the work due up to a time in ns."""
 
     def changes(self) -> list[Change]:
-        """Return which levels took effect."""
+        """Return the levels that took effect since the last call."""
         return _emptied(self._changes)
 
     def samples(self) -> list[Sample]:
-        """Return what was measured."""
+        """Return the samples since the last call."""
         return _emptied(self._samples)
 
     def notices(self) -> list[Notice]:
-        """Return what there is to log."""
+        """Return the notices to log since the last call."""
         return _emptied(self._notices)
 
     @property
     def silent(self) -> list[int]:
-        """Joints that nobody commands any more."""
+        """Numbers of the joints whose commands have stopped."""
         return [x.number for x in self.guards if x.tripped]
 
     @property
     def trips(self) -> int:
-        """How often a joint fell silent."""
+        """Number of excessive silences, summed over the joints."""
         return sum(x.trips for x in self.guards)
 
     @property
     def cut_offs(self) -> list[int]:
-        """Joints whose coil was cut off, and whose levels of before are refused."""
+        """Numbers of the joints that reject levels from before a cut-off."""
         return [x.number for x in self.guards if x.is_cut_off]
 
     def _check_clock(self, stamp: int) -> None:
-        """Refuse a stamp in ns of a clock that began at another time, before it is obeyed."""
+        """Refuse a timestamp in ns of a clock with a different epoch."""
         if stamp and self.time and abs(stamp - self.time) > ANOTHER_CLOCK:
             raise BadInputError(
                 f'command has timestamp {stamp / NANOSECONDS:.3f} s, and the time is '
@@ -282,5 +281,5 @@ class Device(ABC):
 
 
 def _emptied(queue: deque[T]) -> list[T]:
-    """Return what is in a queue, which another thread may be filling."""
+    """Empty a queue, which another thread may be filling, and return its items."""
     return [queue.popleft() for _ in range(len(queue))]

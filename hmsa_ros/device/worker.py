@@ -1,8 +1,8 @@
 """
-A thread that looks after hardware, so that whoever else there is never waits for it.
+A thread that serves hardware, so that no other thread waits for it.
 
-Commands go in and news comes out through queues; no lock is held while hardware is called. The
-thread publishes nothing: what hangs there would keep the coil waiting.
+Commands and results pass through queues; no lock is held during a call of hardware. The thread
+publishes nothing, since blocked publishing would delay the coil.
 """
 
 from collections import deque
@@ -14,67 +14,67 @@ from threading import Condition, Event, Thread
 from time import monotonic, monotonic_ns
 
 from hmsa_ros.device.driven import HardwareDevice
-from hmsa_ros.device.hardware import HardwareError, told
+from hmsa_ros.device.hardware import described, HardwareError
 from hmsa_ros.device.protocol import Kind
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.timekeeping import StepWatch
 
-# In ns: a thread that sleeps wakes up late, by some 50 us, and then waits for Python's lock. It
-# gets that within the switch interval, and keeps it as long: both are this time before a level.
+# In ns: a sleeping thread wakes up about 50 us late, and then waits for Python's global lock, at
+# most for the switch interval. Both are this time before a level.
 _WATCHED = 250_000
-# In s: between attempts to switch off, and how long they go on when the end has been asked for.
+# In s: interval of attempts to switch off, its maximum, and their duration after a request to end.
 _PAUSE, _LONGEST_PAUSE, _LAST_ATTEMPTS = 0.05, 1.0, 0.7
-# In s, of an end with a call that does not return: waiting for it, for each call past it, and
-# for all that follows.
+# In s, for ending while a call blocks: wait for the call, wait for each call that bypasses it, and
+# limit for the rest.
 _PATIENCE, _PAST, _HANGING = 0.8, 0.4, 2.5
-# After hardware has failed and obeys again, in s: a pause, and for how long commands are refused
-# then, so that planners hear of it.
+# In s, after failed hardware obeys again: a pause, and the time during which commands are refused,
+# so that planners receive that state.
 _BREATH, _AWAY = 0.2, 1.0
 _MEND = 'correct it, then start the driver again'
 
 
 class HardwareWorker:
     """
-    A device of hardware that lets time run by itself, by a clock in ns, for one other thread.
+    A device of hardware that follows a clock in ns in its own thread.
 
-    ``make`` is called in its thread, as all of the hardware is. ``failure`` says why it has ended
-    by itself, and ``trouble`` what keeps it from obeying: an error, while it goes on trying to
-    switch off. That other thread calls `look_after` at times, and takes from the ``device`` what
-    came of it.
+    ``make`` is called in this thread, as all hardware is. ``failure`` contains the reason for an
+    end without request. ``trouble`` contains an error that keeps the hardware from obeying, while
+    the worker continues its attempts to switch off. The main thread calls `look_after` regularly,
+    and reads the results from the ``device``.
 
-    If it is to ``reconnect``, an error of hardware ends nothing: once the coils are off, it goes
-    on as after an interlock.
+    With ``reconnect``, an error of hardware does not end the worker: once the coils are off, it
+    continues as after an interlock.
     """
 
-    device: HardwareDevice  # since it has `started`
+    device: HardwareDevice  # available after `started`
 
     def __init__(
             self, make: Callable[[], HardwareDevice], clock: Callable[[], int],
             steady: Callable[[], int] = monotonic_ns, *, reconnect: bool = False) -> None:
         self._make, self._clock, self._steady = make, clock, steady
         self._reconnect = reconnect
-        self._away = ''  # why it has failed, before it goes on
-        self._resumes = 0.0  # until when commands are refused after that, by the monotonic clock
+        self._away = ''  # reason of a failure, until it continues
+        self._resumes = 0.0  # end of the refusal after a failure, by the monotonic clock
         self._steps = StepWatch()
         self._turn = Condition()
         self._ready = Event()
         self._ended = False
         self._saver: Thread | None = None
-        # What is asked for.
+        # Requests to the thread.
         self._commands: deque[Callable[[], None]] = deque()
         self.failure: HmsaError | None = None
         self.trouble = ''
-        self.locked = ''  # why no command is obeyed
+        self.locked = ''  # why commands are refused
         sys.setswitchinterval(_WATCHED / NANOSECONDS)
         self._thread = Thread(target=self._work, name='hardware', daemon=True)
         self._thread.start()
 
-    # -- for the other thread ------------------------------------------------------------------
+    # -- for the main thread -------------------------------------------------------------------
 
     def started(self, seconds: float) -> bool:
         """
-        Wait at most some seconds until the coils are off for a start; return whether they are.
+        Wait for at most some seconds until the coils are off initially; return whether they are.
 
         Raises
         ------
@@ -90,7 +90,7 @@ class HardwareWorker:
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
         """
-        Have the device take a level in T that applies from a stamp in ns on.
+        Pass a level in T that applies from a timestamp in ns on to the device.
 
         Raises
         ------
@@ -104,11 +104,11 @@ class HardwareWorker:
         self._put(partial(self._obey, joint, stamp, level, self._steady()))
 
     def switch_off(self) -> None:
-        """Have all coils switched off, with nothing ahead."""
+        """Switch off all coils, and drop pending levels."""
         self._put(self._switch_off)
 
     def lock(self, why: str) -> None:
-        """Have coils off and commands refused while there is a reason; an empty one ends it."""
+        """Keep coils off and refuse commands while there is a reason; an empty one ends that."""
         if why != self.locked:
             self.locked = why
             self._put(lambda: self.device.lock(why, self._clock()))
@@ -119,7 +119,7 @@ class HardwareWorker:
             self._turn.notify()
 
     def look_after(self) -> None:
-        """See whether the thread lives and its calls return; if not, switch off without it."""
+        """Check that the thread is alive and its calls return; otherwise switch off without it."""
         if self.failure is not None or self._saver is not None:
             return
         if not self._thread.is_alive():
@@ -129,7 +129,7 @@ class HardwareWorker:
                        '(hardware.timeout)')
 
     def close(self) -> None:
-        """Switch all coils off and end; may be called again."""
+        """Switch off all coils and end; may be called repeatedly."""
         with self._turn:
             self._ended = True
             self._turn.notify()
@@ -140,18 +140,18 @@ class HardwareWorker:
         if self._saver is not None:
             self._saver.join(3.0 * _PAST)
 
-    # -- in its own thread ---------------------------------------------------------------------
+    # -- in the thread of the hardware ---------------------------------------------------------
 
     def _work(self) -> None:
-        """Look after the hardware whenever something is due, and sleep until then."""
+        """Serve the hardware whenever work is due, and sleep until then."""
         try:
             self.device = self._make()
             if left := self.device.switch_off(self._clock()):
                 raise HmsaError(
                     f'{left}: the coil could NOT be switched off at the start; {_MEND}')
-        except BaseException as error:  # whatever it is, nobody else would hear of it
+        except BaseException as error:  # any error, which would be lost otherwise
             self.failure = error if isinstance(error, HmsaError) else HmsaError(
-                f'the driver does not start ({told(error)})')
+                f'the driver does not start ({described(error)})')
             return
         finally:
             self._ready.set()
@@ -159,7 +159,7 @@ class HardwareWorker:
             pass
 
     def _serve(self) -> bool:
-        """Look after the hardware; return whether to do so again after an error."""
+        """Serve the hardware; return whether to continue after an error."""
         try:
             if self._away:
                 self._come_back()
@@ -168,7 +168,7 @@ class HardwareWorker:
                     self._resumes = 0.0
                     self.device.lock(self.locked, self._clock())
                     self.trouble = ''
-                self._see_clock()
+                self._check_clock_step()
                 while self._commands:
                     self._commands.popleft()()
                 self.device.advance(self._clock())
@@ -176,26 +176,26 @@ class HardwareWorker:
         except BaseException as error:
             return self._end(
                 str(error) if isinstance(error, HmsaError) else
-                f'the driver failed ({told(error)})',
+                f'the driver failed ({described(error)})',
                 again=self._reconnect and isinstance(error, HardwareError))
         return self._end('', again=False)
 
     def _come_back(self) -> None:
-        """Begin to go on: all is off and locked for a while."""
+        """Prepare to continue: all coils are off and locked for a while."""
         self.trouble, self._away = (
             f'{self._away}: the coil is switched off, and what was commanded is forgotten', '')
         self.device.lock(self.trouble, self._clock())
         self._resumes = monotonic() + _AWAY
 
-    def _see_clock(self) -> None:
-        """Look whether the clock was set, which nobody has been silent for."""
+    def _check_clock_step(self) -> None:
+        """Detect a clock that was set, which must not count as silence."""
         if by := self._steps.step(self._steady(), self._clock(), self._steady()):
             self.device.clock_set(by)
 
     def _obey(self, joint: int, stamp: int, level: float, came: int) -> None:
-        """Take a level that came at a time by the steady clock: calls may have blocked since."""
+        """Accept a level that arrived at a steady time in ns, perhaps during a blocked call."""
         try:
-            self.device.hear(joint, stamp, level, self._clock() - self._steady() + came)
+            self.device.receive_at(joint, stamp, level, self._clock() - self._steady() + came)
         except BadInputError as error:
             self.device.coils[joint].note(Kind.REFUSED, str(error))
 
@@ -204,13 +204,13 @@ class HardwareWorker:
             raise HardwareError(left)
 
     def _wait(self) -> None:
-        """Sleep until something is due; the last of the time to a level is watched instead."""
+        """Sleep until work is due, but busy-wait shortly before a level."""
         device = self.device
         due, level = device.due, device.next_level
         left = math.inf if due is None else due - self._clock()
         if due == level and left <= _WATCHED:
             device.calls.make_ready()
-            # By the steady clock: the other may be set meanwhile.
+            # By the steady clock, since the other may be set meanwhile.
             end = self._steady() + left
             while self._steady() < end and not self._commands:
                 pass
@@ -227,16 +227,16 @@ class HardwareWorker:
 
     def _end(self, why: str, *, again: bool) -> bool:
         """
-        Switch off and close; go on trying where that fails, until the end is asked for.
+        Switch off and close; repeat failed attempts until the end is requested.
 
-        If it is to serve again, return whether it is to, and close nothing.
+        With ``again``, return True without closing once the coils are off.
         """
         begun, pause = monotonic(), _PAUSE
-        last, said = None, False
+        last, reported = None, False
         self._resumes = 0.0
         while left := self.device.switch_off(self._clock()):
-            if not said:
-                said = True
+            if not reported:
+                reported = True
                 self.trouble = (
                     f'{why or left}: the coil could NOT be switched off and may be on'
                     f'{f" ({left})" if why and left != why else ""}; cut the power of the '
@@ -251,26 +251,26 @@ class HardwareWorker:
             self.device.open()
         if again and not self._ended:
             with self._turn:
-                # What fails again at once keeps nobody busy.
+                # Limits the CPU load if the failure recurs immediately.
                 self._turn.wait_for(lambda: self._ended, _BREATH)
-            if not said:
+            if not reported:
                 self.device.open()
             self._away = why
             return True
         closed = '' if left else self.device.close()
-        if self._saver is not None or not (why or left or closed or said):
+        if self._saver is not None or not (why or left or closed or reported):
             return False
-        after = f' at last, after {monotonic() - begun:.1f} s' if said else ''
+        after = f' at last, after {monotonic() - begun:.1f} s' if reported else ''
         self.failure = HmsaError(
             f'{why or left}: the coil was NOT switched off and may be on; cut the power of the '
             'amplifier' if left else
             f'{why or closed or "the hardware failed"}: the coil is switched off{after}; {_MEND}')
         return False
 
-    # -- without its own thread ----------------------------------------------------------------
+    # -- without the thread of the hardware ----------------------------------------------------
 
     def _save(self, why: str) -> None:
-        """Begin to end without the thread, which hangs in a call."""
+        """Start to end without the thread, which is blocked in a call."""
         self.trouble = f'{why}: trying to switch the coil off from another thread'
         self._ended = True
         self.device.calls.give_up(_HANGING)
@@ -278,7 +278,7 @@ class HardwareWorker:
         self._saver.start()
 
     def _switch_off_past(self, why: str) -> None:
-        """Write 0 and close past the call that hangs, each as long as there is patience."""
+        """Write 0 and close, bypassing the blocked call, with a time limit for each."""
         device, now = self.device, self._clock()
         done: dict[int, bool] = {}
         for act in (

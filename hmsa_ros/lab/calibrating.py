@@ -10,7 +10,7 @@ import numpy as np
 
 from hmsa_ros.device.bench import Bench, LEAD, matched, Seen
 from hmsa_ros.device.calibration import loop
-from hmsa_ros.device.hardware import readings, told
+from hmsa_ros.device.hardware import described, readings
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.identification.delays import Delays, delays, field_delays
 from hmsa_ros.identification.recording import Recording
@@ -48,7 +48,7 @@ class _Reader:
                 self.seen += [(middle if x.stamp is None else x.stamp, x.stretch)
                               for x in readings(answer)]
             except BaseException as error:  # whatever a laboratory's class raises
-                self.failure = f'{type(self._probe).__name__}.read raised {told(error)}'
+                self.failure = f'{type(self._probe).__name__}.read raised {described(error)}'
                 return
 
     def close(self) -> Array:

@@ -186,7 +186,7 @@ class DriverNode(DeviceNode):
                 closed = bool(decode(taken.data, Bool).data)
             except BadInputError:
                 closed = False
-            self._interlock.hear(
+            self._interlock.receive(
                 taken.publisher, now, closed=closed,
                 present=lambda: endpoints.publishers_of(self, topics.INTERLOCK.name))
         before, why = self.worker.locked, self._interlock.look(now)

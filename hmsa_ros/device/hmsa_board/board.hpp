@@ -1,28 +1,33 @@
 /*
-A board between a serial line and a coil: levels at their times, samples, and a watchdog.
+A board between a serial line and a coil: timed levels, samples, and a watchdog.
 
 Portable C++11 without libraries or allocation, for a microcontroller and for a host. All times are
-in us since the board began, levels and readings in millionths (of A or V, and of the sensor's unit).
+in us since the board started; levels and readings are integers in units of 1e-6 (of A or V, and of
+the sensor's unit).
 
-A request is a line `NUMBER SESSION VERB VALUES*CRC`, and so is its answer, with the same NUMBER. CRC
-is CRC-16/CCITT-FALSE of all before the star, as four hexadecimal digits. A line that is damaged is
-not answered; a newline before one parts it from noise. Each request may be sent again: what it
-does and answers is the same.
+A request is a line `NUMBER SESSION VERB VALUES*CRC`, and so is its answer, with the same NUMBER.
+CRC
+is CRC-16/CCITT-FALSE of the text before the star, as four hexadecimal digits. A damaged line is
+not
+answered; a newline before a request separates it from noise. Each request may be repeated with the
+same effect and answer.
 
-    H SESSION WATCHDOG    begin a session; the coil goes off when no request has come for WATCHDOG us
-                          -> H VERSION CAPACITY LIMIT RESOLUTION EVENTS SAMPLES, and the session
-                             before, 0 after a start or a silence
+    H SESSION WATCHDOG    begin a session; the coil is switched off after WATCHDOG us without
+    request
+                          -> H VERSION CAPACITY LIMIT RESOLUTION EVENTS SAMPLES, and the previous
+                             session, 0 after a start or a silence
     T                     -> T TIME
-    W LEVEL               put a level out now and drop all ahead -> W TIME LEVEL EVENTS
-    S TIME LEVEL          put a level out at a time; drop all ahead from that time on -> S, F if full
-    A NUMBER              -> A FIRST TIME LEVEL ...: levels that took effect, numbered from FIRST on
-    M NUMBER              -> M FIRST TIME READING ...: the same of samples
-    K                     -> K: a sign of life
-    C                     -> C TEMPERATURE of the coil, in millionths of a degree Celsius; C alone
-                             where it is not measured, as all verbs that the board does not know
+    W LEVEL               output a level now, and drop all scheduled ones -> W TIME LEVEL EVENTS
+    S TIME LEVEL          schedule a level; drop scheduled levels from that time on -> S, F if full
+    A NUMBER              -> A FIRST TIME LEVEL ...: levels that took effect, numbered from FIRST
+    on
+    M NUMBER              -> M FIRST TIME READING ...: samples, in the same form
+    K                     -> K: heartbeat
+    C                     -> C TEMPERATURE of the coil in 1e-6 degrees Celsius; only C if it is not
+                             measured, as for all unknown verbs
 
-From the second on, a TIME in an answer to A and M is the time since the one before. Without a
-session, or in that of another host, all but H are answered with L alone.
+In answers to A and M, each TIME after the first is the difference from the previous one. Without a
+session, or in that of another host, all requests except H are answered with only L.
 */
 #ifndef HMSA_BOARD_HPP
 #define HMSA_BOARD_HPP
@@ -32,7 +37,7 @@ session, or in that of another host, all but H are answered with L alone.
 
 namespace hmsa {
 
-// A sample takes 12 bytes: fewer of them fit into a small microcontroller.
+// A sample takes 12 bytes: reduce their number for a small microcontroller.
 #ifndef HMSA_SAMPLES
 #define HMSA_SAMPLES 128
 #endif
@@ -52,7 +57,7 @@ inline uint16_t checksum(const char *text, int length) {
 
 inline char hexadecimal(unsigned value) { return "0123456789ABCDEF"[value & 15]; }
 
-// Values with their times; the newest SIZE of them are there, numbered from 1 on.
+// Values with their times, numbered from 1; the newest SIZE of them are stored.
 template <int SIZE>
 struct Series {
     int64_t time[SIZE];
@@ -74,25 +79,26 @@ class Board {
         resolution_ = resolution > 0 ? resolution : 1;
     }
 
-    // Take a byte from the line; whole lines are answered.
+    // Receive a byte from the line; complete lines are answered.
     void receive(char byte, int64_t now) {
         if (byte != '\n') {
             if (length_ < LONGEST_LINE) {
                 line_[length_] = byte;
             }
-            // One that is too long grows no further, and is none.
+            // The excess of an overlong line is ignored, and so is the line.
             length_ += length_ <= LONGEST_LINE;
             return;
         }
         int length = length_;
         length_ = 0;
-        // A host asks again when it has waited: an answer under way is not cut off.
+        // Ignored while an answer is being sent, so as not to truncate it: the host repeats
+        // requests.
         if (length <= LONGEST_LINE && sent_ == filled_) {
             obey(length, now);
         }
     }
 
-    // Apply what is due; return the level that is to be put out.
+    // Apply levels that are due; return the output level.
     int32_t advance(int64_t now) {
         while (count_ && time_[first_] <= now) {
             level_ = level_at_[first_];
@@ -109,13 +115,13 @@ class Board {
 
     void sample(int64_t when, int32_t reading) { samples_.add(when, reading); }
 
-    // Optional: the temperature of the coil, in millionths of a degree Celsius.
+    // Optional: set the temperature of the coil, in 1e-6 degrees Celsius.
     void warm(int32_t temperature) {
         temperature_ = temperature;
         measures_warmth_ = true;
     }
 
-    // The next byte for the line, if there is one.
+    // Get the next byte for the line; return whether there is one.
     bool send(char &byte) {
         if (sent_ == filled_) {
             return false;
@@ -124,7 +130,7 @@ class Board {
         return true;
     }
 
-    // When `advance` will do something; -1 for never.
+    // Return the time at which `advance` has work; -1 for never.
     int64_t due() const {
         int64_t silence = session_ ? heard_ + watchdog_ : -1;
         return count_ && (silence < 0 || time_[first_] < silence) ? time_[first_] : silence;
@@ -134,7 +140,7 @@ class Board {
     int32_t limit_, resolution_, level_, temperature_;
     bool measures_warmth_;
     int64_t session_, watchdog_, heard_;
-    // Levels ahead: a ring, rising in time.
+    // Scheduled levels: a ring buffer in chronological order.
     int64_t time_[KEPT];
     int32_t level_at_[KEPT];
     int first_, count_;
@@ -248,7 +254,7 @@ class Board {
         }
     }
 
-    // The level that the output has for one that is asked for.
+    // Return the level, rounded and limited, that the output can have.
     int32_t possible(int64_t level) const {
         int64_t half = resolution_ / 2;
         int64_t steps = (level + (level < 0 ? -half : half)) / resolution_;

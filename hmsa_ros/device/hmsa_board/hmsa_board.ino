@@ -1,9 +1,9 @@
 /*
-The sketch of a board: what is said to its pins. Change the two functions, and the constants, to
-what your amplifier and your sensor need; the protocol is in board.hpp.
+The sketch of a board, which connects it to its pins. Adapt the two functions and the constants to
+your amplifier and your sensor; the protocol is in board.hpp.
 
-Here, a 12-bit analogue output of 0 to 3.3 V, about 1.65 V, drives an amplifier of 2 A/V, and a
-laser gives 0 to 3.3 V for 0 to 50 mm.
+In this example, a 12-bit analogue output of 0 to 3.3 V, centred at 1.65 V, drives an amplifier of
+2 A/V, and a laser sensor outputs 0 to 3.3 V for 0 to 50 mm.
 */
 #include "board.hpp"
 
@@ -14,7 +14,7 @@ const int64_t SAMPLE_PERIOD = 1000;  // us
 hmsa::Board board(LIMIT, RESOLUTION);
 int64_t next_sample = 0;
 
-// micros(), which begins anew after 71 min, continued.
+// micros() without its overflow after 71 min.
 int64_t now() {
     static uint32_t before = 0;
     static int64_t time = 0;
@@ -28,7 +28,7 @@ void put_out(int32_t microamperes) {
     analogWrite(A0, 2047 + microamperes / RESOLUTION);
 }
 
-int32_t measured() {  // in nm, the millionths of a mm
+int32_t measured() {  // in nm, i.e. 1e-6 mm
     return static_cast<int32_t>(analogRead(A1) * 12210LL);
 }
 
