@@ -1,8 +1,8 @@
 """
-Requests worked out as drafts, step by step, without changing the plan in force.
+Drafts: requests planned step by step, without changing the running plan.
 
-Each function is a generator that pauses after a bounded amount of work and returns the draft:
-whoever plans a long sequence can do other things in between. `finish` does it at once.
+Each function is a generator that pauses after a bounded amount of work and finally returns the
+draft, so that callers can do other work in between. `finish` runs one without pauses.
 """
 
 from collections.abc import Generator, Iterable, Iterator, Sequence
@@ -28,30 +28,30 @@ from hmsa_ros.planning.stopping import brake, holdable
 from hmsa_ros.planning.timeline import Draft, Model, Plan, PlannedLevel, PlannedSegment
 
 T = TypeVar('T')
-#: Stretch, rate in 1/s and acceleration in 1/s^2, the latter NaN where it is not given.
+#: Stretch, rate in 1/s and acceleration in 1/s^2; the acceleration is NaN if not given.
 PathPoint = tuple[float, float, float]
-#: Work that pauses now and then.
+#: Work that pauses regularly.
 Steps = Generator[None, None, T]
 
-# How hard to brake where the hardest does not lead to a plan, from the nearest stop on.
+# Fractions of the hardest braking to try, in this order, if that leads to no plan.
 _BRAKE_SHARES = (0.5, 0.1, 0.02, 0.0)
-# How many natural periods later to try again where a plan cannot be made anew at once.
+# Natural periods by which to delay another attempt if resuming at once is impossible.
 _PATIENCE = (0.0, 0.15, 0.3, 0.45, 0.6)
-# How far off its stretch a field at rest may be, as a share of the load.
+# Deviation of the field from the holding load that counts as settled, as a fraction of the load.
 _SETTLED = 1e-6
-# Rate in 1/s that is rest at the end of a path.
+# Rates up to this, in 1/s, count as rest at the end of a path.
 _STOPPED = 1e-7
-# Share of a natural period in which a path is joined again: in a longer one vibration swings
-# farther than if it were left alone.
+# Duration of the return to a path, in natural periods; in a longer one, vibration swings farther
+# than without correction.
 _BACK = 0.4
-# Deviation from a path, as a share of its range, that is too little for a correction to keep.
+# Minimum deviation that a corrected path may leave, as a fraction of its range.
 _ANEW = 1e-4
-# Setpoints that are checked between two pauses, which takes some 0.1 ms; levels take more.
+# Setpoints checked between two pauses, in about 0.1 ms; levels take longer.
 _CHECKED = 200
 
 
 def finish(steps: Steps[T]) -> T:
-    """Do work without a pause and return its result."""
+    """Run work without pauses and return its result."""
     while True:
         try:
             next(steps)
@@ -62,18 +62,18 @@ def finish(steps: Steps[T]) -> T:
 
 @dataclass(frozen=True)
 class Outset:
-    """What a draft is worked out from: a state predicted at a time in ns."""
+    """Start of a draft: a state predicted at a time in ns."""
 
     plan: Plan
     model: Model
-    begin: int  #: the soonest time
+    begin: int  #: earliest time in ns
     state: State
-    #: Place of the first level of the plan whose prediction holds no more.
+    #: Index of the first level of the plan whose prediction is no longer valid.
     stale: int | None = None
 
 
 def check_points(points: Sequence[tuple[float, int]], rest: float) -> Steps[None]:
-    """Refuse points (stretch, end in ns from the start) that are no sequence: `RefusedError`."""
+    """Check points (stretch, end in ns from the start); raise `RefusedError` if invalid."""
     for begin in range(0, max(len(points), 1), _CHECKED):
         part = points[begin:begin + _CHECKED]
         for stretch, _ in part:
@@ -84,7 +84,7 @@ def check_points(points: Sequence[tuple[float, int]], rest: float) -> Steps[None
 
 def check_times(
         points: Sequence[tuple[Any, int]], name: str, first: int = 0, previous: int = -1) -> None:
-    """Refuse with `RefusedError` where there are no points, or times in ns do not increase."""
+    """Raise `RefusedError` if there are no points, or times in ns do not increase."""
     if not points:
         raise RefusedError(
             Code.BAD_INPUT, 'the trajectory has no points: expected at least one')
@@ -99,7 +99,7 @@ def check_times(
 
 
 def check_target(stretch: float, rest: float) -> None:
-    """Refuse with `RefusedError` what no actuator with a rest there has as a stretch."""
+    """Raise `RefusedError` if the stretch is impossible for an actuator with this rest."""
     if reason := impossible(stretch, rest):
         raise RefusedError(Code.BAD_INPUT, reason)
 
@@ -108,13 +108,13 @@ def draft_sequence(
         outset: Outset, points: Sequence[tuple[float, int]], base: int,
         now: int) -> Steps[Draft | None]:
     """
-    Plan checked points (stretch, end in ns) from a start in ns; None if they change nothing.
+    Draft checked points (stretch, end in ns) from a start in ns; None if they change nothing.
 
-    What cannot be carried out is a `RefusedError`.
+    Raise `RefusedError` if the sequence cannot be carried out.
     """
     begin = outset.begin
     if points[0][1] == 0 and len(points) > 1 and base == begin:
-        # A first point at time 0 that repeats where the actuator is asks for nothing.
+        # A first point at time 0 that repeats the present position is ignored.
         here = outset.state.stretch
         if abs(points[0][0] - here) > 1e-6:
             raise RefusedError(
@@ -143,12 +143,12 @@ def draft_sequence(
 
 
 def check_path(points: Sequence[tuple[PathPoint, int]], rest: float) -> None:
-    """Refuse points and times in ns that are no path to rest: `RefusedError`."""
+    """Raise `RefusedError` if points, with times in ns, are no path that ends at rest."""
     check_times(points, 'point')
     given = math.isnan(points[0][0][2])
     for number, ((stretch, *more), _) in enumerate(points):
         check_target(stretch, rest)
-        # Accelerations are of all points or of none.
+        # Either all points have an acceleration, or none has.
         if not (math.isfinite(more[0]) and math.isnan(more[1]) is given
                 and not math.isinf(more[1])):
             raise RefusedError(
@@ -165,10 +165,10 @@ def draft_path(
         outset: Outset, points: Sequence[tuple[PathPoint, int]], base: int,
         now: int) -> Steps[Draft]:
     """
-    Follow a checked path from a start in ns, or join it where it is by now.
+    Draft a checked path from a start in ns, or join it if it has begun.
 
-    From beside it the actuator goes to its first point, or to the first that is a natural period
-    ahead. What cannot be carried out is a `RefusedError`.
+    An actuator that is not on the path moves to its first point, or to the first point that is at
+    least a natural period ahead. Raise `RefusedError` if the path cannot be followed.
     """
     model, state, unit = outset.model, outset.state, outset.model.units.time
     ended, last = points[-1]
@@ -201,9 +201,9 @@ def draft_path(
 
 def draft_path_anew(outset: Outset) -> Steps[Draft]:
     """
-    Plan what is left of the path under way anew, back to it within half a natural period.
+    Draft the rest of the running path again, with a return to it within half a natural period.
 
-    What cannot be carried out is a `RefusedError`.
+    Raise `RefusedError` if the path cannot be followed.
     """
     model, state, place = outset.model, outset.state, outset.plan.under_way(outset.begin)
     segment = outset.plan.segments[place]
@@ -220,7 +220,7 @@ def draft_path_anew(outset: Outset) -> Steps[Draft]:
 def _along(
         outset: Outset, wanted: Path, target: float, tolerance: float,
         **known: Any) -> Steps[Draft]:
-    """Follow a path to rest at a target, of whose setpoint more is known."""
+    """Follow a path to rest at a target; further fields of its segment are given."""
     move = yield from along(
         replace(_frame(outset.model, outset.state), target=target), wanted, tolerance)
     draft = yield from draft_moves(
@@ -229,7 +229,7 @@ def _along(
 
 
 def draft_setpoints(outset: Outset, setpoints: Sequence[Setpoint]) -> Steps[Draft | None]:
-    """Plan setpoints; None where the plan is on the way to the only one, with nothing between."""
+    """Draft setpoints; None if the running plan already ends at the only one of them."""
     planned = outset.plan.segments
     if len(setpoints) == 1 and planned and planned[-1].stretch == setpoints[0].stretch \
             and planned[-1].since <= outset.begin:
@@ -238,13 +238,13 @@ def draft_setpoints(outset: Outset, setpoints: Sequence[Setpoint]) -> Steps[Draf
 
 
 def draft_stop(outset: Outset) -> Steps[Draft]:
-    """Plan how to come to rest as near as the flux density limits allow."""
-    # The load that brakes hardest is held until the first turning point, then the load that
-    # holds that stretch: a two-step command whose target is chosen by its beta_p. Where one
-    # brake does not do, on a grid, through ramps or at a limit, it is a move to a stretch near by.
+    """Draft a stop: rest as near as the flux density limits allow."""
+    # A two-step command with the hardest braking load as beta_p: that load up to the first turning
+    # point, then the load that holds this point. If a single brake is impossible (on a sampling
+    # grid, with ramps or at a limit), plan a move to a stretch near by.
     model, state = outset.model, outset.state
     found = brake(model, state)
-    # A coil that must not step brakes as the shaper smooth does, on from where it would turn.
+    # A coil that must not step brakes as the shaper smooth does, from the turning point on.
     smooth = model.options.shaper == 'smooth'
     if (not smooth and holdable(model, found.stretch) == found.stretch
             and not model.material.creep
@@ -264,19 +264,19 @@ def draft_stop(outset: Outset) -> Steps[Draft]:
             return (yield from draft_moves(outset, [Setpoint(stretch, math.inf)], shaper))
         except BadInputError:
             yield
-    # Nothing stops it at once: let it settle.
+    # No command stops the motion at once: let it settle.
     return (yield from draft_moves(
         outset, [Setpoint(holdable(model, state.stretch), math.inf)], 'step'))
 
 
 def _settled(model: Model, state: State) -> bool:
-    """Return whether the field of a coil that lags holds the stretch already."""
+    """Return whether the field of a lagging coil already holds the stretch."""
     return model.delivery.lag == 0.0 or math.isclose(
         state.load, model.holding(state.stretch), rel_tol=_SETTLED, abs_tol=_SETTLED)
 
 
 def later_outsets(outset: Outset) -> Iterator[int]:
-    """Yield times in ns to begin at where there is no way from the motion at the first."""
+    """Yield times in ns at which to try again if no plan is possible from the first one."""
     model = outset.model
     period = 2.0 * math.pi / model.frequency(outset.state.stretch)
     for share in _PATIENCE:
@@ -285,20 +285,20 @@ def later_outsets(outset: Outset) -> Iterator[int]:
 
 def draft_resumption(outset: Outset, arrival: int | None = None) -> Steps[Draft | None]:
     """
-    Plan what is left of the running plan anew, until it is on its way again; None if nothing is.
+    Draft the rest of the running plan again, up to where both agree; None if nothing is left.
 
-    Rest at the setpoint under way is at ``arrival`` in ns, or as soon as its shaper can. What
-    cannot be carried out from there is a `RefusedError`.
+    The current setpoint is reached at ``arrival`` in ns, or as soon as its shaper can. Raise
+    `RefusedError` if the rest cannot be carried out.
     """
-    # Setpoints end when they did; one that there is no time left for is left out. From where the
-    # new plan meets the running one it goes on as that.
+    # Setpoints end when planned before; one without time left is skipped. Where the new plan meets
+    # the running one, the running one continues.
     planned = outset.plan.segments
     begun = max(outset.plan.under_way(outset.begin), 0)
     first = None if arrival is None else partial(
         through, duration=outset.model.time(arrival - outset.begin))
     refusal: RefusedError | None = None
     for index in range(begun, len(planned)):
-        # Left out setpoints make room for the next one, which is gone to at once.
+        # A skipped setpoint leaves its time to the next one, to which the move starts at once.
         try:
             draft = yield from draft_moves(
                 outset, _left(outset, index), first=first, index=index)
@@ -318,7 +318,7 @@ def draft_resumption(outset: Outset, arrival: int | None = None) -> Steps[Draft 
 
 
 def _left(outset: Outset, index: int) -> Iterator[Setpoint]:
-    """Yield the setpoints of the running plan from a place on, with the time left for them."""
+    """Yield the setpoints of the running plan from an index on, with their remaining durations."""
     planned = outset.plan.segments
     left = outset.begin
     for place in range(index, len(planned) - 1):
@@ -329,7 +329,7 @@ def _left(outset: Outset, index: int) -> Iterator[Setpoint]:
 
 
 def _meeting(outset: Outset, state: State, following: int) -> int | None:
-    """Return from which level on the running plan continues a state at a setpoint's begin."""
+    """Return the index of the level at which the running plan continues a state, else None."""
     planned = outset.plan.segments[following]
     place = outset.plan.place(planned.begin)
     level = outset.plan.levels[place]
@@ -344,9 +344,9 @@ def draft_moves(
         outset: Outset, setpoints: Iterable[Setpoint], shaper: str = '',
         first: Shaper | None = None, index: int | None = None) -> Steps[Draft]:
     """
-    Plan setpoints and place them on the timeline; the shaper is that of the options.
+    Draft setpoints on the timeline; the default shaper is that of the options.
 
-    Where they are those of the running plan from a place on, they go on as that once they meet it.
+    With ``index``, they are those of the running plan from there on, which continues once met.
     """
     model, planned = outset.model, outset.plan.segments
     levels: list[PlannedLevel] = []
@@ -368,7 +368,7 @@ def draft_moves(
 
 
 def _frame(model: Model, state: State) -> Request:
-    """Return the request to stay where a state is."""
+    """Return the request to stay in a state."""
     options = model.options
     return Request(
         state, state.stretch, model.material, model.limits, model.delivery, options.order,
@@ -382,7 +382,7 @@ def _placed(
     start = begin + model.ns(segment.begin)
     state = segment.start
     if math.isnan(state.load):
-        raise ValueError('a segment on the timeline knows the load it starts from')
+        raise ValueError('a segment on the timeline must contain its initial load')
     levels = []
     time = 0.0
     known = len(segment.move.levels) - len(segment.move.tail)
@@ -406,7 +406,7 @@ def _placed(
 
 def _over(
         points: Sequence[tuple[float, int]], base: int, now: int, coordinate: str) -> RefusedError:
-    """Return the refusal of a sequence that is over."""
+    """Return the error for a sequence that has already ended."""
     stretch, last = points[-1]
     if last == 0:
         return RefusedError(

@@ -1,8 +1,8 @@
 """
-The stretch as a flat output: what load makes it follow a path.
+The stretch as a flat output: the load that makes it follow a path.
 
-By the equation of motion a path of the stretch gives the load (M. Fliess, J. Lévine, P. Martin,
-P. Rouchon, Int. J. Control 61, 1327 (1995)).
+The equation of motion determines the load from a path of the stretch (M. Fliess, J. Lévine,
+P. Martin, P. Rouchon, Int. J. Control 61, 1327 (1995)).
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from hmsa_ros.model.simulation import with_followed
 
 
 def fade(share: Array) -> tuple[Array, Array, Array]:
-    """Return a polynomial from 0 to 1 with three derivatives that are 0 at both, and two."""
+    """Return a polynomial from 0 to 1, with three zero derivatives at both ends, and two more."""
     left = 1.0 - share
     return (share ** 4 * (35.0 - 84.0 * share + 70.0 * share ** 2 - 20.0 * share ** 3),
             140.0 * (share * left) ** 3, 420.0 * (share * left) ** 2 * (left - share))
@@ -22,7 +22,7 @@ def fade(share: Array) -> tuple[Array, Array, Array]:
 
 def loads_for(
         stretch: Array, rate: Array, wanted: Array, material: NondimensionalParameters) -> Array:
-    """Return the loads that give wanted accelerations, which are linear in them, (n,) each."""
+    """Return the loads for given accelerations, which are linear in the load, (n,) each."""
     zero, one = (acceleration(stretch, rate, x, material) for x in (0.0, 1.0))
     return (wanted - zero) / (one - zero)
 
@@ -30,7 +30,7 @@ def loads_for(
 def held_along(
         times: Array, stretch: Array, followed: tuple[float, ...],
         material: NondimensionalParameters) -> tuple[Array, Array]:
-    """Return the force (n,) of branches along a path, and what each follows (n, k)."""
+    """Return the overstress (n,) of branches along a path, and the branch states (n, k)."""
     forces = elastic_force(stretch, material)
     behind = np.empty((len(times), len(followed)))
     motion.trail(times, forces, with_followed(material, followed), behind)

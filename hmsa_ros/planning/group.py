@@ -1,7 +1,7 @@
 """
-Planners of several joints that take a request together or not at all.
+Planners of several joints that accept a request together or not at all.
 
-One joint is a group of one, planned as by its planner alone.
+A single joint is a group of one, planned as by its planner alone.
 """
 
 from bisect import bisect_left, bisect_right
@@ -17,11 +17,11 @@ from hmsa_ros.planning.history import Deviation
 from hmsa_ros.planning.planner import Planner
 from hmsa_ros.planning.timeline import Draft, Plan, PlannedSegment
 
-# How often running a plan is made anew, with no command in time in between.
+# Maximum number of successive replans without a command in time.
 _ATTEMPTS = 3
-# What a joint counts as resting within, relative to its load and its natural frequency.
+# Load and rate tolerance within which a joint counts as at rest, relative.
 _AT_REST = 1e-6
-# The first of these that some joint is in is that of all.
+# The state of the group is the first of these that any joint is in.
 _STATES = ('moving', 'waiting', 'holding', 'settling', 'at_rest', 'idle')
 # Setpoints whose arrivals are compared between two pauses.
 _COMPARED = 100
@@ -29,35 +29,35 @@ _COMPARED = 100
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a joint, or all of them, have come in their sequence."""
+    """Progress of a joint, or of all joints, in their sequence."""
 
     state: str = 'idle'  #: idle, or another of `_STATES`
-    setpoint: int = 0  #: under way, from 1
+    setpoint: int = 0  #: current setpoint, from 1
     setpoints: int = 0
     stretch: str = ''  #: target; empty for none, or for several joints
 
 
 @dataclass(frozen=True)
 class Resumption:
-    """How a joint goes on after a deviation: a draft (None if done), or why it comes to rest."""
+    """Continuation of a joint after a deviation: a draft (None if done), or the reason to stop."""
 
     draft: Draft | None
     refusal: str = ''
-    left: float = 0.0  #: vibration that the plan leaves that stays, as a share of the step
+    left: float = 0.0  #: residual vibration of the unchanged plan, as a fraction of the step
 
 
 class PlannerGroup:
     """
-    Several planners, each with a block, limits and a timeline of its own.
+    Several planners, each with its own block, limits and timeline.
 
-    Lead time and command period must be the same for all. Where they are to be ``simultaneous``,
-    which may change from request to request, joints that would arrive sooner begin later, so that
-    all arrive together. ``number`` counts accepted requests from 1.
+    Lead time and command period must be the same for all. With ``simultaneous``, which may change
+    between requests, faster joints start later so that all arrive together. ``number`` counts
+    accepted requests from 1.
     """
 
     def __init__(
             self, planners: Mapping[str, Planner], *, simultaneous: bool = False) -> None:
-        """Take the planners as they are."""
+        """Keep the planners."""
         self.planners = dict(planners)
         self.simultaneous = simultaneous
         self.number = 0
@@ -68,7 +68,7 @@ class PlannerGroup:
     def draft_request(
             self, points: Mapping[str, Sequence[tuple[Any, int]]], stamp: int | None,
             now: int, *, raw: bool = False, path: bool = False) -> Steps[dict[str, Draft]]:
-        """Work out a sequence, levels if raw, or a path, without joints that change nothing."""
+        """Draft a sequence, levels if raw, or a path; omit joints that it does not change."""
         draft: Callable[..., Steps[Draft | None]] = (
             Planner.draft_levels if raw else Planner.draft_path if path
             else Planner.draft_request)
@@ -79,17 +79,17 @@ class PlannerGroup:
         return drafts
 
     def draft_setpoint(self, name: str, stretch: float, now: int) -> Steps[dict[str, Draft]]:
-        """Work out a single stretch for one joint; `draft_request` says more."""
+        """Draft a move of one joint; see `draft_request`."""
         return (yield from self._each(
             [name], lambda name: self.planners[name].draft_setpoint(stretch, now)))
 
     def draft_stop(self, now: int) -> Steps[dict[str, Draft]]:
-        """Work out how all joints come to rest; `draft_request` says more."""
+        """Draft a stop of all joints; see `draft_request`."""
         return (yield from self._each(
             self.planners, lambda name: self.planners[name].draft_stop(now)))
 
     def take(self, drafts: Mapping[str, Draft], now: int) -> bool:
-        """Take drafts of one request, made at the same time (ns); return if anything changes."""
+        """Take drafts of one request, made at the same time (ns); return whether there are any."""
         for name, draft in drafts.items():
             self.planners[name].take(draft, now)
             self._attempts[name] = 0
@@ -97,7 +97,7 @@ class PlannerGroup:
         return bool(drafts)
 
     def draft_resumption(self, name: str, now: int) -> Steps[Resumption]:
-        """Work out how what is left of a joint's plan goes on, or how the joint stops."""
+        """Draft the rest of a joint's plan, or else a stop."""
         planner = self.planners[name]
         try:
             return Resumption((yield from planner.draft_resumption(now)))
@@ -105,18 +105,18 @@ class PlannerGroup:
             return Resumption((yield from planner.draft_stop(now)), str(error))
 
     def resume(self, name: str, found: Resumption, now: int) -> None:
-        """Take a joint's plan that has been made anew."""
+        """Take the new plan of a joint."""
         self._attempts[name] += 1
         self.planners[name].take(found.draft, now)
 
     def may_resume(self, name: str) -> bool:
-        """Return whether a joint may replan; not where several new plans came too late."""
+        """Return whether a joint may replan; False after several replans that came too late."""
         return self._attempts[name] < _ATTEMPTS
 
     def applied(
             self, name: str, stamp: int, flux_density: float,
             tolerance: int) -> Deviation | None:
-        """Take in a joint's change of level as `RunningPlan.applied` does."""
+        """Record a change of level of a joint, as `RunningPlan.applied` does."""
         found = self.planners[name].applied(stamp, flux_density, tolerance)
         if found is not None and found.effect == 0.0:
             self._attempts[name] = 0
@@ -138,7 +138,7 @@ class PlannerGroup:
         return drafts
 
     def _together(self, drafts: dict[str, Draft]) -> Steps[dict[str, Draft]]:
-        """Have moves begin later that would arrive before the slowest to the same setpoint."""
+        """Delay moves that would arrive before the slowest one to the same setpoint."""
         delays: dict[str, list[int]] = {name: [] for name in drafts}
         for number, row in enumerate(zip(*(x.segments for x in drafts.values()), strict=True)):
             latest = max((x.arrival for x in row if x.arrival is not None), default=None)
@@ -151,7 +151,7 @@ class PlannerGroup:
                 yield
         return {name: draft.delayed(delays[name]) for name, draft in drafts.items()}
 
-    # -- what comes of them --------------------------------------------------------------------
+    # -- progress ------------------------------------------------------------------------------
 
     def restart(self) -> None:
         """Drop all plans, after the clock has jumped back."""
@@ -159,23 +159,23 @@ class PlannerGroup:
             planner.restart()
 
     def clock_set(self, by: int) -> None:
-        """Take in that the clock was set ahead by some ns: what is planned goes on as before."""
+        """Shift all plans by the ns that the clock was set ahead."""
         for planner in self.planners.values():
             planner.clock_set(by)
 
     def next_command(self) -> int | None:
-        """Return the time in ns at which a command is to be handed out; None for none."""
+        """Return the time in ns at which to send the next command; None if there is none."""
         times = ((x.next_stamp, x.options.lead_time) for x in self.planners.values())
         return min((stamp - lead for stamp, lead in times if stamp is not None), default=None)
 
     def next_change(self, now: int) -> int | None:
-        """Return the time in ns after now at which progress changes; None for never."""
+        """Return the time in ns of the next change of progress after now; None for none."""
         return min((
             x for planner in self.planners.values() for x in _changes(planner.plan, now)
         ), default=None)
 
     def progress(self, now: int) -> tuple[Progress, dict[str, Progress]]:
-        """Return the progress of all joints, as of the one with most to do, and of each."""
+        """Return the progress of all joints, with the counts of the busiest one, and of each."""
         each = {name: _progress(x.plan, now) for name, x in self.planners.items()}
         if len(each) == 1:
             return next(iter(each.values())), each
@@ -190,8 +190,8 @@ class PlannerGroup:
     def preview(
             self, begin: int,
             limit: int) -> tuple[list[int], dict[str, list[tuple[float, float, float]]]]:
-        """Return stamps in ns and, by joint, stretch, rate (1/s) and flux density (T) at each."""
-        # From when on each joint has the level in force at begin, at most limit changes of any.
+        """Return timestamps (ns) and, by joint, stretch, rate (1/s) and flux density (T)."""
+        # From the time at which all joints have a known level at begin, at most limit changes.
         ahead = [
             [x.stamp for x in planner.plan.ahead(begin, limit)]
             for planner in self.planners.values()]
@@ -202,10 +202,10 @@ class PlannerGroup:
 
 
 def _rests(draft: Draft, segment: PlannedSegment) -> bool:
-    """Whether a joint can as well begin a move later, since it rests until then."""
+    """Return whether a joint can start a move later, since it rests until then."""
     level = draft.levels[bisect_left(draft.levels, segment.begin, key=lambda x: x.stamp)]
     model = level.model
-    # What creeps has relaxed further by then.
+        # A creeping joint would have relaxed further by then.
     return not model.material.creep and (
         abs(level.state.rate) <= _AT_REST
         and math.isclose(
@@ -233,7 +233,7 @@ def _changes(plan: Plan, now: int) -> Iterable[int]:
 
 
 def _progress(plan: Plan, now: int) -> Progress:
-    """Return how far a plan has come."""
+    """Return the progress of a plan."""
     count = len(plan.segments) - plan.kept
     place = plan.under_way(now)
     if place < plan.kept:

@@ -1,4 +1,4 @@
-"""What really took effect, taken into the levels of a plan."""
+"""Record of the levels that took effect, and its merge into the levels of a plan."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -7,41 +7,41 @@ from typing import Any
 
 from hmsa_ros.planning.timeline import Plan, PlannedLevel
 
-# How near a prediction must come to the planned one for what follows to hold as planned: half a
-# nanosecond, to which stamps are rounded, makes some 1e-8 of stretch at full speed. The rate is
-# meant relative to the natural frequency.
+# Tolerance within which a prediction agrees with the planned one, so that the rest of the plan
+# remains valid: rounding timestamps by half a nanosecond changes the stretch by about 1e-8 at full
+# speed. The rate is relative to the natural frequency.
 _AS_PLANNED = 3e-8
-# Levels that differ by less than this share of the largest one are the same to a coil's hardware,
-# which rounds: some steps of a converter of 14 bits.
+# Levels that differ by less than this fraction of the largest one are equal for the hardware,
+# which rounds: a few steps of a 14-bit converter.
 _RESOLUTION = 2e-4
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """How what took effect differs from what was planned."""
+    """Difference between the level that took effect and the plan."""
 
-    late: int = 0  #: ns by which a change came later than planned; negative for earlier
-    lost: int = 0  #: planned changes before it that never took effect
-    foreign: bool = False  #: whether the level was not planned at all
-    asked: float | None = None  #: level in T that the coil did not reach; None where it did
+    late: int = 0  #: ns by which a change was late; negative if early
+    lost: int = 0  #: earlier planned changes that never took effect
+    foreign: bool = False  #: whether the level was not planned
+    asked: float | None = None  #: level in T that the coil did not reach; None if it did
     change: float = field(default=0.0, compare=False)  #: of the level in T
-    #: Amplitude of stretch that is not planned for, beyond a lateness that is expected.
+    #: Unplanned amplitude of stretch, beyond that of the expected lateness.
     effect: float = field(default=0.0, compare=False)
 
     def beyond(self, tolerance: int) -> bool:
-        """Return whether it is more than a change that is some ns late."""
+        """Return whether it is more than a change that is late within the tolerance in ns."""
         return bool(
             self.foreign or self.lost or self.asked is not None or abs(self.late) > tolerance)
 
 
 @dataclass(frozen=True)
 class History:
-    """A plan, and how much of it has happened."""
+    """A plan, and the part of it that has happened."""
 
     plan: Plan
-    sent: int = 1  #: how many levels, the first ones, have been handed out; at least 1
-    known: int = 0  #: place of the last level known to have taken effect
-    #: Place of the first level, not handed out yet, whose prediction holds no more.
+    sent: int = 1  #: number of levels sent, from the first on; at least 1
+    known: int = 0  #: index of the last level known to have taken effect
+    #: Index of the first level, not sent yet, whose prediction is no longer valid.
     stale: int | None = None
 
     @property
@@ -54,8 +54,8 @@ class History:
 
     def unheard(self, now: int) -> int:
         """Count the levels after the last known one that never took effect (time in ns)."""
-        # Only changes are reported. Commands that come so late that they apply all at once make
-        # none if the last of them is the level in force: those before it never were.
+        # Only changes are reported. Commands that arrive so late that they apply all at once cause
+        # no change if the last of them equals the present level: those before it never applied.
         levels, first = self.levels, self.known + 1
         for i in reversed(range(first, self.sent)):
             if (levels[i].stamp <= now
@@ -65,7 +65,7 @@ class History:
         return 0
 
     def without(self, start: int, end: int) -> 'History':
-        """Return the history without levels ``start`` to ``end``, which never were in force."""
+        """Return the history without levels ``start`` to ``end``, which never took effect."""
         sent = self.sent - max(min(self.sent, end) - start, 0)
         return self._with(
             self.levels[:start] + self.levels[end:], sent=sent, stale=start).predicted(sent)
@@ -73,9 +73,9 @@ class History:
     def with_news(
             self, stamp: int, flux_density: float,
             tolerance: int) -> tuple['History', Deviation | None]:
-        """Return the history with a level (T) in effect from a stamp (ns), and its deviation."""
-        # Changes take effect in the order in which they were sent. So those before the one there
-        # is news of have been in force already or never will, and those after it come no earlier.
+        """Return the history with a level (T) in effect from a time (ns), and its deviation."""
+        # Changes take effect in the order of sending. Levels before the reported one have already
+        # been in effect or never will; later ones come no earlier.
         levels, known = self.levels, self.known
         if stamp < levels[known].stamp or stamp == levels[known].stamp and self._near(
                 flux_density, levels[known].flux_density):
@@ -95,9 +95,9 @@ class History:
             taken = levels[rest - 1]
             if self._near(taken.flux_density, flux_density):
                 return self, None
-            # Somebody else's command, or what a watchdog does.
+            # A command from another publisher, or a watchdog.
             deviation = Deviation(lost=self._changes(range(known + 1, rest)), foreign=True)
-        # As the hardware rounds it.
+        # The level as the hardware rounds it.
         news = replace(taken, stamp=stamp, flux_density=flux_density)
         deviation = replace(deviation, change=flux_density - levels[known].flux_density)
         after = tuple(
@@ -107,7 +107,7 @@ class History:
         count = known + 2 + len(after)
         stale: int | None = known + 1
         if short is not None:
-            # Nor does it reach what is to come.
+            # The coil will not reach higher levels to come either.
             changed = (*changed[:known + 2], *(
                 replace(x, flux_density=flux_density) if _beyond(x.flux_density, flux_density)
                 else x for x in changed[known + 2:]))
@@ -118,10 +118,10 @@ class History:
 
     def predicted(self, end: int) -> 'History':
         """
-        Predict stale levels anew up to a place, or until a prediction is as planned.
+        Predict stale levels again up to an index, or until a prediction agrees with the plan.
 
-        Only what has been handed out is predicted where reality differs, so that the work does not
-        grow with the plan; this catches up as far as somebody needs it.
+        After a deviation, only levels that have been sent are predicted again, so that the work
+        does not grow with the plan. This method catches up as far as needed.
         """
         if self.stale is None or self.stale >= end:
             return self
@@ -140,9 +140,9 @@ class History:
 
     def _find(
             self, sent: range, stamp: int, flux_density: float, tolerance: int) -> int | None:
-        """Return which of the levels that were sent has taken effect."""
+        """Return the index of the sent level that has taken effect, else None."""
         levels = self.levels
-        # Nearly always the next one, of perhaps hundreds along a path.
+        # Almost always the next one, among perhaps hundreds along a path.
         for i in sent:
             if abs(levels[i].stamp - stamp) <= tolerance and self._near(
                     levels[i].flux_density, flux_density):
@@ -152,31 +152,31 @@ class History:
             if levels[i].stamp < stamp and levels[i].flux_density != levels[i - 1].flux_density:
                 return i
         if _same(flux_density, levels[self.known].flux_density):
-            return None  # in force already, and not the early beginning of a gentle path
-        # A driver that rounds to its own steps may be early, but leaves no change out for that.
+            return None  # already in effect, and not the early start of a slow path
+        # A driver that rounds to its own steps may be early, but not by skipping a change.
         return next((i for i in same if not self._changes(range(self.known + 1, i))), None)
 
     def _short(
             self, sent: range, stamp: int, flux_density: float, tolerance: int) -> int | None:
-        """Return which of the levels that were sent an amplifier did not reach."""
+        """Return the index of the sent level that the amplifier did not reach, else None."""
         due = [i for i in sent if self.levels[i].stamp <= stamp + tolerance]
         if not due:
             return None
         level = self.levels[due[-1]]
         asked, options = level.flux_density, level.model.options
-        # What a watchdog or somebody else does comes later, or is nothing at all.
+        # Changes by a watchdog or another publisher come later, or are zero.
         soon = stamp - level.stamp <= max(options.lead_time, level.model.ns(1.0))
         short = _beyond(asked, flux_density) and not (
             self._near(asked, flux_density) or self._near(0.0, flux_density))
         return due[-1] if soon and short else None
 
     def _changes(self, places: Sequence[int]) -> int:
-        """Return how many of some levels are another one than that before."""
+        """Return how many of the levels differ from the one before."""
         return sum(not self._near(
             self.levels[i].flux_density, self.levels[i - 1].flux_density) for i in places)
 
     def _near(self, one: float, other: float) -> bool:
-        """Whether two levels in T are the same to hardware that rounds them."""
+        """Return whether two levels in T are equal for hardware that rounds them."""
         if _same(one, other):
             return True
         options = self.levels[-1].model.options
@@ -187,7 +187,7 @@ class History:
 
 
 def agree(one: PlannedLevel, other: PlannedLevel) -> bool:
-    """Return whether two predictions are the same but for what rounding makes of them."""
+    """Return whether two predictions agree to rounding."""
     x, y, level = one.state, other.state, one.model.units.level
     return (
         abs(x.stretch - y.stretch) <= _AS_PLANNED
@@ -200,10 +200,10 @@ def agree(one: PlannedLevel, other: PlannedLevel) -> bool:
 
 
 def _beyond(level: float, limit: float) -> bool:
-    """Whether a level in T is beyond what a coil reaches in its direction."""
+    """Return whether a level in T exceeds the limit that a coil reaches in its direction."""
     return level * limit > 0.0 and abs(level) > abs(limit)
 
 
 def _same(one: float, other: float) -> bool:
-    """Whether two flux densities in T are the same but for rounding on the way."""
+    """Return whether two flux densities in T are equal to rounding."""
     return math.isclose(one, other, rel_tol=1e-9, abs_tol=1e-12)

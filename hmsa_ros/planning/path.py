@@ -1,11 +1,12 @@
 """
-Paths of the stretch that are followed, as a dense trajectory with velocities asks for.
+Paths of the stretch to follow, such as a dense trajectory with velocities.
 
-The stretch is a flat output (`hmsa_ros.planning.flat`). Commands carry a staircase of the load, or
-ramps. The double integral of a staircase is a quadratic spline, and the stretch answers to the
-double integral of what the staircase lacks; so the levels are those whose spline comes nearest,
-in the mean square, to the double integral of the load (of the amplifier's output where the field
-lags). They are as long as a tolerance allows. The last ones are corrected to end at rest exactly.
+The stretch is a flat output (`hmsa_ros.planning.flat`). Commands are steps of the load (zero-order
+hold) or ramps. The double integral of a sequence of steps is a quadratic spline, and the error of
+the stretch follows from the error of this double integral. The levels are therefore those whose
+spline is nearest, in the mean square, to the double integral of the load (of the amplifier output
+if the field lags). They are as long as the tolerance allows. The last ones are corrected to end
+exactly at rest.
 """
 
 from collections.abc import Callable, Generator, Sequence
@@ -27,31 +28,31 @@ from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.shapers.two_step import two_step
 from hmsa_ros.planning.shooting import Attempt, kept, solve, Template
 
-#: Stretch, rate and acceleration, shape (n,) each, at times from the start on.
+#: Stretch, rate and acceleration, shape (n,) each, at times from the start.
 Course = Callable[[Array], tuple[Array, Array, Array]]
 
-# A staircase of steps a apart, each h long, leaves a h^2/(72 sqrt(3) m) of stretch.
+# Steps of height a and duration h cause a ripple of a h^2/(72 sqrt(3) m) in stretch.
 _RIPPLE = 1.0 / (72.0 * math.sqrt(3.0))
-# Share of the tolerance for it: beside a jump of the load it is larger.
+# Fraction of the tolerance for this ripple, which is larger next to a jump of the load.
 _SHARE = 0.15
-# Levels of a path at the least and at the most, of a natural period, of a block, by which blocks
-# overlap, and levels at the end that are corrected at the most.
+# Minimum and maximum number of levels of a path, minimum number per natural period, levels of a
+# block, overlap of blocks, and maximum number of corrected levels at the end.
 _FEWEST, _MOST, _OF_EACH, _BLOCK, _OVERLAP, _LAST = 24, 200_000, 6, 200, 12, 240
-# Breaks of a way back to a path.
+# Knots of a return to a path.
 _JOINT = 9
-# How often ramps are allowed for, and the change of a load that is none.
+# Maximum number of iterations that account for ramps, and the change of load that ends them.
 _RAMPED, _SETTLED = 60, 1e-9
-#: How near a path the actuator is on it, stretch.
+#: Deviation of the stretch up to which the actuator is on a path.
 ON_PATH = 1e-5
-# Stretch that counts as range at the least.
+# Minimum range of stretch of a path.
 _LEAST_RANGE = 1e-3
-# Where limits bind: how fast the actuator may return to the path, in natural frequencies.
+# If limits are active: speeds of the return to the path to try, in natural frequencies.
 _RETURN = (3.0, 1.0)
-# Share of a natural period at the end in which levels are corrected.
+# Duration at the end in which levels are corrected, in natural periods.
 _ENDING = 0.6
 
-# Points of an interval of unit length, and what polynomials through them integrate to: once and
-# twice, up to each point and up to the end; and their value at the end.
+# Gauss points of an interval of unit length, and matrices that integrate polynomials through them
+# once and twice, up to each point and to the end, or evaluate them at the end.
 _POINTS, _WEIGHTS = (0.5 * x for x in np.polynomial.legendre.leggauss(6))
 _POINTS = _POINTS + 0.5
 _ORDERS = np.arange(6)
@@ -64,9 +65,9 @@ _TWICE = (_AT ** (_ORDERS + 2) / ((_ORDERS + 1) * (_ORDERS + 2))) @ _INVERSE
 
 @dataclass(frozen=True)
 class Path:
-    """A path of the stretch, without a dimension, from time 0 on."""
+    """A dimensionless path of the stretch that starts at time 0."""
 
-    #: Times between which it is smooth, increasing, shape (n,), from 0 to its end.
+    #: Knots of the path, increasing, shape (n,), from 0 to its end.
     breaks: Array
     course: Course
 
@@ -75,11 +76,11 @@ class Path:
             cls, times: Array, stretches: Array, rates: Array,
             accelerations: Array | None = None) -> 'Path':
         """
-        Return the path through points, shape (n,) each, as joint_trajectory_controller has it.
+        Return the path through points, shape (n,) each, as joint_trajectory_controller defines it.
 
-        It is a cubic Hermite spline, of degree 5 where accelerations are given.
+        The path is a cubic Hermite spline, or one of degree 5 if accelerations are given.
         """
-        from scipy.interpolate import CubicHermiteSpline, PPoly  # others need not wait for it
+        from scipy.interpolate import CubicHermiteSpline, PPoly  # slow to import
 
         if accelerations is None:
             spline = CubicHermiteSpline(times, stretches, rates)
@@ -90,7 +91,7 @@ class Path:
     @classmethod
     def smooth(cls, times: Array, stretches: Array) -> 'Path':
         """Return the smoothest path through stretches, shape (n,), from rest to rest."""
-        from scipy.interpolate import make_interp_spline  # others need not wait for it
+        from scipy.interpolate import make_interp_spline  # slow to import
 
         ends = [(1, 0.0), (2, 0.0)]
         return cls._of(make_interp_spline(times, stretches, 5, bc_type=(ends, ends)), times)
@@ -101,14 +102,14 @@ class Path:
         return cls(times, lambda t: (spline(t), slope(t), curve(t)))
 
     def since(self, time: float) -> 'Path':
-        """Return what is left of the path from a time on, as from 0."""
+        """Return the rest of the path from a time on, which becomes time 0."""
         begins = np.searchsorted(self.breaks, time, side='right')
         return Path(
             np.append(0.0, self.breaks[begins:] - time),
             lambda t: self.course(t + time))
 
     def scaled(self, unit: float) -> 'Path':
-        """Return the path with its times in another unit, so many old ones long."""
+        """Return the path with its times divided by a unit."""
         scale = np.array([[1.0], [unit], [unit * unit]])
 
         def course(t: Array) -> tuple[Array, Array, Array]:
@@ -118,7 +119,7 @@ class Path:
         return Path(self.breaks / unit, course)
 
     def joined(self, stretch: float, rate: float, span: float) -> 'Path':
-        """Return the path from a state beside its begin, which it leads back from in a span."""
+        """Return the path with a start at another state, from which it returns in a given time."""
         here = self.course(np.zeros(1))
         off, fast = stretch - float(here[0][0]), rate - float(here[1][0])
         back = np.polynomial.Polynomial([
@@ -137,7 +138,7 @@ class Path:
 
 
 def _quintic(spans: Array, x: Array, v: Array, a: Array) -> Array:
-    """Return the coefficients of polynomials of degree 5 between points, highest first."""
+    """Return the coefficients of polynomials of degree 5 between points, highest order first."""
     move = x[1:] - x[:-1] - spans * (v[:-1] + 0.5 * spans * a[:-1])
     gain = (v[1:] - v[:-1] - spans * a[:-1]) * spans
     bend = (a[1:] - a[:-1]) * spans ** 2
@@ -151,11 +152,11 @@ def _quintic(spans: Array, x: Array, v: Array, a: Array) -> Array:
 
 def along(request: Request, path: Path, tolerance: float) -> Generator[None, None, Move]:
     """
-    Follow a path to rest at its end, the target of the request; pauses after some ms of work each.
+    Follow a path to rest at its end, the target of the request; pause after a few ms of work each.
 
-    The tolerance is the deviation that levels may leave, as a share of the range of the path; the
-    reason of the move names the largest one where that is more. A path beyond the stretches of the
-    law, or without rest at its end, is a `RefusedError`.
+    The tolerance is the deviation that levels may leave, as a fraction of the range of the path;
+    if the maximum is larger, the reason of the move reports it. Raise `RefusedError` if the path
+    leaves the range of the model, or has no rest at its end.
     """
     request.holding_load()
     follower = _Follower(request, path, tolerance)
@@ -166,17 +167,17 @@ def along(request: Request, path: Path, tolerance: float) -> Generator[None, Non
 
 
 class _Follower:
-    """Works out the levels of a path block by block."""
+    """Computation of the levels of a path, block by block."""
 
     def __init__(self, request: Request, path: Path, tolerance: float) -> None:
         self._request, self._path = request, path
         self.range, self.edges = _edges(request, path, tolerance)
         self._allowed = tolerance * self.range
-        self.done = 0  # intervals whose levels are known
+        self.done = 0  # intervals with known levels
         self._levels: list[Level] = []
         self._states = [request.start]
         self._followed = followed_by(request.state, request.material)
-        # What integral and double integral of the command have too much, and the load by now.
+        # Errors of the integral and double integral of the command, and the present load.
         inertia = law.mass(request.state.stretch, request.material.packed)
         begin = self._course(np.zeros(1))
         self._lack = np.array([
@@ -188,13 +189,13 @@ class _Follower:
         self._limited: set[Code] = set()
 
     def _course(self, times: Array) -> tuple[Array, Array, Array]:
-        """Return stretch, rate and acceleration of the path, which rests after its end."""
+        """Return stretch, rate and acceleration of the path, which is at rest after its end."""
         end = self._path.breaks[-1]
         stretch, rate, change = self._path.course(np.minimum(times, end))
         return stretch, np.where(times > end, 0.0, rate), np.where(times > end, 0.0, change)
 
     def advance(self) -> None:
-        """Work out the levels of the next block."""
+        """Compute the levels of the next block."""
         first, last = self.done, min(self.done + _BLOCK, len(self.edges) - 1)
         fitted = min(last + _OVERLAP, len(self.edges) - 1)
         edges, keep = self.edges[first:fitted + 1], last - first
@@ -214,14 +215,14 @@ class _Follower:
         self.done = last
 
     def _inverse(self, edges: Array, keep: int) -> tuple[Array, Array]:
-        """Return stretch and load of the path at the points between edges, (n, 6) each."""
+        """Return stretch and load of the path at the Gauss points between edges, (n, 6) each."""
         material = self._request.material
         spans = np.diff(edges)
         times: Array = (edges[:-1, np.newaxis] + spans[:, np.newaxis] * _POINTS).ravel()
         stretch, rate, wanted = self._course(times)
         loads = loads_for(stretch, rate, wanted, material)
         if material.creep:
-            # With the edges, at each of which branches are where the next block begins.
+            # Include the edges, since the next block starts with the branch states at one of them.
             every = np.append(np.column_stack([edges[:-1], times.reshape(-1, 6)]), edges[-1])
             held, behind = held_along(
                 every, self._course(every)[0], self._followed, material)
@@ -231,13 +232,13 @@ class _Follower:
 
     def _fit(self, edges: Array, loads: Array, keep: int) -> Array:
         """Return the levels of a block."""
-        from scipy.interpolate import BSpline  # others need not wait for it
+        from scipy.interpolate import BSpline  # slow to import
         from scipy.sparse.linalg import spsolve
 
         delivery, start = self._request.delivery, self._states[-1].ramps_from
         lag, slew, inner = delivery.lag, delivery.slew, np.diff(edges)[:, np.newaxis]
         since: Array = edges[:-1, np.newaxis] - edges[0] + inner * _AT.T
-        # The amplifier also gives what changes the field: the lag times its growth.
+        # The amplifier also supplies the change of the field: lag times rate.
         once, twice, values = _integrals(loads, inner)
         twice += lag * (once - self._reached * since)
         once += lag * (values - self._reached)
@@ -247,8 +248,8 @@ class _Follower:
         design = BSpline.design_matrix(
             (edges[:-1, np.newaxis] + inner * _POINTS).ravel(), knots, 2).multiply(
                 weights[:, np.newaxis]).tocsc()
-        # The first two coefficients are value and slope at the start, which are 0; the last two
-        # are those at the end, which are given where the path ends.
+        # The first two coefficients are value and slope at the start, both 0; the last two are
+        # value and slope at the end, prescribed where the path ends.
         free = slice(2, -2 if edges[-1] == self.edges[-1] else None)
         normal = (design[:, free].T @ design[:, free]).tocsc()
         coefficients = np.zeros(len(edges) + 1)
@@ -259,7 +260,7 @@ class _Follower:
             before = levels
             wanted = target - more
             if free.stop is not None:
-                # The field is that which holds the end, whatever it is just before.
+                # The final field holds the end of the path, whatever it is just before.
                 slope = once[-1, -1] - self._lack[0] - gained[-1] + lag * (
                     self._request.balance(self._followed) - values[-1, -1])
                 coefficients[-2:] = wanted[-1, -1] - 0.5 * inner[-1, 0] * slope, wanted[-1, -1]
@@ -280,7 +281,7 @@ class _Follower:
         return levels[:keep]
 
     def _take(self, edges: Array, ways: Sequence[Array], stretch: Array) -> None:
-        """Take those levels between edges whose motion stays nearest to the path."""
+        """Keep the candidate levels between edges whose motion stays nearest to the path."""
         request, start = self._request, self._states[-1]
         times = np.column_stack([
             edges[:-1, np.newaxis] + np.diff(edges)[:, np.newaxis] * _POINTS, edges[1:]])
@@ -329,7 +330,7 @@ class _Follower:
         return found
 
     def move(self) -> Move:
-        """Return the move once all levels are known, the last ones corrected to end at rest."""
+        """Return the move of the known levels, with the last ones corrected to end at rest."""
         request, edges = self._request, self.edges
         end = float(edges[-1])
         begin = int(np.searchsorted(edges, end - _ENDING * 2.0 * math.pi / request.frequency))
@@ -337,7 +338,7 @@ class _Follower:
         rest = replace(request, state=self._states[begin])
         found = kept(self._ended(rest, begin), request)
         if found is None:
-            # Beside the path at its end: a move of its own to rest.
+            # The actuator is off the path at its end: add a move to rest.
             begin = len(edges) - 1
             last = two_step(replace(request, state=self._states[-1]))
             found = last.levels, last.duration
@@ -356,7 +357,7 @@ class _Follower:
             float(np.max(away)), float(times[np.argmax(away)])))
 
     def _ended(self, request: Request, begin: int) -> Attempt:
-        """Return the last levels, from the first edge that counts, corrected to end at rest."""
+        """Return the last levels, from edge ``begin`` on, corrected to end at rest."""
         edges, delivery = self.edges[begin:] - self.edges[begin], request.delivery
         levels = np.array([x.load for x in self._levels[begin:]])
         middle = 0.5 * (edges[:-1] + edges[1:]) / edges[-1]
@@ -373,7 +374,7 @@ class _Follower:
         return solve(Template(rounded, levels, np.zeros_like(d_loads), d_loads), request)
 
     def _words(self, largest: float, when: float) -> str:
-        """Return the largest deviation in words, if it is more than levels may leave."""
+        """Return the largest deviation as text if it exceeds the tolerance, else an empty text."""
         if largest <= self._allowed:
             return ''
         request = self._request
@@ -391,13 +392,13 @@ class _Follower:
 
 
 def prepare() -> None:
-    """Load what the first path would wait for, for some tenths of a second."""
+    """Import the modules that the first path needs, which takes a few tenths of a second."""
     for name in ('interpolate', 'sparse.linalg'):
         import_module(f'scipy.{name}')
 
 
 def _integrals(loads: Array, spans: Array) -> tuple[Array, Array, Array]:
-    """Return integral, double integral and value of a load (n, 6), at points and ends, (n, 7)."""
+    """Return integral, double integral and value of a load (n, 6) at points and ends, (n, 7)."""
     once, twice = spans * (loads @ _ONCE.T), spans ** 2 * (loads @ _TWICE.T)
     first = np.append(0.0, np.cumsum(once[:, -1]))[:-1, np.newaxis]
     second = np.append(0.0, np.cumsum(
@@ -407,9 +408,9 @@ def _integrals(loads: Array, spans: Array) -> tuple[Array, Array, Array]:
 
 def _ramped(levels: Array, load: float, spans: Array, slew: float) -> tuple[Array, Array]:
     """
-    Return what ramps to levels add to the double integral of steps to them, and to the integral.
+    Return the differences in double integral and integral between ramps to levels and steps.
 
-    The former at points and ends of intervals, (n, 7), the latter at their ends, (n,).
+    The double integral is at points and ends of intervals, (n, 7), the integral at the ends, (n,).
     """
     changes = np.empty(len(levels))
     for i, (level, span) in enumerate(zip(levels.tolist(), spans[:, 0].tolist(), strict=True)):
@@ -427,7 +428,7 @@ def _ramped(levels: Array, load: float, spans: Array, slew: float) -> tuple[Arra
 
 
 def _edges(request: Request, path: Path, tolerance: float) -> tuple[float, Array]:
-    """Return the range of a path, and the times at which its levels begin, and its end."""
+    """Return the range of a path, the start times of its levels and its end."""
     material, delivery, breaks = request.material, request.delivery, path.breaks
     packed = material.packed
     spans = np.diff(breaks)[:, np.newaxis]
@@ -449,7 +450,7 @@ def _edges(request: Request, path: Path, tolerance: float) -> tuple[float, Array
         bends = np.diff(slopes) / (0.5 * (gaps[:, 1:] + gaps[:, :-1]))
         steep = steep + delivery.lag * np.max(np.abs(bends), axis=1)
     inertia = law.mass(request.target, packed)
-    # A lag takes most of it away again.
+    # A lag attenuates most of the ripple.
     cube = _SHARE * tolerance * span * inertia / (_RIPPLE * np.maximum(steep, 1e-12))
     longest = np.maximum(np.cbrt(cube), (cube * delivery.lag) ** 0.25)
     longest = np.minimum(longest, min(

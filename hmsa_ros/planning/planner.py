@@ -1,9 +1,9 @@
 """
-The planner over time: requests in, a timeline of stamped flux densities out.
+The planner over time: requests in, a timeline of timestamped flux densities out.
 
-Times are integer nanoseconds of whatever clock the caller keeps. A request is worked out as a
-draft (`hmsa_ros.planning.drafting`), which changes nothing, and then taken: several planners can
-so take all of a request or none of it (`hmsa_ros.planning.group`).
+Times are integer nanoseconds of the caller's clock. A request first becomes a draft
+(`hmsa_ros.planning.drafting`), which changes nothing, and is then taken. Several planners can thus
+take all of a request or none of it (`hmsa_ros.planning.group`).
 """
 
 from collections.abc import Callable, Sequence
@@ -25,12 +25,12 @@ from hmsa_ros.planning.timeline import Draft, Model, Options, Plan
 
 __all__ = ['Options', 'Planner']
 
-#: Stretch, rate in 1/s and what branches follow.
+#: Stretch, rate in 1/s and branch states.
 Believed = tuple[float, float, tuple[float, ...]]
 
 
 class Planner(RunningPlan):
-    """Keeps one timeline and replaces its future on request."""
+    """Planner that keeps one timeline and replaces its future on request."""
 
     def __init__(
             self, actuator: ActuatorParameters, options: Options, *,
@@ -38,25 +38,25 @@ class Planner(RunningPlan):
         """Start at rest."""
         super().__init__(
             Model(actuator, options), actuator.rest if stretch is None else stretch)
-        #: Returns stretch, rate in 1/s and what branches follow, as samples show them of a time in
-        #: ns; None for what is predicted.
+        #: Returns the estimate of stretch, rate in 1/s and branch states at a time in ns; None to
+        #: use the prediction.
         self.believed: Callable[[int], Believed | None] = lambda time: None
 
     @property
     def options(self) -> Options:
-        """How the next request is planned."""
+        """Options of the next request."""
         return self.model.options
 
     def set_options(
             self, options: Options, actuator: ActuatorParameters | None = None) -> None:
-        """Plan the next requests with other options or for another block, once checked."""
+        """Plan the next requests with other options or for another block, after checks."""
         self.take_model(self.checked_model(options, actuator or self.model.actuator))
 
     def checked_model(self, options: Options, actuator: ActuatorParameters) -> Model:
         """
-        Return a model after checking that the block can be where it is held.
+        Return the model of options and an actuator that can hold the present position.
 
-        A block that cannot, or whose position is another quantity, is a `BadInputError`.
+        Raise `BadInputError` if it cannot, or if its position is another quantity.
         """
         if (options, actuator) == (self.model.options, self.model.actuator):
             return self.model
@@ -73,7 +73,7 @@ class Planner(RunningPlan):
         return model
 
     def take_model(self, model: Model) -> None:
-        """Plan the next requests under a model; the running plan stays."""
+        """Plan the next requests with a model; the running plan does not change."""
         if model is not self.model:
             self.model = model
             self.revision += 1
@@ -82,26 +82,26 @@ class Planner(RunningPlan):
 
     def request(
             self, points: Sequence[tuple[float, int]], stamp: int | None, now: int) -> Plan:
-        """Take a setpoint sequence; `draft_request` says more."""
+        """Plan and take a setpoint sequence; see `draft_request`."""
         return self.take(drafting.finish(self.draft_request(points, stamp, now)), now)
 
     def setpoint(self, stretch: float, now: int) -> Plan:
-        """Go to one stretch as soon as possible and hold it."""
+        """Move to one stretch as soon as possible and hold it."""
         return self.take(drafting.finish(self.draft_setpoint(stretch, now)), now)
 
     def stop(self, now: int) -> Plan:
-        """Drop what is ahead and come to rest as near as the flux density limits allow."""
+        """Drop the rest of the plan and come to rest as near as the flux density limits allow."""
         return self.take(drafting.finish(self.draft_stop(now)), now)
 
     def draft_request(
             self, points: Sequence[tuple[float, int]], stamp: int | None,
             now: int) -> Steps[Draft | None]:
         """
-        Work out a sequence of points: stretch, and end in ns from the start, strictly increasing.
+        Draft a sequence of points (stretch, end in ns from the start), strictly increasing.
 
-        ``stamp`` is the start in ns, or None for now. A future one keeps the running plan until
-        then, a past one joins the sequence in the middle. The draft is None where the request
-        changes nothing; what cannot be carried out is a `RefusedError`.
+        ``stamp`` is the start in ns, or None for now. Until a future start the running plan
+        continues; with a past one the sequence is joined in the middle. The draft is None if the
+        request changes nothing. Raise `RefusedError` if it cannot be carried out.
         """
         yield from drafting.check_points(points, self.model.material.rest)
         base, outset = self._begin(stamp, now)
@@ -111,9 +111,9 @@ class Planner(RunningPlan):
             self, points: Sequence[tuple[float, int]], stamp: int | None,
             now: int) -> Steps[Draft]:
         """
-        Work out levels in T, in force from times in ns on that count from a stamp, or from now.
+        Draft levels in T with start times in ns, counted from a timestamp or from now.
 
-        What cannot be carried out is a `RefusedError`.
+        Raise `RefusedError` if they cannot be carried out.
         """
         check_levels(points, self.model)
         soonest = self.soonest(now)
@@ -128,29 +128,29 @@ class Planner(RunningPlan):
             self, points: Sequence[tuple[PathPoint, int]], stamp: int | None,
             now: int) -> Steps[Draft]:
         """
-        Work out a path: points (stretch, rate in 1/s, acceleration in 1/s^2 or NaN), times in ns.
+        Draft a path of points (stretch, rate in 1/s, acceleration in 1/s^2 or NaN), times in ns.
 
-        ``stamp`` and refusals are as of `draft_request`. A path that limits keep the actuator from
-        is followed as near as they allow: the draft has a warning then.
+        ``stamp`` and errors are those of `draft_request`. Where limits keep the actuator from the
+        path, it follows as near as they allow, and the draft has a warning.
         """
         drafting.check_path(points, self.model.material.rest)
         base, outset = self._begin(stamp, now)
         return (yield from drafting.draft_path(outset, points, base, now))
 
     def draft_setpoint(self, stretch: float, now: int) -> Steps[Draft | None]:
-        """Work out a move to one stretch; None where it changes nothing."""
+        """Draft a move to one stretch; None if it changes nothing."""
         drafting.check_target(stretch, self.model.material.rest)
         outset = self._outset(self.soonest(now))
         return (yield from drafting.draft_setpoints(outset, [Setpoint(stretch, math.inf)]))
 
     def draft_stop(self, now: int) -> Steps[Draft]:
-        """Work out how to come to rest."""
+        """Draft a stop."""
         return (yield from drafting.draft_stop(self._outset(self.soonest(now))))
 
     def draft_resumption(self, now: int, arrival: int | None = None) -> Steps[Draft | None]:
-        """Plan what is left anew from where the actuator is, to arrive in time if one is given."""
-        # None if nothing is left. From the first time that a command can reach, or, where there is
-        # no way from the motion it meets, a part of a period later.
+        """Draft the rest of the plan again from the present motion, to arrive in time if given."""
+        # None if nothing is left. Start at the earliest time that a command can reach or, if no
+        # plan is possible from the motion then, a fraction of a period later.
         begin = self.soonest(now)
         if self.plan.segments:
             begin = max(begin, self.plan.segments[0].since)
@@ -161,20 +161,20 @@ class Planner(RunningPlan):
             try:
                 return (yield from drafting.draft_resumption(self._outset(later)))
             except RefusedError:
-                # From another phase of the motion it may be possible.
+                # Another phase of the motion may allow it.
                 yield
         return (yield from drafting.draft_resumption(outset))
 
     def draft_path_anew(
             self, begin: int, model: Model, believed: Believed | None) -> Steps[Draft]:
-        """Plan what is left of the path under way anew under a model, from what is believed."""
+        """Draft the rest of the running path again with a model, from an estimated state."""
         return (yield from drafting.draft_path_anew(self._from(begin, model, believed)))
 
     def draft_trim(self, now: int, flux_density: float) -> Steps[Draft]:
-        """Work out how to hold the setpoint under way by another level in T, from rest."""
+        """Draft a corrected level in T that holds the current setpoint, from rest."""
         model, begin = self.model, self.soonest(now)
         state, place = self.state(begin), self.plan.under_way(begin)
-        # Beside the target, by what the model does not know of: it goes by its own stretches.
+        # The model does not account for the steady-state error: use its own equilibrium stretches.
         held, wanted = (float(equilibrium_stretch(model.load(x), model.material)) for x in (
             self.plan.level(begin).flux_density, flux_density))
         draft = yield from drafting.draft_moves(
@@ -185,7 +185,7 @@ class Planner(RunningPlan):
         return replace(draft, segments=(anew,), resumed=place)
 
     def _begin(self, stamp: int | None, now: int) -> tuple[int, Outset]:
-        """Return the start of a request in ns, and what is worked out from the soonest time."""
+        """Return the start of a request in ns, and the earliest outset for it."""
         soonest = self.soonest(now)
         base = soonest if stamp is None else stamp
         return base, self._outset(self.model.on_grid(max(base, soonest)))
@@ -202,11 +202,11 @@ class Planner(RunningPlan):
         return Outset(self.plan, model, begin, state, self._history.stale)
 
     def as_sent(self, time: int) -> bool:
-        """Whether levels are in force at a time in ns that are to be as somebody sent them."""
+        """Return whether the level at a time in ns belongs to commanded levels or a path."""
         found = self.segment(time)
         return found is not None and found[1].code in (Code.LEVELS, Code.PATH) and (
             found[1].arrival is None or time < found[1].arrival)
 
     def soonest(self, now: int) -> int:
-        """Return the first time that a command can still reach in time."""
+        """Return the earliest time that a command can still reach."""
         return self.model.on_grid(now + self.model.options.lead_time)

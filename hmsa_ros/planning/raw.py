@@ -1,7 +1,7 @@
 """
-Levels that are commanded as they are, such as those that `hmsa excite` designs.
+Levels that are commanded unchanged, such as those that `hmsa excite` designs.
 
-Nothing shapes them, but all else holds as for other requests: the limits of the coil, the ramps
+No shaper applies. All other rules are those of other requests: the limits of the coil, the ramps
 of its amplifier, the limits of the block, and rest at the end.
 """
 
@@ -16,19 +16,19 @@ from hmsa_ros.planning.drafting import check_times, draft_moves, Outset, Steps
 from hmsa_ros.planning.setpoint import Setpoint
 from hmsa_ros.planning.timeline import Draft, Model, PlannedLevel, PlannedSegment
 
-# Share of the way to the limits of the law that a motion may go.
+# Fraction of the range from rest to the limits of the model that a motion may use.
 _MARGIN = 0.98
-# Periods after a change of level in which the motion is largest, and samples of each.
+# Periods after a change of level that contain the largest motion, and samples of each.
 _PERIODS, _SAMPLES = 2.0, 40
-# Motion about the rest of the last level that counts as rest, stretch.
+# Amplitude of stretch about the last equilibrium that counts as rest.
 _REST = 5e-4
 
 
 def check_levels(points: Sequence[tuple[float, int]], model: Model) -> None:
     """
-    Check flux densities in T and the times in ns from the start from which they apply.
+    Check flux densities in T and their start times in ns.
 
-    Where there are none, times do not increase or the coil has no such level: `RefusedError`.
+    Raise `RefusedError` if there are none, times do not increase or a level exceeds the limits.
     """
     least, most = model.options.flux_density_min, model.options.flux_density_max
     unit = model.units.load_name
@@ -46,10 +46,10 @@ def check_levels(points: Sequence[tuple[float, int]], model: Model) -> None:
 
 def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Steps[Draft]:
     """
-    Plan checked levels (T, ns); their one setpoint is the stretch that the last one holds.
+    Draft checked levels (T, ns); their one setpoint is the equilibrium stretch of the last one.
 
-    Where the motion has not ended with the last of them, a shaped move to that stretch takes its
-    place. A motion beyond the limits of the block, or without a way to rest, is a `RefusedError`.
+    If the motion has not ended with the last level, a shaped move to that stretch replaces it.
+    Raise `RefusedError` if the motion exceeds the limits of the block or has no way to rest.
     """
     model, state = outset.model, outset.state
     levels: list[PlannedLevel] = []
@@ -100,7 +100,7 @@ def _period(model: Model, stretch: float) -> float:
 
 
 def _check_motion(number: int, level: PlannedLevel, end: int | None) -> None:
-    """Refuse a level under which the block would come too near to the limits of its law."""
+    """Raise `RefusedError` if the block would come too near to the limits of its model."""
     model = level.model
     lower, upper = stretch_limits(model.material)
     home = model.material.rest

@@ -1,7 +1,7 @@
 """
-The plan that runs: its levels are handed out, and what took effect is taken into it.
+The running plan: it hands out its levels and records those that took effect.
 
-Times are integer nanoseconds of whatever clock the caller keeps.
+Times are integer nanoseconds of the caller's clock.
 """
 
 from bisect import bisect_left, bisect_right
@@ -15,30 +15,30 @@ from hmsa_ros.model.simulation import check_stretch, longest_motion
 from hmsa_ros.planning.history import Deviation, History
 from hmsa_ros.planning.timeline import ALWAYS, Draft, Model, Plan, PlannedLevel, PlannedSegment
 
-# Stretch rates of a sample below this share of the natural frequency are rest, where the model
-# would have it move: the model is off then, and not the actuator in motion.
+# Rates of a sample below this fraction of the natural frequency are rest. If the model predicts
+# motion there, the model is in error.
 _SAMPLED_AT_REST = 1e-4
-# How far the model may be off a sample at rest to be believed nevertheless, and without a field,
-# where every model rests alike and the difference is noise or bias of the sensor.
+# Deviation of the model from a sample at rest up to which the model is used nevertheless; without
+# a field, where all models have the same equilibrium, the difference is sensor noise or bias.
 _AGREES, _AGREES_WITHOUT_FIELD = 1e-3, 5e-3
-# Amplitude of stretch up to which drafts hold that were begun before news came.
+# Unplanned amplitude of stretch up to which drafts made before the report remain valid.
 _LITTLE = 1e-4
-# Levels that are kept for news of when they took effect.
+# Past levels that are kept until reports of their effect may arrive.
 _REMEMBERED = 32
 
 
 class RunningPlan:
     """
-    One timeline, of which the past is what really took effect.
+    One timeline, whose past contains the levels that took effect.
 
-    ``revision`` grows whenever what is going to happen changes: drafts made before are no good.
+    ``revision`` increases with every change of the future: earlier drafts are then invalid.
     """
 
     def __init__(self, model: Model, stretch: float) -> None:
         """Start at rest."""
         check_stretch(stretch, model.material, 'initial stretch')
         self.model = model
-        #: How late, in ns, levels to come are expected to take effect, all of them.
+        #: Expected lateness, in ns, of all future levels.
         self.delay = 0
         self._strayed = 0.0
         self._initial = stretch
@@ -48,23 +48,23 @@ class RunningPlan:
 
     @property
     def plan(self) -> Plan:
-        """What is going to happen."""
+        """The plan from the present level on."""
         return self._history.plan
 
     def restart(self) -> None:
-        """Drop all plans: at rest where it was before the first request, as the clock begins."""
+        """Drop all plans and return to the initial state at rest, as the clock has restarted."""
         model, stretch = self.model, self._initial
         load = model.holding(stretch)
         self._begin_with(PlannedLevel(
             ALWAYS, model.flux_density(load), State(stretch, 0.0, load), model))
 
     def clock_set(self, by: int) -> None:
-        """Take in that the clock was set ahead by some ns: what is planned goes on as before."""
+        """Shift the plan by the ns that the clock was set ahead."""
         self._history = replace(self._history, plan=self.plan.shifted(by))
         self.revision += 1
 
     def _begin_with(self, level: PlannedLevel, *, keep: bool = False) -> None:
-        """Begin anew from a level; if its setpoints are kept, so is what was not sent yet."""
+        """Start a new plan from a level, optionally with setpoints and unsent levels kept."""
         old = self.plan if keep else Plan(self.plan.number, (), ())
         ahead = old.levels[self._history.sent:]
         self._history = History(
@@ -75,11 +75,11 @@ class RunningPlan:
             self, stamp: int, stretch: float, rate: float, in_force: float,
             flux_density: float | None = None, *, keep: bool = False) -> None:
         """
-        Drop plans and go on from a state measured at a stamp in ns, with the rate in 1/s.
+        Drop plans and continue from a state measured at a timestamp in ns, with the rate in 1/s.
 
-        ``in_force`` is the field in T, ``flux_density`` the level that a slew limit still ramps
-        to. A state that the block cannot have is a `BadInputError`. The setpoints ahead may be
-        kept, to be planned anew.
+        ``in_force`` is the field in T; ``flux_density`` is the level to which a slew limit still
+        ramps. The future setpoints may be kept, to be planned again. Raise `BadInputError` if the
+        block cannot be in this state.
         """
         model, units = self.model, self.model.units
         check_stretch(stretch, model.material, 'stretch in force')
@@ -104,30 +104,30 @@ class RunningPlan:
         self._begin_with(begin, keep=keep)
 
     def follows(self, flux_density: float) -> bool:
-        """Return whether motion under a level in T can be predicted: what is planned can."""
+        """Return whether motion under a level in T can be predicted; True within the limits."""
         options, model = self.model.options, self.model
-        # With room for the motion that it may find.
+        # With a margin for the present motion.
         more = 2.0 * flux_density
         return options.flux_density_min <= flux_density <= options.flux_density_max or (
             math.isfinite(more) and _can_be_followed(PlannedLevel(
                 0, more, State(model.actuator.rest, 0.0, 0.0), model)))
 
     def abandon(self) -> None:
-        """Drop what is not known to have taken effect, and the setpoints: nobody obeys."""
+        """Drop setpoints and levels not known to have taken effect, as no plant obeys them."""
         count = self._history.known + 1
         plan = self._history.predicted(count).plan
         self._history = History(Plan(plan.number, plan.levels[:count], ()), count, count - 1)
         self.revision += 1
 
     def take(self, draft: Draft | None, now: int) -> Plan:
-        """Replace everything from a draft of the present revision on; return the plan in force."""
+        """Replace the plan from the start of a draft of this revision on; return the plan."""
         if draft is None:
             return self.plan
         history, old, begin = self._history, self.plan, draft.begin
         kept = bisect_left(old.levels, begin, key=lambda x: x.stamp)
         begun = bisect_right(old.levels, now, key=lambda x: x.stamp)
-        # What is over and handed out is forgotten, but for the level in force, and for those
-        # that there may still be news of.
+        # Forget levels that were sent and are over, except the present one and those for which
+        # reports may still arrive.
         over = max(min(history.sent, kept, begun) - 1, 0)
         first = max(min(over, history.known), over - _REMEMBERED)
         new = draft.resumed is None
@@ -142,7 +142,7 @@ class RunningPlan:
         return self.plan
 
     def due(self, now: int) -> tuple[PlannedLevel, ...]:
-        """Hand out the commands to send now, each once: those stamped up to lead_time ahead."""
+        """Return the commands to send now, each once: those up to lead_time ahead."""
         first, latest = self._history.sent, now + self.model.options.lead_time
         if not self.pending or self.plan.levels[first].stamp > latest:
             return ()
@@ -151,35 +151,35 @@ class RunningPlan:
         return self.plan.levels[first:end]
 
     def moves(self, now: int) -> bool:
-        """Return whether setpoints are under way at a time in ns."""
+        """Return whether the plan is moving at a time in ns."""
         segments = self.plan.segments
         return bool(segments) and (segments[-1].arrival is None or now < segments[-1].arrival)
 
     @property
     def pending(self) -> bool:
-        """Whether commands remain to be handed out."""
+        """Whether levels remain to be sent."""
         return self._history.sent < len(self.plan.levels)
 
     @property
     def next_stamp(self) -> int | None:
-        """Stamp in ns of the next command to be handed out; None if there is none."""
+        """Timestamp in ns of the next command to send; None if there is none."""
         return self.plan.levels[self._history.sent].stamp if self.pending else None
 
     @property
     def last_sent(self) -> PlannedLevel:
-        """Level that was handed out last, or the one in force before the first."""
+        """Level that was sent last, or the initial one."""
         return self.plan.levels[self._history.sent - 1]
 
     def beat_stamp(self, now: int) -> int:
-        """Return the time in ns to stamp the level handed out last with when it is repeated."""
+        """Return the timestamp in ns for a heartbeat that repeats the last level."""
         return self.model.on_grid(
             max(now + self.model.options.lead_time, self.last_sent.stamp))
 
     def drop_missed(self, now: int, tolerance: int) -> int:
         """
-        Drop levels never sent, where one is late by more than a tolerance (ns); return how many.
+        Drop unsent levels if one is late by more than a tolerance (ns); return their number.
 
-        Those that are less than lead_time ahead belong to a motion that will not happen.
+        The dropped levels are those less than lead_time ahead: their motion will not happen.
         """
         first = self._history.sent
         if not self.pending or self.plan.levels[first].stamp >= now - tolerance:
@@ -190,7 +190,7 @@ class RunningPlan:
         return end - first
 
     def _leave_out(self, first: int, end: int, now: int) -> None:
-        """Take levels out of the plan: what is over by a time in ns and needs them is not done."""
+        """Remove levels from the plan; mark setpoints before a time in ns that need them."""
         plan, missing = self.plan, self.plan.levels[first].stamp
         over = max(plan.under_way(now), 0)
         reached = bisect_left(plan.segments[:over], missing, key=lambda x: x.arrival or x.begin)
@@ -203,17 +203,17 @@ class RunningPlan:
         self.revision += 1
 
     def unheard(self, now: int) -> int | None:
-        """Return the stamp in ns of the last level that never took effect; None for none."""
+        """Return the timestamp in ns of the last level that never took effect; None for none."""
         count = self._history.unheard(now)
         return self.plan.levels[self._history.known + count].stamp if count else None
 
     def drop_unheard(self, stamp: int) -> None:
-        """Take out of the plan what `unheard` has found."""
+        """Remove the levels found by `unheard` from the plan."""
         first = self._history.known + 1
         self._leave_out(first, first + self._history.unheard(stamp), stamp)
 
     def applied(self, stamp: int, flux_density: float, tolerance: int) -> Deviation | None:
-        """Take in a change of level as `History.with_news` does; None if it is no news."""
+        """Record a change of level as `History.with_news` does; None if it is already known."""
         self._history, deviation = self._history.with_news(stamp, flux_density, tolerance)
         if deviation is not None:
             deviation = replace(deviation, effect=self._effect(deviation, tolerance))
@@ -224,7 +224,7 @@ class RunningPlan:
         return deviation
 
     def _effect(self, deviation: Deviation, tolerance: int) -> float:
-        """Return how far off the plan news leave the actuator, as a stretch."""
+        """Return the amplitude of stretch by which a deviation changes the planned motion."""
         punctual = replace(deviation, late=deviation.late - self.delay)
         if not punctual.beyond(tolerance):
             return 0.0
@@ -232,8 +232,8 @@ class RunningPlan:
             punctual.late, deviation.change)
 
     def vibration(self, late: int, change: float) -> float:
-        """Return the amplitude of stretch that a change in T leaves which is so many ns late."""
-        # It has had as much less momentum: omega times the delay, of the change of its rest.
+        """Return the amplitude of stretch left by a change in T that is late by some ns."""
+        # The missing momentum is omega times the delay, relative to the change of equilibrium.
         level = self.plan.levels[self._history.known]
         model = level.model
         stretch = equilibrium_stretch(level.load, model.material)
@@ -244,11 +244,11 @@ class RunningPlan:
 
     @property
     def awaiting(self) -> bool:
-        """Whether there is no news yet of levels that have been handed out."""
+        """Whether the effect of a sent level has not been reported yet."""
         return self._history.sent > self._history.known + 1
 
     def unknown(self, now: int) -> tuple[PlannedLevel, tuple[PlannedLevel, ...]]:
-        """Return what is in force at a time in ns, as far as there is news, and what follows."""
+        """Return the last level known to apply by a time in ns, and the levels after it."""
         levels, place = self.plan.levels, self._history.known
         known, rest = levels[place], levels[place + 1:]
         time = min(now, rest[0].stamp) if self.awaiting else now
@@ -263,7 +263,7 @@ class RunningPlan:
         return self.model.taken_from(level.at(time), level.model)
 
     def _delayed(self, time: int) -> State:
-        """Predict the state `delay` after a time in ns, with levels to come as late as that."""
+        """Predict the state `delay` after a time in ns, with future levels late by `delay`."""
         state, rest = self.unknown(ALWAYS)
         late = [x for x in rest[:_REMEMBERED + 1] if x.stamp <= time]
         if not self.delay or len(late) > _REMEMBERED:
@@ -274,13 +274,13 @@ class RunningPlan:
         return self.model.taken_from(state.at(time + self.delay), state.model)
 
     def segment(self, now: int) -> tuple[int, PlannedSegment] | None:
-        """Return place and record of the setpoint under way, None before the first begins."""
+        """Return index and record of the current setpoint, None before the first begins."""
         index = self.plan.under_way(now)
         return None if index < 0 else (index, self.plan.segments[index])
 
 
 def _running(plan: Plan, begin: int, now: int) -> tuple[PlannedSegment, ...]:
-    """Return the setpoints of a plan from the one under way to those a draft replaces."""
+    """Return the setpoints of a plan from the current one to those that a draft replaces."""
     end = bisect_left(plan.segments, begin, key=lambda x: x.since)
     running = plan.segments[max(min(plan.under_way(now), end - 1), 0):end]
     if running and running[-1].arrival is not None and running[-1].arrival > begin:

@@ -1,4 +1,4 @@
-"""What follows from an actuator's parameters: times, damping, flux densities and reach."""
+"""Derived quantities of an actuator: times, damping, flux densities and reach."""
 
 from dataclasses import dataclass
 import math
@@ -17,35 +17,35 @@ from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.status import Code
 from hmsa_ros.planning.two_step import CODES, Groups, plan_two_step, plan_two_step_batch
 
-#: Stretches whose flux density is given, where the coil reaches them, and deflections of a beam.
+#: Stretches and beam deflections whose flux density is listed if the coil reaches them.
 STRETCHES = (0.6, 0.8, 0.9, 1.05, 1.1, 1.2, 1.4, 2.0)
 DEFLECTIONS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.7, 0.78)
-#: Move from rest whose duration is given, where the coil allows it.
+#: Size of the move from rest whose duration is reported if the coil allows it.
 USUAL_MOVE = 0.1
-# Points of the first look for the reach on either side.
+# Points of the first search for the reach on either side.
 _LOOK = 400
-# Damping, over the critical one where the block is stiffest, above which no step overshoots and so
-# no two-step command exists: to search for one takes long.
+# Damping, relative to critical damping where the block is stiffest, above which no step overshoots
+# and no two-step command exists; a search for one would take long.
 _OVERDAMPED = 3.0
 
 
 @dataclass(frozen=True)
 class Scales:
-    """What follows from an actuator's parameters and the range of its coil."""
+    """Derived quantities of an actuator and the range of its coil."""
 
     time_unit: float  #: L sqrt(rho/G) in s
-    frequency: float  #: undamped, about rest without field, in Hz
+    frequency: float  #: undamped, at rest without field, in Hz
     c1: float  #: shape 2 H^2/L^2
     zeta: float
-    critical_zeta: float  #: above which small motion about rest does not oscillate
+    critical_zeta: float  #: above it, small motion about rest does not oscillate
     damping: float  #: zeta as a coefficient in N s/m
     critical_damping: float
-    flux_density_unit: float  #: of the load 1, mu0 G/Br in T, or in V
+    flux_density_unit: float  #: level of the dimensionless load 1, mu0 G/Br in T, or in V
     #: Stretches within reach of the coil, and the levels that hold them.
     flux_densities: tuple[tuple[float, float], ...]
-    stretch_limits: tuple[float, float]  #: at which the chains are fully extended
-    held: tuple[float, float]  #: lowest and highest stretch that the coil can hold
-    #: The same that a two-step command reaches from rest; rest itself on a side without one.
+    stretch_limits: tuple[float, float]  #: limiting stretches of the chains
+    held: tuple[float, float]  #: minimum and maximum stretch that the coil can hold
+    #: Minimum and maximum stretch that a two-step command reaches from rest; rest if none.
     reached: tuple[float, float]
     target: float  #: of a usual move from rest; NaN for none
     duration: float  #: of the two-step command for it, in s
@@ -53,9 +53,9 @@ class Scales:
 
 def scales(actuator: ActuatorParameters, least: float, most: float) -> Scales:
     """
-    Work out what follows from parameters and the range of a coil in T.
+    Compute the derived quantities of parameters and the range of a coil in T.
 
-    Ramps are left out of account. A range that is none is a `BadInputError`.
+    Ramps are neglected. Raise `BadInputError` if the range is empty or infinite.
     """
     if not -math.inf < least < most < math.inf:
         raise BadInputError(
@@ -74,7 +74,7 @@ def scales(actuator: ActuatorParameters, least: float, most: float) -> Scales:
         return plan.tau_p if plan.code is Code.TWO_STEP and within else math.nan
 
     def reach(end: float) -> float:
-        # Fractions of the way out, so that the stretches near rest are looked at closely.
+        # Quadratic spacing, so that stretches near rest are resolved.
         targets = home + (end - home) * np.linspace(0.0, 1.0, _LOOK + 1)[1:] ** 2
         if material.zeta > _OVERDAMPED * np.max(critical_zeta(targets, material)):
             return home
@@ -94,7 +94,7 @@ def scales(actuator: ActuatorParameters, least: float, most: float) -> Scales:
             lambda x: math.isfinite(duration(x)), float(targets[last]), float(beyond))
 
     reached = tuple(reach(x) if abs(x - home) > 1e-12 else home for x in held)
-    # Else half of the way, or all of it, on the side that reaches further.
+    # Otherwise half of the way, or all of it, on the side that reaches further.
     end = max(reached, key=lambda x: abs(math.log(x)) if home else abs(x))
     target = next((x for x in (home + USUAL_MOVE, 0.5 * (home + end), end)
                    if x != home and math.isfinite(duration(x))), math.nan)

@@ -1,4 +1,4 @@
-"""Plans for a sequence of setpoints (Eq. 14), each from where the last one really ends."""
+"""Plans for a sequence of setpoints (Eq. 14), each from the true end state of the previous one."""
 
 from bisect import bisect_right
 from collections.abc import Generator, Iterable, Sequence
@@ -20,9 +20,9 @@ from hmsa_ros.planning.setpoint import Setpoint
 from hmsa_ros.planning.shapers import creeping, get_shaper
 from hmsa_ros.planning.shapers.request import Request, Shaper, Work
 
-#: What to do with a setpoint that ends before the move to it does.
+#: Options for a setpoint that ends before the move to it.
 SHORT_SPELL = ('refuse', 'continue')
-# Samples of a motion, and their tolerance, where it must keep inside the limits of its law.
+# Samples of a motion, and their tolerance, for the check against the limits of its model.
 _LOOK, _LOOK_RTOL = 300, 1e-7
 # Periods of small motion that a motion towards pull-in may take.
 _LINGERS = 5.0
@@ -33,11 +33,11 @@ class Segment:
     """One setpoint of a plan."""
 
     setpoint: Setpoint
-    begin: float  #: when the move begins, from the start of the sequence
+    begin: float  #: start of the move, from the start of the sequence
     start: State  #: predicted at begin
-    end: State  #: predicted at the end of the span, or after the last change of level
+    end: State  #: predicted at the end of the setpoint, or after the last change of level
     move: Move  #: its times count from begin
-    holding: float  #: load that holds the stretch once nothing creeps
+    holding: float  #: load that holds the stretch after creep
 
     @property
     def shaped(self) -> bool:
@@ -46,11 +46,11 @@ class Segment:
 
     @property
     def held(self) -> float:
-        """Load at the end of the move: where a span ends before creep does, what it comes to."""
+        """Load at the end of the move; with creep, its limit for long times."""
         return self.holding if self.move.tail else self.move.levels[-1].load
 
     def notes(self) -> list[str]:
-        """Return what is not as requested, a sentence each."""
+        """Return deviations from the request, one sentence each."""
         move = self.move
         found = [move.reason] if move.reason else []
         if move.tail:
@@ -72,24 +72,24 @@ def plan_sequence(
     setpoints : sequence of Setpoint
         At least one.
     frame : Request or NondimensionalParameters
-        What all moves share, and the state from which the first one starts; or a material alone,
-        to start at rest without a field, on ideal hardware. With a command period, spans must be
-        multiples of it. The next move starts from what the rounded command leads to.
+        Common data of all moves, with the initial state; or only a material, to start at rest
+        without a field on ideal hardware. With a command period, durations must be multiples of
+        it. Each move starts from the state that the rounded command reaches.
     shaper : str or Shaper
         A shaper or its name.
     short_spell : {'refuse', 'continue'}
-        For a span that ends before the move: refuse, or plan the next move from the state that
-        is really reached; the last move is then finished after its span.
+        For a duration that ends before the move: refuse, or plan the next move from the state
+        reached by then; the last move is completed after its duration.
 
     Returns
     -------
     tuple of Segment
-        One a setpoint.
+        One per setpoint.
 
     Raises
     ------
     RefusedError
-        If a setpoint cannot be had; its reason names which.
+        If a setpoint cannot be reached; the message names it.
     BadInputError
         If an argument is out of range.
 
@@ -103,7 +103,7 @@ def plan_sequence(
 
 
 def check_short_spell(value: str) -> None:
-    """Refuse what is none of `SHORT_SPELL` with `BadInputError`."""
+    """Raise `BadInputError` if the value is not in `SHORT_SPELL`."""
     if value not in SHORT_SPELL:
         raise BadInputError(
             f'short_spell is {excerpt(value)}: expected one of {", ".join(SHORT_SPELL)}')
@@ -113,10 +113,10 @@ def segments(
         frame: Request, setpoints: Iterable[Setpoint], shaper: Shaper, short_spell: str, *,
         first: Shaper | None = None) -> Generator[Segment, None, None]:
     """
-    Plan setpoint by setpoint; the first may have a shaper of its own.
+    Plan one setpoint after another; the first may have its own shaper.
 
-    Each move is that of the frame but for state and target; the state is where all begins. Raises
-    `RefusedError` where a setpoint cannot be had, `BadInputError` for another argument.
+    The frame gives the initial state and all fields of the moves except state and target. Raise
+    `RefusedError` if a setpoint cannot be reached, `BadInputError` if an argument is out of range.
     """
     shape = first or shaper
     units, state = frame.units, frame.state
@@ -130,7 +130,7 @@ def segments(
         move = creeping.held(
             request, _rounded(shape(request), frame.delivery),
             math.inf if following is None else setpoint.span)
-        # Both are rounded: a span that the move fills exactly is long enough.
+        # Both are rounded: a duration that the move fills exactly is long enough.
         if setpoint.span * (1.0 + 1e-12) < move.duration < math.inf:
             if short_spell == 'refuse':
                 raise RefusedError(
@@ -153,7 +153,7 @@ def segments(
 
 
 def _cut(request: Request, move: Move, span: float, *, last: bool) -> Move:
-    """Return a move that its setpoint leaves no time for; the last one is finished."""
+    """Return a move that is cut at the end of its setpoint; the last one is completed."""
     units = request.units
     return replace(
         move if last else move.until(span), code=Code.SPELL_TOO_SHORT,
@@ -163,20 +163,20 @@ def _cut(request: Request, move: Move, span: float, *, last: bool) -> Move:
 
 
 def _rounded(move: Move, delivery: Delivery) -> Move:
-    """Return a move with its times as commands can carry them."""
+    """Return a move with times rounded to those that commands can have."""
     return Move(
         move.code, tuple(Level(delivery.rounded(x.time), x.load) for x in move.levels),
         delivery.rounded(move.duration), move.reason)
 
 
 def _follow(request: Request, move: Move, span: float) -> State:
-    """Return the state at the end of a span, or where the last ramp ends."""
+    """Return the state at the end of a duration, or at the end of the last ramp."""
     material, delivery = request.material, request.delivery
     end = move.levels[-1].time if math.isinf(move.duration) else move.duration
     if math.isfinite(span):
         end = max(end, span)
     if move.tail:
-        # What branches do after the arrival is known.
+        # The motion of the branches after the arrival is known.
         if move.duration > 0.0:
             _check_known(request, move.until(move.duration).levels, (move.duration,) * 2)
         place = bisect_right(move.levels, end, key=lambda x: x.time) - 1
@@ -194,9 +194,9 @@ def _follow(request: Request, move: Move, span: float) -> State:
 
 def _check_known(request: Request, levels: Sequence[Level], ends: tuple[float, float]) -> None:
     """
-    Refuse a move that swings to where nothing is known of the elastic force, or pulls in.
+    Refuse a move that leaves the range of the elastic model, or pulls in.
 
-    Ends are those of the last ramp and of what is looked at.
+    ``ends`` are the times of the last ramp and of the end of the check.
     """
     material, target = request.material, request.target
     elastic = material.law
@@ -206,18 +206,18 @@ def _check_known(request: Request, levels: Sequence[Level], ends: tuple[float, f
     # The first swing about the last level is the widest.
     swing = 2.0 * math.pi / float(natural_frequency(target, material))
     if elastic.volts:
-        # It lingers where it only just does not pull in.
+            # Just below pull-in the motion lingers.
         swing *= _LINGERS
     times = np.linspace(
         levels[0].time, min(ends[1], ends[0] + swing), _LOOK, dtype=np.float64)
     try:
         stretch = sampled(
             levels, request.start, times, material, request.delivery, _LOOK_RTOL)[STRETCH]
-        # A voltage wins over the elastic force where that falls.
+            # A voltage pulls in where the elastic force decreases below it.
         over = stretch[stretch > stretch_limits(material)[1]]
         pulled = elastic.volts and np.any(elastic_force(over, material) < levels[-1].load)
     except HmsaError:
-        # Without a limit of the chains there is no end to it.
+            # Without limiting extensibility, the motion diverges.
         if not elastic.volts:
             raise
         pulled = True

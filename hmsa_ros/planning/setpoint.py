@@ -1,4 +1,4 @@
-"""What is asked of an actuator: a stretch, and how long it lasts."""
+"""A setpoint of an actuator: a stretch and its duration."""
 
 from dataclasses import dataclass
 import math
@@ -8,7 +8,7 @@ from hmsa_ros.model.laws.coordinate import DEFLECTION, STRETCH
 
 
 def impossible(stretch: float, rest: float) -> str:
-    """Return why no actuator with a rest there has a stretch; empty if one may have it."""
+    """Return why a stretch is impossible for an actuator with this rest; empty if possible."""
     if math.isfinite(stretch) and (stretch > 0.0 or rest == 0.0):
         return ''
     more = ' greater than 0' if rest else ''
@@ -18,14 +18,14 @@ def impossible(stretch: float, rest: float) -> str:
 
 @dataclass(frozen=True)
 class Setpoint:
-    """A stretch and how long it lasts, the paper's (lambda_d, span)."""
+    """A stretch and its duration, the paper's (lambda_d, span)."""
 
     stretch: float  #: target, or another position
-    #: Time from leaving the setpoint before to leaving this one, above 0; infinite to stay.
+    #: Time from the end of the previous setpoint to the end of this one, above 0; may be infinite.
     span: float
 
     def __post_init__(self) -> None:
-        """Check both numbers."""
+        """Check stretch and duration."""
         if not math.isfinite(self.stretch):
             raise BadInputError(f'stretch is {self.stretch:g}: expected a finite number')
         if not self.span > 0.0:

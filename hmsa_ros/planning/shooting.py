@@ -1,12 +1,11 @@
 """
-Commands with free numbers, solved for rest at the target.
+Commands with free parameters, solved for rest at the target.
 
-The two-step command on ideal hardware has a search of its own, `hmsa_ros.motion.two_step`.
-Everything else, a command on a grid, through ramps, or with two intermediate levels of given
-height, has two unknowns as well, and they meet the same two conditions: stretch at the target,
-rate zero, at the instant at which the last level is in force. Where the field lags it has to
-arrive there too, for which a third number is free. Newton solves them with the derivatives that
-come out of the integration.
+The two-step command on ideal hardware has its own search, `hmsa_ros.motion.two_step`. All other
+commands (on a sampling grid, with ramps, or with two intermediate levels of given times) have two
+unknowns as well. They meet the same two conditions when the last level applies: stretch at the
+target, rate zero. If the field lags, it must also reach its final value, which needs a third
+unknown. Newton's method solves them with derivatives from the integration.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -27,7 +26,7 @@ from hmsa_ros.model.simulation import followed_by
 if TYPE_CHECKING:
     from hmsa_ros.planning.shapers.request import Request
 
-# Room for the last ramp before the grid goes on, in what a guess of it takes.
+# Factor on the guessed duration of the last ramp, for the period that follows it.
 _MORE = 1.25
 
 #: A command and the time at which it is at rest; None if there is none.
@@ -36,7 +35,7 @@ Attempt = tuple[tuple[Level, ...], float] | None
 
 @dataclass(frozen=True)
 class Template:
-    """Levels with their derivatives by the unknowns, two or, for a field that lags, three."""
+    """Levels and their derivatives with respect to the two or, with a lag, three unknowns."""
 
     times: Array  #: (n,), the first is 0
     loads: Array  #: (n,), the last holds the target
@@ -52,13 +51,13 @@ class Template:
 
 
 def heights(levels: Sequence[Level]) -> Template:
-    """Return the template of a guess with all heights but the last free."""
+    """Return the template of a guess in which all loads except the last are free."""
     return Template.of(levels, [('load', i) for i in range(len(levels) - 1)])
 
 
 @lru_cache(maxsize=256)
 def _derivatives(count: int, unknowns: tuple[tuple[str, int], ...]) -> tuple[Array, Array]:
-    """Return the derivatives of times and loads, which nobody may change."""
+    """Return the derivatives of times and loads, which are cached and must not be changed."""
     d_times, d_loads = np.zeros((2, count, len(unknowns)))
     for column, (kind, index) in enumerate(unknowns):
         if kind == 'load':
@@ -72,17 +71,17 @@ def solve(
         template: Template, request: 'Request', delivery: Delivery | None = None, *,
         wait: float = 0.0) -> Attempt:
     """
-    Solve a template for rest at the target; the delivery is that of the request unless given.
+    Solve a template for rest at the target; the default delivery is that of the request.
 
-    Where branches creep and the amplifier ramps, rest is when the last ramp ends, or at least
-    ``wait`` after the last level begins, and on a grid whole periods.
+    With creep and ramps, rest is at the end of the last ramp, or at least ``wait`` after the start
+    of the last level; on a sampling grid, after whole periods.
     """
     delivery = delivery or request.delivery
     times, loads = template.times.copy(), template.loads.copy()
     d_times, d_loads = template.d_times, template.d_loads
     state, material = request.state, request.material
     if material.creep and delivery.slew < math.inf:
-        # What the amplifier ramps to at last is where the tail begins.
+        # The tail begins with the load at the end of the last ramp.
         d_times, d_loads = (np.pad(x, ((0, 0), (0, 1))) for x in (d_times, d_loads))
         d_loads[-1, -1] = 1.0
         if delivery.period > 0.0:
@@ -104,20 +103,20 @@ def solve(
 
 
 def kept(found: Attempt, request: 'Request') -> Attempt:
-    """Return a command that keeps the load limits, None in place of another."""
+    """Return a command if it keeps the load limits, else None."""
     return found if found is not None and request.keeps(found[0]) else None
 
 
 def first_kept(guesses: Iterable[Template], request: 'Request') -> Attempt:
-    """Return the first solution of some guesses that keeps the load limits, if there is one."""
+    """Return the first solution among the guesses that keeps the load limits, else None."""
     return next(filter(None, (kept(solve(x, request), request) for x in guesses)), None)
 
 
 def soonest_kept(guesses: Iterable[tuple[float, Template]], request: 'Request') -> Attempt:
     """
-    Return the solution that is soonest at rest and keeps the load limits, if there is one.
+    Return the solution with the earliest rest that keeps the load limits, else None.
 
-    Guesses come with their durations; those longer than a solution are left out.
+    Guesses come with their durations; guesses longer than a solution are skipped.
     """
     best: Attempt = None
     for duration, guess in sorted(guesses, key=itemgetter(0)):
@@ -132,9 +131,9 @@ def soonest_kept(guesses: Iterable[tuple[float, Template]], request: 'Request') 
 def approach(
         ideal: tuple[Level, ...],
         closer: Callable[[tuple[Level, ...], float, float], Attempt], shortest: float) -> Attempt:
-    """Follow levels from ideal to real hardware, in strides down to a share of the way."""
-    # closer(levels, share, aim) solves for the hardware at aim of the way, from levels that are
-    # right at share of it.
+    """Follow levels from ideal to real hardware, in strides down to a given fraction."""
+    # closer(levels, share, aim) solves for hardware at the fraction aim, from levels that solve
+    # it at the fraction share.
     found: Attempt = None
     levels, share, stride = ideal, 0.0, 1.0
     while share < 1.0:
@@ -150,10 +149,10 @@ def approach(
 
 
 def on_time(found: Attempt, request: 'Request') -> Attempt:
-    """Solve once more for the first heights, at times that commands can carry if they can."""
+    """Solve again for the first loads, with times rounded to those that commands can have."""
     if found is None or request.delivery.resolution == 0.0:
         return found
-    # Later ones by a little more, so that ramps still fit.
+    # Delay later levels slightly more, so that ramps still fit.
     resolution = request.delivery.resolution
     rounded = [Level(request.delivery.rounded(x.time) + i * resolution, x.load)
                for i, x in enumerate(found[0])]

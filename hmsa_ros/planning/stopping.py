@@ -1,4 +1,4 @@
-"""Where a motion can come to rest soonest, and the load that gets it there."""
+"""The nearest stretch at which a motion can come to rest, and the load for it."""
 
 from dataclasses import dataclass
 import math
@@ -9,28 +9,28 @@ from hmsa_ros.model.moves import State
 from hmsa_ros.model.simulation import RTOL
 from hmsa_ros.planning.timeline import Model
 
-# Stretch rates below this share of the natural frequency are rounding, not motion.
+# Stretch rates below this fraction of the natural frequency are rounding errors.
 _AT_REST = 1e-6
-# Newton passes on the load of a brake, and the share of its duration that they may miss.
+# Newton iterations for the braking load, and the tolerance of its duration, relative.
 _PASSES = 8
 _ON_TIME = 1e-14
-# How far inside the flux density limits a stop keeps where it has to, as a share.
+# Margin of a stop from the flux density limits, relative.
 _INSIDE = 1e-3
 
 
 @dataclass(frozen=True)
 class Brake:
-    """A load that stops a motion at a stretch, its turning point, where it is held until then."""
+    """A braking load and the stretch at which it stops a motion, its turning point."""
 
     load: float
-    duration: float  #: until then; 0 for what is at rest already
+    duration: float  #: time to the turning point; 0 if already at rest
     stretch: float
 
 
 def brake(model: Model, state: State, share: float = 1.0) -> Brake:
-    """Return the load that stops a motion, and until when; a share of 1 brakes hardest."""
-    # The share is of the way from the load that holds the stretch to the limit on the other side.
-    # A brake of no duration is for a motion that cannot be followed to a turning point.
+    """Return the load that stops a motion, and its duration; a share of 1 brakes hardest."""
+    # The share interpolates between the load that holds the stretch and the opposite limit. The
+    # duration is also 0 if the motion cannot be followed to a turning point.
     holding = model.holding(state.stretch)
     rest = Brake(holding, 0.0, state.stretch)
     frequency = model.frequency(state.stretch)
@@ -39,7 +39,7 @@ def brake(model: Model, state: State, share: float = 1.0) -> Brake:
     up = state.rate > 0.0
     load = model.limits.minimum if up else model.limits.maximum
     if not math.isfinite(load):
-        # Unlimited: a load that stops within a fraction of a period.
+        # Without limits, use a load that stops the motion within a fraction of a period.
         load = holding - math.copysign(10.0 * abs(state.rate) * frequency + 10.0, state.rate)
     if share < 1.0:
         load = holding + share * (load - holding)
@@ -53,8 +53,8 @@ def brake(model: Model, state: State, share: float = 1.0) -> Brake:
     found = turn(load)
     if found is None:
         return rest
-    # A command carries whole nanoseconds. The load is solved for the next one, at which the
-    # motion then is at rest to rounding: at full load half of one leaves more than a move does.
+    # Commands have whole nanoseconds. The load is solved for the next one, so that the motion is
+    # then at rest to rounding: at full load, half a nanosecond leaves more than a move does.
     aim = math.ceil(found[0] / model.delivery.resolution) * model.delivery.resolution
     for _ in range(_PASSES):
         time, stretch, slope = found
@@ -68,7 +68,7 @@ def brake(model: Model, state: State, share: float = 1.0) -> Brake:
 
 
 def holdable(model: Model, stretch: float) -> float:
-    """Return the nearest stretch that a flux density inside the limits holds."""
+    """Return the nearest stretch that a flux density within the limits holds."""
     load = model.holding(stretch)
     least, most = model.limits.minimum, model.limits.maximum
     if least <= load <= most:

@@ -1,9 +1,9 @@
 """
-Records of a plan over time, and the prediction along them.
+Records of a plan over time, and predictions along them.
 
-Times are integer nanoseconds, levels flux densities in tesla: what happens on the wire. Each level
-knows the model under which it was planned, so that a plan that began under other parameters is
-still predicted under those.
+Times are integer nanoseconds and levels are flux densities in tesla, as in messages. Each level
+contains the model with which it was planned, so that predictions of a running plan do not change
+with the parameters.
 """
 
 from bisect import bisect_right
@@ -30,11 +30,11 @@ from hmsa_ros.planning.shapers import creeping, get_shaper
 from hmsa_ros.planning.shapers.pace import PACE, Pace
 from hmsa_ros.planning.shapers.request import as_errors, ERRORS
 
-#: Options that are of coil and block, and can be estimated.
+#: Options that describe coil and block, and can be estimated.
 ESTIMATED = ('coil_time_constant', 'constant_force')
-# Codes of plans that do not do what was requested.
+# Codes of plans that deviate from the request.
 _WARNINGS = (Code.TOO_DAMPED, Code.INDISTINGUISHABLE, Code.SPELL_TOO_SHORT)
-#: Stamp of a level that has been in force at rest for ever.
+#: Timestamp of a level that has always been in effect, at rest.
 ALWAYS = -2**62
 
 
@@ -43,39 +43,39 @@ class Options:
     """How requests are planned."""
 
     shaper: str = 'two_step'  #: a name in `hmsa_ros.planning.shapers.SHAPERS`
-    short_spell: str = 'refuse'  #: for a span that ends before the move: refuse or continue
+    short_spell: str = 'refuse'  #: for a duration that ends before the move: refuse or continue
     flux_density_min: float = -math.inf  #: in T
     flux_density_max: float = math.inf  #: in T
-    lead_time: int = 50_000_000  #: in ns, how far ahead of its stamp a command is sent
-    period: int = 0  #: in ns, of which stamps are multiples; 0 for any time
+    lead_time: int = 50_000_000  #: in ns, time from sending a command to its timestamp
+    period: int = 0  #: of the sampling grid of timestamps, in ns; 0 for any time
     slew_limit: float = math.inf  #: in T/s; infinite for steps
     order: int = 2  #: of the shapers robust and minimax
-    coil_time_constant: float = 0.0  #: in s, of a lag of first order; 0 for at once
-    constant_force: float = 0.0  #: in N, which acts beside the field
-    #: Vibration that levels which follow creep may leave, as a share of the move.
+    coil_time_constant: float = 0.0  #: of a first-order lag, in s; 0 for none
+    constant_force: float = 0.0  #: in N, in addition to that of the field
+    #: Vibration that levels of the creep tail may leave, as a fraction of the move.
     creep_tolerance: float = IDEAL.ripple
-    #: Deviation from a path that levels may leave, as a share of its range.
+    #: Deviation from a path that levels may leave, as a fraction of its range.
     path_tolerance: float = 1e-6
-    #: Of G, damping coefficient and J_lim, as shares, for which minimax plans.
+    #: Relative errors of G, damping coefficient and J_lim that minimax must tolerate.
     errors: Uncertainty = ERRORS
     pace: Pace = PACE  #: of the shaper smooth; the rate in 1/s
 
 
 @dataclass(frozen=True)
 class Model:
-    """Everything that a prediction depends on: the block and how commands reach it."""
+    """All data of a prediction: the block and how commands reach it."""
 
     actuator: ActuatorParameters
     options: Options
     material: NondimensionalParameters = field(init=False)
-    units: Units = field(init=False)  #: sizes of the nondimensional units of time and load
+    units: Units = field(init=False)  #: scales of the dimensionless time and load
     limits: Limits = field(init=False)
-    delivery: Delivery = field(init=False)  #: nondimensional, as limits and pace are
+    delivery: Delivery = field(init=False)  #: dimensionless, like limits and pace
     pace: Pace = field(init=False)
     pull: float = field(init=False)  #: load of the constant force
 
     def __post_init__(self) -> None:
-        """Work out the nondimensional side."""
+        """Compute the dimensionless data."""
         actuator, options = self.actuator, self.options
         get_shaper(options.shaper)
         as_errors(options.errors)
@@ -103,7 +103,7 @@ class Model:
 
     @property
     def others(self) -> dict[str, Any]:
-        """What can be estimated besides parameters of the block, by name."""
+        """Parameters that can be estimated besides those of the block, by name."""
         return {x: getattr(self.options, x) for x in ESTIMATED}
 
     def ns(self, time: float) -> int:
@@ -111,11 +111,11 @@ class Model:
         return round(time * self.units.time * NANOSECONDS)
 
     def time(self, ns: int) -> float:
-        """Return a time in ns without a dimension."""
+        """Return the dimensionless time of a time in ns."""
         return ns / NANOSECONDS / self.units.time
 
     def load(self, flux_density: float) -> float:
-        """Return the load of a flux density in T, with that of the constant force."""
+        """Return the load of a flux density in T plus the constant force."""
         return float(self.units.of_level(flux_density)) + self.pull
 
     def flux_density(self, load: float) -> float:
@@ -135,12 +135,12 @@ class Model:
         return float(acceleration(state.stretch, state.rate, state.load, self.material))
 
     def on_grid(self, time: int) -> int:
-        """Return the next time in ns that a command may be stamped with."""
+        """Return the earliest time in ns, not before the given one, that a command may have."""
         period = self.options.period
         return time if period == 0 else -(-time // period) * period
 
     def follow(self, state: State, load: float, duration: float) -> State:
-        """Predict the state after a load has been commanded for a nondimensional time."""
+        """Predict the state after a load has been commanded for a dimensionless time."""
         return follow((Level(0.0, load),), state, duration, self.material, self.delivery)
 
     def taken_from(self, state: State, other: 'Model') -> State:
@@ -160,48 +160,48 @@ class Model:
 
 @dataclass(frozen=True, slots=True)
 class PlannedLevel:
-    """A change of level, and what is predicted at its stamp."""
+    """A change of level, and the prediction at its timestamp."""
 
-    stamp: int  #: in ns, from which it applies
+    stamp: int  #: start time in ns
     flux_density: float  #: in T
     state: State  #: in the units of the model
-    model: Model = field(repr=False)  #: of the motion from the stamp on
-    #: Stamp in ns with which it was sent, where what was sent before it has come later.
+    model: Model = field(repr=False)  #: of the motion from the timestamp on
+    #: Timestamp in ns with which it was sent, if it was delayed by an earlier, late level.
     sent_for: int | None = None
 
     @property
     def stretch(self) -> float:
-        """Stretch at the stamp."""
+        """Stretch at the timestamp."""
         return self.state.stretch
 
     @property
     def rate(self) -> float:
-        """Stretch rate at the stamp in 1/s."""
+        """Stretch rate at the timestamp in 1/s."""
         return self.state.rate / self.model.units.time
 
     @property
     def in_force(self) -> float:
-        """Flux density in T at the stamp, from which a slew limit ramps to the level."""
+        """Flux density in T at the timestamp, from which a slew limit ramps to the level."""
         return self.model.flux_density(self.state.load)
 
     @property
     def load(self) -> float:
-        """The level without a dimension."""
+        """The level as a dimensionless load."""
         return self.model.load(self.flux_density)
 
     @property
     def due(self) -> int:
-        """Stamp in ns with which it is sent."""
+        """Timestamp in ns with which it is sent."""
         return self.stamp if self.sent_for is None else self.sent_for
 
     def shifted(self, span: int) -> 'PlannedLevel':
-        """Return the level with a span in ns added to its times."""
+        """Return the level with its times shifted by some ns."""
         return replace(
             self, stamp=self.stamp if self.stamp == ALWAYS else self.stamp + span,
             sent_for=None if self.sent_for is None else self.sent_for + span)
 
     def at(self, time: int) -> State:
-        """Predict the nondimensional state at a time in ns; before the stamp, as at the stamp."""
+        """Predict the dimensionless state at a time in ns, not before the timestamp."""
         if self.stamp == ALWAYS:
             return self.state
         return self.model.follow(
@@ -211,20 +211,20 @@ class PlannedLevel:
 
     @property
     def ramped(self) -> float:
-        """Nondimensional time that the field takes to get to the level."""
+        """Dimensionless time in which the field reaches the level."""
         return self.model.delivery.settling(self.load - self.state.ramps_from)
 
     def _settled(self) -> float:
-        """Return the time after which nothing moves, but for creep."""
+        """Return the time after which the motion has ended, except for creep."""
         return self.ramped + longest_motion(self.load, self.model.material)
 
     def sample(self, times: Sequence[int]) -> list[tuple[float, float]]:
-        """Predict stretch and rate (1/s) at times in ns, not decreasing, from the stamp on."""
+        """Predict stretch and rate (1/s) at times in ns, not decreasing, from the timestamp on."""
         if self.stamp == ALWAYS or all(x == self.stamp for x in times):
             return [(self.stretch, self.rate)] * len(times)
         model, settled = self.model, self._settled()
         after = np.array([model.time(x - self.stamp) for x in times])
-        # What has settled may still creep.
+        # After settling, creep may continue.
         count = int(np.searchsorted(after, settled)) if model.material.creep else len(after)
         stretch, rate, *_ = sampled(
             (Level(0.0, self.load),), self.state, np.minimum(after[:count], settled),
@@ -234,7 +234,7 @@ class PlannedLevel:
         return [(x, y / model.units.time) for x, y in found]
 
     def after(self, level: 'PlannedLevel') -> 'PlannedLevel':
-        """Return this level with what is predicted at its stamp if another one precedes it."""
+        """Return this level with the prediction at its timestamp after another level."""
         return replace(self, state=self.model.taken_from(level.at(self.stamp), level.model))
 
 
@@ -243,20 +243,20 @@ class PlannedSegment:
     """One setpoint on the timeline, times in ns."""
 
     stretch: float  #: target
-    begin: int  #: of the move
-    arrival: int | None  #: of rest at the target; None where it is only approached
+    begin: int  #: start of the move
+    arrival: int | None  #: time of rest at the target; None if only approached
     code: Code
-    reason: str  #: why it is not the requested command; empty if it is
-    since: int  #: from which the setpoint holds; the move may begin later
-    #: Bound of what levels that follow creep leave of it in stretch, peak to peak.
+    reason: str  #: why the command is not the requested one; empty if it is
+    since: int  #: start of the setpoint; the move may start later
+    #: Upper bound of the vibration that levels of the creep tail leave in stretch, peak to peak.
     vibration: float = 0.0
-    until: int | None = None  #: end as requested; None for one that is held on
-    carried_out: bool = True  #: whether its commands were sent and took effect, as far as known
-    #: What is followed, in s from ``since`` on; None for a move.
+    until: int | None = None  #: end as requested; None if it is held on
+    carried_out: bool = True  #: whether its commands took effect, as far as reported
+    #: Path to follow, in s from ``since`` on; None for a move.
     path: Path | None = field(default=None, compare=False, repr=False)
 
     def shifted(self, span: int) -> 'PlannedSegment':
-        """Return the segment with a span in ns added to all times."""
+        """Return the segment with its times shifted by some ns."""
         return replace(
             self, begin=self.begin + span, since=self.since + span,
             arrival=None if self.arrival is None else self.arrival + span,
@@ -265,62 +265,62 @@ class PlannedSegment:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is going to happen, from the level in force on."""
+    """The plan from the present level on."""
 
     number: int  #: counts accepted requests from 1; 0 before the first
     levels: tuple[PlannedLevel, ...]  #: by stamp; the first ones may lie in the past
     segments: tuple[PlannedSegment, ...]  #: by time
-    kept: int = 0  #: how many segments, the first ones, belong to earlier requests
+    kept: int = 0  #: number of segments, from the first on, that belong to earlier requests
 
     def shifted(self, span: int) -> 'Plan':
-        """Return the plan with a span in ns added to all times."""
+        """Return the plan with all times shifted by some ns."""
         return replace(
             self, levels=tuple(x.shifted(span) for x in self.levels),
             segments=tuple(x.shifted(span) for x in self.segments))
 
     def ahead(self, now: int, limit: int | None = None) -> tuple[PlannedLevel, ...]:
-        """Return levels from the one in force on; none that is in force for ever."""
+        """Return the levels from the present one on, without the one that always applied."""
         first = self.place(now)
         first += self.levels[first].stamp < 0
         return self.levels[first:None if limit is None else first + limit]
 
     def level(self, time: int) -> PlannedLevel:
-        """Return the level in force at a time, the first one before that."""
+        """Return the level at a time, or the first one before it."""
         return self.levels[self.place(time)]
 
     def place(self, time: int) -> int:
-        """Return the place of the level in force at a time, that of the first before it."""
+        """Return the index of the level at a time, or of the first one before it."""
         return max(bisect_right(self.levels, time, key=lambda x: x.stamp) - 1, 0)
 
     def under_way(self, time: int) -> int:
-        """Return the place of the setpoint that holds at a time, -1 before the first."""
+        """Return the index of the setpoint at a time, -1 before the first."""
         return bisect_right(self.segments, time, key=lambda x: x.since) - 1
 
     def step(self, place: int) -> float:
-        """Return how far the setpoint of a place is from the one before, in stretch."""
+        """Return the distance in stretch of a setpoint from the previous one, by index."""
         before = self.segments[place - 1] if place else self.levels[0]
         return abs(self.segments[place].stretch - before.stretch)
 
 
 @dataclass(frozen=True)
 class Draft:
-    """A plan that has been worked out and not been taken yet."""
+    """A plan that has not been taken yet."""
 
-    begin: int  #: in ns, from which it replaces what was planned
+    begin: int  #: in ns, the start of the part of the plan that it replaces
     levels: tuple[PlannedLevel, ...]
     segments: tuple[PlannedSegment, ...]
-    #: Place of the first setpoint of the running plan that it plans anew; None for a new request.
+    #: Index of the first setpoint of the running plan that is planned again; None for a request.
     resumed: int | None = None
-    missed: int = 0  #: setpoints left out, since their time is over
+    missed: int = 0  #: number of setpoints skipped because their time is over
 
     @property
     def warning(self) -> PlannedSegment | None:
-        """The first setpoint that is only roughly reached, by another command than requested."""
+        """The first setpoint reached only roughly, by another command than the requested one."""
         return next((x for x in self.segments if x.code in _WARNINGS
                      or x.code is Code.PATH and x.reason), None)
 
     def delayed(self, delays: Sequence[int]) -> 'Draft':
-        """Return the draft with the move of each segment delayed by so many ns."""
+        """Return the draft with the move of each segment delayed by its delay in ns."""
         begins = [x.begin for x in self.segments]
         levels = tuple(
             replace(x, stamp=x.stamp + delays[bisect_right(begins, x.stamp) - 1])

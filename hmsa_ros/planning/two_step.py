@@ -1,8 +1,8 @@
 """
 The two-step command of Eqs. 13 and 14, for one move from any state.
 
-A constant load beta_p brings the actuator to its turning point exactly at the target; there
-the load that holds the target, beta_1, takes over and nothing is left to oscillate.
+A constant load beta_p brings the actuator to its turning point exactly at the target. There, the
+load that holds the target, beta_1, replaces it and no vibration remains.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -23,29 +23,29 @@ from hmsa_ros.model.status import Code
 
 #: Relative tolerance of the integration and of beta_p.
 RTOL = 1e-12
-#: Deviation from the target below which the actuator counts as being there already.
+#: Deviation from the target below which the actuator counts as already there.
 HOLD_TOLERANCE = 1e-9
 
-#: By the statuses of `hmsa_ros.motion.two_step`.
+#: Codes by status of `hmsa_ros.motion.two_step`.
 CODES = dict(enumerate((
     Code.TWO_STEP, Code.HOLD, Code.TOO_DAMPED, Code.INDISTINGUISHABLE, Code.NO_TWO_STEP,
     Code.NOT_CONVERGED, Code.OUT_OF_RANGE, Code.BAD_INPUT)))
 
-# Numbers of packed materials that a batch keeps at a time; a table has some 330 a row.
+# Maximum number of values in the packed materials of a batch; a table has about 330 per row.
 _MOST_NUMBERS = 1 << 20
-# Rows that are worth a thread of their own.
+# Minimum number of rows per thread.
 _PART = 256
 
 
 class TwoStep(NamedTuple):
     """Result of `plan_two_step`; loads and times are NaN where there are none."""
 
-    #: ``TWO_STEP`` or ``HOLD`` where the plan leaves no vibration, else why there is none.
+    #: ``TWO_STEP`` or ``HOLD`` if the plan leaves no vibration, else the reason why there is none.
     code: Code
     beta_p: float  #: intermediate load
     tau_p: float  #: time at which the target is reached at rest
     beta_1: float  #: load that holds the target; NaN outside the limits
-    passes: int  #: integrations that the solution took
+    passes: int  #: number of integrations
 
 
 def plan_two_step(
@@ -58,26 +58,25 @@ def plan_two_step(
     Parameters
     ----------
     start : float
-        Stretch at the start, inside the limiting stretches.
+        Initial stretch, inside the limiting stretches.
     target : float
-        Stretch to come to rest at, inside the limiting stretches.
+        Target stretch, inside the limiting stretches.
     material : NondimensionalParameters
         zeta, J_lim and c1.
     rate : float
-        Stretch rate at the start, per unit of nondimensional time.
+        Initial stretch rate, dimensionless.
     load_limits : tuple of float
-        Admissible loads. Where two plans exist, the fastest inside them is taken; where none
-        lies inside, the plan with the direct approach is returned and the caller sees from
-        ``beta_p`` what it would need.
+        Admissible loads. If two plans exist, the fastest one inside the limits is returned. If
+        none is inside, the plan with the direct approach is returned, whose ``beta_p`` shows the
+        load it needs.
     rtol : float
         Relative tolerance, 1e-14 to 1e-4.
 
     Returns
     -------
     TwoStep
-        With `Code.TOO_DAMPED` where the response to beta_1 does not cross the target, so that
-        no two-step command exists, and `Code.INDISTINGUISHABLE` where beta_p equals beta_1 to
-        rounding.
+        With `Code.TOO_DAMPED` if the response to beta_1 does not cross the target, so that no
+        two-step command exists, and `Code.INDISTINGUISHABLE` if beta_p equals beta_1 to rounding.
 
     Raises
     ------
@@ -97,12 +96,12 @@ def plan_two_step(
     least, most = load_limits
     status, beta_p, tau_p, beta_1, passes = motion.two_step(
         start, rate, target, material.packed, least, most, rtol, HOLD_TOLERANCE)
-    # Past the constructor, which would take 3 % of the time of a plan.
+    # Skip the constructor, which would take 3 % of the time of a plan.
     return tuple.__new__(TwoStep, (CODES[status], beta_p, tau_p, beta_1, passes))
 
 
 def available_cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, 'sched_getaffinity'):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -119,7 +118,7 @@ class TwoStepBatch:
 
 
 class Groups(NamedTuple):
-    """Numbers of `NondimensionalParameters` as arrays, and the law of them all."""
+    """Values of `NondimensionalParameters` as arrays, and their common hyperelastic model."""
 
     zeta: ArrayLike = 0.2
     j_lim: ArrayLike = 5.0
@@ -127,7 +126,7 @@ class Groups(NamedTuple):
     elastic: Elastic | None = None  #: in place of ``j_lim``
 
 
-#: The paper's.
+#: Those of the paper.
 USUAL = Groups()
 
 
@@ -136,12 +135,12 @@ def plan_two_step_batch(
         rate: ArrayLike = 0.0, load_limits: tuple[float, float] = (-math.inf, math.inf),
         rtol: float = RTOL, workers: int = 0) -> TwoStepBatch:
     """
-    Plan many moves at once, over all cores.
+    Plan many moves at once on all cores.
 
     Parameters
     ----------
     start, target, rate : array_like
-        As for `plan_two_step`, broadcast against each other and the groups.
+        As for `plan_two_step`, broadcast with each other and the groups.
     groups : Groups
         Materials.
     load_limits : tuple of float
@@ -149,12 +148,12 @@ def plan_two_step_batch(
     rtol : float
         Relative tolerance, 1e-14 to 1e-4.
     workers : int
-        Threads; 0 for one a core.
+        Threads; 0 for one per core.
 
     Returns
     -------
     TwoStepBatch
-        A row that cannot be planned carries its status and NaN; it never spoils the others.
+        A row that cannot be planned contains its status and NaN, and does not affect the others.
 
     Raises
     ------
@@ -169,7 +168,7 @@ def plan_two_step_batch(
         shape = np.broadcast_shapes(*(a.shape for a in given))
     except ValueError as error:
         raise BadInputError(f'the arrays do not broadcast against each other: {error}') from error
-    # Where there is but one material, it is packed once.
+    # A single material is packed only once.
     alike = all(a.size == 1 for a in given[3:])
     elastic = groups.elastic
     columns = [np.broadcast_to(a, shape).flatten() for a in given[:3 if alike else 6]]

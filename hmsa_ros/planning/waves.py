@@ -1,8 +1,8 @@
 """
-Periodic motions of the stretch: their shapes, the paths that lead through them, and their reach.
+Periodic motions of the stretch: shapes, paths and feasible frequencies.
 
-A path begins and ends at rest: the wave is faded in and out by a polynomial with three derivatives
-that are zero at either end. All is without a dimension.
+A path starts and ends at rest: a polynomial with three zero derivatives at either end fades the
+wave in and out. All quantities are dimensionless.
 """
 
 from collections.abc import Callable
@@ -18,18 +18,18 @@ from hmsa_ros.planning.flat import fade, loads_for
 from hmsa_ros.planning.path import Path
 from hmsa_ros.planning.shapers.request import Request
 
-#: Value and two derivatives by the phase, whose period is 1, shape (n,) each.
+#: Value and two derivatives with respect to the phase, whose period is 1, shape (n,) each.
 Shape = Callable[[Array], tuple[Array, Array, Array]]
 
-# Harmonics of a triangle, whose corners they round.
+# Harmonics of a triangle wave; they round its corners.
 _HARMONICS: Array = np.arange(1.0, 11.0, 2.0, dtype=np.float64)
-# Cycles and natural periods that a wave is faded in and out for at the least.
+# Minimum number of cycles and of natural periods of each fade.
 _FADE_CYCLES, _FADE_PERIODS = 1, 2.0
-# Breaks of a path in a cycle, and phases at which the reach is looked at.
+# Knots of a path per cycle, and phases at which limits are checked.
 _BREAKS, _PHASES = 8, 128
-# Share of the slew limit that ramps from level to level may need.
+# Fraction of the slew limit that ramps between levels may use.
 _SLEW_SHARE = 0.75
-# Frequencies that are looked at, in units of the natural one.
+# Frequencies to check, relative to the natural frequency.
 _LOOK: Array = np.geomspace(1e-3, 30.0, 400).astype(np.float64)
 
 
@@ -39,7 +39,7 @@ def sine(phase: Array) -> tuple[Array, Array, Array]:
 
 
 def triangle(phase: Array) -> tuple[Array, Array, Array]:
-    """Return a triangle of five harmonics, weighted after Lanczos, with peaks of 1."""
+    """Return a triangle wave of five harmonics with Lanczos weights and peaks of 1."""
     signs = (-1.0) ** (_HARMONICS // 2)
     weights = np.sinc(_HARMONICS / (_HARMONICS[-1] + 2.0)) / _HARMONICS ** 2
     return _series(phase, _HARMONICS, signs * weights / weights.sum())
@@ -54,11 +54,11 @@ def _series(phase: Array, orders: Array, weights: Array) -> tuple[Array, Array, 
 
 def sampled_shape(times: Array, stretches: Array) -> Shape:
     """
-    Return the shape of one period of samples, shape (n,), about its mean and with peaks of 1.
+    Return the shape of one period of samples, shape (n,), with zero mean and peaks of 1.
 
-    Samples that do not end where they began, or are no wave, are a `BadInputError`.
+    Raise `BadInputError` if the samples do not end where they began, or are no wave.
     """
-    from scipy.interpolate import CubicSpline  # others need not wait for it
+    from scipy.interpolate import CubicSpline  # slow to import
 
     if len(times) < 4 or np.any(np.diff(times) <= 0.0):
         raise BadInputError(
@@ -95,7 +95,7 @@ class Wave:
     amplitude: float  #: of the stretch, above 0
 
     def path(self, request: Request, frequency: float, last: float, cycles: float) -> Path:
-        """Return the path from rest through some cycles back to rest, perhaps a sweep."""
+        """Return the path of a wave or sweep from rest, with a number of cycles, to rest."""
         start = request.state.stretch
         period = 2.0 * math.pi / float(
             law.natural_frequency(self.mean, request.material.packed))
@@ -136,7 +136,7 @@ class Wave:
         return Path(np.append(np.concatenate(breaks), edges[-1]), course)
 
     def within(self, request: Request, frequency: float) -> bool:
-        """Return whether limits of field and slew rate allow the wave at a frequency."""
+        """Return whether the limits of field and slew rate allow the wave at a frequency."""
         material, delivery, limits = request.material, request.delivery, request.limits
         packed = material.packed
         value, slope, curve = self.shape(np.arange(_PHASES) / _PHASES)
@@ -147,7 +147,7 @@ class Wave:
             stretch, self.amplitude * frequency * slope,
             self.amplitude * frequency ** 2 * curve, material)
         if material.creep:
-            # At most: as if branches did not relax during a cycle.
+            # Upper bound: branches that do not relax during a cycle.
             forces = elastic_force(stretch, material)
             found = found + material.branches[:, 0].sum() * (forces - forces.mean())
         step = 1.0 / (_PHASES * frequency)
@@ -157,7 +157,7 @@ class Wave:
                     and np.max(np.abs(_growth(found, step))) <= _SLEW_SHARE * delivery.slew)
 
     def reach(self, request: Request) -> list[tuple[float, float]]:
-        """Return the bands of frequencies that limits allow, within 0.001 to 30 natural ones."""
+        """Return the frequency bands that limits allow, within 0.001 to 30 natural frequencies."""
         natural = float(law.natural_frequency(self.mean, request.material.packed))
         looked = _LOOK * natural / (2.0 * math.pi)
         held = np.array([self.within(request, x) for x in looked.tolist()], dtype=int)
@@ -167,6 +167,6 @@ class Wave:
 
 
 def _growth(values: Array, step: float) -> Array:
-    """Return the change of periodic values per unit of time."""
+    """Return the time derivative of periodic values."""
     found: Array = (np.roll(values, -1) - np.roll(values, 1)) / (2.0 * step)
     return found

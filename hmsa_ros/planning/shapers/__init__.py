@@ -1,8 +1,8 @@
 """
-Shapers: ways to command one move, in a registry by name.
+Shapers, which command one move, in a registry by name.
 
-A shaper takes a `Request` and answers with a `Move`, or refuses with a reason. Everything is
-nondimensional; `Units` only words the messages.
+A shaper takes a `Request` and returns a `Move`, or raises `RefusedError` with a reason. All
+quantities are dimensionless; `Units` only format the messages.
 """
 
 import math
@@ -21,17 +21,17 @@ from hmsa_ros.planning.shapers.umzv import umzv
 #: Shapers by name.
 SHAPERS: dict[str, Shaper] = {
     'two_step': advised(two_step),
-    # They plan wherever two_step does.
+    # These find a plan whenever two_step does.
     **{x.__name__: advised(x, sooner=two_step) for x in (robust, minimax)},
     'minimum_time': advised(minimum_time),
-    # Whose search for a path that is not there takes long: what to ease, but not how much.
+    # A failed search for a path takes long: advise which limits to relax, but not by how much.
     'smooth': advised(smooth, (math.inf,)),
     **{x.__name__: x for x in (step, zv, zvd, ei, umzv)},
 }
 
 
 def get_shaper(name: str) -> Shaper:
-    """Return the shaper of a name in `SHAPERS`, a `BadInputError` for another."""
+    """Return a shaper by its name in `SHAPERS`; raise `BadInputError` for another name."""
     try:
         return SHAPERS[name]
     except KeyError:

@@ -1,4 +1,4 @@
-"""What to change where no command is found: limits with whose other values there is one."""
+"""Advice after a failed search: relaxed limits for which a command exists."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,14 +10,14 @@ from hmsa_ros.model.moves import Limits, Move
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.shapers.request import Request, Shaper, Work
 
-# Codes of refusals that a limit may be to blame for.
+# Codes of refusals that may be due to a limit.
 _SEARCHED = (Code.FLUX_LIMIT, Code.SLEW_LIMIT, Code.NO_TWO_STEP, Code.NOT_CONVERGED)
-# By the limit that is to blame, those first that are most often wrong rather than given.
+# Codes by the limiting quantity; those most often set wrongly come first.
 _CODES = {'flux': Code.FLUX_LIMIT, 'slew': Code.SLEW_LIMIT, 'period': Code.NO_TWO_STEP,
           'lag': Code.NO_TWO_STEP}
-# Work of the search for advice.
+# Work limit of the search for advice.
 _ADVISING = 400_000
-# How much wider or faster limits are tried.
+# Factors by which limits are relaxed.
 _FACTORS = (1.5, 3.0, 10.0, 30.0, math.inf)
 
 
@@ -25,9 +25,9 @@ def advised(
         shaper: Shaper, factors: Sequence[float] = _FACTORS,
         sooner: Shaper | None = None) -> Shaper:
     """
-    Return a shaper whose refusals name what limits, eased so much, it finds a command with.
+    Return a shaper whose refusals name the relaxed limits for which it finds a command.
 
-    Another shaper that finds one for the same requests may be asked for that, and answer sooner.
+    ``sooner`` is a faster shaper for this search that succeeds for the same requests.
     """
     asked = sooner or shaper
 
@@ -49,7 +49,7 @@ def advised(
 
 
 def _ways(shaper: Shaper, request: Request) -> list[tuple[str, ...]]:
-    """Return the smallest sets of limits without any of which there is a command."""
+    """Return the smallest sets of limits whose removal makes a command possible."""
     delivery, limits = request.delivery, request.limits
     there = [name for name, limited in (
         ('flux', limits != Limits()), ('slew', delivery.slew < math.inf),
@@ -64,7 +64,7 @@ def _ways(shaper: Shaper, request: Request) -> list[tuple[str, ...]]:
 
 def _advice(
         shaper: Shaper, request: Request, names: Sequence[str], factors: Sequence[float]) -> str:
-    """Return in words with which values of some limits there is a command."""
+    """Return relaxed values of some limits for which a command exists, as text."""
     factor = next(x for x in factors if x == math.inf or _succeeds(
         shaper, eased(request, names, x)))
     there, units = eased(request, names, factor), request.units
@@ -81,7 +81,7 @@ def _advice(
 
 
 def eased(request: Request, names: Sequence[str], factor: float) -> Request:
-    """Return a request with limits (flux, slew, period, lag) some times as wide, or without."""
+    """Return a request with limits (flux, slew, period, lag) relaxed by a factor, or removed."""
     delivery, limits = request.delivery, request.limits
     if 'flux' in names:
         width = limits.maximum - limits.minimum

@@ -1,8 +1,8 @@
 """
-Moves of an elastomer that creeps, and the levels that keep it at rest afterwards.
+Moves of a viscoelastic elastomer, and the tail of levels that keeps it at rest afterwards.
 
-At arrival the branches still hold something. To stay at rest the level has to follow it,
-psi'(l_d) + sum h_i exp(-t/tau_i) for Maxwell branches, as a staircase.
+At arrival the branches still have an overstress. To stay at rest, the level must follow its decay,
+psi'(l_d) + sum h_i exp(-t/tau_i) for Maxwell branches, in steps (zero-order hold).
 """
 
 from collections.abc import Sequence
@@ -27,21 +27,21 @@ from hmsa_ros.model.simulation import (
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.shapers.request import Request
 
-# The least move that counts, and how much more a staircase may leave than is worked out.
+# Minimum move, and safety factor on the computed vibration of a tail.
 _LEAST_MOVE, _SURE = 1e-3, 1.25
-# Levels of a staircase at the most.
+# Maximum number of levels of a tail.
 _MOST = 300
-# Codes of moves that leave vibration, even if the model is exact.
+# Codes of moves that leave vibration even with an exact model.
 _RINGING = (Code.LINEAR, Code.MINIMAX)
-# Time for which a target is held at the least.
+# Minimum time for which a target is held.
 _SHORTEST = 1e-9
 
 
 def carried(
         state: State, before: NondimensionalParameters,
         after: NondimensionalParameters) -> tuple[float, ...]:
-    """Return what branches have followed of a state, for another material."""
-    # What they remember is a stretch: at rest, they are relaxed under any law.
+    """Return the branch states of a state for another material."""
+    # The branches remember a stretch: at rest, they are relaxed for any model.
     if len(state.followed) != len(after.branches):
         return ()
     found = tuple(
@@ -51,10 +51,10 @@ def carried(
 
 
 def arrival(request: Request, found: Move) -> State:
-    """Return the state to which a move leads, at rest at the target."""
+    """Return the state that a move reaches, at rest at the target."""
     end = request.start
     if found.duration > 0.0:
-        # The last level counts where it is ramped to.
+        # The last level applies from the end of the ramp to it.
         end = follow(
             found.until(found.duration).levels, end, found.duration, request.material,
             request.delivery)
@@ -64,10 +64,10 @@ def arrival(request: Request, found: Move) -> State:
 
 def held(request: Request, found: Move, span: float) -> Move:
     """
-    Return a move with the staircase that keeps it at rest while branches relax.
+    Return a move with the tail of levels that keeps it at rest while branches relax.
 
-    Its times are as commands carry them; it is held until ``span`` after its start. Where nothing
-    creeps, or the target is only approached, it stays as it was.
+    Times are rounded to those that commands can have; the target is held until ``span`` after the
+    start. Without creep, or if the target is only approached, the move does not change.
     """
     material, delivery = request.material, request.delivery
     if not material.creep or not found.duration < np.inf:
@@ -110,7 +110,7 @@ def held(request: Request, found: Move, span: float) -> Move:
 
 def _passed(
         request: Request, levels: Sequence[Level], times: Array) -> tuple[State, ...]:
-    """Return the states at times at which levels begin, where the block is not at rest."""
+    """Return the states at the start of levels during which the block is not at rest."""
     delivery = request.delivery
     rows, _ = ramps(levels, request.load, float(times[-1]), delivery.slew)
     switches, loads, _ = zip(*rows, strict=True)
@@ -126,7 +126,7 @@ def _passed(
 
 def _ramped(
         request: Request, times: Array, changes: Array, found: Move) -> tuple[Array, float]:
-    """Return how much sooner to command levels that are ramped to, and what ramps add."""
+    """Return how much earlier to command ramped levels, and the vibration that ramps add."""
     delivery, packed = request.delivery, request.material.packed
     ramps: Array = np.abs(changes) / delivery.slew
     if np.any(ramps > np.diff(times, append=np.inf)):
@@ -138,7 +138,7 @@ def _ramped(
     frequency = request.frequency
     if delivery.period > 0.0:
         return 0.0 * ramps, float(np.sum(np.abs(changes) * ramps) / (inertia * frequency))
-    # In the middle of the ramp the step would have been: what is left is of second order.
+    # Centre the ramp on the ideal step: the remaining error is of second order.
     late = 0.5 * ramps
     late[0], left = _first(request, found, float(changes[0]))
     more = np.sum(np.abs(changes) * ramps ** 2) / 12.0 + np.abs(changes[0]) * left / frequency
@@ -146,7 +146,7 @@ def _ramped(
 
 
 def _first(request: Request, found: Move, change: float) -> tuple[float, float]:
-    """Return how much sooner to change the level at arrival, and how much ramp is not made up."""
+    """Return how much earlier to change the level at arrival, and the uncompensated ramp time."""
     slew, ramp = request.delivery.slew, abs(change) / request.delivery.slew
     levels = found.until(found.duration).levels
     if not levels or math.isinf(slew):
@@ -158,6 +158,6 @@ def _first(request: Request, found: Move, change: float) -> tuple[float, float]:
         return late, ramp - 2.0 * late
     if last * change >= 0.0:
         return 0.0, ramp
-    # The last ramp is turned round before its end: as much is missing of it as comes later.
+    # The last ramp reverses before its end: the part it lacks balances the part that follows.
     late = min(ramp / (2.0 + math.sqrt(2.0)), abs(last) / slew)
     return late, ((ramp - 2.0 * late) ** 2 - 2.0 * late * late) / ramp

@@ -1,10 +1,10 @@
 """
-Levels of free heights: what leads to rest where a single intermediate level does not.
+Levels of free heights, for moves that a single intermediate level cannot bring to rest.
 
-As many heights are free as there are conditions: two for stretch and rate, and a third one where
-the field lags, which has to arrive with them. Levels are equally long, the shortest first, on
-whatever grid and through whatever ramps; where nothing but ramps bounds the command, the fastest
-one ramps without a pause and turns twice.
+The number of free levels equals the number of conditions: two for stretch and rate, and a third
+one if the field lags and must arrive with them. Levels have equal durations, the shortest first,
+with any sampling grid and ramps. If only ramps limit the command, the fastest one ramps without a
+pause and reverses twice.
 """
 
 from collections.abc import Iterator
@@ -27,15 +27,15 @@ from hmsa_ros.planning.shooting import (
     Template,
 )
 
-# Lengths of all levels together, in half periods at the target.
+# Total durations of the levels to try, in half periods at the target.
 _LENGTHS = (0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0)
-# Ramps to begin the search for two swings with, in quarters of a period.
+# Initial ramps of the search for two swings, in quarter periods.
 _SWINGS = (0.3, 0.1, 0.7, 0.03, 1.2)
 _NUMBERS = {2: 'two', 3: 'three'}
 
 
 def at_rest(request: Request) -> bool:
-    """Return whether stretch, rate and, where that lags, field are those of the target."""
+    """Return whether stretch, rate and (if it lags) field are those of the target."""
     state, packed = request.state, request.material.packed
     if abs(state.stretch - request.target) > AT_REST or not request.still:
         return False
@@ -46,7 +46,7 @@ def at_rest(request: Request) -> bool:
 
 
 def free_heights(request: Request) -> Attempt:
-    """Return the shortest levels of free heights that keep the limits, if there are any."""
+    """Return the shortest levels of free heights that keep the limits, else None."""
     delivery = request.delivery
     if delivery.period > 0.0 or delivery.lag > 0.0 or math.isinf(delivery.slew):
         return first_kept(_equal(request), request)
@@ -55,7 +55,7 @@ def free_heights(request: Request) -> Attempt:
 
 
 def free_levels(request: Request) -> Move:
-    """Come to rest by levels of free heights: `RefusedError` if the limits have none."""
+    """Come to rest with levels of free heights; raise `RefusedError` if none keep the limits."""
     found = free_heights(request)
     if found is None:
         raise RefusedError(*_refusal(request))
@@ -64,9 +64,9 @@ def free_levels(request: Request) -> Move:
 
 def through(request: Request, duration: float) -> Move:
     """
-    Come to rest after a given time by levels that are all as long.
+    Come to rest after a given time with levels of equal duration.
 
-    Where the limits have no such move: `RefusedError`.
+    Raise `RefusedError` if the limits allow no such move.
     """
     count, period, holding = request.unknowns, request.delivery.period, request.holding_load()
     edges = duration / count * np.arange(count + 1)
@@ -83,7 +83,7 @@ def through(request: Request, duration: float) -> Move:
 
 
 def no_single(request: Request) -> str:
-    """Word why levels of free heights are used."""
+    """Return the reason why levels of free heights are used."""
     settled = ' and a push that settles the field' if request.delivery.lag > 0.0 else ''
     level = request.units.drive.name
     return (f'no single intermediate {level}{settled} within the limits leads as soon from '
@@ -92,7 +92,7 @@ def no_single(request: Request) -> str:
 
 
 def _equal(request: Request) -> Iterator[Template]:
-    """Yield guesses of levels that are all as long."""
+    """Yield guesses of levels with equal durations."""
     delivery, holding, count = request.delivery, request.holding_load(), request.unknowns
     half, before = math.pi / request.frequency, 0.0
     for share in _LENGTHS:
@@ -108,7 +108,7 @@ def _equal(request: Request) -> Iterator[Template]:
 
 
 def _swings(request: Request) -> Iterator[tuple[float, Template]]:
-    """Yield guesses of two levels that ramps only just reach, with their durations."""
+    """Yield guesses of two levels that ramps just reach, with their durations."""
     slew, start, holding = request.delivery.slew, request.load, request.holding_load()
     longest = 0.5 * math.pi / request.frequency
     for share, rest, sign in product(_SWINGS, _SWINGS, (1.0, -1.0)):

@@ -4,9 +4,9 @@ The unshaped step and linear input shapers, as references for comparison.
 ZV and ZVD (N. C. Singer, W. P. Seering, "Preshaping command inputs to reduce system
 vibration", J. Dyn. Syst. Meas. Control 112, 1990) and EI with 5 % tolerated vibration
 (W. E. Singhose, W. P. Seering, N. C. Singer, "Residual vibration reduction using vector
-diagrams to generate shaped inputs", J. Mech. Des. 116, 1994), designed for the motion
-linearised about the target, branches that creep included. The actuator is not linear: they leave
-vibration, the more the larger the move.
+diagrams to generate shaped inputs", J. Mech. Des. 116, 1994) are designed for the motion
+linearised about the target, including viscoelastic branches. As the actuator is nonlinear, they
+leave vibration that increases with the size of the move.
 """
 
 from collections.abc import Callable
@@ -20,16 +20,16 @@ from hmsa_ros.planning.shapers.creeping import arrival
 from hmsa_ros.planning.shapers.modes import oscillation
 from hmsa_ros.planning.shapers.request import Request
 
-#: Impulses (time, share) for a root -decay + i frequency of the motion, by time.
+#: Impulses (time, weight) for a root -decay + i frequency of the motion, by time.
 Impulses = Callable[[complex], list[tuple[float, float]]]
 
 _EI_TOLERANCE = 0.05
-# Passes in which the levels meet what branches hold at arrival.
+# Iterations that match the levels to the overstress at arrival.
 _PASSES = 6
 
 
 def step(request: Request) -> Move:
-    """Apply the target's own load at once and let the motion ring down, the paper's unshaped."""
+    """Apply the holding level at once, the paper's unshaped input; the motion rings down."""
     return request.plain(Code.STEP, '')
 
 
@@ -45,7 +45,7 @@ def zvd(request: Request) -> Move:
 
 def ei(request: Request) -> Move:
     """
-    Three impulses, insensitive at the price of 5 % vibration at the design point.
+    Three impulses, insensitive at the cost of 5 % vibration at the design point.
 
     The undamped amplitudes are weighted with the decay over half a period, as is usual for
     light damping.
@@ -55,7 +55,7 @@ def ei(request: Request) -> Move:
 
 
 def _spaced(*weights: float) -> Impulses:
-    """Return impulses half a damped period apart, decaying as the motion does."""
+    """Return impulses half a damped period apart, which decay as the motion does."""
     def impulses(root: complex) -> list[tuple[float, float]]:
         half_period = math.pi / root.imag
         decay = math.exp(root.real * half_period)
@@ -82,7 +82,7 @@ def shaped(request: Request, impulses: Impulses) -> Move:
         times = [round(x / period) * period for x in times]
 
     def levels_to(last: float) -> tuple[Level, ...]:
-        # On a coarse grid two may be at the same time: the later one counts.
+        # On a coarse grid two levels may coincide in time: the later one applies.
         loads = {time: request.load + share * (last - request.load)
                  for time, share in zip(times, shares, strict=True)} | {times[-1]: last}
         return tuple(starmap(Level, loads.items()))
@@ -90,7 +90,7 @@ def shaped(request: Request, impulses: Impulses) -> Move:
     levels = levels_to(holding)
     end = levels[-1].time
     for _ in range(_PASSES if material.creep else 0):
-        # Of what branches hold at arrival, after the last ramp, and what is followed afterwards.
+        # Account for the overstress at arrival, after the last ramp, and for the tail.
         rows, _ = ramps(levels, request.load, math.inf, request.delivery.slew)
         end = max(end, rows[-1][0])
         if period > 0.0:

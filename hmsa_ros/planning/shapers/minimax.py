@@ -1,14 +1,14 @@
 """
-Levels that leave the least vibration at the worst, wherever in a box or ellipsoid parameters are.
+Levels that minimise the worst-case vibration over a box or ellipsoid of parameters.
 
-A chain of two-step commands leaves none if the model is exact, and more the further it is off.
-Here the nominal case is one of many: in the time of the chain, some levels of equal length are
-chosen such that the largest vibration of all cases is as small as it can be (for linear
-oscillators: extra-insensitive shapers, W. E. Singhose, W. P. Seering, N. C. Singer, J. Mech. Des.
-116, 1994). The vibration that a case leaves is a vector, stretch and rate in units of its
-amplitude: what of the state is in the oscillating mode of the motion about where it comes to rest,
-not in what branches creep. Each pass takes it linear in the levels, and finds the least of the
-largest length within bounds of the levels and of what ramps reach.
+A chain of two-step commands leaves no vibration with an exact model, and more with larger errors.
+Here the nominal case is one of many: within the duration of the chain, levels of equal duration
+are chosen that minimise the largest vibration of all cases (for linear oscillators:
+extra-insensitive shapers, W. E. Singhose, W. P. Seering, N. C. Singer, J. Mech. Des. 116, 1994).
+The vibration of a case is a vector, stretch and rate in units of its amplitude: the part of the
+state in the oscillating mode about equilibrium, without the creep of the branches. Each iteration
+linearises it in the levels, and minimises the largest length within the bounds of levels and
+ramps.
 """
 
 from collections.abc import Sequence
@@ -32,50 +32,50 @@ from hmsa_ros.planning.shapers.modes import oscillation
 from hmsa_ros.planning.shapers.request import as_errors, LARGEST_ERROR, Request
 from hmsa_ros.planning.shapers.robust import robust
 
-#: Least number of levels besides the one that holds the target, of steps and of ramps, and how
-#: many a half period.
+#: Minimum number of levels besides the holding level, with steps and with ramps, and number of
+#: levels per half period.
 LEVELS, RAMPED, OF_EACH = 8, 6, 2
 _RTOL = 1e-9
-# Of the range of the levels: the change by which the vibration is differentiated, and the widest
-# change of a first pass.
+# Relative to the range of the levels: the increment for differentiation, and the largest change in
+# the first iteration.
 _CHANGE, _STRIDE = 1e-5, 0.3
-# Passes, and what they may cost: each integrates all cases once for each level and correction, in
-# steps as many as the motion has levels, radians, and time constants of the fastest branch.
+# Maximum number of iterations and their cost: each integrates all cases once per level and
+# correction, in as many steps as there are levels, radians and fastest branch time constants.
 _PASSES, _COST = 24, 400_000
-# Of the range of the levels.
+# Margin of the levels, relative to their range.
 _MARGIN = 1e-3
-# Of the stride: bounds that are met are this far away, to begin inside of them.
+# Minimum distance from bounds, relative to the stride, so that the search starts inside of them.
 _LEAST_ROOM = 1e-3
-# Vibration that is rounding.
+# Vibration that counts as rounding error.
 _NOTHING = 1e-8
-# A pass that gains a smaller share is the last one.
+# An iteration with a smaller relative gain is the last one.
 _GAIN = 0.002
-# How the stride grows and shrinks; a step that gains a smaller share of what it should is tried
-# anew so often, and then shrinks it.
+# Growth and reduction of the stride; a step with less than a fraction of the expected gain is
+# repeated a number of times, and then reduces the stride.
 _GROWN, _SHRUNK, _POOR, _CORRECTED = 2.0, 0.4, 0.3, 3
-# Of the interior point: length to begin with, how near to the least to come, the Newton decrement
-# from which on steps are whole, how fast the path goes to its end, and steps.
+# Interior point method: initial length, relative tolerance, Newton decrement below which steps are
+# full, reduction of the path parameter, and maximum number of steps.
 _BEGIN, _NEAR, _STEEP, _CLOSER, _NEWTON_PASSES = 1.5, 1e-3, 0.3, 0.05, 60
-# Lengths of the push that settles a lagging field, in time constants, and how well it does.
+# Durations of the push that settles a lagging field, in time constants, and its tolerance.
 _PUSHES = (0.7, 1.0, 1.5, 2.2, 3.2, 4.6, 7.0)
 _SETTLED, _SECANTS = 1e-12, 8
-# Passes in which the last levels meet what branches hold at arrival, and how nearly.
+# Iterations that match the last levels to the overstress at arrival, and their tolerance.
 _CARRIED, _BALANCED = 6, 1e-8
-# Shorter than this share of the chain there is no use in it.
+# Minimum duration of the levels before the push, as a fraction of the chain.
 _SHORTEST = 0.4
-# As a share of the move: from nearer to rest it is planned as from rest, and kept.
+# Relative to the move: a start nearer to rest is planned as rest, so that the result is cached.
 _AT_REST = 1e-5
 _KEPT = 256
 
 
 def minimax(request: Request) -> Move:
     """
-    Command a move that leaves the least vibration at the worst, within ``request.errors``.
+    Command a move with minimum worst-case vibration for errors within ``request.errors``.
 
-    It takes as long as the chain of ``request.order`` two-step commands, and its levels are within
-    those of the chain and the loads that hold start and target. At arrival some vibration is left
-    even if the model is exact, about as much as at the worst. Where no such command is better than
-    the chain, it is what `robust` answers.
+    The move takes as long as the chain of ``request.order`` two-step commands. Its levels are
+    between those of the chain and the loads that hold start and target. Even with an exact model,
+    some vibration remains at arrival, about as much as in the worst case. If no such command is
+    better than the chain, the result is that of `robust`.
     """
     as_errors(request.errors)
     state, packed = request.state, request.material.packed
@@ -86,7 +86,7 @@ def minimax(request: Request) -> Move:
     away = abs(state.rate) / frequency + (
         abs(request.field - held) + abs(request.load - held)) / stiffness
     if away < _AT_REST * span:
-        # So that the same move is found again: NaN for the load that holds it would be none.
+        # Makes equal moves compare equal: NaN for the holding load would not.
         start = round(state.stretch, 9)
         return _kept(replace(
             request, state=State(start, load=float(law.elastic_force(start, packed)))))
@@ -100,19 +100,19 @@ def _kept(request: Request) -> Move:
 
 @dataclass(frozen=True)
 class _Case:
-    """An actuator that the command may meet, and where it starts, in its own units."""
+    """An actuator in the uncertainty set, and its initial state, in its own units."""
 
     packed: Array
     stiffer: float
     faster: float
     stretch: float
     rate: float
-    branches: Array  #: (n, 6), with what they follow at the start
+    branches: Array  #: (n, 6), with their initial states
     rest: float
-    force: float  #: that holds it
+    force: float  #: that holds the rest
     stiffness: float
-    mode: Array  #: (2, 2 + n), the vibration of a state about rest
-    tail: Array  #: (2, n), of levels that follow forces of the model's branches
+    mode: Array  #: (2, 2 + n), maps a state about rest to vibration
+    tail: Array  #: (2, n), vibration due to the tail of levels for the branches of the model
 
 
 def _cases(request: Request, holding: float) -> list[_Case]:
@@ -132,13 +132,13 @@ def _cases(request: Request, holding: float) -> list[_Case]:
 
 
 def _case(request: Request, holding: float, errors: Errors) -> _Case | None:
-    """Return an actuator in error, None if it does not oscillate about where it would rest."""
+    """Return an actuator with errors, None if it does not oscillate about its equilibrium."""
     state, nominal = request.state, request.material.packed
     stiffer, faster = errors.stiffer, errors.faster
     material = errors.actual(request.material)
     packed = material.packed
     rest = law.equilibrium_stretch(holding / stiffer, packed)
-    # What the field in force holds is off by as much as its stretch.
+    # The equilibrium under the initial field has an error, by which the stretch is shifted.
     shift = law.equilibrium_stretch(request.field / stiffer, packed) - law.equilibrium_stretch(
         request.field, nominal)
     stretch = state.stretch + shift
@@ -159,7 +159,7 @@ def _case(request: Request, holding: float, errors: Errors) -> _Case | None:
 def left(
         request: Request, cases: Sequence[_Case], levels: Sequence[Level],
         arrival: float) -> Array:
-    """Return the vibration that is left of a command, (n, 2); infinite if it gets lost."""
+    """Return the vibration after a command, (n, 2); infinite if the integration fails."""
     delivery = request.delivery
     rows, _ = ramps(levels, request.load, arrival, delivery.slew)
     faster, stiffer = np.array([(x.faster, x.stiffer) for x in cases]).T[:, :, np.newaxis]
@@ -178,7 +178,7 @@ def left(
             continue
         followed = out[3:, 0]
         if len(ratios) and x is cases[0]:
-            # What the levels afterwards follow is that of the model, which is the first.
+            # The tail of levels follows the branches of the nominal case, which is the first.
             held = ratios * (x.force - followed)
         row[:] = x.mode[:, 0] * (out[0, 0] - x.rest) + x.mode[:, 1] * out[1, 0]
         if len(ratios):
@@ -187,7 +187,7 @@ def left(
 
 
 def largest(vibration: Array) -> float:
-    """Return the length of the longest vector of (n, 2), as peak to peak in shares of a move."""
+    """Return the length of the longest vector of (n, 2): peak to peak, relative to the move."""
     return math.sqrt((vibration * vibration).sum(axis=1).max())
 
 
@@ -214,17 +214,17 @@ def _designed(request: Request) -> Move:
 
 @dataclass(frozen=True)
 class _Frame:
-    """Times of levels and of their end, what they may be, and the last levels."""
+    """Times of the levels and their end, bounds, and the last levels."""
 
-    times: list[float]  #: the last is that of the push that settles a lagging field, if it does
+    times: list[float]  #: the last is the time of the push that settles a lagging field, if any
     last: float  #: time of the level that holds the target
     low: Array
     high: Array
-    room: Array  #: from a level to the next one, as far as ramps reach
+    room: Array  #: maximum change from each level to the next, by ramps
 
 
 def _frame(request: Request, chain: Move, length: float) -> _Frame | None:
-    """Return the frame of a command as long as the chain, with a push of so many lags, or None."""
+    """Return the frame of a command as long as the chain, with a push of given lags, or None."""
     delivery, limits, holding = request.delivery, request.limits, chain.levels[-1].load
     bounds = [request.field, *(x.load for x in chain.levels)]
     low, high = max(min(bounds), limits.minimum), min(max(bounds), limits.maximum)
@@ -238,7 +238,7 @@ def _frame(request: Request, chain: Move, length: float) -> _Frame | None:
         end -= max(length * delivery.lag + delivery.ramp(0.5 * (high - low)), grid)
         if grid > 0.0:
             end = math.floor(end / grid + 1e-9) * grid
-        # However far the field still is, the push that settles it keeps the limits.
+        # The push that settles the field keeps the limits for any field in the bounds.
         share = 1.0 / math.expm1(length)
         if not (limits.minimum <= holding - share * (high - holding)
                 and holding + share * (holding - low) <= limits.maximum):
@@ -250,13 +250,13 @@ def _frame(request: Request, chain: Move, length: float) -> _Frame | None:
         times, last = [delivery.rounded(x) for x in times], delivery.rounded(last)
     if end < _SHORTEST * chain.duration or len(times) < 3:
         return None
-    # A level in between must not look like one that holds start or target.
+    # Intermediate levels must differ from those that hold start or target.
     margin = _MARGIN * (high - low)
     least, most = np.full(len(times) - 1, low + margin), np.full(len(times) - 1, high - margin)
-    # Less than ramps reach by what levels are changed to differentiate by them.
+    # Leave room for the increments of the differentiation.
     room = delivery.slew * np.diff(times) - 4.0 * _CHANGE * (high - low)
     if delivery.slew < math.inf:
-        # So that the last ramp ends in time.
+        # Ensures that the last ramp ends in time.
         reach = delivery.slew * (chain.duration - times[-1]) + np.append(
             np.cumsum(room[:0:-1])[::-1], 0.0)
         least, most = np.maximum(least, holding - reach), np.minimum(most, holding + reach)
@@ -268,7 +268,7 @@ def _frame(request: Request, chain: Move, length: float) -> _Frame | None:
 def _search(
         request: Request, cases: Sequence[_Case], chain: Move,
         frame: _Frame) -> tuple[tuple[Level, ...], float]:
-    """Return levels, and the largest vibration that they leave in any case."""
+    """Return levels, and the largest vibration over all cases."""
     low, high = frame.low, frame.high
     span = float(np.max(high - low))
 
@@ -318,7 +318,7 @@ def _search(
             gain = before - largest(new)
             if gain > _POOR * expected or not largest(new) < math.inf:
                 break
-            # What is curved shows there: the same from what was found.
+            # Correct for the nonlinearity found there: repeat the step from its result.
             step = least_largest(new - slopes @ (there - loads), slopes, rows, room)
         renew = gain > 0.0
         if renew:
@@ -328,7 +328,7 @@ def _search(
 
 
 def _reached(request: Request, frame: _Frame, loads: Array) -> Array:
-    """Return the loads inside the bounds that ramps reach."""
+    """Return the loads within the bounds that ramps can reach."""
     loads = np.clip(loads, frame.low, frame.high)
     if math.isinf(request.delivery.slew):
         return loads
@@ -343,16 +343,16 @@ def _command(
         request: Request, chain: Move, frame: _Frame, loads: Array,
         like: Sequence[Level] = ()) -> tuple[Level, ...]:
     """
-    Return levels, the push that settles a lagging field, if one does, and the last level.
+    Return levels, the push that settles a lagging field (if there is one), and the last level.
 
-    Branches hold at arrival about what they do after the levels ``like``, by default the chain's.
+    The overstress at arrival is first estimated from the levels ``like``, by default the chain's.
     """
     levels = [Level(*x) for x in zip(frame.times, loads.tolist(), strict=False)]
     holding = chain.levels[-1].load
     if not request.material.creep or (
             request.delivery.lag == 0.0 and frame.last == chain.duration):
         return _settled(request, chain, frame, levels, holding, holding)
-    # Field and amplifier meet what the branches hold, which hardly depends on how they do.
+    # Match field and amplifier to the overstress, which hardly depends on how they reach it.
     wanted, last = _balance(request, chain, like or chain.levels)
     for _ in range(_CARRIED):
         found = _settled(request, chain, frame, levels, wanted, last)
@@ -366,7 +366,7 @@ def _command(
 
 
 def _balance(request: Request, chain: Move, levels: Sequence[Level]) -> tuple[float, float]:
-    """Return what field and amplifier are at arrival, from when on they follow the branches."""
+    """Return field and amplifier output at arrival, from which they follow the branches."""
     material = request.material
     followed = arrival(request, replace(chain, levels=tuple(levels))).followed
     holding = request.holding_load()
@@ -378,7 +378,7 @@ def _balance(request: Request, chain: Move, levels: Sequence[Level]) -> tuple[fl
 def _settled(
         request: Request, chain: Move, frame: _Frame, levels: Sequence[Level], wanted: float,
         load: float) -> tuple[Level, ...]:
-    """Return levels, the push after which the field is as wanted, and the last level."""
+    """Return levels, the push after which the field has its final value, and the last level."""
     delivery = request.delivery
     last = Level(frame.last, load)
     if delivery.lag == 0.0:
@@ -406,7 +406,7 @@ def _settled(
 
 
 def _starts(request: Request, chain: Move, frame: _Frame) -> list[Array]:
-    """Return the mean levels of a chain between times, and what its ramps reach at their ends."""
+    """Return the mean levels of a chain between times, and the loads that its ramps reach."""
     times, ends = frame.times, [*(x.time for x in chain.levels[1:]), math.inf]
     found: list[Array] = [np.array([
         sum(level.load * max(0.0, min(end, until) - max(level.time, begin))
@@ -422,13 +422,14 @@ def _starts(request: Request, chain: Move, frame: _Frame) -> list[Array]:
 
 def least_largest(now: Array, slopes: Array, rows: Array, room: Array) -> Array:
     """
-    Return what makes the longest of some vectors shortest, to a thousandth or so of the least.
+    Return the step that minimises the longest of some vectors, to about a thousandth.
 
     Vectors are ``now`` (n, 2) at 0, with derivatives ``slopes`` (n, 2, m). The result (m,) keeps
-    ``rows @ x`` (k, m) below ``room`` (k,), of which all are above 0.
+    ``rows @ x`` (k, m) below ``room`` (k,), whose elements are above 0.
     """
-    # An interior point: Newton on length/path - sum ln(length^2 - |vector|^2) - sum ln(room left),
-    # shortened as self-concordance asks (S. Boyd, L. Vandenberghe, Convex Optimization, 2004).
+    # Interior point method: Newton's method on
+    # length/path - sum ln(length^2 - |vector|^2) - sum ln(room left), with steps damped for
+    # self-concordance (S. Boyd, L. Vandenberghe, Convex Optimization, 2004).
     count = slopes.shape[2]
     size = largest(now)
     x: Array = np.zeros(count)
@@ -452,7 +453,7 @@ def least_largest(now: Array, slopes: Array, rows: Array, room: Array) -> Array:
         try:
             step = -np.linalg.solve(hessian, gradient)
         except np.linalg.LinAlgError:
-            # Some direction changes nothing, as where fewer cases differ than there are levels.
+            # Some direction has no effect, as when fewer cases differ than there are levels.
             step = -np.linalg.lstsq(hessian, gradient, rcond=None)[0]
         steep = math.sqrt(max(-float(gradient @ step), 0.0))
         share = 1.0 if steep < _STEEP else 1.0 / (1.0 + steep)

@@ -1,4 +1,4 @@
-"""The fastest command within the load limits that is found."""
+"""The fastest command found within the load limits."""
 
 from dataclasses import replace
 import math
@@ -10,7 +10,7 @@ from hmsa_ros.planning.shapers.push_brake import push_brake
 from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.shapers.two_step import two_step
 
-# Of the search for full push and full brake.
+# Work limit of the search for full push and full brake.
 _PUSHING = 400_000
 
 
@@ -18,13 +18,14 @@ def minimum_time(request: Request) -> Move:
     """
     Push with the load limit on one side, brake with the other, then hold.
 
-    Through ramps that do not reach the limits, turn before. On a grid, through ramps and with a
-    field that lags, the two-step command can be sooner at rest, or the only one within the limits:
-    it is used then, and the move's reason says so. Where none is found: `RefusedError`.
+    With ramps that do not reach the limits, reverse earlier. On a sampling grid, with ramps or
+    with a field that lags, the two-step command can be at rest earlier, or be the only one within
+    the limits; it is then used, and the move's reason says so. Raise `RefusedError` if none is
+    found.
     """
     found: list[Move] = []
     refusals: list[RefusedError] = []
-    # What the two-step command would find alone, it finds here.
+    # Separate work limits ensure that two_step finds here all that it finds alone.
     pushing = request.work.more(_PUSHING)
     shapers = [(push_brake, pushing), (two_step, request.work)]
     if request.delivery.period == 0.0 and request.delivery.slew < math.inf:

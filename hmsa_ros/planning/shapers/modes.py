@@ -1,4 +1,4 @@
-"""The motion linearised about rest: its oscillating mode, with branches that creep."""
+"""Linearised motion about rest: the oscillating mode, with viscoelastic branches."""
 
 import math
 
@@ -11,7 +11,7 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import NondimensionalParameters
 from hmsa_ros.model.simulation import paces
 
-# Of a branch, in units of the natural frequency.
+# Minimum rate of a branch, relative to the natural frequency.
 _SLOWEST = 1e-6
 
 
@@ -19,14 +19,14 @@ def oscillation(
         material: NondimensionalParameters, stretch: float,
         above: ArrayLike) -> tuple[complex, Array, Array] | None:
     """
-    Return the mode that oscillates about rest at a stretch; None if none does.
+    Return the oscillating mode about rest at a stretch; None if the motion does not oscillate.
 
-    Branches flow in proportion, as fast as they do under what they hold over their ratio.
+    Branches are linearised at their present overstress.
 
-    First its root, -decay + i frequency. Then the rows (2, 2 + n) that make a vector of a state:
-    deviation of the stretch, rate, and what n branches follow, less the force at rest, over the
-    stiffness. The vector is as long as the amplitude of the stretch. Last the vector (2, n) of a
-    state that rests under 1 of load that decays as each branch does.
+    The first item is the root, -decay + i frequency. The second are the rows (2, 2 + n) that map a
+    state to a vector: deviation of the stretch, rate, and the n branch states less the force at
+    rest, over the stiffness. The length of the vector is the amplitude of the stretch. The third
+    is the vector (2, n) of a state at rest under a unit load that decays as each branch does.
     """
     packed, branches = material.packed, material.branches
     mass = law.mass(stretch, packed)
@@ -52,7 +52,7 @@ def oscillation(
     root = complex(roots[place])
     if not root.imag > 0.0:
         return None
-    # The share of a state in the mode whose stretch is 1.
+    # Projection of a state onto the mode, normalised to stretch 1.
     share = 2.0 * np.linalg.inv(modes)[place] * modes[0, place]
     rows = np.array([share.real, -share.imag])
     pushed = np.array([0.0, 1.0 / mass, *np.zeros(len(branches))])

@@ -1,24 +1,24 @@
-"""How fast the shaper smooth moves where nothing limits it."""
+"""Pace of the shaper smooth without other limits."""
 
 from dataclasses import dataclass
 import math
 
 from hmsa_ros.errors import BadInputError
 
-#: Natural periods that a move may take.
+#: Range of the minimum duration of a move, in natural periods.
 LEAST_PERIODS, MOST_PERIODS = 0.2, 50.0
 
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast the shaper smooth moves."""
+    """Minimum duration and maximum rate of the shaper smooth."""
 
-    #: Natural periods about the target that a move takes at the least, 0.2 to 50.
+    #: Minimum duration of a move, in natural periods about the target, 0.2 to 50.
     periods: float = 1.0
-    rate: float = math.inf  #: largest stretch rate, above 0; infinite for any
+    rate: float = math.inf  #: maximum stretch rate, above 0; infinite for no limit
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
+        """Check the ranges."""
         if not LEAST_PERIODS <= self.periods <= MOST_PERIODS:
             raise BadInputError(
                 f'smooth_periods is {self.periods:g}: expected {LEAST_PERIODS:g} to '
@@ -27,5 +27,5 @@ class Pace:
             raise BadInputError(f'stretch_rate_max is {self.rate:g}: expected a number above 0')
 
 
-#: A natural period, at any rate.
+#: One natural period, at any rate.
 PACE = Pace()

@@ -1,4 +1,4 @@
-"""Full push, full brake, hold: on ideal hardware the fastest command within load limits."""
+"""Full push, full brake, hold: the fastest command within load limits on ideal hardware."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -25,15 +25,15 @@ from hmsa_ros.planning.shooting import (
 )
 
 _RTOL = 1e-12
-# Room that is left below the limits, as a share, for what rounded times ask of the levels.
+# Relative margin below the limits, for levels that change when times are rounded.
 _MARGIN = 1e-4
-# Periods to add on the grid where the least number gives no solution.
+# Extra grid periods of push and brake to try if the minimum numbers give no solution.
 _MORE_PERIODS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 2), (3, 3))
-# Behind a lag: the share of a command by which longer ones are, and of the last level in lags.
+# With a lag: relative increment of the command duration, and duration of the last level in lags.
 _STRIDES, _PUSH = 12, math.log(2.0)
-# Heights to try, as shares of what the limits allow.
+# Heights to try, as fractions of those that the limits allow.
 _SHARES = (1.0, 0.5, 0.25, 0.1, 0.05)
-# Strides in which a push is followed, in radians of the vibration, and how many at the most.
+# Strides of the search along a push, in radians of the vibration, and their maximum number.
 _STRIDE, _MOST_STEPS = 0.05, 8_000
 _SHORTEST_STRIDE = 0.03
 
@@ -42,10 +42,10 @@ def push_brake(request: Request) -> Move:
     """
     Push with the load limit on one side, brake with the other, then hold.
 
-    With bounded load the fastest transfer is bang-bang with one switch, and behind a lag with two.
-    It exists from any state, moving ones and those above critical damping included, as long as the
-    limits leave room on both sides of the target's own load: `RefusedError` otherwise. Without
-    limits, a push of twice the move's change of load is used.
+    With bounded load the fastest transfer is bang-bang with one switch, and with two if the field
+    lags. It exists from any state, in motion or above critical damping, if the limits leave room
+    on both sides of the holding load; otherwise raise `RefusedError`. Without limits, the push is
+    twice the change of load of the move.
     """
     holding = request.holding_load()
     if at_rest(request):
@@ -55,7 +55,7 @@ def push_brake(request: Request) -> Move:
     if lags and request.delivery.period > 0.0:
         found = _fastest_on_grid(request, least, most)
     else:
-        # On a grid and through ramps full height may leave no time to switch.
+        # On a sampling grid or with ramps, full height may leave no time to switch.
         found = next(filter(None, (_attempt(
             request, *(holding + share * (x - holding) for x in (least, most)))
             for share in _SHARES)), None)
@@ -70,7 +70,7 @@ def push_brake(request: Request) -> Move:
 
 
 def _attempt(request: Request, low: float, high: float) -> Attempt:
-    """Push and brake with given loads; None if no command within the limits comes of it."""
+    """Push and brake with given loads; None if this yields no command within the limits."""
     push, brake = (high, low) if _upwards(request, low, high) else (low, high)
     elastic = replace(request, material=request.material.elastic)
     try:
@@ -96,15 +96,15 @@ def _attempt(request: Request, low: float, high: float) -> Attempt:
 
 def _carried(request: Request, plain: tuple[Level, ...]) -> Attempt:
     """
-    Solve for the times of push, brake and, behind a lag, push again.
+    Solve for the times of push, brake and, with a lag, second push.
 
-    What branches hold and the lag grow where they are too much at once.
+    Branches and lag are increased gradually if they are too strong to include at once.
     """
     material, delivery, creep = request.material, request.delivery, request.material.creep.held
     push, brake, holding = (x.load for x in plain)
-    # The second push ends when the field, at the brake's level before, is at the holding load.
+    # The second push ends when the field, previously at the brake level, is at the holding load.
     length = math.log1p((holding - brake) / (push - holding))
-    # How much of a branch a motion as fast as this feels.
+    # Effective fraction of each branch for a motion at this frequency.
     speeds = paces(material, request.behind(request.target)) / request.frequency
     felt = 1.0 / (1.0 + speeds ** 2)
 
@@ -144,7 +144,7 @@ def _on_grid(
 
 
 def _fastest_on_grid(request: Request, least: float, most: float) -> Attempt:
-    """Return the shortest three levels on the grid that keep the limits, if there are any."""
+    """Return the shortest three levels on the grid that keep the limits, else None."""
     period, lag, holding = request.delivery.period, request.delivery.lag, request.holding_load()
     longest = math.ceil((2.0 * math.pi / request.frequency + 3.0 * lag) / period) + 6
 
@@ -155,7 +155,7 @@ def _fastest_on_grid(request: Request, least: float, most: float) -> Attempt:
             Level(max(1, (count - last) // 2) * period, holding),
             Level((count - last) * period, holding), Level(count * period, holding)))
 
-    # On a fine grid long ones in strides, and then what the last stride has left out.
+    # On a fine grid, increase the duration in strides, then search the last stride again.
     shortest = count = 3
     while count < longest:
         found = first_kept([guess(count)], request)
@@ -166,7 +166,7 @@ def _fastest_on_grid(request: Request, least: float, most: float) -> Attempt:
 
 
 def _bounds(request: Request, holding: float) -> tuple[float, float]:
-    """Return the loads to push and brake with: the limits, or twice the move's own change."""
+    """Return the loads for push and brake: the limits, or twice the change of the move."""
     state = request.state
     change = abs(holding - law.elastic_force(state.stretch, request.material.packed))
     mass = law.mass(state.stretch, request.material.packed)
@@ -186,7 +186,7 @@ def _bounds(request: Request, holding: float) -> tuple[float, float]:
 
 
 def _turn(request: Request, state: State, load: float) -> tuple[float, float] | None:
-    """Return time and stretch at which a load turns a motion, None if it cannot be followed."""
+    """Return time and stretch of the turning point under a load, None if there is none."""
     status, time, stretch, _, _ = motion.turning_point(
         state.stretch, state.rate, math.copysign(1.0, state.rate), load, 1.0,
         request.material.packed, _RTOL)
@@ -194,7 +194,7 @@ def _turn(request: Request, state: State, load: float) -> tuple[float, float] | 
 
 
 def _upwards(request: Request, least: float, most: float) -> bool:
-    """Return whether to push up: full braking would stop short of the target, seen upwards."""
+    """Return whether to push upwards: full braking would stop below the target."""
     state = request.state
     turned = None if state.rate == 0.0 else _turn(
         request, state, least if state.rate > 0.0 else most)
@@ -202,7 +202,7 @@ def _upwards(request: Request, least: float, most: float) -> bool:
 
 
 def _durations(request: Request, push: float, brake: float) -> tuple[float, float]:
-    """Return about how long to push so that braking turns at the target, and how long to brake."""
+    """Return approximate durations of the push and of the brake that turns at the target."""
     material, target = request.material, request.target
     direction = math.copysign(1.0, push - brake)
     pushed, stride = (Level(0.0, push),), _STRIDE / (request.frequency + material.zeta)
@@ -210,11 +210,11 @@ def _durations(request: Request, push: float, brake: float) -> tuple[float, floa
     def turn(start: State, way: float, load: float) -> tuple[float, float]:
         if way * start.rate <= 0.0:
             return 0.0, start.stretch
-        # Too hard against a limiting stretch to be followed: far beyond the target.
+        # The motion runs into a limiting stretch: count it as far beyond the target.
         return _turn(request, start, load) or (
             0.0, float(material.packed[law.UPPER if way > 0.0 else law.LOWER]))
 
-    # Moving away, the push first has to bring it to a stop.
+    # If moving away, the push first has to stop the motion.
     begin, stretch = turn(request.state, -direction, push)
     here = request.state if begin == 0.0 else State(stretch, 0.0)
     pushing, before = 0.0, -math.inf
@@ -232,5 +232,5 @@ def _durations(request: Request, push: float, brake: float) -> tuple[float, floa
             Code.FLUX_LIMIT,
             f'{request.named_target} is not reached under {request.units.load_text(push)}: '
             f'expected wider {request.units.drive.name} limits')
-    # What the last stride went too far.
+    # Interpolate in the last stride.
     return begin + pushing - stride * beyond / (beyond - before), braking

@@ -1,4 +1,4 @@
-"""What a shaper gets, and the checks that all shapers share."""
+"""The input of a shaper, and checks that all shapers share."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,21 +19,21 @@ from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import Units
 from hmsa_ros.planning.shapers.pace import PACE, Pace
 
-#: How far off G, damping coefficient and J_lim are expected to be, as shares.
+#: Default relative errors of G, damping coefficient and J_lim.
 ERRORS = (0.1, 0.1, 0.1)
-#: The largest of them.
+#: Maximum relative error.
 LARGEST_ERROR = 0.9
-#: Chained two-step commands of robust at the most.
+#: Maximum order of robust, its number of chained two-step commands.
 MOST_ORDER = 16
-#: What is as good as at rest: of stretch and load, and of the rate over the frequency.
+#: Tolerance within which a state is at rest: of stretch and load, and of rate over frequency.
 AT_REST = 1e-9
 
 
 def as_errors(values: Sequence[float] | Ellipsoid) -> Uncertainty:
     """
-    Return errors of G, damping coefficient and J_lim; an ellipsoid is checked already.
+    Return errors of G, damping coefficient and J_lim; an ellipsoid has already been checked.
 
-    Others than three numbers of 0 to 0.9 are a `BadInputError`.
+    Raise `BadInputError` for values other than three numbers of 0 to 0.9.
     """
     if isinstance(values, Ellipsoid):
         return values
@@ -53,42 +53,42 @@ def as_errors(values: Sequence[float] | Ellipsoid) -> Uncertainty:
 @dataclass
 class Work:
     """
-    What a request may still cost, counted in steps of the integration, times their numbers.
+    Remaining work of a request, in integration steps times the number of variables.
 
-    Its searches share it: when nothing is left, they find nothing more. So what is found does not
-    depend on how fast or how busy a machine is.
+    Its searches share it and end when none is left. Results therefore do not depend on the speed
+    or load of the machine.
     """
 
     left: int = 700_000
-    #: Of a search for advice, which has no more than this for all that it tries.
+    #: Whether it is for a search for advice, which shares this limit among all its attempts.
     advising: bool = False
 
     def more(self, left: int) -> 'Work':
-        """Return work for one more way to the same target."""
+        """Return the work limit of another method for the same target."""
         return self if self.advising else Work(left)
 
 
 @dataclass(frozen=True)
 class Request:
-    """One move to be commanded, from a state of motion or rest to rest at a target."""
+    """One move to command, from a state in motion or at rest to rest at a target."""
 
     state: State
     target: float
     material: NondimensionalParameters
     limits: Limits = field(default_factory=Limits)
     delivery: Delivery = IDEAL
-    order: int = 2  #: chained two-step commands of robust; minimax takes as long
+    order: int = 2  #: number of chained two-step commands of robust; minimax takes as long
     units: Units = field(default_factory=Units)  #: for the messages
-    #: Of G, damping coefficient and J_lim, as `as_errors` returns them, for minimax.
+    #: Relative errors of G, damping coefficient and J_lim from `as_errors`, for minimax.
     errors: Uncertainty = ERRORS
-    pace: Pace = PACE  #: of smooth; the rate per unit of nondimensional time
+    pace: Pace = PACE  #: of smooth; dimensionless rate
     work: Work = field(default_factory=Work, compare=False)
 
     @classmethod
     def of(
             cls, material: NondimensionalParameters, start: State | None = None,
             **more: Any) -> 'Request':
-        """Return a request to stay, from rest without a field unless a start is given."""
+        """Return a request to stay in a state, by default at rest without a field."""
         state = start or State(material.rest)
         return cls(state, state.stretch, material, **more)
 
@@ -110,14 +110,14 @@ class Request:
 
     @property
     def field(self) -> float:
-        """Load in force before the move."""
+        """Load before the move."""
         if math.isfinite(self.state.load):
             return self.state.load
         return float(law.elastic_force(self.state.stretch, self.material.packed))
 
     @property
     def start(self) -> State:
-        """The state with the load in force, where that is the one that holds it."""
+        """The state, with the holding load if the load is not given."""
         return replace(self.state, load=self.field)
 
     @property
@@ -127,12 +127,12 @@ class Request:
 
     @property
     def still(self) -> bool:
-        """Whether the actuator does not move, though nothing may hold it there."""
+        """Whether the actuator does not move, even if it is not in equilibrium."""
         return abs(self.state.rate) <= AT_REST * self.frequency
 
     @property
     def unknowns(self) -> int:
-        """How many numbers of a command are free: for stretch, rate and a field that lags."""
+        """Number of free values of a command: for stretch, rate and a field that lags."""
         return 2 + (self.delivery.lag > 0.0)
 
     def keeps(self, levels: Sequence[Level]) -> bool:
@@ -150,26 +150,26 @@ class Request:
         return load
 
     def behind(self, stretch: float) -> Array:
-        """Return how far what branches follow at the start is from the force at a stretch."""
+        """Return the force at a stretch minus the initial branch states."""
         force = float(law.elastic_force(stretch, self.material.packed))
         return np.array([force - x for x in followed_by(self.state, self.material)])
 
     def balance(self, followed: Sequence[float]) -> float:
-        """Return the load that keeps the target at rest where branches have followed forces."""
+        """Return the load that keeps the target at rest for given branch states."""
         load = float(law.elastic_force(self.target, self.material.packed))
         return load + float(sum(
             ratio * (load - force) for (ratio, *_), force in zip(
                 self.material.branches.tolist(), followed, strict=True)))
 
     def check(self, levels: Sequence[Level]) -> None:
-        """Refuse levels outside the load limits with `Code.FLUX_LIMIT` and the value needed."""
+        """Raise `RefusedError` with `Code.FLUX_LIMIT` for levels outside the load limits."""
         for level in levels:
             self.limits.check(level.load, self.target, self.units)
 
     def plain(self, code: Code, reason: str) -> Move:
-        """Return the unshaped step instead, which approaches the target, with code and reason."""
+        """Return the unshaped step, which approaches the target, with code and reason."""
         return Move(code, (Level(0.0, self.holding_load()),), math.inf, reason)
 
 
-#: Answers a request with a move, or refuses with a reason.
+#: Returns a move for a request, or raises `RefusedError` with a reason.
 Shaper = Callable[[Request], Move]

@@ -1,11 +1,11 @@
 """
 Chained two-step commands, the nonlinear counterpart of ZVD and its higher orders.
 
-Two two-step commands without a hold between them, through the stretch that beta_p itself would
-hold, leave no vibration either, and forgive errors of the model as a ZVD shaper does: the
-vibration that the first one leaves in error meets the second half a period later. A chain of
-order n goes through the stretches that the levels of order n - 1 would hold, which on a linear
-oscillator gives the levels of n convolved ZV shapers.
+Two two-step commands without a hold between them, through the equilibrium stretch of beta_p, leave
+no vibration either, and tolerate model errors as a ZVD shaper does: the vibration that the first
+command leaves meets that of the second half a period later. A chain of order n goes through the
+equilibrium stretches of the levels of order n - 1, which for a linear oscillator gives the levels
+of n convolved ZV shapers.
 """
 
 from dataclasses import replace
@@ -20,7 +20,7 @@ from hmsa_ros.planning.shapers.creeping import arrival
 from hmsa_ros.planning.shapers.request import MOST_ORDER, Request
 from hmsa_ros.planning.shapers.two_step import two_step
 
-# Of times, as a share.
+# Relative rounding error of times.
 _ROUNDING = 1e-12
 
 
@@ -28,16 +28,16 @@ def robust(request: Request) -> Move:
     """
     Command a move through ``request.order`` chained two-step commands.
 
-    It has ``order + 1`` levels on ideal hardware, and takes about ``order`` times as long as the
-    two-step command, which is that of order 1. Where there is no chain, it is what `two_step`
-    answers. An order that is not 1 to `MOST_ORDER` is a `BadInputError`.
+    The move has ``order + 1`` levels on ideal hardware, and takes about ``order`` times as long as
+    the two-step command, which is the chain of order 1. If there is no chain, the result is that
+    of `two_step`. Raise `BadInputError` if the order is not 1 to `MOST_ORDER`.
     """
     if not 1 <= request.order <= MOST_ORDER:
         raise BadInputError(f'order is {request.order}: expected 1 to {MOST_ORDER}')
     move = two_step(request)
     if request.order == 1 or move.code is not Code.TWO_STEP:
         return move
-    # Waypoints belong to the actuator, not to the hardware: they come from the ideal command.
+    # Waypoints are independent of the hardware: they come from the ideal command.
     ideal = replace(request, delivery=IDEAL, material=request.material.elastic)
     chain = two_step(ideal)
     for _ in range(request.order - 1):
@@ -65,12 +65,12 @@ def _chain(request: Request, waypoints: list[float]) -> Move:
             return move
         last = move.levels[-1]
         if levels and begin > levels[-1].time and request.delivery.period > 0.0:
-            # At rest at the end of a ramp: the next command waits for the grid.
+            # At rest at the end of a ramp: the next command starts on the sampling grid.
             begin = math.ceil(begin / request.delivery.period - 1e-9) * request.delivery.period
         levels += [Level(begin + x.time, x.load) for x in move.levels]
         begin += move.duration
         if levels[-1].time >= (1.0 - _ROUNDING) * begin:
-            # No ramp to finish: the next command takes over at once.
+            # There is no ramp to complete: the next command starts at once.
             levels.pop()
         if request.material.creep:
             state = arrival(replace(request, state=state, target=waypoint), move)

@@ -1,11 +1,11 @@
 """
-Moves without a step of the level: the stretch follows a smooth path, the level follows from it.
+Moves without a step of the level: the level is computed from a smooth path of the stretch.
 
-The stretch is a flat output (`hmsa_ros.planning.flat`): a path of it gives the load, and the
-amplifier's level by one derivative more where the field lags. The path is the motion as it would
-go on under the level in force, faded into the target by a polynomial with three derivatives that
-are zero at either end. So it begins with whatever motion, field and level there are, and ends at
-rest. What commands carry of the level, a staircase or ramps, is corrected to end there exactly.
+The stretch is a flat output (`hmsa_ros.planning.flat`): a path determines the load, and one more
+derivative determines the amplifier level if the field lags. The path is the motion as it would
+continue under the present level, faded into the target by a polynomial with three zero derivatives
+at either end. It therefore starts with the present motion, field and level, and ends at rest. The
+steps or ramps that commands use for the level are corrected to end exactly at rest.
 """
 
 from dataclasses import replace
@@ -27,17 +27,17 @@ from hmsa_ros.planning.shapers.pace import MOST_PERIODS
 from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.shooting import Attempt, kept, solve, Template
 
-# Points of a path, levels of a natural period, and how many there are at least and at most.
+# Points of a path, levels per natural period, and minimum and maximum number of levels.
 _POINTS = 129
 _OF_EACH, _FEWEST, _MOST = 32, 16, 300
 _SHARES: Array = np.linspace(0.0, 1.0, _POINTS).astype(np.float64)
-# How far a path has faded from the motion as it would go on into the target, with derivatives.
+# The fading polynomial, from present motion (0) to target (1), with derivatives.
 _FADED, _FADING, _CURVED = fade(_SHARES)
-# Growth of the duration where limits are not kept, and how often the last growth is halved.
+# Factor on the duration if limits are not kept, and number of bisections of the last increase.
 _LONGER, _HALVINGS = 1.25, 5
-# How much longer a command may get that cannot be solved for, and how often.
+# Factor on the duration if the command cannot be solved for, and maximum number of attempts.
 _RETRY, _RETRIES = 1.08, 5
-# Share of the slew limit that the path may use, and of the limits that corrections may need.
+# Fraction of the slew limit that the path may use, and margin for corrections, relative.
 _SLEW_SHARE, _SLACK = 0.95, 0.01
 
 
@@ -45,14 +45,14 @@ def smooth(request: Request) -> Move:
     """
     Command a move along a smooth path of the stretch, in the shortest time that limits allow.
 
-    ``request.pace`` has its least duration and largest rate. The move ends at rest exactly. Where
-    no path keeps the limits: `RefusedError`.
+    ``request.pace`` gives the minimum duration and the maximum rate. The move ends exactly at
+    rest. Raise `RefusedError` if no path keeps the limits.
     """
     holding = request.holding_load()
     if at_rest(request):
         return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
     packed = request.material.packed
-    # Of the slower end: near a limit of the law, and where the force hardly rises, they differ.
+    # Use the slower end: near a limit of the model, and where the force is flat, they differ.
     period = 2.0 * math.pi / min(
         law.natural_frequency(x, packed) for x in (request.target, request.state.stretch))
     path = _shortest(request, holding, period)
@@ -74,7 +74,7 @@ def smooth(request: Request) -> Move:
 
 
 class _Path(NamedTuple):
-    """Levels of the amplifier that lead along a path, evenly spaced over its duration."""
+    """Amplifier levels along a path, evenly spaced over its duration."""
 
     duration: float
     loads: Array
@@ -82,7 +82,7 @@ class _Path(NamedTuple):
 
 
 def _shortest(request: Request, holding: float, period: float) -> _Path | None:
-    """Return the shortest path within the limits, None if there is none."""
+    """Return the shortest path within the limits, else None."""
     shortest = short = duration = request.pace.periods * period
     longest = max(MOST_PERIODS * period, 2.0 * shortest)
     path = _path(request, holding, duration)
@@ -100,7 +100,7 @@ def _shortest(request: Request, holding: float, period: float) -> _Path | None:
 
 
 def _path(request: Request, holding: float, duration: float) -> _Path | None:
-    """Return the levels of a path of some duration, None if it does not keep the limits."""
+    """Return the levels of a path of a given duration, None if it does not keep the limits."""
     material, delivery, limits = request.material, request.delivery, request.limits
     packed = material.packed
     times: Array = duration * _SHARES
@@ -120,7 +120,7 @@ def _path(request: Request, holding: float, duration: float) -> _Path | None:
     if material.creep:
         loads = loads + held_along(times, stretch, followed, material)[0]
     if delivery.lag > 0.0:
-        # The field as it would go on needs no change of the level.
+        # The field of the unforced motion needs no change of the level.
         more: Array = loads - field
         loads = request.load + more + delivery.lag * np.gradient(more, times[1], edge_order=2)
     slopes = np.gradient(loads, times[1], edge_order=2)
@@ -134,9 +134,9 @@ def _path(request: Request, holding: float, duration: float) -> _Path | None:
 def _free(
         request: Request, times: Array) -> tuple[Array, Array, Array, Array, tuple[float, ...]]:
     """
-    Return the motion under the level in force.
+    Return the motion under the present level.
 
-    Stretch, rate, acceleration, field, and what branches follow at first.
+    The result contains stretch, rate, acceleration, field and the initial branch states.
     """
     material, state = request.material, request.state
     load, field = request.load, request.field
@@ -156,7 +156,7 @@ def _free(
 
 
 def _delivered(request: Request, path: _Path, holding: float, period: float) -> Attempt:
-    """Return a path's levels as commands carry them, corrected to end at rest."""
+    """Return the levels of a path as commands, corrected to end at rest."""
     delivery, limits = request.delivery, request.limits
     duration, along, slopes = path
     count = min(max(math.ceil(_OF_EACH * duration / period), _FEWEST), _MOST)
@@ -167,13 +167,13 @@ def _delivered(request: Request, path: _Path, holding: float, period: float) -> 
             math.ceil(duration / (_MOST * delivery.period) - 1e-9))
         count = max(math.ceil(duration / each - 1e-9), 3 + (delivery.lag > 0.0))
     times = each * np.arange(count + 1)
-    # Ramps to a level make it late: the more, the longer they take.
+    # Ramps delay a level in proportion to their duration.
     middle = (np.arange(count) + 0.5) / count
     steep = np.interp(middle, _SHARES, np.abs(slopes)) / delivery.slew
     loads = np.interp(middle + 0.5 * np.minimum(steep, 1.0) / count, _SHARES, along)
     inside: Array = ((limits.minimum < loads) & (loads < limits.maximum)).astype(np.float64)
     loads = np.clip(loads, limits.minimum, limits.maximum)
-    # Corrections that act on stretch and rate at the end, and on the field.
+    # Corrections that change stretch and rate at the end, and the field.
     left = duration * (1.0 - middle)
     angle = 2.0 * math.pi / period * left
     window = inside * 4.0 * middle * (1.0 - middle)

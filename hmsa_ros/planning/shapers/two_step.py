@@ -26,42 +26,42 @@ from hmsa_ros.planning.shooting import (
 )
 from hmsa_ros.planning.two_step import CODES, HOLD_TOLERANCE, plan_two_step, RTOL
 
-# Of the push that settles a lagging field, in time constants: it passes the holding level by as
-# much as the level before falls short of it; others on a grid are longer.
+# Duration of the push that settles a lagging field, in time constants: it exceeds the holding
+# level by as much as the previous level falls short of it; others on a grid are longer.
 _PUSH = math.log(2.0)
-# Periods of the grid beyond the least number; behind a lag with factors on the push, too.
+# Extra grid periods; with a lag, also factors on the push.
 _MORE = (0, 1, 2, 3)
 _BEHIND_LAG = (*_MORE, 4, 6, 9), (1, 2, 3)
-# Where a search begins: shares of the way between the least and the largest level, and the longest
-# hold in eighths of a period.
+# Initial values of a search: fractions of the range of levels, and the longest hold in eighths of
+# a period.
 _HEIGHTS = (0.5, 0.3, 0.7, 0.1, 0.9)
 _LONGEST_HOLD = 18
-# Ramps slower than this are refused without a search, which would take seconds.
+# Slower ramps are refused without a search, which would take seconds.
 _MOST_HALF_PERIODS = 80
 _SHORTEST_STRIDE = 0.05
-# Half periods and lags from which on levels of free heights may be sooner there.
+# Duration, in half periods and lags, above which levels of free heights may be faster.
 _SLOW = 3.0
-# Codes of plans in whose place something else is done at once.
+# Codes of plans that are replaced at once.
 _WITHOUT = (Code.HOLD, Code.TOO_DAMPED, Code.INDISTINGUISHABLE)
 
 
 def two_step(request: Request) -> Move:
     """
-    Apply beta_p for tau_p, then beta_1 (Eq. 13): at rest at the target, nothing left to ring.
+    Apply beta_p for tau_p, then beta_1 (Eq. 13): rest at the target without residual vibration.
 
-    Where branches hold, wherever they arrive: what they hold then is followed afterwards. Where
-    the field lags, a short push more settles it. On a grid the heights are solved for, of one
-    level more, and through ramps beta_p and its duration. Where no single level leads to rest
-    within the limits, levels of free heights do. Where the response is too damped to cross
-    the target there is no such command; the unshaped step, which does not overshoot there, takes
-    its place. All say so in the move's reason.
+    With viscoelastic branches, a tail of levels then follows their overstress at arrival. If the
+    field lags, a short push settles it. On a sampling grid the heights of one more level are
+    solved for, and with ramps beta_p and its duration. If no single level within the limits leads
+    to rest, levels of free heights do. If the response is overdamped and does not cross the
+    target, no such command exists; the unshaped step, which does not overshoot then, replaces it.
+    The move's reason reports each of these cases.
     """
     holding = request.holding_load()
     delivery, creeps = request.delivery, bool(len(request.material.branches))
     lags, at_once = delivery.lag > 0.0, delivery.period == 0.0 and delivery.slew == math.inf
     if lags and at_rest(request):
         return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
-    # On a grid and through ramps commands begin without the lag, whose push is a level more.
+    # On a sampling grid or with ramps, start without the lag, whose push needs another level.
     code, levels = _late(request, delivery.lag if at_once else 0.0) \
         if lags or creeps else _plain(request)
     if code in _WITHOUT and not (lags and code is Code.HOLD):
@@ -86,7 +86,7 @@ def two_step(request: Request) -> Move:
 
 
 def _sooner(request: Request, duration: float) -> Move | None:
-    """Return levels of free heights that are at rest before a slow command, None if none are."""
+    """Return levels of free heights that are at rest before a slow command, else None."""
     if duration <= _SLOW * request.delivery.lag or duration <= _SLOW * (
             math.pi / request.frequency + request.delivery.lag):
         return None
@@ -96,7 +96,7 @@ def _sooner(request: Request, duration: float) -> Move | None:
 
 
 def _plain(request: Request) -> tuple[Code, tuple[Level, ...]]:
-    """Return code and levels of ideal hardware without branches."""
+    """Return code and levels for ideal hardware without branches."""
     state, limits = request.state, request.limits
     plan = plan_two_step(
         state.stretch, request.target, request.material, rate=state.rate,
@@ -105,7 +105,7 @@ def _plain(request: Request) -> tuple[Code, tuple[Level, ...]]:
 
 
 def _late(request: Request, lag: float) -> tuple[Code, tuple[Level, ...]]:
-    """Return code and levels with branches or behind a lag, at any time and in steps."""
+    """Return code and levels with branches or a lag, at any time and in steps."""
     state, material, limits = request.state, request.material, request.limits
     status, beta_p, tau_p, beta_1, push, until = motion.two_step_late(
         state.stretch, state.rate, request.target, limits.minimum, limits.maximum, RTOL,
@@ -113,7 +113,7 @@ def _late(request: Request, lag: float) -> tuple[Code, tuple[Level, ...]]:
         request.load, lag)
     code = CODES[status]
     if code is not Code.TWO_STEP:
-        # What there is to say of it is that of the elastic motion.
+        # The reason is that of the elastic motion.
         elastic = _plain(replace(request, material=material.elastic))[0]
         return elastic if elastic in _WITHOUT else Code.NO_TWO_STEP, ()
     levels = Level(0.0, beta_p), Level(tau_p, beta_1)
@@ -122,7 +122,7 @@ def _late(request: Request, lag: float) -> tuple[Code, tuple[Level, ...]]:
 
 
 def _without(request: Request, code: Code, holding: float) -> Move:
-    """Return what takes the place of two levels where there are none."""
+    """Return the move that replaces two levels where they do not exist."""
     if code is Code.HOLD:
         return Move(code, (Level(0.0, holding),), 0.0)
     return request.plain(code, f'zeta {request.material.zeta:g} ' + (
@@ -134,7 +134,7 @@ def _without(request: Request, code: Code, holding: float) -> Move:
 
 
 def _delivered(request: Request, levels: tuple[Level, ...]) -> Attempt:
-    """Return the command that a grid or ramps make of one at any time and in steps, if any."""
+    """Return the command on a grid or with ramps for one at any time and in steps, else None."""
     if request.delivery.period > 0.0:
         return first_kept(_on_grid(request, *levels), request)
     return _ramped(request, levels)
@@ -144,8 +144,8 @@ def _on_grid(request: Request, first: Level, last: Level) -> Iterator[Template]:
     """
     Yield guesses on the grid: one level, another for a period, and one that settles the field.
 
-    The share of that period that the ideal command spends at the last level gives its height. The
-    push is long enough not to ask for much more than the limits.
+    The fraction of that period that the ideal command spends at the last level gives its height.
+    The push is long enough not to exceed the limits by much.
     """
     delivery = request.delivery
     period, lag = delivery.period, delivery.lag
@@ -163,12 +163,12 @@ def _on_grid(request: Request, first: Level, last: Level) -> Iterator[Template]:
 
 def _ramped(request: Request, ideal: tuple[Level, ...]) -> Attempt:
     """
-    Solve for the level between two ramps and for how long it holds, and the push if one settles.
+    Solve for the level between two ramps and its duration, and the push that settles the field.
 
-    A linear oscillator comes to rest where ramps and hold together span an odd number of half
-    periods. The solution for the first that fits is followed from fast ramps to the real ones.
-    Where that takes more than one half period, or is beyond the limits, the soonest of many
-    guesses may be better. What is found is followed from no lag to the lag.
+    A linear oscillator comes to rest if ramps and hold together last an odd number of half
+    periods. The solution for the smallest feasible number is followed from fast ramps to the real
+    ones. If that takes more than one half period, or exceeds the limits, the fastest of many
+    guesses may be better. The solution is then followed from no lag to the lag.
     """
     first, last = ideal
     delivery, start = replace(request.delivery, lag=0.0), request.load
@@ -176,7 +176,7 @@ def _ramped(request: Request, ideal: tuple[Level, ...]) -> Attempt:
     bare = replace(request, delivery=delivery)
 
     def slower(levels: tuple[Level, ...], share: float, aim: float) -> Attempt:
-        # The ramps lengthen about their middles, so that the second one begins earlier.
+        # Ramps lengthen about their midpoints, so that the second one starts earlier.
         shift = 0.5 * (aim - share) / slew * (
             abs(levels[0].load - start) - abs(levels[1].load - levels[0].load))
         guess = (levels[0], Level(levels[1].time + shift, levels[1].load))
@@ -185,7 +185,7 @@ def _ramped(request: Request, ideal: tuple[Level, ...]) -> Attempt:
             replace(delivery, slew=slew / aim))
 
     def later(levels: tuple[Level, ...], share: float, aim: float) -> Attempt:
-        # The push undoes what the field has not settled of the first level, as far as ramps reach.
+        # The push compensates for the unsettled part of the first level, as far as ramps reach.
         missing = levels[-1].load - levels[0].load
         push = math.copysign(
             min(abs(missing), slew * aim * lag * math.log1p(math.exp(-_PUSH))), missing)

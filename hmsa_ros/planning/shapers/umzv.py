@@ -1,9 +1,9 @@
 """
-The fastest shaper that is full on, off and on again, as a reference for comparison.
+The fastest shaper that switches on, off and on again, as a reference for comparison.
 
 UM-ZV (W. E. Singhose, N. C. Singer, W. P. Seering, "Time-optimal negative input shapers", J. Dyn.
-Syst. Meas. Control 119, 198, 1997): three impulses of 1, -1 and 1, within a third of a period
-where ZV takes half of one. It needs no level but those of start and target, and forgives less.
+Syst. Meas. Control 119, 198, 1997): three impulses of 1, -1 and 1 within a third of a period,
+where ZV takes half a period. It needs only the levels of start and target, and is less robust.
 """
 
 import cmath
@@ -13,9 +13,9 @@ from hmsa_ros.model.moves import Move
 from hmsa_ros.planning.shapers.linear import shaped
 from hmsa_ros.planning.shapers.request import Request
 
-# Strides from no damping to all of it, and Newton passes of each.
+# Strides from no damping to full damping, and Newton iterations of each.
 _STRIDES, _PASSES = 16, 4
-# Steeper decays, so near to critical damping that nothing oscillates for long, are taken for this.
+# Maximum decay ratio: beyond it, so near to critical damping, the motion hardly oscillates.
 _STEEPEST = -6.0
 
 
@@ -25,8 +25,8 @@ def umzv(request: Request) -> Move:
 
 
 def _impulses(root: complex) -> list[tuple[float, float]]:
-    """Return impulses (time, share) of a root -decay + i frequency: 1 - e^-rs + e^-rt is 0."""
-    # In phase angles, from those without damping, a sixth and a third of a period.
+    """Return impulses (time, weight) of a root -decay + i frequency: 1 - e^-rs + e^-rt is 0."""
+    # Phase angles, starting with those without damping, a sixth and a third of a period.
     angles = [math.pi / 3.0, 2.0 * math.pi / 3.0]
     for i in range(1, _STRIDES + 1):
         unit = complex(max(root.real / root.imag, _STEEPEST) * i / _STRIDES, 1.0)
