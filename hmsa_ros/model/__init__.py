@@ -1,5 +1,5 @@
 """
-The actuator: its parameters and law, its equations and its motion, free of ROS.
+The actuator: parameters, hyperelastic model, equations and motion; does not depend on ROS.
 
 All quantities are dimensionless as in the paper (Eq. 11) unless a name says otherwise.
 """

@@ -1,9 +1,9 @@
 """
 Several actuators over time in SI units, advanced together by one compiled call.
 
-Time is integer nanoseconds, so that it does not drift. Each actuator is integrated in pieces of
-its own, from change to change of what drives it: what happens to one leaves no trace in the
-numbers of another, and one alone moves bit for bit as it does among others.
+Time is integer nanoseconds, so that it does not drift. Each actuator is integrated separately,
+from one change of its drive to the next: events of one actuator do not affect the numbers of
+another, and an actuator alone moves bit for bit as it does among others.
 """
 
 from collections.abc import Sequence
@@ -26,19 +26,19 @@ from hmsa_ros.model.units import NANOSECONDS
 #: Relative tolerance of the integration.
 RTOL = 1e-13
 _NEVER = np.iinfo(np.int64).max
-# A larger load is no longer distinguishable from the limit itself.
+# Larger loads are indistinguishable from the limit.
 _LARGEST_LOAD = 1e9
 
 
 def check_stretch(
         stretch: float, material: NondimensionalParameters, name: str = 'stretch') -> None:
-    """Refuse with `BadInputError` a stretch beyond the limits of a group."""
+    """Raise `BadInputError` for a stretch beyond the limits of a material."""
     lower, upper = stretch_limits(material)
     if not lower < stretch < upper:
         coordinate = material.coordinate.name
         whose = f'J_lim {material.j_lim:g}' if material.law is None \
             else f'law {material.law.law}'
-        # Parameters keep their names.
+        # Parameter names stay unchanged.
         called = re.sub(r'\bstretch\b', coordinate, name)
         why = f'; {more}' if (more := pulls_in(material)) else ''
         raise BadInputError(
@@ -47,7 +47,7 @@ def check_stretch(
 
 
 def pulls_in(material: NondimensionalParameters) -> str:
-    """Return in words where a voltage has no equilibrium that is stable; empty for nowhere."""
+    """Return a sentence on where no voltage has a stable equilibrium; empty if there always is."""
     upper = stretch_limits(material)[1]
     if material.law is None or not material.law.volts or upper == material.law.limits[1]:
         return ''
@@ -56,7 +56,7 @@ def pulls_in(material: NondimensionalParameters) -> str:
 
 
 def unheld(material: NondimensionalParameters) -> str:
-    """Return in words which stretches the force falls at, so that none is held; empty for none."""
+    """Return a sentence on stretches that cannot be held, as the force falls; empty if none."""
     if material.law is None or material.law.volts:
         return pulls_in(material)
     sides = [
@@ -71,15 +71,15 @@ def unheld(material: NondimensionalParameters) -> str:
 @dataclass(frozen=True)
 class Setup:
     """
-    One actuator with the amplifier and the coil that drive it; it starts at rest, relaxed.
+    One actuator with its amplifier and coil; it starts at rest, with relaxed branches.
 
     An amplifier with a slew limit ramps to a commanded level; a coil with a time constant
-    follows the amplifier as a first order lag. Both together are a ramp that is followed late.
+    follows the amplifier as a first-order lag. Both together give a lagged ramp.
     """
 
     actuator: ActuatorParameters
-    stretch: float = 1.0  #: held at the start by its flux density
-    slew_limit: float = math.inf  #: of the level in T/s, above 0; infinite for steps
+    stretch: float = 1.0  #: initial stretch, held by its flux density
+    slew_limit: float = math.inf  #: of the amplifier in T/s, above 0; infinite for steps
     coil_time_constant: float = 0.0  #: in s; 0 for no lag
 
     def __post_init__(self) -> None:
@@ -101,12 +101,12 @@ class Setup:
                 law.elastic_force(stretch, self.actuator.nondimensional.packed)))
 
     def check_level(self, flux_density: float) -> None:
-        """Refuse with `BadInputError` a level in T that nobody could follow."""
+        """Raise `BadInputError` for a level in T that is too large to simulate."""
         units = self.actuator.units
         _check_load(units.drive.name, flux_density, units.load_name.strip(), units.load)
 
     def check_force(self, force: float) -> None:
-        """Refuse with `BadInputError` a disturbing force in N that nobody could follow."""
+        """Raise `BadInputError` for a disturbing force in N that is too large to simulate."""
         if self.actuator.units.drive.squared and force:
             raise BadInputError(
                 f'disturbing force is {force:g} N: expected 0 for law dielectric, whose load is '
@@ -115,7 +115,7 @@ class Setup:
 
 
 def _check_load(name: str, value: float, unit_name: str, unit: float) -> None:
-    """Refuse a value whose load is too large; the load 1 is a unit of it."""
+    """Raise `BadInputError` for a value with too large a load; ``unit`` is the value of load 1."""
     if not abs(value / unit) < _LARGEST_LOAD:
         raise BadInputError(
             f'{name} is {value:g} {unit_name}: expected a finite value below '
@@ -124,11 +124,11 @@ def _check_load(name: str, value: float, unit_name: str, unit: float) -> None:
 
 class Actuators:
     """
-    Actuators that take stamped commands and forces, and advance together to a time in ns.
+    Actuators that accept timestamped commands and forces, and advance together to a time in ns.
 
-    ``schedules`` and ``forces`` have, of each, the levels in T and the disturbing forces in N that
-    are in force and ahead; ``changes`` actuator, time in ns and level in T of each change that has
-    taken effect. Whoever reads the changes clears them.
+    For each actuator, ``schedules`` and ``forces`` contain the present and future levels in T and
+    disturbing forces in N. ``changes`` lists actuator, time in ns and level in T of each change
+    that has taken effect; the reader of the list clears it.
     """
 
     def __init__(self, setups: Sequence[Setup], *, time: int = 0) -> None:
@@ -173,7 +173,7 @@ class Actuators:
 
     @property
     def stretch(self) -> Array:
-        """Stretch of each, a view."""
+        """Stretch of each; a view."""
         return self._state[:, 0]
 
     @property
@@ -184,13 +184,13 @@ class Actuators:
 
     @property
     def flux_density(self) -> Array:
-        """Flux density in force on each in T."""
+        """Flux density at each in T."""
         drive = self._drive
         field: Array = self._levels + (drive[:, 2] - drive[:, 1] * self._lags) * self._units
         return field
 
     def reset(self, i: int, stretch: float | None = None, rate: float = 0.0) -> None:
-        """Have one go on at its initial or another stretch, held by its flux density."""
+        """Reset one to its initial or another stretch, held by its flux density."""
         setup = self.setups[i]
         stretch = setup.stretch if stretch is None else stretch
         self.set_state(i, stretch, rate, setup.holding(stretch))
@@ -199,10 +199,10 @@ class Actuators:
             self, i: int, stretch: float, rate: float, flux_density: float,
             level: float | None = None) -> None:
         """
-        Have one go on from another state, relaxed, with nothing ahead and no force.
+        Set another state of one, with relaxed branches, no commands ahead and no force.
 
-        The rate is in 1/s; ``level`` (T) is what the amplifier is on its way to, if it is not the
-        flux density in force. A state out of range is a `BadInputError`.
+        The rate is in 1/s; ``level`` (T) is the level to which the amplifier still ramps, by
+        default the present flux density. Raise `BadInputError` if the state is out of range.
         """
         check_stretch(stretch, self.setups[i].actuator.nondimensional)
         if not math.isfinite(rate):
@@ -212,7 +212,7 @@ class Actuators:
         if len(self._branches):
             self._branches[i, :, motion.FOLLOWER] = law.elastic_force(
                 stretch, self._material[i])
-        # A coil that lags is behind an amplifier that has arrived, another is not.
+        # The amplifier of a lagging coil may have arrived before the field; that of another not.
         behind = self._lags[i] > 0.0
         self._levels[i] = level if behind and math.isinf(self._slews[i]) else flux_density
         self._drive[i] = 0.0
@@ -225,18 +225,18 @@ class Actuators:
         self.changes.append((i, self.time, level))
 
     def equilibrium(self, i: int) -> float:
-        """Return the stretch at which the flux density in force would hold one."""
+        """Return the equilibrium stretch of one under the present flux density."""
         return float(law.equilibrium_stretch(
             self._scales[i].of_level(self.flux_density[i]), self._material[i]))
 
-    # -- what drives them ----------------------------------------------------------------------
+    # -- drive ---------------------------------------------------------------------------------
 
     def command(self, i: int, stamp: int, flux_density: float) -> int:
         """
-        Take a command in T from its stamp in ns on, which supersedes all stamped at or after it.
+        Take a command in T from its timestamp in ns on; it replaces all at or after this time.
 
-        Returns how late the change is in ns: a late one applies at once. A command for the level
-        which holds then anyway changes nothing, and is not late.
+        Return the lateness of the change in ns: a late command applies at once. A command for the
+        level that applies anyway changes nothing, and is not late.
         """
         self.setups[i].check_level(flux_density)
         changed = self.schedules[i].insert(max(stamp, self.time), flux_density)
@@ -244,32 +244,32 @@ class Actuators:
         return max(self.time - stamp, 0) if changed else 0
 
     def force(self, i: int, stamp: int, force: float) -> None:
-        """Take a force in N along the field, from a stamp in ns on, superseding later ones."""
+        """Take a force in N along the field from a timestamp in ns on; it replaces later ones."""
         self.setups[i].check_force(force)
         self.forces[i].insert(max(stamp, self.time), force)
         self._plan(i)
 
     def limit_slew(self, i: int, slew: float) -> None:
-        """Have one's amplifier ramp no faster than a rate in T/s, nor than its own limit."""
+        """Limit the ramps of one amplifier to a rate in T/s, in addition to its own limit."""
         setup = self.setups[i]
         self._slews[i] = min(slew, setup.slew_limit) \
             / setup.actuator.flux_density_unit * setup.actuator.time_unit
 
     def _plan(self, i: int) -> None:
-        """Note when the next thing happens to one, at once while its amplifier ramps."""
+        """Set the time of the next event of one; at once while its amplifier ramps."""
         ramping = self._levels[i] != self.schedules[i].current
         self._events[i] = -1 if ramping else self._next(i)
 
     def _next(self, i: int) -> int:
-        """Return when the next command or force of one takes effect, in ns."""
+        """Return the time in ns of the next command or force of one."""
         return min((
             x for x in (self.schedules[i].next_stamp, self.forces[i].next_stamp)
             if x is not None), default=_NEVER)
 
     def _set_drive(self, i: int, slope: float, level: float | None = None) -> None:
-        """Bring the load into line with amplifier, coil and force; the field does not jump."""
+        """Update the load for amplifier, coil and force; the field does not jump."""
         lag = self._lags[i]
-        # A voltage has none.
+        # A voltage has no lag.
         flux = self.flux_density[i] / self._units[i] if lag > 0.0 else 0.0
         if level is not None:
             self._levels[i] = level
@@ -286,10 +286,10 @@ class Actuators:
 
     def advance(self, time: int) -> list[tuple[int, int]]:
         """
-        Integrate to a time in ns, each change applied exactly at its stamp.
+        Integrate to a time in ns, with each change applied exactly at its timestamp.
 
-        Returns the actuators whose load is too large to follow, and the times in ns where they
-        stay. A time that is not ahead changes nothing but applies what is due.
+        Return the actuators whose load is too large to simulate, and the times in ns at which they
+        stop. A time that is not ahead only applies changes that are due.
         """
         due = self._events <= time
         failed = []
@@ -307,7 +307,7 @@ class Actuators:
         return failed
 
     def _advance_one(self, i: int, end: int) -> int:
-        """Advance one from change to change; return the time that it has reached."""
+        """Advance one from change to change; return the time reached in ns."""
         now = self.time
         end = max(end, now)
         schedule, forces = self.schedules[i], self.forces[i]
@@ -335,12 +335,12 @@ class Actuators:
                 return now
 
     def _begin_piece(self, i: int, level: float | None = None) -> None:
-        """Begin anew where the load has a corner, the amplifier at another level if given."""
+        """Start a new piece at a corner of the load, with the amplifier at a level if given."""
         self._set_drive(i, 0.0, level)
         self._state[i, 2] = 0.0
 
     def _integrate(self, i: int, duration: int) -> bool:
-        """Integrate one while nothing new comes; its amplifier may arrive meanwhile."""
+        """Integrate one up to its next event; its amplifier may arrive during this time."""
         left = duration / NANOSECONDS / float(self._time_units[i])
         target = self.schedules[i].current
         change = (target - self._levels[i]) / self._units[i]
@@ -365,7 +365,7 @@ class Actuators:
         return not self._integrated(i, i + 1, self._all)
 
     def _integrated(self, first: int, last: int, wanted: NDArray[np.bool_]) -> int:
-        """Integrate actuators over their durations; return how many do not get through."""
+        """Integrate actuators over their durations; return the number of failures."""
         return motion.follow(
             first, last, wanted, self._state, self._drive, self._material, self._branches,
             self._durations, RTOL, self._status)

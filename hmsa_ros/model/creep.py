@@ -1,4 +1,4 @@
-"""Creep of the elastomer: up to three branches beside the law, which flow in proportion or not."""
+"""Viscoelasticity: up to three branches in parallel with the hyperelastic model."""
 
 from dataclasses import dataclass, replace
 import math
@@ -8,9 +8,9 @@ from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.flows import FLOWS
 from hmsa_ros.model.flows.record import Flow, FLOW_CONSTANTS, MAXWELL
 
-#: Branches that an elastomer may have.
+#: Maximum number of branches.
 MOST = 3
-# A branch that is faster than this share of the unit of time damps, and nothing else.
+# Minimum relaxation time, in time scales: a faster branch is equivalent to damping.
 _FASTEST = 1e-3
 _STIFFEST = 1e3
 
@@ -18,17 +18,17 @@ _STIFFEST = 1e3
 @dataclass(frozen=True)
 class Creep:
     """
-    Up to three branches of an elastomer.
+    Up to three viscoelastic branches of an elastomer.
 
-    The law is what the elastomer holds in the end; branch i adds h_i = ratio_i x_i to its force,
-    with x_i' = (dW/dl)' - flow(x_i), in units of G. With the flow of Maxwell, x_i/time_i, they
-    are a Prony series.
+    The hyperelastic model gives the force for long times; branch i adds h_i = ratio_i x_i, with
+    x_i' = (dW/dl)' - flow(x_i), in units of G. With the Maxwell flow, x_i/time_i, the branches are
+    a Prony series.
     """
 
-    ratios: tuple[float, ...] = ()  #: stiffness in units of that of the law, 0 to 1000
-    times: tuple[float, ...] = ()  #: of relaxation, in s
+    ratios: tuple[float, ...] = ()  #: stiffness relative to the hyperelastic model, 0 to 1000
+    times: tuple[float, ...] = ()  #: relaxation times in s
     flow: str = MAXWELL.name  #: one of `hmsa_ros.model.flows.FLOWS`
-    constants: tuple[tuple[float, ...], ...] = ()  #: of the flow, each for every branch
+    constants: tuple[tuple[float, ...], ...] = ()  #: of the flow, each with one value per branch
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -65,12 +65,12 @@ class Creep:
 
     @property
     def law(self) -> Flow:
-        """How the branches flow."""
+        """Flow rule of the branches."""
         return FLOWS[self.flow]
 
     @property
     def held(self) -> 'Creep':
-        """The branches that hold anything."""
+        """The branches with a stiffness above 0."""
         kept = [i for i, x in enumerate(self.ratios) if x > 0.0]
 
         def of(values: tuple[float, ...]) -> tuple[float, ...]:
@@ -82,14 +82,14 @@ class Creep:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """The parameters that describe the branches, none where there are none."""
+        """Parameters that describe the branches; none without branches."""
         if not self:
             return {}
         flow = {'viscoelastic.flow': self.flow} if self.law is not MAXWELL else {}
         return {f'viscoelastic.{x}': list(y) for x, y in self._named.items()} | flow
 
     def rows(self) -> list[list[float]]:
-        """Return the branches that hold anything as `hmsa_ros.motion` takes them."""
+        """Return the branches with a stiffness above 0 as arguments of `hmsa_ros.motion`."""
         held, rest = self.held, [0.0] * (FLOW_CONSTANTS - len(self.law.constants) + 1)
         return [
             [ratio, 1.0 / time, float(self.law.kind), *constants, *rest]
@@ -97,11 +97,11 @@ class Creep:
                 held.ratios, held.times, *held.constants, strict=True)]
 
     def __bool__(self) -> bool:
-        """Return whether there is a branch that holds anything."""
+        """Return whether any branch has a stiffness above 0."""
         return any(self.ratios)
 
     def check(self, time_unit: float) -> None:
-        """Refuse with `BadInputError` what only damps, for a unit of time in s."""
+        """Raise `BadInputError` for branches that only damp, with a time scale in s."""
         for time, *constants in zip(self.times, *self.constants, strict=True):
             least = _FASTEST * time_unit * self.law.hastens(*constants)
             if time < least:

@@ -1,9 +1,9 @@
 """
-How commands reach the coil: at any time or on a grid, in steps or in ramps.
+Delivery of commands to the coil: at any time or on a sampling grid, in steps or in ramps.
 
-A command names a level. Ideal hardware takes it up at once; sampled hardware takes commands at
-multiples of a period only; an amplifier with a slew limit ramps to the level; the field of a coil
-follows its amplifier with a lag of first order.
+A command contains a level. Ideal hardware applies it at once. Sampled hardware applies commands
+only at multiples of a period; an amplifier with a slew limit ramps to the level; the field of a
+coil follows its amplifier with a first-order lag.
 """
 
 from collections.abc import Sequence
@@ -13,23 +13,23 @@ import math
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.moves import Level
 
-# Time constants after which nothing is left of a lag.
+# Time constants after which a lag has settled.
 _SETTLED = 40.0
 
 
 @dataclass(frozen=True)
 class Delivery:
-    """Nondimensional properties of the hardware that carries the command."""
+    """Dimensionless properties of the hardware that applies commands."""
 
     period: float = 0.0  #: commands take effect at multiples of this; 0 for any time
-    slew: float = math.inf  #: largest change of the load per unit of time; infinite for steps
+    slew: float = math.inf  #: maximum rate of the load; infinite for steps
     resolution: float = 0.0  #: times of commands are rounded to multiples of this; 0 for none
-    lag: float = 0.0  #: time constant of the field behind the amplifier
-    #: Vibration that levels which follow creep may leave, as a share of the move.
+    lag: float = 0.0  #: time constant of the field
+    #: Vibration that levels of the creep tail may leave, as a fraction of the move.
     ripple: float = 1e-6
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
+        """Check the values."""
         for name, value in (('command period', self.period), ('coil time constant', self.lag)):
             if not 0.0 <= value < math.inf:
                 raise BadInputError(
@@ -45,28 +45,28 @@ class Delivery:
         return self.period == 0.0 and math.isinf(self.slew) and self.lag == 0.0
 
     def settling(self, change: float) -> float:
-        """Return after what time (ramp and lag) nothing is left of a signed change of the load."""
+        """Return the time (ramp and lag) in which a signed change of the load settles."""
         return self.ramp(change) + _SETTLED * self.lag
 
     def rounded(self, time: float) -> float:
-        """Return a time, which may be infinite, as the nearest multiple of the resolution."""
+        """Return a time, possibly infinite, rounded to a multiple of the resolution."""
         if self.resolution == 0.0 or math.isinf(time):
             return time
         return round(time / self.resolution) * self.resolution
 
     def ramp(self, change: float) -> float:
-        """Return how long a signed change of the load takes; 0 without a slew limit."""
+        """Return the duration of a signed change of the load; 0 without a slew limit."""
         return 0.0 if math.isinf(self.slew) else abs(change) / self.slew
 
 
 IDEAL = Delivery()
 
-#: Time of a switch, load from then on, and its change per unit of time.
+#: Start time, initial load and rate of the load.
 Piece = tuple[float, float, float]
 
 
 def late(pieces: Sequence[Piece], end: float, field: float, lag: float) -> float:
-    """Return the load that a lagging field has reached at a time after the amplifier's pieces."""
+    """Return the lagging load at a time after the amplifier's pieces."""
     for i, (begin, load, slope) in enumerate(pieces):
         span = (pieces[i + 1][0] if i + 1 < len(pieces) else end) - begin
         line = load - slope * lag
@@ -78,10 +78,10 @@ def ramps(
         levels: Sequence[Level], load: float, end: float,
         slew: float) -> tuple[list[Piece], float]:
     """
-    Return the pieces of the load that levels make, and the last load.
+    Return the pieces of the load for some levels, and the last load.
 
-    Levels are by time, the first at the start, and ``load`` is in force before; ``end`` is not
-    before the last.
+    Levels are ordered by time, the first at the start; ``load`` applies before. ``end`` is not
+    before the last level.
     """
     rows: list[Piece] = []
     for number, level in enumerate(levels):

@@ -1,9 +1,9 @@
 """
-The actuator's equations for arrays: energies, forces, equilibrium, limits, linearised motion.
+Equations of the actuator for arrays: energies, forces, equilibrium, limits, linearised motion.
 
-Every function takes arrays or scalars, broadcast against each other, and returns float64,
-NaN outside the limits. Stretch comes first, then rate and load, then the material, a group or
-J_lim of a Gent block. The load is the signed
+All functions take arrays or scalars that broadcast with each other, and return float64, NaN
+outside the limits. Stretch comes first, then rate and load, then the material: a dimensionless
+group, or J_lim of a Gent block. The load is the signed
 ``beta = Br B/(mu0 G)``; the paper's b is ``sign(beta) sqrt|beta|``. Equation numbers are those
 of Polymers 2022, 14, 3037. The equations themselves are in `hmsa_ros.model.law`.
 """
@@ -17,7 +17,7 @@ from hmsa_ros.model import law
 from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters
 
 Array = NDArray[np.float64]
-#: What functions accept: older NumPy types do not know what ``linspace`` returns.
+#: Accepted array types: older NumPy stubs do not type the result of ``linspace`` precisely.
 Floats = NDArray[np.floating[Any]]
 # A number is J_lim of a Gent block.
 Material = NondimensionalParameters | float
@@ -28,7 +28,7 @@ def _array(value: ArrayLike) -> Array:
 
 
 def packed(material: Material) -> Array:
-    """Return what `hmsa_ros.motion` takes for a material."""
+    """Return the packed material for `hmsa_ros.motion`."""
     if isinstance(material, NondimensionalParameters):
         return material.packed
     return law.pack(0.0, material, 1.0)
@@ -69,7 +69,7 @@ def damping(material: NondimensionalParameters) -> float:
 def acceleration(
         stretch: ArrayLike, rate: ArrayLike, load: ArrayLike,
         material: NondimensionalParameters) -> Array:
-    """Return the second derivative of the stretch in nondimensional time, Eq. 11."""
+    """Return the second derivative of the stretch with respect to dimensionless time, Eq. 11."""
     columns = np.broadcast_arrays(_array(stretch), _array(rate), _array(load))
     out = np.empty(columns[0].size)
     stretches, rates, loads = (np.array(x).ravel() for x in columns)
@@ -90,21 +90,21 @@ def acceleration_si(
 def energy(
         stretch: ArrayLike, rate: ArrayLike, load: ArrayLike,
         material: NondimensionalParameters) -> Array:
-    """Return the total energy m l'^2/2 + psi - beta l, which falls at the rate d l'^2."""
+    """Return the total energy m l'^2/2 + psi - beta l, which decreases at the rate d l'^2."""
     return (0.5 * mass(stretch, material) * _array(rate) ** 2
             + elastic_energy(stretch, material) - _array(load) * _array(stretch))
 
 
 def equilibrium_stretch(load: ArrayLike, material: Material) -> Array:
-    """Return the one stretch at which a finite load is in balance; inverse of `elastic_force`."""
+    """Return the equilibrium stretch of a finite load; inverse of `elastic_force`."""
     return _evaluate(law.EQUILIBRIUM, load, material)
 
 
 def stretch_limits(material: Material) -> tuple[float, float]:
     """
-    Return the limiting stretches, at which the chains are fully extended, both excluded.
+    Return the limiting stretches at full extension of the chains, both excluded.
 
-    They are 0 and infinity where the law has none.
+    They are 0 and infinity for models without limits.
     """
     made = packed(material)
     return float(made[law.LOWER]), float(made[law.UPPER])

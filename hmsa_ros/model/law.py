@@ -1,18 +1,18 @@
 """
-The law of the actuator: what it weighs, how it pushes back, what drives it.
+The equation of motion of the actuator: inertia, elastic force and load.
 
-In nondimensional energy form every actuator of this package obeys
+In dimensionless energy form every actuator of this package obeys
 
     m(l) l'' + m'(l) l'^2 / 2 + d l' + psi'(l) = beta
 
 with stretch ``l``, time in units of ``L sqrt(rho/G)`` and the signed load
-``beta = Br B/(mu0 G)``. This module has the parts: everything else takes them from here. A beam
-has the deflection of its tip for ``l``, inertia m of its own, and a damping that grows with it.
+``beta = Br B/(mu0 G)``. This module defines its terms for all others. A beam
+has the deflection of its tip for ``l``, its own inertia m, and a damping that grows with it.
 
-The compiled functions (`hmsa_ros.motion`) take one array ``material``, as `pack` makes it: a
-header (`KIND` to `UPPER`), then the constants of the law from `CONSTANTS` on, as many as it has,
-tables included. Nothing here checks its arguments. Where there is no energy the results are NaN.
-Between `LOWER` and `UPPER` the force rises, so that each stretch can be held.
+The compiled functions (`hmsa_ros.motion`) take one array ``material``, made by `pack`: a header
+(`KIND` to `UPPER`), then the constants of the hyperelastic model from `CONSTANTS` on, including
+tables. Arguments are not checked. Where there is no energy, results are NaN. Between `LOWER` and
+`UPPER` the force increases, so that each stretch can be held.
 """
 
 from collections.abc import Callable
@@ -42,19 +42,19 @@ __all__ = [
     'elastic_stiffness', 'equilibrium_stretch', 'evaluate', 'gent_limits', 'held', 'mass',
     'natural_frequency', 'pack']
 
-# Places in the packed material.
-KIND = 0  # which law
-ZETA = 1  # damping of the group
+# Indices in the packed material.
+KIND = 0  # family of the model
+ZETA = 1  # damping
 C1 = 2  # shape of the block, 2 H^2/L^2
-DAMPING = 3  # d, of a beam at rest
-LOWER = 4  # limiting stretches; 0 and infinity where there are none
+DAMPING = 3  # d; of a beam at rest
+LOWER = 4  # limiting stretches; 0 and infinity without limits
 UPPER = 5
 
-# Points and halvings of the search for where a force falls.
+# Points and bisections of the search for a falling force.
 _LOOK = 4000
 _HALVINGS = 60
 
-# What `evaluate` computes.
+# Quantities that `evaluate` computes.
 FORCE, STIFFNESS, ENERGY, MASS, FREQUENCY, CRITICAL_ZETA, EQUILIBRIUM = range(7)
 
 Array = NDArray[np.float64]
@@ -62,7 +62,7 @@ Array = NDArray[np.float64]
 
 def gent_limits(i_j: Any) -> tuple[Any, Any]:
     """
-    Return the stretches at which chains of limit 1/i_j are fully extended, for arrays too.
+    Return the stretches at which chains of limit 1/i_j are fully extended, also for arrays.
 
     They are the positive roots of l^3 - (1/i_j + 3) l + 2; 0 and infinity for i_j = 0.
     """
@@ -72,7 +72,7 @@ def gent_limits(i_j: Any) -> tuple[Any, Any]:
         lower = 2.0 * np.sqrt(p / 3.0) * np.cos((angle - 2.0 * math.pi) / 3.0)
         upper = 2.0 * np.sqrt(p / 3.0) * np.cos(angle / 3.0)
         for _ in range(2):
-            # Newton steps recover the digits lost where the roots lie close together.
+            # Newton steps recover digits lost if the roots lie close together.
             lower = lower - (lower ** 3 - p * lower + 2.0) / (3.0 * lower * lower - p)
             upper = upper - (upper ** 3 - p * upper + 2.0) / (3.0 * upper * upper - p)
     endless = np.isinf(p)
@@ -81,9 +81,9 @@ def gent_limits(i_j: Any) -> tuple[Any, Any]:
 
 def pack(zeta: Any, j_lim: Any, c1: Any, elastic: Elastic | None = None) -> Array:
     """
-    Return the packed material of a Gent block, or of one with another law.
+    Return the packed material of a Gent block, or of one with another model.
 
-    Neo-Hookean where J_lim is infinite. Arrays (n,) give n rows.
+    The model is neo-Hookean if J_lim is infinite. Arrays (n,) give n rows.
     """
     zeta, j_lim, c1 = (np.asarray(x, dtype=np.float64) for x in (zeta, j_lim, c1))
     if elastic is not None:
@@ -102,7 +102,7 @@ def pack(zeta: Any, j_lim: Any, c1: Any, elastic: Elastic | None = None) -> Arra
 
 @lru_cache(maxsize=256)
 def held(elastic: Elastic) -> tuple[float, float]:
-    """Return the stretches around that at rest between which the force of a law rises."""
+    """Return the stretches around rest between which the force of a model increases."""
     material = np.array([elastic.family, 0.0, 1.0, 0.0, *elastic.limits, *elastic.constants])
 
     def rising(end: float) -> float:
@@ -122,7 +122,7 @@ def held(elastic: Elastic) -> tuple[float, float]:
 
 
 def boundary(holds: Callable[[float], bool], inside: float, outside: float) -> float:
-    """Return the last place on the way to ``outside`` at which a condition holds."""
+    """Return the last point on the way to ``outside`` at which a condition holds."""
     if holds(outside):
         return outside
     for _ in range(_HALVINGS):
@@ -135,7 +135,7 @@ def boundary(holds: Callable[[float], bool], inside: float, outside: float) -> f
 
 
 def stack(materials: Any) -> Array:
-    """Return packed materials as rows, though their laws have different numbers of constants."""
+    """Return packed materials as rows, padded to the same number of constants."""
     rows = np.zeros((len(materials), max((len(x) for x in materials), default=0)))
     for row, material in zip(rows, materials, strict=True):
         row[:len(material)] = material

@@ -1,4 +1,4 @@
-"""By how much an actuator differs from its model, or may differ."""
+"""Errors of the model parameters, and their uncertainty."""
 
 from dataclasses import dataclass, replace
 from itertools import product
@@ -14,16 +14,16 @@ from hmsa_ros.model.parameters import NondimensionalParameters
 @dataclass(frozen=True)
 class Errors:
     """
-    By how much the actuator differs from the model: actual value = model's (1 + error).
+    Errors of the model: actual value = model's (1 + error).
 
-    Errors are above -1; that of the damping coefficient may be -1, for none.
+    Errors are above -1; that of the damping coefficient may be -1 (no damping).
     """
 
-    #: Of G, which scales the loads, the time unit and, for a given coefficient c, zeta.
+    #: Of G, which affects the loads, the time scale and, for a given coefficient c, zeta.
     shear_modulus: float = 0.0
     zeta: float = 0.0  #: of the damping coefficient c
     j_lim: float = 0.0
-    remanence: float = 0.0  #: of Br, which scales the loads
+    remanence: float = 0.0  #: of Br, which affects the loads
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -36,21 +36,21 @@ class Errors:
 
     @property
     def stiffer(self) -> float:
-        """Return the actuator's unit of load in that of the model."""
+        """Return the actuator's unit of load relative to that of the model."""
         return (1.0 + self.shear_modulus) / (1.0 + self.remanence)
 
     @property
     def faster(self) -> float:
-        """Return the model's unit of time in that of the actuator."""
+        """Return the model's time scale relative to that of the actuator."""
         return math.sqrt(1.0 + self.shear_modulus)
 
     def delivery(self, planned: Delivery) -> Delivery:
-        """Return how ramps and lag of the model are in the actuator's units."""
+        """Return ramps and lag of the model in the actuator's units."""
         return Delivery(
             slew=planned.slew / self.faster / self.stiffer, lag=planned.lag * self.faster)
 
     def actual(self, material: NondimensionalParameters) -> NondimensionalParameters:
-        """Return the model's group for the actuator: zeta = c/8 sqrt(1/(L^2 H^2 rho G))."""
+        """Return the actuator's dimensionless group: zeta = c/8 sqrt(1/(L^2 H^2 rho G))."""
         return replace(
             material,
             zeta=material.zeta * (1.0 + self.zeta) / self.faster,
@@ -65,7 +65,7 @@ Offs = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """Where errors may be together, around none."""
+    """A confidence region of the errors, centred at zero."""
 
     axes: tuple[Offs, ...]  #: half axes, one to four
 
@@ -85,5 +85,5 @@ class Ellipsoid:
         return [(a, b, c, d) for a, b, c, d in np.clip(offs, -largest, largest).tolist()]
 
 
-#: Largest errors of G, damping coefficient and J_lim by themselves, or of all together.
+#: Maximum errors of G, damping coefficient and J_lim separately, or all of them jointly.
 Uncertainty = tuple[float, float, float] | Ellipsoid

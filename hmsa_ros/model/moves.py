@@ -10,15 +10,15 @@ from hmsa_ros.model.units import Units
 
 @dataclass(frozen=True)
 class State:
-    """Stretch, stretch rate, the load in force and the amplifier's output, nondimensional."""
+    """Stretch, stretch rate, load and output of the amplifier, dimensionless."""
 
     stretch: float
     rate: float = 0.0
-    #: In force: ramps and lags begin from it; NaN for the one that holds the stretch.
+    #: Present load, from which ramps and lags start; NaN for the load that holds the stretch.
     load: float = math.nan
-    #: Load that a field that lags is following; None where the two are the same.
+    #: Load that a lagging field approaches; None if equal to the load.
     amplifier: float | None = None
-    #: Elastic force that each Maxwell branch has followed; empty where they have relaxed.
+    #: Elastic force that each Maxwell branch has followed; empty if relaxed.
     followed: tuple[float, ...] = ()
 
     @property
@@ -37,15 +37,15 @@ class Level:
 
 @dataclass(frozen=True)
 class Move:
-    """How one target is reached."""
+    """The command for one target."""
 
     code: Code
     levels: tuple[Level, ...]  #: in order; the last one holds the target
-    duration: float  #: time until rest at the target; infinite where it is only approached
-    reason: str = ''  #: why it is not the requested command; empty if it is
-    #: Predicted at the last levels, which hold the target while branches relax, if any do.
+    duration: float  #: time until rest at the target; infinite if only approached
+    reason: str = ''  #: why the command is not the requested one; empty if it is
+    #: Predicted states at the last levels, which hold the target while branches relax.
     tail: tuple[State, ...] = ()
-    vibration: float = 0.0  #: bound of what these levels leave in the stretch, peak to peak
+    vibration: float = 0.0  #: upper bound of the vibration due to these levels, peak to peak
 
     def until(self, time: float) -> 'Move':
         """Return the move without the levels from a time on."""
@@ -71,7 +71,7 @@ class Limits:
                 f'{self.maximum:g}')
 
     def check(self, load: float, target: float, units: Units) -> None:
-        """Refuse a load outside the limits with `RefusedError`; units word the message."""
+        """Raise `RefusedError` for a load outside the limits; units format the message."""
         if not self.minimum <= load <= self.maximum:
             raise RefusedError(
                 Code.FLUX_LIMIT,

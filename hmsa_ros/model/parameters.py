@@ -1,4 +1,4 @@
-"""Parameters of an actuator, in SI units and as the nondimensional group of Eq. 11."""
+"""Parameters of an actuator, in SI units and as the dimensionless group of Eq. 11."""
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -18,12 +18,12 @@ _ZERO_ALLOWED = ('zeta', 'damping_coefficient')
 # Infinite for neo-Hookean.
 _INFINITE_ALLOWED = ('j_lim', 'chain_limit')
 _NO_NUMBERS = ('law', 'creep')
-# Units and groups beyond this and its inverse are of no block, and overflow in the equations.
+# Scales and groups beyond this and its inverse belong to no block, and overflow in the equations.
 _SMALLEST = 1e-100
 
 
 def _check(record: object) -> None:
-    """Refuse a record with a field that is out of range."""
+    """Raise `BadInputError` if a field of a record is out of range."""
     for field in fields(record):  # type: ignore[arg-type]
         name, value = field.name, getattr(record, field.name)
         if name in _NO_NUMBERS:
@@ -31,7 +31,7 @@ def _check(record: object) -> None:
         if not isinstance(value, (int, float)) or isinstance(value, bool):
             raise BadInputError(f'{name} is {value!r}: expected a number')
         zero, endless = name in _ZERO_ALLOWED, name in _INFINITE_ALLOWED
-        # Compared, since a whole number may be too large to convert.
+        # Compared first, since an integer may be too large to convert.
         if not (0.0 < value <= sys.float_info.max or zero and value == 0.0
                 or endless and value == math.inf):
             raise BadInputError(
@@ -43,23 +43,23 @@ def _check(record: object) -> None:
 @dataclass(frozen=True)
 class NondimensionalParameters:
     """
-    What Eq. 11 depends on.
+    The dimensionless parameters of Eq. 11.
 
     Attributes
     ----------
     zeta : float
-        Damping coefficient c/8 sqrt(1/(L^2 H^2 rho G)), at least 0. It is not a damping
-        ratio: about a stretch of 1.1 the motion is critically damped near 2.16 for J_lim 5.
+        Damping coefficient c/8 sqrt(1/(L^2 H^2 rho G)), at least 0. This is not a damping
+        ratio: about a stretch of 1.1 critical damping is near 2.16 for J_lim 5.
     j_lim : float
-        Limit of the chains' extension J_lim of the Gent model (Eq. 4), greater than 0;
-        infinite for the neo-Hookean one.
+        Limiting extensibility J_lim of the Gent model (Eq. 4), greater than 0; infinite for the
+        neo-Hookean model.
     c1 : float
         Shape 2 H^2/L^2, greater than 0. The paper does not state it; the damping that it calls
         critical implies 2 (H = L).
     law : Elastic, optional
-        Elastic energy in units of G, in place of the Gent model: J_lim is then without effect.
+        Elastic energy in units of G. It replaces the Gent model, and J_lim has no effect.
     creep : Creep
-        Branches beside the law, their times in units of time; default none.
+        Viscoelastic branches, with times in time scales; default none.
 
     Raises
     ------
@@ -80,37 +80,37 @@ class NondimensionalParameters:
 
     @property
     def coordinate(self) -> Coordinate:
-        """What the position is: a stretch, or the deflection of a beam."""
+        """Kind of position, such as a stretch or the deflection of a beam."""
         return coordinate_of(self.law)
 
     @property
     def rest(self) -> float:
-        """Stretch at rest without a field; the deflection of a beam."""
+        """Stretch (or deflection of a beam) at rest without a field."""
         return self.coordinate.rest
 
     @cached_property
     def packed(self) -> NDArray[np.float64]:
-        """The one argument of the compiled law, see `hmsa_ros.model.law`."""
-        from hmsa_ros.model import law  # not all who have parameters need it
+        """The material argument of compiled functions, see `hmsa_ros.model.law`."""
+        from hmsa_ros.model import law  # imports NumPy, which not all users of parameters need
 
         return law.pack(self.zeta, self.j_lim, self.c1, self.law)
 
     @cached_property
     def branches(self) -> NDArray[np.float64]:
-        """Branches that hold anything, as `hmsa_ros.motion` takes them, shape (n, 6)."""
+        """Branches with a stiffness above 0 for `hmsa_ros.motion`, shape (n, 6)."""
         from hmsa_ros.motion import BRANCH  # as above
 
         return np.array(self.creep.rows()).reshape(-1, BRANCH)
 
     @cached_property
     def elastic(self) -> 'NondimensionalParameters':
-        """The group without its branches."""
+        """The group without branches."""
         return replace(self, creep=Creep()) if self.creep else self
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """What sizes (m) and law make of parameters in SI units, for a block and for a beam."""
+    """Geometric factors of parameters in SI units, from sizes (m) and model, for block or beam."""
 
     half_length: float
     half_thickness: float
@@ -118,25 +118,25 @@ class Geometry:
 
     @property
     def c1(self) -> float:
-        """Shape 2 H^2/L^2 of a block, or that of the block with the inertia of a beam."""
+        """Shape 2 H^2/L^2 of a block, or of the block with the inertia of a beam."""
         shape = None if self.law is None else self.law.shape
         return shape or 2.0 * (self.half_thickness / self.half_length) ** 2
 
     @property
     def loaded(self) -> float:
-        """Area in m^2 that a force acts on: a face of a block, or the section of a beam."""
+        """Area in m^2 on which a force acts: a face of a block, or the section of a beam."""
         section = self.law.section if self.law is not None and self.law.section else 1.0
         return 4.0 * section * self.half_length ** 2
 
     @property
     def damped(self) -> float:
-        """Damping coefficient of zeta 1 in m^2, in units of sqrt(rho G): 8 L H of a block."""
+        """Damping coefficient for zeta 1 over sqrt(rho G), in m^2: 8 L H for a block."""
         if self.law is not None and self.law.section:
             return 1.25 * self.loaded
         return 8.0 * self.half_length * self.half_thickness
 
     def damping_unit(self, density: float, shear_modulus: float) -> float:
-        """Return the damping coefficient of zeta 1 in N s/m; units are SI."""
+        """Return the damping coefficient for zeta 1 in N s/m; arguments are in SI units."""
         return self.damped * math.sqrt(density * shear_modulus)
 
 
@@ -162,10 +162,9 @@ class ActuatorParameters:
     damping_coefficient : float
         c of Eq. 9 in N s/m, at least 0.
     law : Elastic, optional
-        Elastic energy in units of G, in place of the Gent model: J_lim is then without
-        effect.
+        Elastic energy in units of G. It replaces the Gent model, and J_lim has no effect.
     creep : Creep
-        Branches beside the law, for planning; default none.
+        Viscoelastic branches, for planning; default none.
 
     Raises
     ------
@@ -185,7 +184,7 @@ class ActuatorParameters:
     creep: Creep = Creep()
 
     def __post_init__(self) -> None:
-        """Check the values, and that the equations can be scaled by them."""
+        """Check the values, and that they give usable scales."""
         _check(self)
         try:
             scales = self.time_unit, self.flux_density_unit, self.nondimensional.c1
@@ -202,7 +201,7 @@ class ActuatorParameters:
     def check_drive(
             self, slew_limit: float = math.inf, lag: float = 0.0, creep: Creep | None = None,
             ) -> None:
-        """Refuse with `BadInputError` ramps, a lag in s or creep, if a voltage is the drive."""
+        """Raise `BadInputError` for ramps, a lag in s or creep if a voltage is the drive."""
         if self.units.drive.squared and (slew_limit < math.inf or lag or creep):
             raise BadInputError(
                 f'slew limit {slew_limit:g} V/s, time constant {lag:g} s and '
@@ -214,12 +213,12 @@ class ActuatorParameters:
             cls, material: NondimensionalParameters, *, shear_modulus: float, density: float,
             half_length: float, remanence: float) -> 'ActuatorParameters':
         """
-        Return the actuator that has a nondimensional group at a given scale.
+        Return the actuator with a dimensionless group at a given scale.
 
         Parameters
         ----------
         material : NondimensionalParameters
-            zeta, J_lim and c1, and the law.
+        zeta, J_lim and c1, and the hyperelastic model.
         shear_modulus, density, half_length, remanence : float
             The scale, in Pa, kg/m^3, m and T.
 
@@ -234,7 +233,7 @@ class ActuatorParameters:
             If a value is not finite or out of range.
 
         """
-        # Checked before the root is taken: a negative product has none.
+        # Checked before the square root, which a negative product does not have.
         cube = cls(shear_modulus, density, half_length, half_length, remanence,
                    material.j_lim, 0.0)
         made = replace(
@@ -245,47 +244,47 @@ class ActuatorParameters:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """All that is a number, by name."""
+        """All numeric values, by name."""
         return {x.name: getattr(self, x.name) for x in fields(self) if x.name not in _NO_NUMBERS}
 
     @property
     def coordinate(self) -> Coordinate:
-        """What the position is: a stretch, or the deflection of a beam."""
+        """Kind of position, such as a stretch or the deflection of a beam."""
         return coordinate_of(self.law)
 
     @property
     def rest(self) -> float:
-        """Stretch at rest without a field; the deflection of a beam."""
+        """Stretch (or deflection of a beam) at rest without a field."""
         return self.coordinate.rest
 
     @property
     def geometry(self) -> Geometry:
-        """What sizes and law make of parameters in SI units."""
+        """Geometric factors from sizes and model."""
         return Geometry(self.half_length, self.half_thickness, self.law)
 
     @property
     def time_unit(self) -> float:
-        """Seconds in one unit of nondimensional time, L sqrt(rho/G)."""
+        """Time scale L sqrt(rho/G) in s."""
         return self.half_length * math.sqrt(self.density / self.shear_modulus)
 
     @cached_property
     def period(self) -> float:
         """Period in s of small undamped motion about rest without a field."""
-        from hmsa_ros.model import law  # not all who have parameters need it
+        from hmsa_ros.model import law  # imports NumPy, which not all users of parameters need
 
         frequency = law.natural_frequency(self.rest, self.nondimensional.packed)
         return 2.0 * math.pi * self.time_unit / frequency
 
     @property
     def flux_density_unit(self) -> float:
-        """Level of the load 1: flux density mu0 G/Br in T, or voltage h sqrt(2 G/eps) in V."""
+        """Level of load 1: flux density mu0 G/Br in T, or voltage h sqrt(2 G/eps) in V."""
         if self.law is not None and self.law.volts:
             return self.law.volts * math.sqrt(self.shear_modulus)
         return MU_0 * self.shear_modulus / self.remanence
 
     @cached_property
     def units(self) -> Units:
-        """Sizes of the nondimensional units in s, and in T or V."""
+        """Scales of time in s, and of the level in T or V."""
         coordinate = self.coordinate
         return Units(
             self.time_unit, self.flux_density_unit, ' s', f' {coordinate.drive.unit}',
@@ -293,7 +292,7 @@ class ActuatorParameters:
 
     @property
     def damping_unit(self) -> float:
-        """Damping coefficient in N s/m of zeta 1: 8 L H sqrt(rho G), or that of a beam's tip."""
+        """Damping coefficient in N s/m for zeta 1: 8 L H sqrt(rho G), or that of a beam's tip."""
         return self.geometry.damping_unit(self.density, self.shear_modulus)
 
     @property
@@ -303,7 +302,7 @@ class ActuatorParameters:
 
     @cached_property
     def nondimensional(self) -> NondimensionalParameters:
-        """The group that Eq. 11 depends on."""
+        """The dimensionless group of Eq. 11."""
         return NondimensionalParameters(
             zeta=self.damping_coefficient / self.damping_unit,
             j_lim=self.chain_limit,
@@ -314,9 +313,9 @@ class ActuatorParameters:
 
 def paper_actuator(material: NondimensionalParameters | None = None) -> ActuatorParameters:
     """
-    Return a soft silicone block with the paper's nondimensional parameters.
+    Return a soft silicone block with the paper's dimensionless parameters.
 
-    G = 10 kPa, rho = 1900 kg/m^3, L = 10 mm, Br = 0.1 T: a time unit of 4.4 ms.
+    G = 10 kPa, rho = 1900 kg/m^3, L = 10 mm, Br = 0.1 T: a time scale of 4.4 ms.
 
     Parameters
     ----------

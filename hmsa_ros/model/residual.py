@@ -1,4 +1,4 @@
-"""What is left of a move: residual vibration after arrival."""
+"""Residual vibration after the arrival of a move."""
 
 import math
 
@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from hmsa_ros.errors import HmsaError
 
-#: Shares of a step below this are rounding of times and numbers, and are not told apart.
+#: Smaller fractions of a step are rounding errors.
 RESOLVED = 1e-8
 
 
@@ -15,10 +15,10 @@ def residual_vibration(
         time: ArrayLike, stretch: ArrayLike, *, arrival: float, end: float,
         step: float) -> float:
     """
-    Return the peak-to-peak stretch after arrival as a share, not percent, of the commanded step.
+    Return the peak-to-peak stretch after arrival as a fraction (not percent) of the step.
 
-    Samples from ``arrival`` to ``end``, both included, count; ``time`` (n,) increases, in the unit
-    of both. Fewer than two of them, or a step of zero, are an `HmsaError`. 0 is rest.
+    Samples from ``arrival`` to ``end``, both included, count; ``time`` (n,) increases, in the same
+    unit. Raise `HmsaError` for fewer than two of them, or a step of zero. 0 means rest.
     """
     time = np.asarray(time, dtype=np.float64)
     inside = (time >= arrival) & (time <= end)
@@ -32,9 +32,9 @@ def residual_vibration(
 
 def percent(share: float, sign: str = '') -> str:
     """
-    Word a share of a step in percent, without the unit; a question mark for what is not known.
+    Format a fraction of a step in percent, without the unit; NaN gives a question mark.
 
-    What is below `RESOLVED` is said to be; ``sign`` is ``'+'`` to show the sign of others.
+    Values below `RESOLVED` are shown as ``<``; with ``sign`` ``'+'`` others have a sign.
     """
     if math.isnan(share):
         return '?'

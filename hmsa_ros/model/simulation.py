@@ -1,8 +1,8 @@
 """
-Response of the actuator to a command: sampled, or followed step by step as the plant does.
+Response of the actuator to a command, sampled or step by step.
 
-Commands take effect exactly at their times, inside the integration: each piece between two
-changes of level is integrated on its own.
+Commands take effect exactly at their times: each piece between two changes of level is integrated
+separately.
 """
 
 from collections.abc import Sequence
@@ -28,11 +28,10 @@ __all__ = [
     'ActuatorSimulation', 'check_stretch', 'follow', 'longest_motion', 'response', 'RTOL',
     'sampled', 'simulate', 'too_large']
 
-# Time constants after which nothing is left of a motion, and periods after which nobody knows
-# its phase.
+# Time constants after which a motion has settled, and periods after which its phase is uncertain.
 _SETTLED = 40.0
 _MOST_PERIODS = 2000.0
-# A stress too small to be told from none, and how exactly branches relax alone.
+# Stress that counts as zero, and tolerance of the relaxation without inertia.
 _NOTHING, _SLOWLY = 1e-12, 1e-12
 _STUCK = 'the integration ran out of steps: the load is too large to follow'
 
@@ -42,22 +41,22 @@ def simulate(
         material: NondimensionalParameters, *, stretch: float | None = None, rate: float = 0.0,
         slopes: ArrayLike | None = None) -> tuple[Array, Array]:
     """
-    Sample the response to a piecewise constant or linear load; `sampled` that to levels.
+    Sample the response to a piecewise constant or linear load; `sampled` does so for levels.
 
     Parameters
     ----------
     switches : array_like, shape (m,)
-        Times at which a level begins, increasing; the motion starts at the first.
+        Start times of the levels, increasing; the motion starts at the first.
     loads : array_like, shape (m,)
-        Load beta from each switch on.
+        Load beta from each time on.
     times : array_like, shape (n,)
-        Times to sample at, not decreasing, none before the first switch.
+        Sampling times, not decreasing, none before the first switch.
     material : NondimensionalParameters
         zeta, J_lim and c1.
     stretch, rate : float
         State at the first switch; default at rest without a field.
     slopes : array_like, shape (m,), optional
-        Change of the load per unit of time from each switch on; default none.
+        Rate of the load from each time on; default zero.
 
     Returns
     -------
@@ -69,7 +68,7 @@ def simulate(
     BadInputError
         If shapes, order or range of the arguments are wrong.
     HmsaError
-        If the integration does not get through.
+        If the integration fails.
 
     """
     switches, loads, times = _vector(switches), _vector(loads), _vector(times)
@@ -95,7 +94,7 @@ def simulate(
 def follow(
         levels: Sequence[Level], state: State, end: float, material: NondimensionalParameters,
         delivery: Delivery) -> State:
-    """Return the state that levels lead to at a time after the last of them, without checks."""
+    """Return the state at a time after the last level; arguments are not checked."""
     pieces, last = ramps(levels, state.ramps_from, end, delivery.slew)
     if material.creep or delivery.lag > 0.0:
         return _follow_slowly(pieces, last, state, end, material, delivery)
@@ -104,7 +103,7 @@ def follow(
 
 
 def followed_by(state: State, material: NondimensionalParameters) -> tuple[float, ...]:
-    """Return what each branch that holds anything has followed in a state."""
+    """Return the branch states of a state: the elastic force that each branch has followed."""
     count = len(material.branches)
     if len(state.followed) == count:
         return state.followed
@@ -113,14 +112,14 @@ def followed_by(state: State, material: NondimensionalParameters) -> tuple[float
 
 def with_followed(
         material: NondimensionalParameters, followed: ArrayLike) -> Array:
-    """Return branches as `hmsa_ros.motion` takes them, with what they have followed."""
+    """Return branches with given branch states, as arguments of `hmsa_ros.motion`."""
     branches = material.branches.copy()
     branches[:, motion.FOLLOWER] = followed
     return branches
 
 
 def paces(material: NondimensionalParameters, above: ArrayLike) -> Array:
-    """Return how fast branches relax that hold so much over their ratio, in units of G."""
+    """Return the relaxation rates of branches with a stress over their ratio, in units of G."""
     given: Array = np.asarray(above, dtype=np.float64)
     given = np.where(np.abs(given) > _NOTHING, given, _NOTHING)
     found: Array = flow_rates(material, given) / given
@@ -128,7 +127,7 @@ def paces(material: NondimensionalParameters, above: ArrayLike) -> Array:
 
 
 def flow_rates(material: NondimensionalParameters, above: Array) -> Array:
-    """Return how fast branches follow that hold so much over their ratio, in units of G."""
+    """Return the flow rates of branches with a stress over their ratio, in units of G."""
     rates = np.empty(len(above))
     motion.flow_rates(material.branches, above, rates)
     return rates
@@ -138,10 +137,10 @@ def sampled(
         levels: Sequence[Level], state: State, times: Array, material: NondimensionalParameters,
         delivery: Delivery = IDEAL, rtol: float = RTOL) -> Array:
     """
-    Return stretch, rate, field and what n branches follow under levels, shape (3 + n, m).
+    Return stretch, rate, field and n branch states under levels, shape (3 + n, m).
 
-    The state is that where the first level begins; times (m,) do not decrease. A load too large to
-    follow is an `HmsaError`.
+    The state is that at the start of the first level; times (m,) do not decrease. Raise
+    `HmsaError` if a load is too large to simulate.
     """
     pieces, _ = ramps(
         levels, state.ramps_from, max(float(times[-1]), levels[-1].time), delivery.slew)
@@ -152,10 +151,10 @@ def response(
         actuator: ActuatorParameters, delivery: Delivery, times: Array, levels: Array, at: Array,
         start: float) -> tuple[Array, Array, Array]:
     """
-    Return stretch, rate in 1/s and level in force at times in s (n,), from rest at a stretch.
+    Return stretch, rate in 1/s and level at times in s (n,), from rest at a stretch.
 
-    Levels (m,), in T or V, are in force from their times in s on; before the first, the level
-    that holds the start. Raises as `sampled`.
+    Levels (m,), in T or V, apply from their times in s on; before the first one, the level that
+    holds the start applies. Errors are those of `sampled`.
     """
     units, material = actuator.units, actuator.nondimensional
     held = float(law.elastic_force(start, material.packed))
@@ -183,7 +182,7 @@ def _sampled(
 def _follow_slowly(
         pieces: Sequence[Piece], last: float, state: State, end: float,
         material: NondimensionalParameters, delivery: Delivery) -> State:
-    """Integrate until vibration has ended; from then on branches relax alone."""
+    """Integrate until vibration has ended; from then on only the branches relax."""
     rings, amplifier = end, last if delivery.lag > 0.0 else None
     if material.creep:
         rings = min(end, max(pieces[-1][0], 0.0) + longest_motion(last, material)
@@ -204,15 +203,15 @@ def _follow_slowly(
 def _relaxed(
         followed: Array, last: float, share: Array, duration: float,
         material: NondimensionalParameters) -> Array:
-    """Return what branches follow after a duration without inertia, under a constant load."""
-    # The elastic force is linear in what they follow, which follows it.
+    """Return the branch states after a duration without inertia, under a constant load."""
+    # The elastic force is linear in the branch states, which follow it.
     if material.creep.law.kind == MAXWELL.kind:
         speeds = material.branches[:, motion.SPEED]
         values, vectors = np.linalg.eig(speeds[:, None] * (share - np.eye(len(share))))
         left = np.linalg.solve(vectors, followed - last)
         found: Array = last + np.real(vectors @ (left * np.exp(values * duration)))
         return found
-    from scipy.integrate import solve_ivp  # others need not wait for it
+    from scipy.integrate import solve_ivp  # slow to import
 
     def change(_: float, y: Array) -> Array:
         return flow_rates(material, last + share @ (y - last) - y)
@@ -223,12 +222,12 @@ def _relaxed(
 
 
 def _vector(values: ArrayLike) -> Array:
-    """Return a contiguous copy."""
+    """Return the values as a new contiguous array."""
     return np.array(values, dtype=np.float64, ndmin=1, order='C')
 
 
 def longest_motion(load: float, material: NondimensionalParameters) -> float:
-    """Return the time after which motion under a load beta has settled, or a bound for it."""
+    """Return the time after which motion under a load beta has settled, or an upper bound."""
     stretch = law.equilibrium_stretch(load, material.packed)
     frequency = law.natural_frequency(stretch, material.packed)
     longest = _MOST_PERIODS * 2.0 * math.pi / frequency
@@ -237,7 +236,7 @@ def longest_motion(load: float, material: NondimensionalParameters) -> float:
         return longest
     if decay < frequency:
         return min(longest, _SETTLED / decay)
-    # The slower of two decays.
+    # Overdamped: use the slower of the two decays.
     return _SETTLED * 2.0 * decay / frequency ** 2
 
 
@@ -286,7 +285,7 @@ class ActuatorSimulation:
 
     @property
     def time(self) -> int:
-        """Time in ns that the state belongs to; setting it skips what lies between."""
+        """Time of the state in ns; setting it skips the time in between."""
         return self._all.time
 
     @time.setter
@@ -305,38 +304,38 @@ class ActuatorSimulation:
 
     @property
     def flux_density(self) -> float:
-        """Flux density in force, in T."""
+        """Present flux density in T."""
         return float(self._all.flux_density[0])
 
     @property
     def schedule(self) -> CommandSchedule:
-        """Commands in force and ahead, in T."""
+        """Present and future commands in T."""
         return self._all.schedules[0]
 
     def reset(self) -> None:
-        """Return to the initial state, at rest, with no command ahead; time goes on."""
+        """Return to the initial state at rest, without future commands; time continues."""
         self._all.reset(0)
 
     def set_state(
             self, stretch: float, rate: float, flux_density: float,
             level: float | None = None) -> None:
-        """Go on from another state, as `Actuators.set_state`."""
+        """Continue from another state, see `Actuators.set_state`."""
         self._all.set_state(0, stretch, rate, flux_density, level)
 
     def command(self, stamp: int, flux_density: float) -> int:
-        """Take a command in T, as `Actuators.command`; return how late it is in ns."""
+        """Take a command in T, see `Actuators.command`; return its lateness in ns."""
         return self._all.command(0, stamp, flux_density)
 
     def force(self, stamp: int, force: float) -> None:
-        """Take a disturbing force in N, as `Actuators.force`."""
+        """Take a disturbing force in N, see `Actuators.force`."""
         self._all.force(0, stamp, force)
 
     def equilibrium(self) -> float:
-        """Return the stretch that the flux density in force would hold."""
+        """Return the equilibrium stretch under the present flux density."""
         return self._all.equilibrium(0)
 
     def advance(self, time: int) -> None:
-        """Integrate to a time in ns; a load too large to follow is an `HmsaError`."""
+        """Integrate to a time in ns; raise `HmsaError` if the load is too large to simulate."""
         failed = self._all.advance(time)
         self._all.changes.clear()
         if failed:
@@ -345,6 +344,6 @@ class ActuatorSimulation:
 
 
 def too_large(time: int, flux_density: float) -> str:
-    """Return the sentence for a load that cannot be followed, at a time in ns and in T."""
+    """Return the message for a load that is too large to simulate, at a time in ns and in T."""
     return (f'the integration stopped at {time} ns under {flux_density:g} T: the load is too '
             'large to follow')

@@ -1,4 +1,4 @@
-"""Verdicts on a move or on a request, and the error that carries one."""
+"""Outcomes of a move or a request, and the error that contains one."""
 
 from enum import Enum
 
@@ -7,10 +7,9 @@ from hmsa_ros.errors import BadInputError
 
 class Code(str, Enum):
     """
-    The outcome of a move or a request; the value is what messages and files carry.
+    The outcome of a move or a request; messages and files contain the value.
 
-    In this order: plans that can be carried out, refusals, outcomes of a request, and what was
-    measured.
+    The order is: feasible plans, refusals, outcomes of a request, and measured outcomes.
     """
 
     TWO_STEP = 'two_step'
@@ -73,9 +72,9 @@ class Code(str, Enum):
 
 
 class RefusedError(BadInputError):
-    """A request that cannot be carried out; whatever ran before runs on. `code` says why."""
+    """A request that cannot be carried out; the running plan continues. `code` is the reason."""
 
     def __init__(self, code: Code, reason: str) -> None:
-        """Keep the code beside the sentence, which says what, got and expected."""
+        """Store the code with the message, which contains the value and the expectation."""
         super().__init__(reason)
         self.code = code

@@ -1,4 +1,4 @@
-"""Units: of time, and of what messages to a person give."""
+"""Scales of dimensionless quantities, and units in messages."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,18 +13,18 @@ EPSILON_0 = 8.8541878188e-12
 
 @dataclass(frozen=True)
 class Drive:
-    """What moves an actuator, and the level of which a load is made."""
+    """Drive of an actuator, a field or a voltage, and its relation to the load."""
 
     name: str
     plural: str
     symbol: str
     unit: str
     shown: str  #: unit in tables and figures
-    per: float  #: of these in one of the other
-    squared: bool = False  #: whether a load grows as the square of the level
+    per: float  #: number of shown units in one unit
+    squared: bool = False  #: whether the load is the square of the level
 
     def text(self, level: float, form: str = '.3g') -> str:
-        """Word a level as it is shown."""
+        """Format a level in the shown unit."""
         return f'{self.per * level:{form}} {self.shown}'
 
 
@@ -34,45 +34,45 @@ VOLTAGE = Drive('voltage', 'voltages', 'U', 'V', 'V', 1.0, squared=True)
 
 @dataclass(frozen=True)
 class Units:
-    """Units in which messages give times and loads."""
+    """Units for times and loads in messages."""
 
-    time: float = 1.0  #: size of the nondimensional unit in the named one, as load
+    time: float = 1.0  #: time scale, in the named unit
     load: float = 1.0  #: level of the load 1
-    time_name: str = ''  #: with a leading space; empty for nondimensional values, as load_name
+    time_name: str = ''  #: with a leading space; empty for dimensionless values, as load_name
     load_name: str = ''
-    coordinate: str = 'stretch'  #: what a position is called
+    coordinate: str = 'stretch'  #: name of a position
     drive: Drive = FLUX
 
     def level(self, load: Any) -> Any:
-        """Return the level of a load, or an array of them; of one that no voltage has, minus."""
+        """Return the level of a load or array; negative for a load that no voltage has."""
         if self.drive.squared:
             return abs(load) ** 0.5 * ((load >= 0.0) * 2.0 - 1.0) * self.load
         return load * self.load
 
     def of_level(self, level: Any) -> Any:
-        """Return the load of a level, or an array of them; voltages of either sign attract."""
+        """Return the load of a level or array; voltages of either sign attract."""
         load = level / self.load
         return load * load if self.drive.squared else load
 
     def change(self, level: float, by: float) -> float:
-        """Return by how much the load changes at the most as a level changes."""
+        """Return the maximum change of the load when a level changes by an amount."""
         more = (2.0 * abs(level) + abs(by)) / self.load if self.drive.squared else 1.0
         return by / self.load * more
 
     def range(self, least: float, largest: float) -> tuple[float, float]:
-        """Return the least and the largest load of levels within two."""
+        """Return the minimum and maximum load in a range of levels."""
         least = max(least, 0.0) if self.drive.squared else least
         return self.of_level(least), self.of_level(largest)
 
     def time_text(self, value: float) -> str:
-        """Word a nondimensional time with four significant digits."""
+        """Format a dimensionless time with four significant digits."""
         return f'{value * self.time:.4g}{self.time_name}'
 
     def slew_text(self, value: float) -> str:
-        """Word a slew rate (load per nondimensional time) with four digits, as in ``'20 T/s'``."""
+        """Format a slew rate (dimensionless) with four digits, as in ``'20 T/s'``."""
         unit = f'{self.load_name}/{self.time_name.strip()}' if self.time_name else ''
         return f'{value * self.load / self.time:.4g}{unit}'
 
     def load_text(self, value: float) -> str:
-        """Word a nondimensional load beta with four significant digits."""
+        """Format a dimensionless load beta with four significant digits."""
         return f'{self.level(value):.4g}{self.load_name}'

@@ -1,4 +1,4 @@
-"""Power law: a branch flows the faster the more it holds, and the less the more it has relaxed."""
+"""Power law: the flow rate increases with the stress and decreases with relaxation."""
 
 from hmsa_ros.model.flows.record import Constant, Flow
 

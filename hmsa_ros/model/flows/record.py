@@ -1,33 +1,33 @@
-"""What a flow is: the number that the compiled motion gives it, and its constants."""
+"""Record of a flow rule: its number in the compiled motion, and its constants."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
-#: Constants of a flow at the most, as in `hmsa_ros/motion/hmsa/flow.hpp`.
+#: Maximum number of constants of a flow rule, as in `hmsa_ros/motion/hmsa/flow.hpp`.
 FLOW_CONSTANTS = 2
 
 
 @dataclass(frozen=True)
 class Constant:
-    """One constant of a flow, of which each branch has one."""
+    """One constant of a flow rule, with one value per branch."""
 
     name: str  #: of the parameter, after ``viscoelastic.``
-    words: str  #: what it is
+    words: str  #: description
     minimum: float  #: closed range
     maximum: float
 
 
 @dataclass(frozen=True)
 class Flow:
-    """How fast a branch follows the elastic force, by the stress that it holds over its ratio."""
+    """Flow rule: the rate at which a branch follows the elastic force, from stress over ratio."""
 
     name: str
     kind: int
-    rate: str  #: as a formula of that stress x, in units of G, and the relaxation time tau
-    source: str  #: where it was published
+    rate: str  #: formula in that stress x, in units of G, and the relaxation time tau
+    source: str  #: publication
     constants: tuple[Constant, ...] = ()
-    #: From the constants to how many times as fast as the relaxation time says a branch relaxes
-    #: that holds as much as the shear modulus.
+    #: Maps the constants to the relaxation rate at a stress of the shear modulus, relative to
+    #: that given by the relaxation time.
     hastens: Callable[..., float] = lambda: 1.0
 
 

@@ -1,7 +1,7 @@
 """
-The laws of elasticity: one table, and one module for each with its constants and its source.
+Hyperelastic models: a table, and one module for each model with its constants and source.
 
-Nothing here is compiled; forces and energies are in `hmsa_ros/motion/hmsa/law.hpp`.
+These modules are not compiled; forces and energies are in `hmsa_ros/motion/hmsa/law.hpp`.
 """
 
 from hmsa_ros.model.laws import (
@@ -16,7 +16,7 @@ from hmsa_ros.model.laws import (
 )
 from hmsa_ros.model.laws.record import Law
 
-#: By name; the first is the default.
+#: Models by name; the first is the default.
 LAWS: dict[str, Law] = {x.name: x for x in (
     gent.GENT, gent.NEO_HOOKEAN, mooney_rivlin.LAW, yeoh.LAW, ogden.LAW, arruda_boyce.LAW,
     table.LAW, beam.LAW, dielectric.LAW)}

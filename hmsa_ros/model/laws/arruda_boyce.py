@@ -1,4 +1,4 @@
-"""Arruda-Boyce: eight chains, by the first five terms of the inverse Langevin function."""
+"""Arruda-Boyce: eight chains, with five terms of the inverse Langevin function."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,8 +1,8 @@
 """
 Beam: clamped at one end, magnetised along its length, in a field across it.
 
-Its first mode alone, as far as it bends. The coordinate is the deflection of the tip over the
-length: a uniform field does work along it as a constant force at the tip does, so that its load
+Only the first mode is modelled, at any amplitude. The coordinate is the deflection of the tip over
+the length: the work of a uniform field is that of a constant force at the tip, so that the load
 is that of a block. Length and thickness are those of the block's parameters. In the units here
 the beam at rest has stiffness 3 and inertia 1, as a block with c1 = 5.
 """
@@ -15,12 +15,12 @@ from hmsa_ros.model.laws.record import BEAM, Constant, Elastic, given, Law, posi
 
 #: c1 of the block that has the inertia of a beam at rest.
 SHAPE = 5.0
-# Thickness over length from which on it is no slender beam.
+# Maximum thickness over length of a slender beam.
 _THICKEST = 0.25
 
 
 def _scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
-    from hmsa_ros.model.laws import bending  # imports NumPy, which not all who have laws need
+    from hmsa_ros.model.laws import bending  # imports NumPy, which not all users of laws need
 
     if 'actuator.half_length' not in values:
         raise BadInputError(
@@ -46,7 +46,7 @@ def _scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
 
 
 def _completed(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return where a beam is at rest, unless a value says where it begins."""
+    """Return the initial position of a beam at rest, unless it is given."""
     return {} if 'initial_stretch' in values else {'initial_stretch': 0.0}
 
 

@@ -1,11 +1,11 @@
 """
-One mode of a clamped-free beam that bends as far as it likes, as functions of its tip.
+One mode of a clamped-free beam at large deflections, as functions of its tip.
 
-The tangent at the share ``s`` of the length turns by ``theta(s) = q f(s)``, where ``f`` is the
+The tangent at the fraction ``s`` of the length turns by ``theta(s) = q f(s)``, where ``f`` is the
 slope of the first mode of a beam, scaled so that ``q`` is the angle of the tip. The coordinate
-is ``u = integral of sin(theta)``, the deflection of the tip across the beam over its length:
-along it a uniform field across does work as a constant force at the tip does. In the units of
-`hmsa_ros.model.laws.beam` elastic force, inertia and damping are then functions of ``u`` alone,
+is ``u = integral of sin(theta)``, the deflection of the tip across the beam over its length: the
+work of a uniform field across it is that of a constant force at the tip. In the units of
+`hmsa_ros.model.laws.beam`, elastic force, inertia and damping are then functions of ``u`` alone,
 the same for every beam.
 """
 
@@ -16,30 +16,30 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-#: Root of cos x cosh x = -1: the first frequency is its square times sqrt(EI/(rho A L^4)).
+#: Root of cos x cosh x = -1; the first frequency is its square times sqrt(EI/(rho A L^4)).
 ROOT = 1.8751040687119611
-#: Largest angle of the tip that is planned for.
+#: Maximum angle of the tip in plans.
 LARGEST_ANGLE = np.radians(80.0)
-# The tables go on to here, where a stop begins that no beam has.
+# End of the tables, where an artificial stop begins.
 _TABLE_ANGLE = np.radians(95.0)
-# Points of the quadrature along the beam, and pieces of the tables with their degree.
+# Points of the quadrature along the beam, and number and degree of the pieces of the tables.
 _POINTS, _PIECES, _DEGREE = 48, 96, 7
 _NEWTON = 60
 
 
 @cache
 def _rule() -> tuple[Array, Array, Array]:
-    """Return weights along the beam, what integrates up to each of its points, and f there."""
+    """Return quadrature weights, the matrix that integrates up to each point, and f there."""
     legendre = np.polynomial.legendre
     x, weights = legendre.leggauss(_POINTS)
-    # Of each polynomial of Legendre its integral, by the polynomials through the points.
+    # Integrate the Legendre polynomials, and change the basis to values at the points.
     integrals = legendre.legval(x, legendre.legint(np.eye(_POINTS), lbnd=-1)).T
     up_to: Array = 0.5 * integrals @ np.linalg.inv(legendre.legvander(x, _POINTS - 1))
     return 0.5 * weights, up_to, slope(0.5 + 0.5 * x)
 
 
 def slope(share: ArrayLike) -> Array:
-    """Return the slope of the first mode at shares of the length, 1 at the tip."""
+    """Return the slope of the first mode at fractions of the length, 1 at the tip."""
     ratio = (np.sin(ROOT) - np.sinh(ROOT)) / (np.cos(ROOT) + np.cosh(ROOT))
     x = ROOT * np.append(np.ravel(share), 1.0)
     unscaled = np.sinh(x) + np.sin(x) + ratio * (np.cosh(x) - np.cos(x))
@@ -48,7 +48,7 @@ def slope(share: ArrayLike) -> Array:
 
 
 def _turned(angle: ArrayLike) -> Array:
-    """Return by how much the beam is turned at its points, for angles of the tip in rad."""
+    """Return the rotation of the beam at its points, for angles of the tip in rad."""
     return np.multiply.outer(np.asarray(angle, dtype=np.float64), _rule()[2])
 
 
@@ -68,7 +68,7 @@ def _gain(angle: ArrayLike) -> Array:
 
 @cache
 def fold() -> float:
-    """Return the angle at which the tip deflects the most: beyond it a field pulls it back."""
+    """Return the angle at which the tip deflects most: beyond it a field pulls it back."""
     angle = 1.8
     weights, _, f = _rule()
     for _ in range(_NEWTON):
@@ -80,7 +80,7 @@ def angle_of(deflections: ArrayLike) -> Array:
     """Return the angle of the tip in rad at deflections, each within that of `fold`."""
     wanted = np.asarray(deflections, dtype=np.float64)
     most = float(deflection(fold()))
-    # What is left of the deflection is about a square of what is left of the angle.
+    # Near the fold the missing deflection is about the square of the missing angle.
     angle: Array = np.sign(wanted) * fold() * (
         1.0 - np.sqrt(np.maximum(1.0 - np.abs(wanted) / most, 0.0)))
     for _ in range(_NEWTON):
@@ -101,12 +101,12 @@ def inertia_of_angle(angle: ArrayLike) -> Array:
 
 
 def tangent(deflected: float, share: ArrayLike) -> Array:
-    """Return the angle in rad by which a bent beam is turned at shares of its length."""
+    """Return the rotation in rad of a bent beam at fractions of its length."""
     return float(angle_of(deflected)) * slope(share)
 
 
 def centreline(deflected: float, points: int) -> tuple[Array, Array]:
-    """Return places along and across the beam from clamp to tip, over its length."""
+    """Return positions along and across the beam from clamp to tip, over its length."""
     # At the points, and halfway between them.
     turned = tangent(deflected, np.linspace(0.0, 1.0, 2 * points - 1))
     ends, middle = turned[::2], turned[1::2]
@@ -123,10 +123,10 @@ def packed() -> tuple[float, ...]:
     """
     Return the constants of ``Beam`` in ``motion/hmsa/system.hpp``.
 
-    Number of pieces; deflections of the fold and of the end of the tables; inverse of the
-    share of ``1 - sqrt(1 - u/fold)`` that each piece has; force, stiffness, inertia and
-    damping at the end. Then of each piece: deflection and energy where it begins, and the
-    factors of the powers of what is beyond for force, inertia and damping.
+    The order is: number of pieces; deflections of the fold and of the end of the tables; inverse
+    width of the pieces in ``1 - sqrt(1 - u/fold)``; force, stiffness, inertia and damping at the
+    end. For each piece follow its initial deflection and energy, and the polynomial coefficients
+    of force, inertia and damping.
     """
     most = float(deflection(fold()))
     end = float(deflection(_TABLE_ANGLE))
@@ -143,7 +143,7 @@ def packed() -> tuple[float, ...]:
     powers = nodes[:, None] ** np.arange(_DEGREE + 1)
     factors = np.linalg.solve(powers, values[..., None])[..., 0]
     pieces = factors / widths[:, None] ** np.arange(_DEGREE + 1)
-    # Nothing holds a straight beam.
+    # The force on a straight beam is exactly zero.
     pieces[0, 0, 0] = 0.0
     at_end = widths[-1] ** np.arange(_DEGREE + 1)
     last = pieces[:, -1] @ at_end

@@ -1,4 +1,4 @@
-"""What the position of an actuator is: a stretch, the deflection of a beam, a capacitance."""
+"""Kinds of position of an actuator: stretch, deflection of a beam, capacitance ratio."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -9,20 +9,20 @@ from hmsa_ros.model.units import Drive, FLUX, VOLTAGE
 
 @dataclass(frozen=True)
 class Coordinate:
-    """What a position is, and which values it may have."""
+    """A kind of position, and the range of its values."""
 
     name: str  #: in sentences, as plural
     plural: str
     symbol: str  #: in axes of figures, as tex
     tex: str
-    meaning: str  #: what it is, and about which value
+    meaning: str  #: definition and typical value
     rest: float  #: without a field
-    at_rest: tuple[float, float]  #: what a sensor may show without a field
-    possible: tuple[float, float]  #: what a sensor may usually show
-    conceivable: tuple[float, float]  #: what can be a position at all
-    usual: tuple[float, float]  #: range of a motion that is not too large
-    drive: Drive = FLUX  #: what moves it
-    looks: str = ''  #: what other values may be, and how to mend them; empty where the values tell
+    at_rest: tuple[float, float]  #: range of a sensor without a field
+    possible: tuple[float, float]  #: usual range of a sensor
+    conceivable: tuple[float, float]  #: range of any position
+    usual: tuple[float, float]  #: range of a motion of moderate size
+    drive: Drive = FLUX  #: field or voltage
+    looks: str = ''  #: likely meaning of other values, and a remedy; empty if evident
 
 
 STRETCH = Coordinate(
@@ -38,22 +38,22 @@ CAPACITANCE = Coordinate(
     'capacitance ratio', 'capacitance ratios', 'C/C₀', 'C/C_0',
     'the capacitance over that without a voltage, around 1', 1.0,
     (0.5, 2.0), (0.05, 50.0), (0.0, 400.0), (0.5, 3.0), VOLTAGE)
-#: What a position is called where nothing more is known.
+#: Name of a position of unknown kind.
 POSITION = 'position'
 COORDINATES = {x.name: x for x in (STRETCH, DEFLECTION, CAPACITANCE)}
 
 
 def shared_name(names: Iterable[str]) -> str:
-    """Return what positions of several actuators are called together."""
+    """Return the common name of the positions of several actuators."""
     found = set(names)
     return found.pop() if len(found) == 1 else POSITION
 
 
 def drive_of(name: str) -> Drive:
-    """Return what moves an actuator whose positions have a name; a field if it is unknown."""
+    """Return the drive of an actuator by the name of its positions; a field if unknown."""
     return COORDINATES.get(name, STRETCH).drive
 
 
 def coordinate_of(law: Elastic | None) -> Coordinate:
-    """Return what the position is under a law; None for Gent."""
+    """Return the kind of position of a model; None for Gent."""
     return STRETCH if law is None else COORDINATES[law.coordinate]

@@ -1,10 +1,10 @@
 """
-A rising curve of level against stretch, out of measured points.
+An increasing curve of level against stretch, fitted to measured points.
 
-A spline of degree 5 with four continuous derivatives. It minimises the squares of what it misses
-and, weighted, of its third derivative; the weight is that of generalised cross-validation
-(P. Craven, G. Wahba, Numer. Math. 31, 377 (1979)), or larger where the curve would not rise.
-Points without scatter, less than 1/5000 of their range, are interpolated.
+The curve is a spline of degree 5 with four continuous derivatives. It minimises the squared errors
+plus, weighted, the squared third derivative. The weight is that of generalised cross-validation
+(P. Craven, G. Wahba, Numer. Math. 31, 377 (1979)), or larger if the curve would not increase.
+Points with a scatter below 1/5000 of their range are interpolated.
 """
 
 from collections.abc import Sequence
@@ -22,26 +22,26 @@ from hmsa_ros.errors import BadInputError
 
 Array = NDArray[np.float64]
 
-#: Fewest and most points.
+#: Minimum and maximum number of points.
 FEWEST, MOST = 6, 2000
-# Ranges; levels beyond are likely in mT, stretches in percent or mm.
+# Valid ranges; larger levels are likely in mT, other stretches in percent or mm.
 _STRETCHES, _LARGEST_LEVEL = (0.1, 10.0), 5.0
 _DEGREE = 5
-# Functions of the basis: with more points than that they are fewer than the points.
+# Maximum number of basis functions.
 _FUNCTIONS = 40
-# Weights of the roughness, for levels and stretches of a range of 1.
+# Weights of the roughness to try, for levels and stretches normalised to a range of 1.
 _WEIGHTS = np.logspace(-18.0, 2.0, 61)
-# What cross-validation counts for a degree of freedom: with 1 it follows noise now and then.
+# Cost of a degree of freedom in cross-validation; with 1 the curve sometimes follows noise.
 _PRICE = 1.2
-# What a curve may miss of points: in units of the scatter, and as a share of their range.
+# Maximum deviation of a curve from points: in standard deviations, and relative to their range.
 _DEVIATIONS, _SHARE = 4.0, 0.02
-# Less scatter than this share of the range is interpolated.
+# Points with a smaller scatter, relative to the range, are interpolated.
 _EXACT = 2e-4
-# Most scatter, as a share of the range, and least slope, as one of the mean slope.
+# Maximum scatter, relative to the range, and minimum slope, relative to the mean slope.
 _MOST_SCATTER, _LEAST_SLOPE = 0.05, 0.02
-# Within which share of the range the level at stretch 1 counts as 0.
+# Tolerance within which the level at stretch 1 counts as 0, relative to the range.
 _ZERO = 5e-3
-# From an end the stop is so far, as a share of the way from stretch 1 to the end.
+# Distance of the stop from an end, as a fraction of that from stretch 1 to the end.
 _STOP = 0.1
 _LOOK = 24
 
@@ -57,8 +57,8 @@ class Curve(NamedTuple):
         """
         Return the constants of ``Table`` in ``motion/hmsa/law.hpp``, for a unit in T.
 
-        Number of pieces and depths of the stops; of each piece begin, energy there and factors;
-        end, energy, force and stiffness there.
+        The order is: number of pieces and depths of the stops; start, initial energy and
+        coefficients of each piece; end, with energy, force and stiffness there.
         """
         level, breaks = self.level, self.level.x
         energy = level.antiderivative()
@@ -73,9 +73,9 @@ class Curve(NamedTuple):
 
 def points_in(name: str) -> tuple[list[float], list[float]]:
     """
-    Return stretches and levels in T of a CSV with the columns ``stretch`` and ``flux_density``.
+    Return stretches and levels in T of a CSV file with columns ``stretch`` and ``flux_density``.
 
-    A file or row that cannot be used is a `BadInputError`.
+    Raise `BadInputError` if the file or a row cannot be used.
     """
     from hmsa_ros.columns import read_table
 
@@ -91,7 +91,7 @@ def points_in(name: str) -> tuple[list[float], list[float]]:
 def _check(
         stretch: Sequence[float], flux: Sequence[float], source: str,
         places: Sequence[str]) -> None:
-    """Refuse points that no block can have, with where they are."""
+    """Raise `BadInputError` for points that no block can have, with their place."""
     if len(stretch) != len(flux) or not FEWEST <= len(stretch) <= MOST:
         rows = f'{len(stretch)}' if len(stretch) == len(flux) \
             else f'{len(stretch)} stretches and {len(flux)} levels'
@@ -127,10 +127,10 @@ def _check(
 @lru_cache(maxsize=32)
 def fitted(stretch: tuple[float, ...], flux: tuple[float, ...]) -> Curve:
     """
-    Return the curve through points, which rises everywhere and is 0 at stretch 1.
+    Return the curve through points, which increases everywhere and is 0 at stretch 1.
 
-    Points are stretches, rising from below 1 to above, and the levels in T that hold them. Points
-    that no rising curve follows within their scatter are a `BadInputError`.
+    Points are stretches, increasing from below 1 to above, and the levels in T that hold them.
+    Raise `BadInputError` if no increasing curve fits them within their scatter.
     """
     _check(stretch, flux, 'law table', [f'row {i}' for i in range(1, len(stretch) + 1)])
     x, y = np.array(stretch), np.array(flux)
@@ -139,7 +139,7 @@ def fitted(stretch: tuple[float, ...], flux: tuple[float, ...]) -> Curve:
     knots = _knots(u)
     basis = BSpline(knots, np.eye(len(knots) - _DEGREE - 1), _DEGREE)
     design = basis(u)
-    curves, roughness, parts = _told_apart(design, _roughness(basis), v)
+    curves, roughness, parts = _separated(design, _roughness(basis), v)
     shares = 1.0 / (1.0 + _WEIGHTS[:, None] * roughness)
     coefficients = shares * parts @ curves.T
     squares = np.sum((v - coefficients @ design.T) ** 2, axis=1)
@@ -152,13 +152,13 @@ def fitted(stretch: tuple[float, ...], flux: tuple[float, ...]) -> Curve:
         raise BadInputError(
             f'law table has a scatter of {scatter * height:.3g} T about a smooth curve: expected '
             f'at most {_MOST_SCATTER * height:.3g} T, {_MOST_SCATTER:.0%} of its range')
-    # The roughest that rises everywhere; where not even a parabola does, it misses the points.
+    # Use the least smooth curve that increases everywhere; if none does, even parabolas misfit.
     slopes = basis.derivative()(_points(knots, np.linspace(0.0, 1.0, _LOOK)))
     chosen = next((x for x in coefficients[best if scatter > _EXACT else 0:]
                    if np.min(slopes @ x) > _LEAST_SLOPE), np.zeros(len(basis.c)))
     missed = np.abs(design @ chosen - v)
     if np.max(missed) > max(_DEVIATIONS * scatter, _SHARE):
-        # Where the points themselves turn back the most.
+        # Report the point of the largest decrease.
         falls = np.maximum.accumulate(v) - v
         i = int(np.argmax(falls if np.max(falls) > 0.0 else missed))
         raise BadInputError(
@@ -177,7 +177,7 @@ def fitted(stretch: tuple[float, ...], flux: tuple[float, ...]) -> Curve:
 
 
 def _knots(u: Array) -> Array:
-    """Return knots from 0 to 1: points, or quantiles of many, without those next to the ends."""
+    """Return knots from 0 to 1: the points, or quantiles of many, without those near the ends."""
     edge = (_DEGREE + 1) // 2
     inner = u[edge:-edge] if len(u) <= _FUNCTIONS else np.quantile(
         u, np.linspace(0.0, 1.0, _FUNCTIONS - _DEGREE + 1)[1:-1])
@@ -187,14 +187,14 @@ def _knots(u: Array) -> Array:
 
 
 def _points(knots: Array, shares: ArrayLike) -> Array:
-    """Return points at shares of each piece between knots."""
+    """Return points at fractions of each piece between knots."""
     breaks = knots[_DEGREE:-_DEGREE, None]
     points: Array = (breaks[:-1] + np.diff(breaks, axis=0) * np.asarray(shares)).ravel()
     return points
 
 
 def _roughness(basis: BSpline) -> Array:
-    """Return what squared and added gives the integral of the squared third derivative."""
+    """Return the matrix whose squared norm is the integral of the squared third derivative."""
     nodes, weights = np.polynomial.legendre.leggauss(3)
     third = basis.derivative(3)(_points(basis.t, 0.5 + 0.5 * nodes))
     widths = np.diff(basis.t[_DEGREE:-_DEGREE])
@@ -202,15 +202,16 @@ def _roughness(basis: BSpline) -> Array:
     return made
 
 
-def _told_apart(design: Array, rough: Array, levels: Array) -> tuple[Array, Array, Array]:
+def _separated(design: Array, rough: Array, levels: Array) -> tuple[Array, Array, Array]:
     """
-    Return coefficients of the curves that the roughness tells apart, by column.
+    Return coefficients of the curves that diagonalise the roughness, by column.
 
-    And how rough each is, and what the points say of each: one decomposition serves every weight.
+    Also return their roughness and their coefficients in the fit; one decomposition serves all
+    weights.
     """
     q, r = np.linalg.qr(design)
     inverse = np.linalg.inv(r)
-    # A piece has 3 rows: few pieces have fewer than there are directions.
+    # A piece has 3 rows: with few pieces there may be fewer rows than directions.
     square = np.vstack([rough @ inverse, np.zeros_like(inverse)])
     _, sizes, directions = np.linalg.svd(square, full_matrices=False)
     roughness = sizes ** 2

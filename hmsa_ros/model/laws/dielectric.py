@@ -1,10 +1,10 @@
 """
-Dielectric: an elastomer between compliant electrodes, driven by a voltage, by the law of Gent.
+Dielectric: an elastomer between compliant electrodes, driven by a voltage, with the Gent model.
 
 The coordinate is the capacitance over that at rest, ``q = l^-2`` for the stretch l along the
 thickness: the energy of the charge is ``q (eps/2) (V/h)^2`` per volume, so that
-``(eps/2) (V/h)^2/G`` is a load as that of a block is. Sizes, density, G and J_lim are those of the
-block's parameters; a remanence has no effect.
+``(eps/2) (V/h)^2/G`` is the load, as for a block. Sizes, density, G and J_lim are those of the
+block's parameters; the remanence has no effect.
 """
 
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ def _scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
     if not limit > 0.0:
         raise BadInputError(
             f'parameter actuator.chain_limit is {limit:g}: expected more than 0, or inf')
-    from hmsa_ros.model.law import gent_limits  # imports NumPy, which not all who have laws need
+    from hmsa_ros.model.law import gent_limits  # imports NumPy, which not all users of laws need
 
     least, largest = (float(x) for x in gent_limits(1.0 / limit))
     return modulus, Elastic(

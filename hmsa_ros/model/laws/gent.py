@@ -1,4 +1,4 @@
-"""Gent, and the neo-Hookean law that it becomes without a limit of the chains."""
+"""Gent, and neo-Hookean, its limit for infinite J_lim."""
 
 from hmsa_ros.model.laws.record import Law
 

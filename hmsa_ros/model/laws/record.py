@@ -1,4 +1,4 @@
-"""What a law of elasticity is: its constants, and what is left of it without its scale."""
+"""Record of a hyperelastic model: its constants, and its dimensionless energy."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -6,41 +6,41 @@ from typing import Any
 
 from hmsa_ros.errors import BadInputError, excerpt
 
-# Families of laws: the first number of a packed material.
+# Families of models, the first number of a packed material, with their constants.
 GENT = 0.0  # 1/J_lim
 NEO_HOOKEAN = 1.0  # none
 POLYNOMIAL = 2.0  # b, a_1 to a_5 of b (I2 - 3) + sum a_k (I1 - 3)^k
 OGDEN = 3.0  # number of terms, then mu and alpha of each
-TABLE = 4.0  # number of pieces, then what `hmsa_ros.model.laws.curve.Curve.packed` returns
-BEAM = 5.0  # what `hmsa_ros.model.laws.bending.packed` returns
+TABLE = 4.0  # number of pieces, then the result of `hmsa_ros.model.laws.curve.Curve.packed`
+BEAM = 5.0  # result of `hmsa_ros.model.laws.bending.packed`
 ARRUDA_BOYCE = 6.0  # mu, lambda_m
 DIELECTRIC = 7.0  # 1/J_lim
 _COORDINATES = {BEAM: 'deflection', DIELECTRIC: 'capacitance ratio'}
 
-#: Place of the constants in a packed material.
+#: Index of the first constant in a packed material.
 CONSTANTS = 6
-#: Powers of I1 - 3 that the polynomial family has.
+#: Number of powers of I1 - 3 in the polynomial family.
 POWERS = 5
-#: Of a law that is a formula: no block reaches these stretches.
+#: Limits of a model that is a formula: no block reaches these stretches.
 ENDLESS = (1e-3, 1e3)
 
 
 @dataclass(frozen=True)
 class Constant:
-    """One constant of a law."""
+    """One constant of a model."""
 
     name: str  #: of the parameter, as in ``'law.c10'``
-    symbol: str  #: what it is in the energy
+    symbol: str  #: meaning in the energy
     #: Pa scales with the shear modulus, T with the flux density of load 1; empty for others.
     unit: str = 'Pa'
     kind: type = float  #: float, list or str
     minimum: float = -1e12  #: of the number, or of each in a list; closed range
     maximum: float = 1e12
     fixed: bool = False  #: whether it is read once, when a node starts
-    #: Among the constants of the family, the first of a list, which has every other place; -1 for
-    #: one that cannot be identified.
+    #: Index among the constants of the family; for a list, of its first value, with a stride of 2;
+    #: -1 if it cannot be identified.
     place: int = -1
-    inverse: bool = False  #: whether 1 over it goes to 0 where it is without effect
+    inverse: bool = False  #: whether its inverse is 0 if it has no effect
 
 
 @dataclass(frozen=True)
@@ -49,13 +49,13 @@ class Elastic:
 
     law: str  #: name
     family: float  #: one of the families above
-    constants: tuple[float, ...]  #: those of the family
-    #: Parameters that gave it, those in Pa and in T in units of the block.
+    constants: tuple[float, ...]  #: constants of the family
+    #: Parameters that it was made from, those in Pa and in T in units of the block.
     given: tuple[tuple[str, Any], ...]
-    limits: tuple[float, float] = ENDLESS  #: beyond which nothing is known
-    shape: float | None = None  #: c1 in place of that of a block
+    limits: tuple[float, float] = ENDLESS  #: range in which the energy is known
+    shape: float | None = None  #: c1, if not that of a block
     section: float = 0.0  #: width times thickness of a beam over its length squared; 0 for a block
-    #: Voltage of the load 1 over the root of G, in V/sqrt(Pa); 0 for what a field drives.
+    #: Voltage of load 1 over the root of G, in V/sqrt(Pa); 0 for actuators driven by a field.
     volts: float = 0.0
 
     @property
@@ -65,32 +65,32 @@ class Elastic:
 
     @property
     def coordinate(self) -> str:
-        """What the coordinate is called."""
+        """Name of the coordinate."""
         return _COORDINATES.get(self.family, 'stretch')
 
 
 @dataclass(frozen=True)
 class Law:
-    """A law that may be chosen."""
+    """A hyperelastic model to choose."""
 
     name: str  #: value of the parameter ``law``
     energy: str  #: W per reference volume
-    source: str  #: where it was published
-    constants: tuple[Constant, ...] = ()  #: besides those of the actuator
-    #: From the values of the constants, and of the actuator, to the shear modulus at small strain
-    #: and what is left of the law in units of it; none for Gent and its limit.
+    source: str  #: publication
+    constants: tuple[Constant, ...] = ()  #: in addition to those of the actuator
+    #: Maps the values of the constants, and of the actuator, to the shear modulus at small strain
+    #: and the energy in units of it; None for Gent and neo-Hookean.
     scaled: Callable[[Mapping[str, Any]], tuple[float, Elastic]] | None = None
-    own_modulus: bool = True  #: whether G follows from the constants of what is scaled
-    endless: bool = False  #: whether J_lim is infinite, whatever the parameter says
-    #: From the values of the constants to those that are in a file which they name.
+    own_modulus: bool = True  #: whether the constants of a scaled model determine G
+    endless: bool = False  #: whether J_lim is infinite, regardless of the parameter
+    #: Maps the values of the constants to those read from a file that they name.
     completed: Callable[[Mapping[str, Any]], dict[str, Any]] | None = None
 
 
 def positive_modulus(law: str, modulus: float, words: str, values: Sequence[Any]) -> float:
     """
-    Return a shear modulus at small strain in Pa, which follows from constants as the words say.
+    Return a shear modulus at small strain in Pa; ``words`` describe how constants determine it.
 
-    If it is not positive, at rest such a block would not be stable: `BadInputError`.
+    Raise `BadInputError` if it is not positive, as such a block would not be stable at rest.
     """
     if not 1e-3 <= modulus <= 1e12:
         raise BadInputError(
@@ -103,10 +103,10 @@ def polynomial(
         law: Law, values: Mapping[str, Any], modulus: float, powers: Sequence[float],
         second: float = 0.0) -> Elastic:
     """
-    Return a law that is a polynomial of I1 - 3, and linear in I2 - 3, in units of the modulus.
+    Return a model that is a polynomial of I1 - 3, and linear in I2 - 3, in units of the modulus.
 
-    All but the values are in Pa: the modulus at small strain, factors of the ``powers`` 1, 2, ...,
-    at most `POWERS`, of I1 - 3, and the factor of I2 - 3.
+    The modulus at small strain, the factors of the ``powers`` 1, 2, ... of I1 - 3 (at most
+    `POWERS`) and the factor of I2 - 3 are in Pa.
     """
     filled = (*powers, *(0.0,) * (POWERS - len(powers)))
     return Elastic(
@@ -116,7 +116,7 @@ def polynomial(
 
 def given(
         law: Law, values: Mapping[str, Any], modulus: float) -> tuple[tuple[str, Any], ...]:
-    """Return the constants of a law, those in Pa in units of the shear modulus."""
+    """Return the constants of a model, with those in Pa in units of the shear modulus."""
     def scaled(constant: Constant) -> Any:
         value = values[constant.name]
         if constant.kind is list:

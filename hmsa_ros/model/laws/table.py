@@ -1,4 +1,4 @@
-"""Table: measured levels that hold a block at rest, in place of a model of the material."""
+"""Table: measured levels that hold a block at rest, instead of a formula."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,14 +11,14 @@ _FILE, _STRETCH, _FLUX = 'law.file', 'law.stretch', 'law.flux_density'
 
 
 def _completed(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the points in the file, where the parameters do not have them."""
+    """Return the points from the file, unless the parameters contain them."""
     if values[_STRETCH] or values[_FLUX]:
         return {}
     if not values[_FILE]:
         raise BadInputError(
             f'law {LAW.name} has neither {_FILE} nor points: expected the path of a CSV with the '
             'columns stretch and flux_density (T)')
-    from hmsa_ros.model.laws import curve  # imports NumPy, which not all who have laws need
+    from hmsa_ros.model.laws import curve  # imports NumPy, which not all users of laws need
 
     return dict(zip((_STRETCH, _FLUX), curve.points_in(values[_FILE]), strict=True))
 
@@ -29,7 +29,7 @@ def _scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
     values = {**values, **_completed(values)}
     stretch, flux = tuple(values[_STRETCH]), tuple(values[_FLUX])
     found = curve.fitted(stretch, flux)
-    # psi'' is 3 at rest, in units of G, whatever the law.
+    # psi'' is 3 at rest, in units of G, for all models.
     unit = found.slope / 3.0
     remanence = float(values['actuator.remanence'])
     modulus = positive_modulus(
