@@ -218,7 +218,7 @@ class ActuatorParameters:
         Parameters
         ----------
         material : NondimensionalParameters
-        zeta, J_lim and c1, and the hyperelastic model.
+            zeta, J_lim and c1, and the hyperelastic model.
         shear_modulus, density, half_length, remanence : float
             The scale, in Pa, kg/m^3, m and T.
 
