@@ -1,8 +1,8 @@
 """
-The equation of motion, compiled when the package is built: C++ templates over any scalar.
+The equation of motion, compiled when the package is built: C++ templates over any scalar type.
 
-``hmsa/*.hpp`` do not use Python and allocate nothing; ``module.cpp`` binds them. Everything is
-nondimensional but `respond`, and nothing checks values: whoever calls these functions does.
+``hmsa/*.hpp`` do not use Python and allocate no memory; ``module.cpp`` binds them. All quantities
+are dimensionless except in `respond`, and values are not checked: callers do that.
 """
 
 from hmsa_ros.motion._motion import (
@@ -37,11 +37,11 @@ __all__ = [
     'turning_point',
     'two_step', 'two_step_batch', 'two_step_late']
 
-#: Statuses of a turning point: found; into an equilibrium instead; out of steps; against a
-#: limiting stretch too hard to be resolved. Those of `follow` are the first and the third.
+#: Statuses of a turning point: found; approach to an equilibrium instead; out of steps; too close
+#: to a limiting stretch to be resolved. Those of `follow` are the first and the third.
 DONE, NO_TURN, STUCK, TOO_CLOSE = range(4)
-#: Columns of a branch: gamma, 1/tau, the number of its flow and the constants of that, and where
-#: it goes on with the state, what it follows; and how many there are.
+#: Columns of a branch: gamma, 1/tau, number and constants of its flow rule, and the force that it
+#: has followed, from which it continues; last, the number of columns.
 RATIO, SPEED, FLOW, FLOW_CONSTANT, FOLLOWER, BRANCH = 0, 1, 2, 3, 5, 6
-#: Rows that `sample` writes before what the branches follow.
+#: Rows that `sample` writes before those of the branch states.
 STRETCH, RATE, FIELD, FOLLOWED = range(4)

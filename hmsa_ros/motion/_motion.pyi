@@ -1,4 +1,4 @@
-# Of the compiled module; arrays are contiguous, of float64 unless said otherwise.
+# Stubs of the compiled module; arrays are contiguous, of float64 unless stated otherwise.
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,15 +15,15 @@ def damping(stretch: float, material: Array, /) -> float: ...
 def evaluate(what: int, values: Array, material: Array, out: Array, /) -> None: ...
 def accelerations(
     stretch: Array, rate: Array, load: Array, material: Array, out: Array, /) -> None: ...
-# Status, time, stretch, and the derivatives of stretch and time by the load.
+# Return status, time, stretch, and derivatives of stretch and time by the load.
 def turning_point(
     stretch: float, rate: float, direction: float, load: float, move: float, material: Array,
     rtol: float, /) -> tuple[int, float, float, float, float]: ...
-# Status, beta_p, tau_p, beta_1 and passes.
+# Return status, beta_p, tau_p, beta_1 and number of integrations.
 def two_step(
     start: float, rate: float, target: float, material: Array, least: float, most: float,
     rtol: float, hold: float, /) -> tuple[int, float, float, float, int]: ...
-# Status, beta_p, tau_p, beta_1, and where the field lags the push that follows and when it ends.
+# Return status, beta_p, tau_p, beta_1 and, if the field lags, level and end of the final push.
 def two_step_late(
     start: float, rate: float, target: float, least: float, most: float, rtol: float, hold: float,
     material: Array, branches: Array, followed: tuple[float, ...], field: float, load: float,
@@ -32,7 +32,7 @@ def two_step_batch(
     start: Array, rate: Array, target: Array, materials: Array, stride: int, least: float,
     most: float, rtol: float, hold: float, wide: bool, status: NDArray[np.int64], beta_p: Array,
     tau_p: Array, beta_1: Array, /) -> None: ...
-# How many actuators do not get through.
+# Return the number of actuators whose integration fails.
 def follow(
     first: int, last: int, wanted: NDArray[np.bool_], state: Array, drive: Array, material: Array,
     branches: Array, durations: Array, rtol: float, status: NDArray[np.int64], /) -> int: ...
@@ -41,16 +41,16 @@ def sample(
     stretch: float, rate: float, field: float, switches: Array, loads: Array, slopes: Array,
     lag: float, times: Array, material: Array, branches: Array, rtol: float, out: Array, /
 ) -> bool: ...
-# Whether it is solved, the duration, and the work that it was of the most that it may be.
+# Return whether it is solved, the duration, and the work, at most most_work.
 def solve(
     times: Array, loads: Array, d_times: Array, d_loads: Array, stretch: float, rate: float,
     field: float, load: float, target: float, slew: float, lag: float, material: Array,
     branches: Array, followed: Array, most_work: int, /) -> tuple[bool, float, int]: ...
-# How fast branches follow that hold so much over their ratios.
+# Compute the flow rates of branches with given stresses over their ratios.
 def flow_rates(branches: Array, above: Array, out: Array, /) -> None: ...
-# What branches follow under an elastic force that is linear between times; whether all do.
+# Compute branch states for an elastic force that is linear between times; return success.
 def trail(times: Array, forces: Array, branches: Array, out: Array, /) -> bool: ...
-# How many levels there are, and a bound of their vibration.
+# Return the number of levels, and an upper bound of their vibration.
 def staircase(
     behind: Array, branches: Array, stretch: float, material: Array, lag: float, period: float,
     end: float, ripple: float, out: Array, /) -> tuple[int, float]: ...
@@ -61,7 +61,7 @@ def respond(
     rtol: float, stretch: Array, rate: Array, jacobian: Array, by_rate: Array, behind: Array,
     behind_last: Array, /
 ) -> bool: ...
-# The stretch at which a level holds the actuator; no number if there is none.
+# Return the equilibrium stretch under a level; NaN if there is none.
 def rest(
     theta: Array, material: Array, level: float, wanted: NDArray[np.int64], slopes: Array, /
 ) -> float: ...

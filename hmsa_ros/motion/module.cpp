@@ -1,5 +1,5 @@
-// The motion as Python has it: functions over numbers and buffers, which check no values. Their
-// arguments and results are those of the functions here, by `bound`.
+// Python bindings of the motion: functions over numbers and buffers, which do not check values.
+// `bound` converts their arguments and results.
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 #include <tuple>
@@ -15,7 +15,7 @@ namespace {
 using namespace hmsa;
 using GentBlock = Block<double, Gent>;
 
-// Calls f with the actuator of a packed material.
+// Calls f with the actuator type of a packed material.
 template <class F> auto with_system(const double *m, const F &f)
 {
     if (int(m[kind_at]) > neo_hookean) {
@@ -29,8 +29,8 @@ template <class F> auto with_system(const double *m, const F &f)
 }
 template <int n> constexpr std::integral_constant<int, n> fixed{};
 
-// While it lives, numbers below the least normal one are 0. What fades, as a branch, the field of a
-// coil and their derivatives do, falls to them, and x86 takes ten times as long with them.
+// Flushes subnormal numbers to 0 while it exists. Decaying values, such as branches, the field of a
+// coil and their derivatives, become subnormal, which is ten times slower on x86.
 class Flushed {
 #ifdef __SSE2__
     const unsigned before = _mm_getcsr();
@@ -43,7 +43,7 @@ public:
 
 // -- arguments and results -----------------------------------------------------------------------
 
-// A contiguous array that the caller keeps.
+// A contiguous array owned by the caller.
 template <class T> struct Array {
     T *data;
     int count;
@@ -71,7 +71,7 @@ template <> struct Argument<int> {
         return got != -1 || !PyErr_Occurred();
     }
 };
-// Given back at the end.
+// Released at the end.
 template <class T> struct Argument<Array<T>> {
     Py_buffer view{};
     Array<T> got{};
@@ -94,7 +94,7 @@ template <class T> struct Argument<Array<T>> {
     Argument(const Argument &) = delete;
     ~Argument() { PyBuffer_Release(&view); }
 };
-// What the branches have followed, or nothing.
+// The states of the branches, or nothing.
 struct Followed {
     double values[most_branches];
     int count;
@@ -150,7 +150,7 @@ template <auto f> PyObject *bound(PyObject *, PyObject *const *arguments, Py_ssi
 {
     return call(f, arguments, count);
 }
-// Does work while other threads of Python run.
+// Releases the interpreter lock during work.
 template <class F> auto apart(const F &f)
 {
     PyThreadState *state = PyEval_SaveThread();
@@ -159,7 +159,7 @@ template <class F> auto apart(const F &f)
     return result;
 }
 
-// -- the law ---------------------------------------------------------------------------------------
+// -- hyperelastic models ---------------------------------------------------------------------------
 
 enum Quantity { force_q, stiffness_q, energy_q, mass_q, frequency_q, critical_zeta_q, equilibrium_q, damping_q };
 double quantity(int what, double x, const double *m)
@@ -236,7 +236,7 @@ auto two_step_late(double start, double rate, double target, double least, doubl
     const Plan &plan = found.plan;
     return std::tuple{plan.status, plan.beta_p, plan.tau_p, plan.beta_1, found.push, found.until};
 }
-// One source, two instruction sets: all that a step does is inlined into what names its own.
+// One source, two instruction sets: all of a step is inlined into the function with the attribute.
 __attribute__((target("avx2"), flatten)) void plan_wide(const Rows &rows)
 {
     plan_lanes<four, Gent>(rows);
@@ -267,7 +267,7 @@ Nothing two_step_batch(Numbers start, Numbers rate, Numbers target, Numbers mate
 
 // -- motion over time -------------------------------------------------------------------------------
 
-// How many do not get through.
+// Returns the number of actuators whose integration fails.
 int follow(int first, int last, Array<const bool> wanted, Results state, Results drive, Numbers material,
     Results branches, Numbers durations, double rtol, Statuses status)
 {
@@ -299,7 +299,7 @@ int follow(int first, int last, Array<const bool> wanted, Results state, Results
     }
     return failed;
 }
-// Whether the motion was followed to its end.
+// Returns whether the motion was followed to its end.
 bool sample_of(double stretch, double rate, double field, Numbers switches, Numbers loads, Numbers slopes,
     double lag, Numbers times, Numbers material, Numbers branches, double rtol, Results out)
 {
@@ -319,7 +319,7 @@ bool sample_of(double stretch, double rate, double field, Numbers switches, Numb
     });
 }
 
-// How fast branches follow that hold so much, (count,).
+// Computes the flow rates of branches with given stresses over their ratios, (count,).
 Nothing flow_rates(Numbers branches, Numbers above, Results out)
 {
     const int creeping = above.count;
@@ -331,7 +331,7 @@ Nothing flow_rates(Numbers branches, Numbers above, Results out)
     }
     return {};
 }
-// What branches follow, (times, count), under an elastic force that is linear between times.
+// Computes branch states, (times, count), for an elastic force that is linear between times.
 bool trail_of(Numbers times, Numbers forces, Numbers branches, Results out)
 {
     const int creeping = branches.count / branch_columns;
@@ -341,7 +341,7 @@ bool trail_of(Numbers times, Numbers forces, Numbers branches, Results out)
 
 // -- levels ---------------------------------------------------------------------------------------
 
-// Whether it is solved, the duration, and the work that it was.
+// Returns whether it is solved, the duration, and the work.
 std::tuple<bool, double, int> solve(Results times, Results loads, Numbers d_times, Numbers d_loads,
     double stretch, double rate, double field, double load, double target, double slew, double lag,
     Numbers material, Numbers branches, Numbers followed, int most_work)
@@ -373,7 +373,7 @@ std::tuple<bool, double, int> solve(Results times, Results loads, Numbers d_time
     });
     return {solved, lasts, work};
 }
-// The number of levels and a bound of their vibration.
+// Returns the number of levels and an upper bound of their vibration.
 std::tuple<int, double> staircase(Numbers behind, Numbers branches, double stretch, Numbers material,
     double lag, double period, double end, double ripple, Results out)
 {
@@ -410,7 +410,7 @@ bool respond_gent(const Recorded &of, int from)
 {
     if (!__builtin_cpu_supports("avx2"))
         return respond_as<Eight, Block<Eight, Gent>>(of, from);
-    // What identification does most has code of its own.
+    // The most common case of identification has its own code.
     if (of.branches == 0 && of.wanted_count - from <= 4)
         return respond_wide<Dual<four, 1>, 0>(of, from);
     if (of.branches == 1 && of.theta[first_branch + 2] == maxwell)
@@ -434,7 +434,7 @@ bool respond_all(const Recorded &of)
     while ((from += 8) < of.wanted_count);
     return true;
 }
-// Whether the motion was followed to its end.
+// Returns whether the motion was followed to its end.
 bool respond(Numbers theta, Numbers material, int branches, Places wanted, Numbers start, Numbers begins,
     Numbers levels, Numbers ramps, double field, double field_lag, Numbers times, double rtol,
     Results stretch, Results rate, Results jacobian, Results by_rate, Numbers behind, Results behind_last)
@@ -458,8 +458,8 @@ bool respond(Numbers theta, Numbers material, int branches, Places wanted, Numbe
     of.behind_last = behind_last.count ? behind_last.data : nullptr;
     return apart([&] { return respond_all(of); });
 }
-// The stretch at which a level holds the actuator, no number if there is none; its derivatives by
-// what is wanted are written.
+// Returns the equilibrium stretch under a level, NaN if there is none, and writes its derivatives
+// by the wanted parameters.
 double rest(Numbers theta, Numbers material, double level, Places wanted, Results slopes)
 {
     if (!fit(theta.count >= first_branch && wanted.count == slopes.count))

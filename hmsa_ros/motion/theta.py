@@ -1,11 +1,11 @@
 """
-Places in the parameters that `hmsa_ros.motion.respond` takes, and differentiates by.
+Indices of the parameters that `hmsa_ros.motion.respond` takes and differentiates by.
 
-After `FIRST_BRANCH` come, `BRANCH` a branch, gamma, tau, the number of its flow and the constants
-of that. Beyond all places, constant
-i of the law is `CONSTANT` plus i, and the time at which piece m of the levels begins `SWITCH` plus
-m. `FRICTION` and `SQUARE` are forces that no motion has, to differentiate by alone: one against
-the motion whatever its rate, and one with the square of the rate.
+From `FIRST_BRANCH` on, each branch has `BRANCH` values: gamma, tau, number of its flow rule and
+its constants. Beyond all indices, constant i of the hyperelastic model is `CONSTANT` plus i, and
+the start time of piece m of the levels is `SWITCH` plus m. `FRICTION` and `SQUARE` are forces that
+are zero in every motion and only serve differentiation: one against the motion at any rate, and
+one with the square of the rate.
 """
 
 STIFFNESS, DAMPING, DRIVE, FORCE, LAG, STRETCH, RATE, FIRST_BRANCH = range(8)

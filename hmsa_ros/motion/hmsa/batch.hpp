@@ -1,4 +1,5 @@
-// Many moves: those from rest several in lock-step where the law allows it.
+// Many moves at once; those from rest run several in lock-step if the hyperelastic model allows
+// it.
 #pragma once
 #include "two_step.hpp"
 
@@ -6,7 +7,7 @@ namespace hmsa {
 struct Rows {
     int count;
     const double *start, *rate, *target, *materials;
-    int stride;  // numbers from one material to the next; 0 for one of all
+    int stride;  // values from one material to the next; 0 for a common material
     Wanted wanted;
     int64_t *status;
     double *beta_p, *tau_p, *beta_1;
@@ -32,8 +33,8 @@ template <class System> void plan_rows(const Rows &rows)
     }
 }
 
-// A lane whose move is done takes the next one, so that none waits for another. The plan of a row
-// has the same bits in any batch, and alone.
+// A lane whose move is done takes the next one, so that no lane waits. The plan of a row is bit
+// for bit the same in any batch, and alone.
 template <class R, template <class> class Law>
 HMSA_INLINE void plan_lanes(const Rows &rows)
 {
@@ -79,7 +80,7 @@ HMSA_INLINE void plan_lanes(const Rows &rows)
         row_of[i] = -1;
         if (fill(i)) {
             busy++;
-        } else {  // rests beside the others
+        } else {  // idles beside the others
             swing.system.read(i, rows.materials);
             swing.begin(i, 1, 0, 0, 1, 1, 1, 0, 1e-7);
             swing.idle(i);

@@ -1,6 +1,7 @@
 // A dielectric elastomer between compliant electrodes, by its capacitance over that at rest, q:
-// the charge on them does work along it as a constant force does. A block of thickness l = q^-1/2
-// by the law of Gent; with dl/dq = -l^3/2 its force is psi'(l) dl/dq, its inertia m(l) (dl/dq)^2.
+// the work of the charge along q is that of a constant force. The elastomer is a Gent block of
+// thickness l = q^-1/2; with dl/dq = -l^3/2 its force is psi'(l) dl/dq, its inertia m(l)
+// (dl/dq)^2.
 #pragma once
 #include "law.hpp"
 
@@ -20,7 +21,7 @@ struct Dielectric {
         return law.force(l) * (l * l * l) * -0.5;
     }
     double energy(double q) const { return law.energy(thickness(q)); }
-    // 1/M, M'/(2 M), and what multiplies the damping at rest, over M.
+    // 1/M, M'/(2 M), and the factor on the damping at rest, over M.
     template <class S> void inertia(const S &q, S &i_mass, S &falls, S &damps) const
     {
         const S l = thickness(q), q3 = q * q * q, i = inverse(inverse(l * l * l) + c1);

@@ -10,8 +10,8 @@ constexpr double node[16] = {
     0.0, 0.05260015195876773, 0.0789002279381516, 0.1183503419072274, 0.2816496580927726,
     0.3333333333333333, 0.25, 0.3076923076923077, 0.6512820512820513, 0.6, 0.8571428571428571, 1.0,
     1.0, 0.1, 0.2, 0.7777777777777778};
-// Rows of the Runge-Kutta matrix, then the weights; of three stages more for dense output, and its
-// weights.
+// Rows of the Runge-Kutta matrix, then the weights; then the three additional stages of the dense
+// output, and its weights.
 constexpr double a[20][16] = {
     {},
     {0.05260015195876773},
@@ -68,7 +68,7 @@ constexpr double e5[12] = {
     1.6643771824549864, -0.35032884874997366, 0.3341791187130175, 0.08192320648511571,
     -0.022355307863886294};
 
-// x += weight k, where the weight is not 0: known when compiled.
+// x += weight k, skipped at compile time if the weight is 0.
 template <int I, int J, class R> HMSA_INLINE void add(R &x, const R &k)
 {
     if constexpr (J == 0)
@@ -78,14 +78,14 @@ template <int I, int J, class R> HMSA_INLINE void add(R &x, const R &k)
 }
 }  // namespace dop853
 
-// The numbers in a state: values, then derivatives.
+// The number of scalars in a state: values, then derivatives.
 template <class S> constexpr int size_of = sizeof(S) / sizeof(real<S>);
 
 // f(i, y, k): derivative k of state y at node i of the step. Returns the error in units of rtol.
 template <class S, int W, int stages = 12> struct Step {
     using R = real<S>;
-    // Where a state is more than three numbers and their derivatives by one, a loop over the stages,
-    // and over as many numbers as are in use: one code for all of them.
+    // For states of more than three values with one derivative each, loop over the stages and over
+    // the values in use, so that they share one code.
     static constexpr bool unrolled = W <= 3 && count_of<S> <= 1 && stages == 12;
     static constexpr bool pairs = sizeof(Pair<R>) > sizeof(R);
     static_assert(unrolled || !pairs || W * size_of<S> % 2 == 0, "no room for the last pair");
@@ -98,7 +98,7 @@ template <class S, int W, int stages = 12> struct Step {
             std::memset(static_cast<void *>(k), 0, sizeof k);
     }
     S k[stages][W];
-    // A row of the tableau for numbers m and on of a state: one at a time, or a pair.
+    // A row of the tableau for value m of a state, or for a pair from m on.
     template <class V> HMSA_INLINE static V load(const S *x, int m)
     {
         V numbers;
@@ -117,7 +117,7 @@ template <class S, int W, int stages = 12> struct Step {
         V sum = load<V>(y, m);
         if constexpr (I > 1)
             sum = sum + h * row<V, I>(m, std::make_integer_sequence<int, I - 1>());
-        // What came last is added last: the rest is ready when it comes.
+        // The latest stage is added last, when the other terms are ready.
         sum = sum + (dop853::a[I][I - 1] * h) * load<V>(k[I - 1], m);
         std::memcpy(reinterpret_cast<R *>(x) + m, &sum, sizeof sum);
     }
@@ -158,7 +158,7 @@ template <class S, int W, int stages = 12> struct Step {
             }
         stage<12>(y, h, end);
     }
-    // Coefficients of the dense output of as many numbers of a state; k[12] is the slope at the end.
+    // Coefficients of the dense output for the first values of a state; k[12] is the final slope.
     template <class F, int... I> HMSA_INLINE void spread(const F &f, const S *y, const R &h, const S *end,
         int numbers, R (*to)[2 * size_of<S>], std::integer_sequence<int, I...>)
     {
@@ -176,7 +176,7 @@ template <class S, int W, int stages = 12> struct Step {
                 std::memcpy(to[i] + m, rows + i, sizeof(V));
         }
     }
-    // At a share x of the step.
+    // Evaluates at the fraction x of the step.
     HMSA_INLINE static void between(double x, const S *y, int numbers, const R (*by)[2 * size_of<S>], S *at)
     {
         for (int m = 0; m < numbers; m++) {
@@ -186,7 +186,7 @@ template <class S, int W, int stages = 12> struct Step {
             reinterpret_cast<R *>(at)[m] = load<R>(y, m) + sum;
         }
     }
-    // The error of the first two alone, the second of which is small against ``fastest``.
+    // The error of the first two values, the second of which is scaled by ``fastest``.
     template <class F> HMSA_INLINE double scaled(
         const F &f, const S *y, double h, double rtol, double fastest, S *end)
     {
@@ -223,7 +223,7 @@ template <class S, int W, int stages = 12> struct Step {
         return h * n5 / sqrt(R(double(width()) * (n5 + 0.01 * n3) + 1e-300));
     }
 };
-// Factor of the next step's length; 0.2 for an error that is no number.
+// Factor on the length of the next step; 0.2 if the error is NaN.
 template <class R> HMSA_INLINE R resized(const R &error)
 {
     const R x = 0.9 / sqrt(sqrt(sqrt(R(error + 1e-12)))), least = R{} + 0.2, most = R{} + 6.0;

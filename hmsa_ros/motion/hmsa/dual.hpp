@@ -7,7 +7,8 @@ namespace hmsa {
 template <class R, int N> struct Dual {
     R v;
     R d[N];
-    // Number by number: in halves, as compilers copy bytes, a vector is not read back at once.
+    // Copied value by value: after a bytewise copy in halves, a vector cannot be read back at
+    // once.
     HMSA_INLINE Dual &operator=(const Dual &x)
     {
         v = x.v;
@@ -26,7 +27,7 @@ template <class R> HMSA_INLINE const R &value(const R &x) { return x; }
 template <class R, int N> HMSA_INLINE const R &value(const Dual<R, N> &x) { return x.v; }
 
 #define HMSA_OP template <class R, int N> HMSA_INLINE Dual<R, N> operator
-// A loop over two would keep them in memory.
+// Unrolled, since a loop over two would keep them in memory.
 #define HMSA_ONE(n, expression) { constexpr int i = n; c.d[i] = expression; }
 #define HMSA_EACH(expression) \
     if constexpr (N <= 2) { HMSA_ONE(0, expression) HMSA_ONE(N - 1, expression) } \
@@ -37,7 +38,7 @@ HMSA_OP -(const Dual<R, N> &a, const Dual<R, N> &b) { Dual<R, N> c{a.v - b.v, {}
 HMSA_OP *(const Dual<R, N> &a, const Dual<R, N> &b) { Dual<R, N> c{a.v * b.v, {}}; HMSA_EACH(a.d[i] * b.v + a.v * b.d[i]); }
 HMSA_OP -(const Dual<R, N> &a) { Dual<R, N> c{-a.v, {}}; HMSA_EACH(-a.d[i]); }
 #undef HMSA_OP
-// With a number that depends on no parameter: of type R, or a literal.
+// Operations with a constant of type R, or a literal.
 #define HMSA_OP template <class R, int N, class B, class = std::enable_if_t<count_of<B> == 0>> HMSA_INLINE Dual<R, N> operator
 HMSA_OP +(const Dual<R, N> &a, const B &b) { Dual<R, N> c{a.v + b, {}}; HMSA_EACH(a.d[i]); }
 HMSA_OP +(const B &a, const Dual<R, N> &b) { return b + a; }
@@ -62,7 +63,7 @@ template <class R, int N> HMSA_INLINE void set(Dual<R, N> &x, int i, double valu
     for (R &d : x.d)
         set(d, i, 0);
 }
-// The derivative by parameter j. Where R is lanes, all share a value, and each has parameters of its own.
+// The derivative by parameter j. For lanes, all share a value, and each has its own parameters.
 template <class R, int N> HMSA_INLINE double slope(const Dual<R, N> &x, int j)
 {
     return get(x.d[j / lanes<R>], j % lanes<R>);
@@ -71,7 +72,7 @@ template <class R, int N> HMSA_INLINE void incline(Dual<R, N> &x, int j, double 
 {
     set(x.d[j / lanes<R>], j % lanes<R>, slope);
 }
-// A number as its own parameter; and what was differentiated by it, by the parameters of x.
+// A value as its own parameter; and the chain rule for a function of it.
 template <class S> HMSA_INLINE S seeded(const real<S> &x)
 {
     if constexpr (count_of<S> > 0)

@@ -1,16 +1,17 @@
-// How a branch of creep flows: what it follows goes w' = speed flow(x), where x = psi'(l) - w is what
-// it holds over its ratio. A flow is this function over any scalar, and how x fades while the stretch
-// stays, as a sum of exponentials. Derivatives come from Dual, those by its constants too: C is their
-// type. It reads its constants from those of a branch (hmsa_ros/model/flows).
+// Flow rules of viscoelastic branches: the branch state follows w' = speed flow(x), where
+// x = psi'(l) - w is the stress over its ratio. A rule contains this function over any scalar, and
+// the decay of x at constant stretch as a sum of exponentials. Dual provides derivatives,
+// including those by its constants, of type C. Constants are read from those of a branch
+// (hmsa_ros/model/flows).
 #pragma once
 #include "dual.hpp"
 
 namespace hmsa {
-// Numbers as in hmsa_ros/model/flows/record.py; and constants of a flow at the most.
+// Numbers as in hmsa_ros/model/flows/record.py; and the maximum number of constants of a rule.
 enum Flow { maxwell, power_law };
 constexpr int flow_constants = 2;
 
-// Exponentials: a share of what there was, and how fast it decays.
+// A sum of exponentials: fractions of the initial value, and decay rates.
 struct Fading {
     static constexpr int most = 96;
     int count = 0;
@@ -30,12 +31,12 @@ template <class C> struct PowerLaw {
     void seed(int constant, int j) { incline(constant == 0 ? m : s, j, 1); }
     template <class S> S operator()(const S &x) const
     {
-        constexpr double nothing = 1e-200;  // so that there is a logarithm
+        constexpr double nothing = 1e-200;  // avoids the logarithm of 0
         const S size = x * inverse(s);
         return x * power(S(size * size + nothing), C(0.5 * (m - 1.0)));
     }
-    // x = x0 (1 + a t)^(-n) is the mean of exponentials whose speeds have a Gamma distribution: a sum
-    // over their logarithms, right to 1e-8. The slow ones are one until a time.
+    // x = x0 (1 + a t)^(-n) is the mean of exponentials whose rates have a Gamma distribution: a
+    // sum over their logarithms, accurate to 1e-8. Slow ones count as constant up to a time.
     Fading fading(double x, double speed, double until) const
     {
         constexpr double nothing = 1e-9, deep = 21;
@@ -68,7 +69,7 @@ template <class C> struct PowerLaw {
     }
 };
 
-// One of them, chosen while it runs.
+// A flow rule, chosen at run time.
 template <class C> struct AnyFlow {
     int kind = maxwell;
     PowerLaw<C> power_law_flow{};
@@ -78,7 +79,7 @@ template <class C> struct AnyFlow {
         power_law_flow.read(from + 1);
     }
     void seed(int constant, int j) { power_law_flow.seed(constant, j); }
-    // Of one that does not flow in proportion.
+    // Exponentials of a nonlinear rule.
     template <class S> HMSA_APART S other(const S &x) const { return power_law_flow(x); }
     Fading fading(double x, double speed, double until) const
     {

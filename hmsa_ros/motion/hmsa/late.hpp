@@ -1,5 +1,5 @@
-// The two-step command where branches hold and the field lags: stretch, rate and field arrive
-// together, by a short push more, which settles the field.
+// The two-step command with viscoelastic branches and a lagging field: stretch, rate and field
+// arrive together, by a short additional push that settles the field.
 #pragma once
 #include "shooting.hpp"
 #include "two_step.hpp"
@@ -7,21 +7,21 @@
 namespace hmsa {
 struct Late {
     Plan plan;
-    double push, until;  // a level from tau_p to then; beta_1 where no field lags
+    double push, until;  // level and end of the push from tau_p on; beta_1 without a lag
 };
 struct Before {
-    double field, load;  // in force, and the amplifier's
+    double field, load;  // at the start: load, and output of the amplifier
     double lag;
     const double *branches;  // (branch_count, branch_columns)
     int branch_count;
-    const double *followed;  // null where they have relaxed
+    const double *followed;  // null if relaxed
 };
 
 template <int NB, class System> Late late(const System &system, const Branches<NB> &branches, const double *m,
     const Move &move, const Wanted &wanted, const Before &before)
 {
-    // Of the push, in time constants: it passes the holding level by as much as the level before
-    // falls short of it.
+    // Duration of the push, in time constants: it exceeds the holding level by as much as the
+    // previous level falls short of it.
     constexpr double length = 0.6931471805599453;
     Planner<System, NB> planner;
     auto &search = planner.search;
@@ -43,7 +43,7 @@ template <int NB, class System> Late late(const System &system, const Branches<N
     const Shot shot{3, 3, times, loads, d_times, d_loads, move.start, move.rate, before.field,
         before.load, move.target, infinity(), before.lag, before.branches, before.branch_count,
         search.followed, most_attempts};
-    // Unknowns of laws that have no code of their own: as many as there may be.
+    // Number of unknowns for models without their own code: the maximum.
     Shooting<System, has_own_code<System> ? 3 : most_unknowns> shooting{system, shot};
     double lasts;
     if (!shooting.solve(m, lasts))

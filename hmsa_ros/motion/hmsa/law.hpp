@@ -1,7 +1,7 @@
-// Hyperelastic laws in units of the shear modulus at small strain. A law is its force over any
-// scalar, and its energy; derivatives come from Dual, those by its constants too: R is their type, and
-// seed makes one of them the parameter j. It reads them from those of a packed material
-// (hmsa_ros/model/law.py). Where there is no energy, the force is not a number.
+// Hyperelastic models in units of the shear modulus at small strain. A model contains its force
+// over any scalar, and its energy. Dual provides derivatives, including those by its constants, of
+// type R; seed makes one of them the parameter j. Constants are read from a packed material
+// (hmsa_ros/model/law.py). Where there is no energy, the force is NaN.
 #pragma once
 #include "dual.hpp"
 
@@ -34,7 +34,7 @@ template <class R> struct Polynomial {
     void seed(int constant, int j) { incline(c[constant], j, 1); }
     template <class S> HMSA_INLINE S force(const S &l) const
     {
-        // Free of cancellation near l = 1.
+        // Avoids cancellation near l = 1.
         const S i_l = inverse(positive(l)), e = l - 1.0;
         const S half = e * (l * l + l + 1.0) * i_l * i_l, x = e * e * (l + 2.0) * i_l;
         S sum = x * (5.0 * c[5]) + 4.0 * c[4];
@@ -54,8 +54,8 @@ template <class R> struct Polynomial {
 };
 
 template <class R> struct ArrudaBoyce : Polynomial<R> {
-    // mu sum C_i lambda_m^(2 - 2 i) (I1^i - 3^i), E. M. Arruda and M. C. Boyce, J. Mech. Phys. Solids
-    // 41, 389 (1993): a polynomial once I1 is 3 and what it is above.
+    // mu sum C_i lambda_m^(2 - 2 i) (I1^i - 3^i), E. M. Arruda and M. C. Boyce, J. Mech. Phys.
+    // Solids 41, 389 (1993), expanded as a polynomial in I1 - 3.
     R mu, lambda_m;
     void read(int lane, const double *from)
     {
@@ -76,7 +76,7 @@ template <class R> struct ArrudaBoyce : Polynomial<R> {
         for (R &x : this->c)
             x = 0.0 * mu;
         for (int i = 1; i <= 5; i++) {
-            double binomial = terms[i - 1];  // times 3^(i - k) and i over k
+            double binomial = terms[i - 1];  // times 3^(i - k) and the binomial (i, k)
             for (int k = i; k > 0; k--) {
                 this->c[k] = this->c[k] + factor * binomial;
                 binomial *= 3.0 * k / (i - k + 1);
@@ -89,7 +89,7 @@ template <class R> struct ArrudaBoyce : Polynomial<R> {
 template <class R> struct Ogden {
     // sum mu/a (l^a + 2 l^(-a/2) - 3), R. W. Ogden, Proc. R. Soc. Lond. A 326, 565 (1972).
     int count;
-    R terms[6];  // mu and a of each
+    R terms[6];  // mu and a of each term
     void read(int lane, const double *c)
     {
         count = int(c[0]);
@@ -133,8 +133,8 @@ template <int N, class S> HMSA_INLINE S horner_slope(const double *c, const S &u
         sum = sum * u + k * c[k];
     return sum;
 }
-// Beyond the end of a table the force goes on with the slope there, and rises without bound at a
-// stop that lies a depth away.
+// Beyond the end of a table the force continues with the slope there, and increases without bound
+// towards a stop at a given depth.
 template <class S> HMSA_INLINE S beyond(const S &way, double depth, double force, double stiffness)
 {
     return force + stiffness * way * inverse(positive(1.0 - way * (1.0 / depth)));
@@ -147,7 +147,7 @@ inline double energy_beyond(double way, double depth, double force, double stiff
     return force * way - stiffness * depth * depth * (log1p(-share) + share);
 }
 
-// Energy at a way into a piece of the force of degree N: its begin, the energy there, its factors.
+// Energy within a piece of the force of degree N, from its start, initial energy and coefficients.
 template <int N> double energy_within(const double *piece, double way)
 {
     double total = 0;

@@ -1,5 +1,5 @@
-// Motion over time, with Maxwell branches and behind a coil that lags. Where the output of the
-// amplifier is linear in time, the field behind it is a line and an exponential.
+// Motion over time, with viscoelastic branches and a coil that lags. If the output of the
+// amplifier is linear in time, the lagging field is the sum of a line and an exponential.
 #pragma once
 #include "swing.hpp"
 
@@ -20,7 +20,7 @@ template <class S> struct Drive {
         rest = rest * exp(-decay * duration);
     }
 };
-// Of a field that follows with a lag an amplifier's output begin + slope t.
+// The load of a field that lags behind an amplifier output begin + slope t.
 template <class S> Drive<S> following(const S &begin, double slope, double lag, const S &field)
 {
     const S line = begin - slope * lag;
@@ -31,14 +31,14 @@ template <class S, class System, int NB> struct Motion {
     const System &system;
     const Branches<NB> &branches;
     const int width = 2 + branches.count();
-    S y[room_of<S, NB>] = {};  // stretch, rate, what the branches follow
+    S y[room_of<S, NB>] = {};  // stretch, rate, branch states
     Step<S, room_of<S, NB>> step;
-    int room = most_attempts, made = 0;  // steps that it may try to the end of a piece; and has
+    int room = most_attempts, made = 0;  // maximum and actual number of steps in a piece
     Motion(const System &a, const Branches<NB> &b) : system(a), branches(b) { step.use(width); }
 
-    // Integrates over a duration; h is the step to begin with, 0 for none known, and to go on with.
-    // Motion that meets a limiting stretch too hard to be resolved turns there, in no time and
-    // without loss.
+    // Integrates over a duration; h is the initial step, 0 if unknown, and then the next step.
+    // Motion too close to a limiting stretch to be resolved reverses there, in no time and without
+    // loss.
     HMSA_APART bool advance(const Drive<S> &drive, double duration, double zeta, double rtol, double &h)
     {
         const bool fades = drive.decay > 0 && (value(drive.rest) != 0 || count_of<S> > 0);
@@ -84,20 +84,20 @@ template <class S, class System, int NB> struct Motion {
     template <int N> static void negate(Dual<double, N> &x) { x.v = -x.v; }
 };
 
-// What is left of an exponential after a duration: nothing that a sum would not show.
+// The remaining fraction of an exponential after a duration; 0 if it would vanish in a sum.
 inline double faded(double line, double rest, double decay, double duration)
 {
     rest *= exp(-decay * duration);
     return abs(rest) > 1e-17 * (1e-3 + abs(line)) ? rest : 0;
 }
 
-// Actuators that are advanced together, each by a duration of its own: rows of stretch, rate and
-// step, of the drive, of the packed material, and of the branches (most_branches, branch_columns).
+// Actuators that are advanced together, each by its own duration: rows of stretch, rate and step,
+// of the drive, of the packed material, and of the branches (most_branches, branch_columns).
 struct Plant {
     double *state, *drive;
     const double *material;
     int stride;
-    double *branches;  // null where nothing creeps
+    double *branches;  // null without branches
     const double *durations;
     double rtol;
 };
@@ -126,8 +126,9 @@ template <int NB, class System> bool advance_row(
 }
 
 // Samples at increasing times of the response to an amplifier whose output is loads[m] +
-// slopes[m] (t - switches[m]) from switches[m] on; the motion begins at the first, which is not later
-// than the first time. Rows of out (3 + branch_count, count) are stretch, rate, field and followers.
+// slopes[m] (t - switches[m]) from switches[m] on; the motion begins at the first switch, which is
+// not after the first time. Rows of out (3 + branch_count, count) are stretch, rate, field and
+// branch states.
 struct Course {
     int pieces, count;
     const double *switches, *loads, *slopes, *times;
@@ -170,8 +171,8 @@ template <int NB, class System> bool sample(
     return true;
 }
 
-// What branches follow under an elastic force given at times, and linear in between; from what the
-// rows of the branches say.
+// Branch states for an elastic force given at times, and linear in between; initial states are in
+// the rows of the branches.
 struct Trail {
     int count;
     const double *times, *forces, *branches;
@@ -185,7 +186,7 @@ inline bool trail(const Trail &of)
     branches.read(of.branches, of.branch_count);
     Step<double, 1> step;
     for (int b = 0; b < of.branch_count; b++) {
-        // Of how far it is behind; exactly where it flows in proportion.
+        // In terms of the distance from the force; exact for a linear rule.
         double x = of.forces[0] - of.branches[branch_columns * b + follower_at], end, h = 0;
         for (int i = 0; i < of.count; i++) {
             const double span = i ? of.times[i] - of.times[i - 1] : 0;
@@ -200,7 +201,7 @@ inline bool trail(const Trail &of)
                     if (n == most_attempts)
                         return false;
                     h = min(h > 0 ? h : 0.1 / branches.tangent(b, x), left);
-                    const double scale = abs(x) + 1e-9;  // errors count against what there is
+                    const double scale = abs(x) + 1e-9;  // errors are relative to the present value
                     double y = x / scale;
                     const double error = step([&](int, const double *at, double *by) {
                         *by = sign * (slope - branches.rate(b, *at * scale)) / scale;

@@ -1,12 +1,12 @@
-// Numbers: a double, or a vector of doubles, one a lane. What differs between them is here alone.
+// Scalars: a double, or a vector of doubles with one per lane. Only this file distinguishes them.
 #pragma once
 #include <cstdint>
 #include <cstring>
 #include <type_traits>
 
-// GCC stops inlining where a unit grows, and a step then takes twice as long.
+// GCC stops inlining as a unit grows, which doubles the time of a step.
 #define HMSA_INLINE inline __attribute__((always_inline))
-// What is done once a pass, kept out of what is done in every step.
+// For functions called once per integration, kept out of the code of every step.
 #define HMSA_APART __attribute__((noinline))
 
 namespace hmsa {
@@ -26,7 +26,7 @@ template <class R> HMSA_INLINE void set(R &x, int i, double value) { x[i] = valu
 
 HMSA_INLINE double sqrt(double x) { return __builtin_sqrt(x); }
 #ifdef __SSE2__
-// GCC 12 makes single roots of a loop over lanes.
+// GCC 12 compiles a loop over lanes to single square roots.
 HMSA_INLINE two sqrt(two x) { return __builtin_ia32_sqrtpd(x); }
 HMSA_INLINE four sqrt(four x)
 {
@@ -44,7 +44,7 @@ template <class R> HMSA_INLINE R sqrt(R x)
 HMSA_INLINE double abs(double x) { return __builtin_fabs(x); }
 HMSA_INLINE double max(double a, double b) { return a > b ? a : b; }
 HMSA_INLINE double min(double a, double b) { return a < b ? a : b; }
-// By bits: where lanes are wider than the machine's, a choice by ?: is taken apart.
+// Bitwise: with lanes wider than those of the machine, ?: is split up.
 template <class R> using bits_of = decltype(R{} < R{});
 template <class R> HMSA_INLINE R abs(R x)
 {
@@ -56,16 +56,16 @@ template <class R> HMSA_INLINE R select(const bits_of<R> &is, const R &a, const 
     return (R)(((bits_of<R>)a & is) | ((bits_of<R>)b & ~is));
 }
 
-// No number where x is not positive: the step control then rejects the step.
+// NaN where x is not positive: the step control then rejects the step.
 HMSA_INLINE double positive(double x) { return x > 0 ? x : __builtin_nan(""); }
-// All bits set are no number.
+// All bits set give NaN.
 template <class R> HMSA_INLINE R positive(R x) { return (R)((bits_of<R>)x | ~(x > 0)); }
 
 inline double infinity() { return __builtin_inf(); }
 inline bool finite(double x) { return x - x == 0; }
 
-// exp and log of our own, to 2 units in the last place: glibc chooses versions with fused
-// multiply-add at run time, and with them other bits on other machines.
+// Own exp and log, accurate to 2 units in the last place: glibc selects versions with fused
+// multiply-add at run time, whose results differ between machines.
 inline double two_to(int64_t n)
 {
     const int64_t bits = (n + 1023) << 52;
@@ -122,7 +122,7 @@ inline double log1p(double x)
     const double u = 1 + x;
     if (u == 1)
         return x;
-    // What rounding took from u is put back, by W. Kahan.
+    // Restores what rounding took from u, after W. Kahan.
     return u < infinity() ? log(u) * (x / (u - 1)) : u;
 }
 inline double expm1(double x)
@@ -135,7 +135,7 @@ inline double expm1(double x)
     }
     return exp(x) - 1;
 }
-// Both of an angle, reduced by pi/2 in three parts (W. J. Cody, W. Waite, 1980).
+// Sine and cosine of an angle, reduced by pi/2 in three parts (W. J. Cody, W. Waite, 1980).
 inline void sine_cosine(double x, double &sine, double &cosine)
 {
     const double n = (x * 0.6366197723675814 + 6755399441055744.0) - 6755399441055744.0;
@@ -156,7 +156,7 @@ inline void sine_cosine(double x, double &sine, double &cosine)
     if (quarter == 1 || quarter == 2)
         cosine = -cosine;
 }
-// Worked out once where lanes are alike.
+// Computed once if lanes are equal.
 template <class R> inline R exp(R x)
 {
     const double at = x[0], first = exp(at);

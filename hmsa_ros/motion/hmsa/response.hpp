@@ -6,39 +6,39 @@
 #include "motion.hpp"
 
 namespace hmsa {
-// Places in theta; after first_branch gamma, tau, flow and its constants of each branch in turn. Beyond all places:
-// constant i of the law is the first plus i, the time at which piece m begins the second plus m.
-// Two forces that no motion has are there to be differentiated by alone: one against the motion
-// whatever its rate, and one with the square of the rate.
+// Indices in theta; from first_branch on gamma, tau, flow rule and its constants of each branch.
+// Beyond all indices, constant i of the hyperelastic model is the first plus i, and the start time
+// of piece m the second plus m. Two forces that are zero in every motion only serve
+// differentiation: one against the motion at any rate, and one with the square of the rate.
 enum Theta { stiffness_of, damping_of, drive_of, force_of, lag_of, stretch_of, rate_of, first_branch };
 constexpr int branch_places = 3 + flow_constants;
 constexpr int friction_of = 400, square_of = 401, constant_of = 500, switch_of = 1000;
-// Rate over the fastest frequency at which the friction turns.
+// Rate, relative to the fastest frequency, over which the friction changes sign.
 constexpr double soft_rate = 3e-3;
 
-// Largest phase of a step: the dense output is then good to about 1e-8, and so are derivatives, which
-// ring on when the motion is over: the error that is controlled is that of the motion alone. And in
-// times of the fastest branch: beyond some six the derivatives would grow without an end.
+// Maximum phase of a step: the dense output is then accurate to about 1e-8, as are derivatives,
+// which continue to ring after the motion, whose error alone is controlled. Also the maximum step
+// in times of the fastest branch: beyond about six the derivatives would grow without bound.
 constexpr double longest_phase = 1, relaxed_share = 4;
-// What no recording needs and a start value far off may ask for.
+// Work limits, beyond the needs of any recording, for start values with large errors.
 constexpr int most_response_steps = 20000, most_steps_a_sample = 20;
 
 struct Recorded {
     const double *theta, *material;
     int branches;
     int wanted_count;
-    const int64_t *wanted;  // places by which to differentiate
-    const double *start;  // derivatives of the initial stretch by these
+    const int64_t *wanted;  // indices of the parameters to differentiate by
+    const double *start;  // derivatives of the initial stretch by them
     int pieces;
     const double *begins, *levels, *ramps;
-    double field, field_lag;  // at the first begin, and its derivative by the lag
+    double field, field_lag;  // at the first start, and its derivative by the lag
     int count;
     const double *times;
     double rtol;
     double *stretch, *rate;  // (count,)
     double *jacobian, *by_rate;  // (count, wanted_count); the latter may be null
-    // How far what each branch follows is from the elastic force at the begin, and at the last time;
-    // null for not at all, and for not asked.
+    // Distance of the branch states from the elastic force at the start, and at the last time;
+    // null for zero, and if not needed.
     const double *behind;
     double *behind_last;
     bool by_constants() const
@@ -50,7 +50,7 @@ struct Recorded {
     }
 };
 
-// N of the wanted parameters at a time, from one of them on; the motion is the same to the bit.
+// N of the wanted parameters at a time, from a given one on; the motion is the same to the bit.
 template <class C, class System, int NB = most_branches> struct Response {
     using S = C;
     using R = real<S>;
@@ -59,14 +59,14 @@ template <class C, class System, int NB = most_branches> struct Response {
     const int from, creeping = NB == most_branches ? of.branches : NB, width = 2 + creeping;
     Response(const Recorded &recorded, int first) : of(recorded), from(first) { step.use(width); }
     System system;
-    typename System::Bare bare;  // the same without derivatives
+    typename System::Bare bare;  // the system without derivatives
     S a, damping, drive, force, lag;
     Branches<NB, S> branches;
     Branches<NB> bare_branches;
     double level, ramp;
-    S excess;  // of the field over the line, where the piece began
+    S excess;  // of the field over the line, at the start of the piece
     double piece_begin, fastest;
-    int rubs, squares;  // places among the derivatives, -1 for none
+    int rubs, squares;  // indices among the derivatives, -1 for none
     Step<S, most, 16> step;
 
     static S plain(double x) { return S{R{} + x}; }
@@ -153,7 +153,7 @@ template <class C, class System, int NB = most_branches> struct Response {
                     of.by_rate[int64_t(i) * of.wanted_count + from + j] = slope(v, j);
             });
     }
-    // Derivatives of the stretch at which a level holds the actuator at rest.
+    // Derivatives of the equilibrium stretch under a level.
     void hold(double l, double level, double *slopes)
     {
         set_up();
@@ -167,7 +167,7 @@ template <class C, class System, int NB = most_branches> struct Response {
         set_up();
         S y[most] = {}, end[most], at[2] = {};
         R dense[7][2 * size_of<S>];
-        const int shown = of.by_rate ? 2 * size_of<S> : size_of<S> + 1;  // numbers of it that are asked for
+        const int shown = of.by_rate ? 2 * size_of<S> : size_of<S> + 1;  // requested values
         y[0] = plain(of.theta[stretch_of]), y[1] = seeded_at(rate_of);
         if constexpr (N > 0)
             each([&](int j, int) { incline(y[0], j, of.start[from + j]); });
@@ -187,7 +187,7 @@ template <class C, class System, int NB = most_branches> struct Response {
         int piece = 0, i = 0;
         const int64_t attempts = most_response_steps + int64_t(most_steps_a_sample) * of.count;
         for (int64_t attempt = 0; attempt < attempts; attempt++) {
-            for (; i < of.count && of.times[i] <= t; i++)  // before the begin it is uniform
+            for (; i < of.count && of.times[i] <= t; i++)  // at rest before the start
                 put(i, y[0] + y[1] * (of.times[i] - t), y[1]);
             if (i == of.count) {
                 for (int b = 0; of.behind_last && b < creeping; b++)
@@ -240,7 +240,7 @@ template <class C, class System, int NB = most_branches> struct Response {
         excess = before - level + lag * ramp;
         if constexpr (N > 0)
             if (jump != 0) {
-                // By a lag of 0, or by a later switch: what the step lacks is an impulse.
+                // By a lag of 0, or by a later switch: the missing part of the step is an impulse.
                 const double impulse = first(drive) * jump / bare.mass(first(y[0]));
                 each([&](int j, int wanted) {
                     if (wanted == switch_of + piece || (wanted == lag_of && !(of.theta[lag_of] > 0)))
@@ -248,7 +248,8 @@ template <class C, class System, int NB = most_branches> struct Response {
                 });
             }
     }
-    // One step, whose first slope is known unless it is fresh; the rate counts in natural frequencies.
+    // One step, whose first slope is known unless fresh; rates are relative to natural
+    // frequencies.
     double make(const S *y, bool fresh, double dt, double h, S *end)
     {
         return step.scaled([&](int stage, const S *x, S *by) __attribute__((always_inline)) {

@@ -1,5 +1,5 @@
-// Levels with free numbers, moved until they end at rest at a target: Newton, with the derivatives
-// that come out of the integration.
+// Levels with free values, changed until they end at rest at a target: Newton's method, with
+// derivatives from the integration.
 #pragma once
 #include "motion.hpp"
 
@@ -8,10 +8,10 @@ constexpr int most_levels = 304, most_unknowns = 4;  // stretch, rate, field, an
 
 struct Shot {
     int levels, unknowns;
-    double *times, *loads;  // (levels,), moved in place
+    double *times, *loads;  // (levels,), changed in place
     const double *d_times, *d_loads;  // (levels, unknowns)
     double stretch, rate;
-    double field, load;  // in force at the start, and the amplifier's
+    double field, load;  // at the start: load, and output of the amplifier
     double target, slew, lag;
     const double *branches;  // (branch_count, branch_columns)
     int branch_count;
@@ -20,20 +20,19 @@ struct Shot {
 };
 
 template <class System, int P> struct Shooting {
-    // Tolerances of the first pass, far from the solution and at it, the largest and as shares of
-    // the move; and the distance from rest, as a share, from which on it is measured with the last.
+    // Tolerances of the integrations: first, far from the solution and near it, absolute and
+    // relative to the move; and the relative distance from rest below which the final one applies.
     static constexpr double first = 1e-6, rough = 1e-8, rough_share = 1e-7, fine_most = 1e-12,
         fine_share = 1e-11, fine_least = 1e-13, near = 2e-4;
-    // A ramp that misses the next level by less has just reached it.
+    // A ramp that misses the next level by less counts as reaching it.
     static constexpr double reached = 1e-12;
     static constexpr int most = 25;
-    // A Newton step that must be cut shorter leads nowhere; and trials leave the first guess by
-    // this factor at the most.
+    // Minimum fraction of a Newton step; and maximum ratio of trial values to the first guess.
     static constexpr double least_share = 0.01, farthest_trial = 10;
-    // As shares of the move: what the last step may leave, and what is accepted where rounding ends
-    // the search. And the share of the distance that a fine pass has to leave less than.
+    // Relative to the move: the error left by the last step, and the accepted error if rounding
+    // ends the search. And the maximum ratio of distances in successive fine integrations.
     static constexpr double last = 1e-12, accepted = 1e-10, slowest = 0.1;
-    // What rounding leaves of any move.
+    // Rounding error of any move.
     static constexpr double rounded = 1e-12;
 
     const System &system;
@@ -41,16 +40,16 @@ template <class System, int P> struct Shooting {
     Shooting(const System &a, const Shot &b) : system(a), shot(b) {}
     double zeta;
     Branches<most_branches> branches;
-    int count;  // of pieces
+    int count;  // number of pieces
     double duration[2 * most_levels], begin[2 * most_levels], slope[2 * most_levels];
     double d_duration[2 * most_levels][P], d_begin[2 * most_levels][P];
-    double end[3 + most_branches], d_end[3 + most_branches][P];  // stretch, rate, field, followers
-    double miss[most_unknowns], trial[most_unknowns][P];  // as many rows as unknowns
+    double end[3 + most_branches], d_end[3 + most_branches][P];  // stretch, rate, field, branches
+    double miss[most_unknowns], trial[most_unknowns][P];  // one row per unknown
     double frequency_at_target, stiffness, force;
     double first_times[most_levels], first_loads[most_levels];
-    int work = 0;  // steps, each as often as it has numbers of a kind
+    int work = 0;  // steps, times the number of values and derivatives
 
-    // Fills in the pieces of the load and their derivatives; false if a ramp does not fit.
+    // Computes the pieces of the load and their derivatives; false if a ramp does not fit.
     bool cut()
     {
         const int n = shot.unknowns;
@@ -111,7 +110,7 @@ template <class System, int P> struct Shooting {
         } else
             return x;
     }
-    // Follows the pieces; with derivatives where S has them.
+    // Integrates the pieces; with derivatives if S has them.
     template <class S> bool respond(double rtol)
     {
         return with_branches<S, System>(shot.branches, shot.branch_count, [&](const auto &branches) {
@@ -139,7 +138,8 @@ template <class System, int P> struct Shooting {
             drive.go_on(duration[m]);
             field = drive.load();
             if constexpr (count_of<S> > 0) {
-                // By the length of the piece: the equation at its end.
+                // By the duration of the piece: the derivative is the equation of motion at its
+                // end.
                 S by[2 + NB];
                 change(system, branches, motion.y, field, by);
                 const double change = slope[m] - value(drive.rest) * drive.decay;
@@ -161,9 +161,9 @@ template <class System, int P> struct Shooting {
             put(3 + b, motion.y[2 + b]);
         return true;
     }
-    // How far the end is from rest at the target, in units of stretch, and the derivatives: the
-    // stretch, the rate, where the field lags the field, and where branches hold and the amplifier
-    // ramps its last load, from which the next levels go on.
+    // Distance of the end from rest at the target, in units of stretch, and its derivatives. The
+    // conditions are stretch, rate, field (if it lags) and, with branches and a ramping amplifier,
+    // its last load, from which the next levels start.
     double missed(bool derivatives)
     {
         const int n = derivatives ? shot.unknowns : 0;
@@ -185,7 +185,7 @@ template <class System, int P> struct Shooting {
             row++;
         }
         for (int b = 0; b < shot.branch_count; b++)
-            // What a branch holds the field has to balance, and the amplifier to lead.
+            // The field has to balance the overstress, and the amplifier to lead it.
             for (int i = 2; i < row; i++) {
                 const double share = branches.ratio[b] / stiffness;
                 Dual<double, 1> above{force - end[3 + b], {1}};
@@ -244,8 +244,8 @@ template <class System, int P> struct Shooting {
             shot.times[i] = time, shot.loads[i] = load;
         }
     }
-    // Coarse passes bring the derivatives and a guess for those that measure the end finely,
-    // without derivatives. Returns whether it is solved; and the duration, the last ramp included.
+    // Coarse integrations give the derivatives and a guess for fine ones, which measure the end
+    // without derivatives. Returns whether it is solved, and the duration including the last ramp.
     bool solve(const double *material, double &lasts)
     {
         using S = Dual<double, P>;
@@ -278,7 +278,7 @@ template <class System, int P> struct Shooting {
             high = 0;
             for (int i = 0; i < levels; i++)
                 high = max(high, abs(shot.loads[i]));
-            // A wild trial is not worth its integration.
+            // An extreme trial is not integrated.
             const bool fits = high < farthest_load && shot.times[levels - 1] < longest && cut();
             if (fits && (measuring ? respond<double>(tolerance) : respond<S>(tolerance)))
                 now = missed(!measuring);
@@ -300,7 +300,7 @@ template <class System, int P> struct Shooting {
                 for (int c = 0; c < n; c++)
                     x[c] += step[c];
                 before = now, share = 0;
-                // Derivatives of so far away leave about that share.
+                // With derivatives from this distance, about that fraction remains.
                 if (now * size <= last * move * move) {
                     place(x, share, step);
                     const bool still = cut();

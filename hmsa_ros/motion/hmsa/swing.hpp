@@ -1,6 +1,6 @@
 // Motion under a constant load up to its first turning point in a direction, with derivatives by
-// the load. R double: one motion. R lanes: several in lock-step; what is out of the ordinary is
-// decided a lane at a time, by its own numbers alone, so that lanes have the bits of one motion.
+// the load. R double: one motion. R lanes: several in lock-step; exceptional cases are decided one
+// lane at a time, only by its own values, so that each lane is bit for bit a single motion.
 #pragma once
 #include "system.hpp"
 
@@ -12,12 +12,13 @@ struct Event {
     double time, stretch, by_load, time_by_load;
 };
 
-// Steps of a swing, of a creep into an equilibrium, and of the search inside the last step.
+// Maximum steps of a swing, of a slow approach to an equilibrium, and of the search in the last
+// step.
 constexpr int most_steps = 20000, most_creeping = 2000, most_inside = 60;
-// A closer approach to an equilibrium than this share of the move counts as rest.
+// A distance from an equilibrium below this fraction of the move counts as rest.
 constexpr double at_rest = 1e-12;
-// A stretch rounded to a part in 2^52 changes the acceleration by that share of l omega^2. Where
-// this is more than the tolerance keeps, motion close to a limiting stretch is not resolved.
+// Rounding the stretch to a part in 2^52 changes the acceleration by this fraction of l omega^2.
+// If this exceeds the tolerance, motion close to a limiting stretch is not resolved.
 constexpr double rounding = 3e-16, resolved = 1e-8;
 
 template <class R, class System, int NB = 0> struct Swing {
@@ -31,10 +32,10 @@ template <class R, class System, int NB = 0> struct Swing {
     S y[W], end[W];
     R beta, sign, h, t, rtol;
     R still, calm;  // a rate and an acceleration below both are rest
-    R room;  // beyond this, l omega is felt by rounding
-    R error, squared, slope, steps;  // of the step that was made
-    Mask inside;  // whether the turning point is being looked for within a step
-    Mask special;  // whether a lane has to decide
+    R room;  // beyond this, rounding affects l omega
+    R error, squared, slope, steps;  // of the last step
+    Mask inside;  // whether the turning point is searched within a step
+    Mask special;  // whether a lane needs a decision
     struct Bracket {
         double before, after, size, enough;
     } bracket[n];
@@ -66,7 +67,7 @@ template <class R, class System, int NB = 0> struct Swing {
             return found;
         }
     }
-    // From a state, with the length against which closeness to an equilibrium is measured, the
+    // From a state, with the length relative to which closeness to an equilibrium is measured, the
     // natural frequency at the start, and zeta.
     HMSA_APART void begin(int i, double l, double v, double load, double direction, double move,
         double frequency, double zeta, double tolerance, const double *followed = nullptr)
@@ -80,7 +81,7 @@ template <class R, class System, int NB = 0> struct Swing {
         set(sign, i, direction);
         set(rtol, i, tolerance);
         const double fast = frequency + 3 * zeta, root = sqrt(sqrt(sqrt(tolerance)));
-        // A fixed phase of the local oscillation. Where the force turns, the frequency vanishes.
+        // A fixed phase of the local oscillation. Where the force has an extremum, it vanishes.
         set(h, i, 7 * root / (fast + 1e-9));
         set(t, i, 0);
         set(steps, i, 0);
@@ -88,7 +89,7 @@ template <class R, class System, int NB = 0> struct Swing {
         set(calm, i, at_rest * move * fast * fast);
         set(room, i, min(tolerance, resolved) / rounding);
         put(inside, i, false);
-        // The error of the time that is left by a last Taylor series is of the third order in it.
+        // The final Taylor series has an error of third order in the remaining time.
         bracket[i] = {0, 0, 0, root * root * root};
     }
     void idle(int i)
@@ -97,7 +98,7 @@ template <class R, class System, int NB = 0> struct Swing {
         set(steps, i, -infinity());
         put(inside, i, false);
     }
-    // Makes one step of all lanes; returns whether some of them have to decide.
+    // Makes one step of all lanes; returns whether some of them need a decision.
     HMSA_INLINE bool advance()
     {
         const S load{beta, {R{} + 1.0}};
@@ -120,7 +121,7 @@ template <class R, class System, int NB = 0> struct Swing {
         h = select(special, h, R(h * resized(error)));
         return any(special);
     }
-    // What comes of a lane that has to decide, whose system for one motion is given.
+    // Decides on a lane, whose system for one motion is given.
     template <class One> Event decide(int i, const One &one)
     {
         return has(inside, i) ? land(i, one) : look(i);
@@ -139,7 +140,7 @@ template <class R, class System, int NB = 0> struct Swing {
             return over(no_turn);
         if (get(steps, i) > most)
             return over(stuck);
-        // The error counts against what rounding lets a step keep.
+        // Relative to the accuracy that rounding allows in a step.
         const double counted = get(error, i) * (get(rtol, i) / max(get(rtol, i), kept));
         if (!(counted <= 1 && direction * v > 0 && direction * w <= 0)) {
             if (counted <= 1) {
@@ -152,8 +153,8 @@ template <class R, class System, int NB = 0> struct Swing {
             set(h, i, all * resized(counted));
             return {goes_on, 0, 0, 0, 0};
         }
-        // A step of fitting length from the same start: by the secant, or where the start
-        // decelerates by the parabola through both rates and that slope.
+        // A step of suitable length from the same start: by the secant or, if the start
+        // decelerates, by the parabola through both rates and that slope.
         double dt = all * v / (v - w);
         if (direction * a < 0) {
             const double c = (w - v - a * all) / (all * all), root = a * a - 4 * c * v;
@@ -174,7 +175,8 @@ template <class R, class System, int NB = 0> struct Swing {
             at[m] = {get(end[m].v, i), {get(end[m].d[0], i)}};
         change(one, branches, at, D{get(beta, i), {1}}, by);
         const D &x = at[0], &u = at[1], &a = by[1];
-        // Without deceleration it is too early or too late: outside, so that it is bisected.
+        // Without deceleration the trial is too early or too late: reject it, so that it is
+        // bisected.
         double left = -1 - all;
         if (direction * a.v < 0) {
             // The jerk is the derivative along the motion.
@@ -196,7 +198,7 @@ template <class R, class System, int NB = 0> struct Swing {
         (direction * w > 0 ? bracket[i].before : bracket[i].after) = all;
         return again(i, all + left);
     }
-    // The first turning point of one motion, once it has begun.
+    // The first turning point of one motion, after initialisation.
     HMSA_APART Event turn(const System &one)
     {
         for (;;)

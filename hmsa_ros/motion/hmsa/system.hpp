@@ -1,4 +1,4 @@
-// The equation of motion, once, over any scalar (Eq. 11 in energy form):
+// The equation of motion, defined once for any scalar (Eq. 11 in energy form):
 //     m(l) l'' + m'(l) l'^2 / 2 + d l' + psi'(l) = beta
 // with stretch l, time in L sqrt(rho/G) and the load beta = Br B/(mu0 G).
 #pragma once
@@ -8,12 +8,12 @@
 #include "law.hpp"
 
 namespace hmsa {
-// Places in a packed material, and the families of laws (hmsa_ros/model/law.py, laws/record.py).
+// Indices in a packed material, and families of models (hmsa_ros/model/law.py, laws/record.py).
 enum Place { kind_at, zeta_at, c1_at, damping_at, lower_at, upper_at, constants_at };
 enum Family { gent, neo_hookean, polynomial, ogden, table, beam, arruda_boyce, dielectric };
 
-// What depends on the stretch alone is differentiated by it, and by all else after; unless the
-// constants of the law have derivatives, too.
+// Functions of the stretch alone are differentiated by it, and then by the chain rule, unless the
+// constants of the model have derivatives, too.
 template <class S, class C> using Along = std::conditional_t<
     (count_of<C> > 0 || count_of<S> == 0), S, Dual<real<S>, 1>>;
 template <class L, bool direct, class S> HMSA_INLINE decltype(auto) inner(const S &l)
@@ -47,8 +47,8 @@ template <class C, template <class> class Law> struct Block {
         law.read(lane, m + constants_at);
     }
     void seed(int constant, int j) { law.seed(constant, j); }
-    // The acceleration under net(psi'(l)), the load less all that is elastic; also the square of the
-    // natural frequency where it is asked for.
+    // The acceleration under net(psi'(l)), the load less all elastic forces; optionally also the
+    // square of the natural frequency.
     template <class S, class D, class F> HMSA_INLINE S acceleration(
         const S &l, const S &v, const D &damping, const F &net, real<S> *squared = nullptr) const
     {
@@ -71,7 +71,7 @@ template <class C, template <class> class Law> struct Block {
 };
 
 // A clamped beam by the deflection of its tip, odd in it, from tables of degree 7
-// (hmsa_ros/model/laws/bending.py): inertia of its own, and a damping that grows with it.
+// (hmsa_ros/model/laws/bending.py): it has its own inertia, and a damping that grows with it.
 struct Beam {
     double drag;
     const double *c;
@@ -92,7 +92,7 @@ struct Beam {
         const double *p = piece(a);
         return horner<7>(p + 2, S(size - *p)) * sign;
     }
-    // 1/m, m'/(2 m), and what multiplies the damping at rest, over m.
+    // 1/m, m'/(2 m), and the factor on the damping at rest, over m.
     template <class S> void inertia(const S &l, S &i_mass, S &falls, S &damps) const
     {
         const double x = value(l), a = abs(x), sign = x < 0 ? -1 : 1;
@@ -116,8 +116,8 @@ struct Beam {
     }
 };
 
-// An actuator of any law beside Gent, chosen while it runs: a step with it calls, and a step with
-// Gent does not. C is the type of the constants.
+// An actuator of any model except Gent, chosen at run time: its steps make calls, those of Gent do
+// not. C is the type of the constants.
 template <class C> struct AnyOf {
     static constexpr bool direct = count_of<C> > 0;
     using Bare = AnyOf<double>;
@@ -169,7 +169,7 @@ template <class C> struct AnyOf {
     {
         return with_law([&](const auto &law) { return law.energy(l); });
     }
-    // 1/m, m'/(2 m), and what multiplies the damping at rest, over m.
+    // 1/m, m'/(2 m), and the factor on the damping at rest, over m.
     template <class L> HMSA_APART void inertia(const L &l, L &i_mass, L &falls, L &damps) const
     {
         if (kind == beam)
@@ -213,13 +213,13 @@ template <class C> struct AnyOf {
 using Any = AnyOf<double>;
 
 constexpr int most_branches = 3;
-// Columns of a branch: ratio, 1/time, its flow and the constants of that, and where it goes on with
-// the state, what it follows.
+// Columns of a branch: ratio, 1/time, number and constants of its flow rule and, if it is part of
+// the state, the force that it has followed.
 enum Column { ratio_at, speed_at, flow_at, follower_at = flow_at + 1 + flow_constants, branch_columns };
 
-// Branches beside the law: branch i holds ratio (psi'(l) - w), where w follows the elastic force,
-// w' = speed flow(psi'(l) - w). C is the type of their constants. As many as there may be flow as
-// they like, fewer in proportion.
+// Viscoelastic branches: branch i adds the force ratio (psi'(l) - w), where w follows the elastic
+// force, w' = speed flow(psi'(l) - w). C is the type of their constants. The maximum number of
+// branches may have any flow rule, fewer are linear.
 template <int NB, class C = double> struct Branches {
     static constexpr bool flows = NB == most_branches;
     C ratio[NB + 1] = {}, speed[NB + 1] = {};
@@ -246,15 +246,15 @@ template <int NB, class C = double> struct Branches {
                 return flow[b].other(above) * speed[b];
         return above * speed[b];
     }
-    // How fast a branch relaxes that holds so much.
+    // Relaxation rate of a branch under a stress over its ratio.
     double pace(int b, double above) const
     {
         above = abs(above) > 1e-12 ? above : 1e-12;
         return rate(b, above) / above;
     }
-    // How steeply the rate rises with what a branch holds.
+    // Derivative of the flow rate by the stress over its ratio.
     double tangent(int b, double above) const { return rate(b, Dual<double, 1>{above, {1}}).d[0]; }
-    // What each holds under an elastic force, and the derivative of what it follows.
+    // Stresses of the branches under an elastic force, and the derivatives of their states.
     template <class S, class F> HMSA_INLINE void hold(const S &force, const S *followed, S *by, const F &held) const
     {
         for (int b = 0; b < count(); b++) {
@@ -264,13 +264,13 @@ template <int NB, class C = double> struct Branches {
         }
     }
 };
-// Scalars in a state with so many branches; in pairs where a step goes through them in a loop.
+// Number of scalars in a state with branches; an even number if a step loops over them in pairs.
 template <class S, int NB> constexpr int room_of = (count_of<S> <= 1 || lanes<real<S>> > 1) && NB <= 1 ? 2 + NB : (3 + NB) / 2 * 2;
-// Blocks have code of their own; other laws share as much as they can.
+// Blocks have their own code; other models share as much as possible.
 template <class System> constexpr bool has_own_code = false;
 template <class C, template <class> class Law> constexpr bool has_own_code<Block<C, Law>> = true;
-// Calls f with the branches of rows. None, and one that flows in proportion, have code of their own,
-// unless it would be made once more for each of many derivatives.
+// Calls f with the branches of rows. No branch and one linear branch have their own code, unless
+// it would be compiled again for each of many derivatives.
 template <class S, class System, class F> auto with_branches(const double *rows, int count, const F &f)
 {
     const auto call = [&](auto branches) {
@@ -286,7 +286,7 @@ template <class S, class System, class F> auto with_branches(const double *rows,
     }
     return call(Branches<most_branches>{});
 }
-// The derivative by time of a state: stretch, rate, what the branches follow.
+// The time derivative of a state: stretch, rate, branch states.
 template <int NB, class System, class S, class L> HMSA_INLINE void change(const System &system,
     const Branches<NB> &branches, const S *x, const L &load, S *by, real<S> *squared = nullptr)
 {
@@ -300,7 +300,7 @@ template <int NB, class System, class S, class L> HMSA_INLINE void change(const 
         }, squared);
 }
 
-// Of small undamped motion about a stretch; where the force falls, the rate at which motion grows.
+// Frequency of small undamped motion about a stretch; the growth rate where the force falls.
 template <class System> double frequency(const System &system, double l)
 {
     return sqrt(abs(system.elastic(l).d[0]) / system.mass(l));
@@ -309,7 +309,7 @@ template <class System> double critical_zeta(const System &system, const double 
 {
     return 4 / m[c1_at] * sqrt(system.mass(l) * system.elastic(l).d[0]) / system.shape(l);
 }
-// Beyond what can be held, the limit on its side. psi' rises between the limits.
+// Beyond the loads that can be held, the limit on that side. psi' increases between the limits.
 template <class System> double equilibrium(const System &system, const double *m, double beta)
 {
     double lower = m[lower_at], upper = m[upper_at];
@@ -334,8 +334,8 @@ template <class System> double equilibrium(const System &system, const double *m
             lower = l;
         else
             return l;
-        // Newton on ln(force/beta), on which a pole at a limit acts about linearly; on the force
-        // itself where it is of the other sign or small.
+        // Newton's method on ln(force/beta), which a pole at a limit makes nearly linear; on the
+        // force itself if it has the other sign or is small.
         const double ratio = force.v / beta;
         const double step = ratio > 1 ? log(ratio) * force.v / force.d[0] : off / force.d[0];
         double next = l - step;

@@ -1,6 +1,6 @@
-// Constant levels that keep an elastomer at rest on its target while its branches relax. Levels are
-// those of the amplifier. Where the field lags behind it, so does the vibration that they leave: its
-// bound holds as well.
+// Constant levels that keep an elastomer at rest on its target while its branches relax. Levels
+// are those of the amplifier. A lagging field attenuates the vibration that they leave, so that
+// its bound remains valid.
 #pragma once
 #include "motion.hpp"
 
@@ -28,36 +28,35 @@ inline Complex exp(Complex a)
     return {size * cosine, size * sine};
 }
 
-// Columns of a staircase: time, load over that of rest, and, where it begins, deviation of stretch,
-// rate, and field over that of rest.
+// Columns of the tail: time, load over that of rest and, at the start, deviation of stretch, rate,
+// and field over that of rest.
 enum Row { time_column, excess_column, deviation_column, rate_column, field_column, columns };
 
 struct Tail {
-    // Vibration that a pair of levels leaves, in units of slope of the tail times duration^3/mass.
+    // Vibration due to a pair of levels, in units of slope of the tail times duration^3/mass.
     static constexpr double pair_share = 0.05;
-    // Longest level of a pair, in half periods, and the phase beyond which a grid allows none.
+    // Maximum duration of a level of a pair, in half periods, and the phase limit for a grid.
     static constexpr double longest = 0.5, last_phase = 2.6;
-    // Vibration about a single level in units of the drift during it: the drift, what a step of
-    // that height rings to both sides, and some to be sure.
+    // Vibration about a single level relative to the drift during it: the drift, the ringing after
+    // a step of that height to both sides, and a margin.
     static constexpr double single = 3.5;
-    static constexpr double forever = 1e15;  // half periods of a single level at the most
-    // Half periods for which a branch is followed whose flow never ends.
+    static constexpr double forever = 1e15;  // maximum half periods of a single level
+    // Half periods for which a branch with an endless decay is followed.
     static constexpr double endless = 1e6;
-    // A term that has decayed by so many times its own time is nothing.
+    // Phase after which a decayed term counts as zero.
     static constexpr double faded_phase = 50;
-    // How the vibration grows until there is room for its levels, and how often the way back is
-    // halved.
+    // Growth of the vibration until its levels fit, and number of bisections on the way back.
     static constexpr double coarser = 3;
     static constexpr int halvings = 5;
 
-    int count;  // of branches
-    const double *rows, *behind;  // (count, branch_columns), and psi' less what each follows (count,)
+    int count;  // number of branches
+    const double *rows, *behind;  // (count, branch_columns), and psi' minus branch states (count,)
     double lag, period, until;
     double *out;  // (room, columns)
     int room;
     double stiffness, inertia, frequency, half;
     Complex modes[2];
-    // What the branches hold as it fades on target, as exponentials.
+    // The overstress as it decays on target, as exponentials.
     static constexpr int most_terms = most_branches * Fading::most;
     int terms;
     double held[most_terms], speed[most_terms], excess[most_terms];
@@ -71,7 +70,7 @@ struct Tail {
         frequency = hmsa::frequency(system, stretch);
         Branches<most_branches> branches;
         branches.read(rows, count);
-        // Branches are springs to fast motion, dampers to slow motion.
+        // For fast motion branches are springs, for slow motion dampers.
         const double own = system.drag * system.shape(stretch);
         double drag = own;
         for (int i = 0; i < 3; i++) {
@@ -99,12 +98,12 @@ struct Tail {
             for (int i = 0; i < fading.count; i++, terms++) {
                 held[terms] = branches.ratio[b] * behind[b] * fading.share[i];
                 speed[terms] = fading.speed[i];
-                // So that the field, behind the amplifier, is what they hold.
+                // The amplifier leads, so that the lagging field equals the overstress.
                 excess[terms] = held[terms] * (1 - lag * speed[terms]);
             }
         }
     }
-    // Of the tail at a time: its value, and the bounds of value and slope.
+    // The remaining tail at a time: its value, and bounds of value and slope.
     void left(double time, double &sum, double &bound, double &steepest) const
     {
         sum = bound = steepest = 0;
@@ -123,7 +122,7 @@ struct Tail {
         left(time, sum, found, steepest);
         return found;
     }
-    // What a mode, exp(mode t) and ``turned`` after a span, takes up of exp(-speed t).
+    // Response of a mode, exp(mode t) and ``turned`` after a span, to exp(-speed t).
     static Complex taken(Complex mode, Complex turned, double speed, double span)
     {
         const Complex gap = mode + speed;
@@ -138,15 +137,15 @@ struct Tail {
             sum = sum + taken(mode, turned, speed[b], span) * (of[b] * exp(-speed[b] * time));
         return sum;
     }
-    // What a mode takes up of the tail in two spans, in units of a level in one.
+    // Response of a mode to the tail in two spans, in units of a level in one.
     Complex both(Complex mode, Complex turned, double time, double span) const
     {
         const Complex sum = passed(excess, mode, turned, time, span) * turned
             + passed(excess, mode, turned, time + span, span);
         return sum * mode / (turned - 1);
     }
-    // Two levels of the same length between which the oscillator goes from rest to rest: both modes
-    // are still at the end where a turned once + b once = what they have taken up by then.
+    // Two levels of equal duration between which the oscillator goes from rest to rest: both modes
+    // are at rest at the end if a turned once + b once equals their response until then.
     void pair(double time, double span, double &a, double &b) const
     {
         const Complex one = exp(modes[0] * span), other = exp(modes[1] * span);
@@ -155,13 +154,12 @@ struct Tail {
         const Complex level = (first - second) / (one - other);
         a = level.re, b = (first - level * one).re;
     }
-    // For how long the tail may go down by a drift: odd multiples of a half period, since rings of
-    // equal steps so far apart cancel.
-    // And all of it that is left may stay.
+    // Duration in which the tail decreases by a drift: an odd multiple of a half period, so that
+    // the ringing of equal steps cancels. The whole remaining tail may be left.
     double single_span(double time, double drift, double rest) const
     {
         const double here = bound(time);
-        double low = 0, high = 1, less = -drift, more = -drift;  // than the drift
+        double low = 0, high = 1, less = -drift, more = -drift;  // differences from the drift
         for (; high < forever; high *= 2) {
             const double later = bound(time + high * half);
             more = here - later - drift;
@@ -186,7 +184,7 @@ struct Tail {
             span = max(__builtin_floor(span / period + 0.5), 1.0) * period;
         return span;
     }
-    // How many levels a ripple takes, -1 for more than there is room for, and their vibration.
+    // Number of levels for a ripple, -1 if they do not fit, and their vibration.
     int levels(double ripple, bool counting, double &most) const
     {
         double time = 0;
@@ -204,7 +202,7 @@ struct Tail {
                 break;
             if (single * steepest * half <= ripple * stiffness || frequency * period > last_phase) {
                 const double drift = ripple * stiffness / single;
-                // From rest on target half of it, and about the target then.
+                // Half of it when starting from rest on target, later about the target.
                 const double span = single_span(
                     time, drifting ? drift : 0.5 * drift, 0.25 * ripple * stiffness);
                 double later, rest, unused;
@@ -232,7 +230,7 @@ struct Tail {
         return found + 1;
     }
     static double cube_root(double x) { return exp(log(x) / 3); }
-    // Deviation, rate and field where levels begin, from rest on target.
+    // Deviation, rate and field at the start of the levels, from rest on target.
     void predict(int found) const
     {
         const Complex gap = (modes[0] - modes[1]) * inertia;
@@ -260,9 +258,9 @@ struct Tail {
                 field += over * exp(-span / lag);
         }
     }
-    // While the tail is steep, pairs of levels, from rest to rest; later single levels as long as
-    // the ripple, a vibration of the stretch from peak to peak, allows, or one as near above it as
-    // there is room for. Returns how many there are, and a bound of the vibration.
+    // While the tail is steep, use pairs of levels, from rest to rest; later single levels as long
+    // as the ripple (a peak-to-peak vibration of the stretch) allows, or one as little above it as
+    // the room allows. Returns the number of levels, and an upper bound of the vibration.
     int staircase(double ripple, double &most) const
     {
         double fine = ripple, rough = ripple;

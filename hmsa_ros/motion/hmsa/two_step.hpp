@@ -1,4 +1,4 @@
-// The two-step command (Eq. 13): the load whose first turning point is the target, and when.
+// The two-step command (Eq. 13): the load whose first turning point is the target, and its time.
 #pragma once
 #include "swing.hpp"
 
@@ -20,32 +20,32 @@ struct Move {
 struct Wanted {
     double least, most;  // admissible loads
     double rtol;
-    double hold;  // deviation below which the actuator counts as being there already
+    double hold;  // deviation below which the actuator counts as already there
     bool rough = false;  // a guess for another search
 };
 
-// Sign of the deviation is decided by the linearised motion below this share of the move or of the
-// room to a limit.
+// Below this fraction of the move or of the distance to a limit, the linearised motion determines
+// the sign of the deviation.
 constexpr double linear = 1e-6;
 constexpr int most_passes = 80, newton_passes = 8, most_stuck = 4, most_crossing = 200000;
 constexpr double coarse = 3e-7, farthest = 1e3;
 
-// What the cubic through two points, with a slope at each, adds to the line through the first at a
-// share of the way from it to the second.
+// Difference between the cubic through two points with slopes, and the line through both, at a
+// fraction of the way.
 inline double beyond_line(double share, double rise, double way, double slope, double other)
 {
     const double bend = way * (slope + other) - 2 * rise;
     return share * share * (rise - way * slope - bend + share * bend);
 }
 
-// Newton on d = direction (beta_1 - beta_p) > 0, kept inside a bracket: at d = 0 the motion
-// overshoots the target, at a large d it stops short. The difference is the unknown because it
-// falls below the rounding of beta_p itself near critical damping. The turning point is compared to
-// the target by ln((l - lower)/(upper - l)), on which the load acts about linearly even close to a
-// limiting stretch. The first passes are coarse and only guess for the last ones, which bracket
-// anew. The search ends at the admissible loads, or far from the target's own where they are
-// infinite. In place of beta_1, d counts from the load that holds the target while branches stay
-// where they are: under it the motion overshoots, too.
+// Newton's method on d = direction (beta_1 - beta_p) > 0, kept inside a bracket: at d = 0 the
+// motion overshoots the target, at a large d it stops short. The difference is the unknown because
+// near critical damping it is smaller than the rounding of beta_p. The turning point is compared
+// to the target by ln((l - lower)/(upper - l)), which is nearly linear in the load even close to a
+// limiting stretch. The first integrations are coarse and only give a guess for the last ones,
+// which start a new bracket. The search ends at the admissible loads or, if they are infinite, far
+// from the holding load. With branches, d is relative to the load that would hold the target in
+// their present states, under which the motion also overshoots.
 template <class System, int NB = 0> struct Search {
     System system;
     Branches<NB> branches;
@@ -54,13 +54,15 @@ template <class System, int NB = 0> struct Search {
     double fine, enough, tolerance, least, most, top, guess, low, high, d;
     int pass, times_stuck;
     bool rough;
-    // Of the turning point before: d, its excess, and the slope of d by that; its time, and the slope
-    // of that by the load; how far d went from there as a share, and how exact the pass was.
+    // Of the previous turning point: d, its excess, and the slope of d by it; its time, and the
+    // slope of it by the load; the relative change of d since then, and the accuracy of the
+    // integration.
     struct { double d, excess, slope, time, time_by_load, went, exact; } before;
     Plan plan;
 
     double load() const { return held - direction * d; }
-    // What holds a force while the branches stay, with what a motion feels of them.
+    // The load that balances a force at fixed branch states, with the fraction that a motion
+    // feels.
     double balance(double force, const double *felt) const
     {
         double load = force;
@@ -68,10 +70,10 @@ template <class System, int NB = 0> struct Search {
             load += felt[b] * (force - followed[b]);
         return load;
     }
-    // Without damping the energy balance gives d. The linear oscillator says how it shrinks with
-    // damping, by 2 K/(1 + K) with the decay K over half a period; its damping ratio is the damping
-    // force, at the rate that the balance gives half way, against that of the spring. Branches are
-    // springs to fast motion, dampers to slow motion.
+    // Without damping the energy balance gives d. For a linear oscillator, damping reduces it by
+    // 2 K/(1 + K) with the decay K over half a period. The damping ratio is the damping force over
+    // that of the spring, at the rate half way from the balance. For fast motion branches are
+    // springs, for slow motion dampers.
     HMSA_APART double first_guess() const
     {
         if (target == start)
@@ -100,7 +102,7 @@ template <class System, int NB = 0> struct Search {
         const double decay = xi < 0.9 ? exp(-3.141592653589793 * xi / sqrt(1 - xi * xi)) : 1e-3;
         return direction * (held - end) + delta * 2 * decay / (1 + decay);
     }
-    // Returns whether there is something to search.
+    // Returns whether a search is needed.
     HMSA_APART bool begin(const System &of, const double *m, const Move &from, double where, const Wanted &wanted)
     {
         system = of;
@@ -111,11 +113,11 @@ template <class System, int NB = 0> struct Search {
         held = balance(beta_1, branches.ratio);
         frequency_at_start = sqrt(branches.total) * frequency(system, start);
         move = abs(target - start) + abs(rate) / frequency(system, target);
-        const double size = 1 + target;  // errors count against the move and the room that is left
+        const double size = 1 + target;  // errors are relative to the move and the remaining room
         fine = max(min(wanted.rtol, 1e-10 * move / size), 1e-14);
         enough = max(0.1 * sqrt(fine), 1e-14 * size / move);
         tolerance = max(fine, coarse * min(min(size, move), min(target - lower, upper - target)) / size);
-        // A smaller difference of loads is rounding of the elastic force.
+        // A smaller difference of loads is a rounding error of the elastic force.
         least = 1e-14 * (abs(held) + abs(target) * elastic.d[0]);
         most = infinity();
         if (rate == 0) {
@@ -128,7 +130,8 @@ template <class System, int NB = 0> struct Search {
         top = direction * (held - (direction > 0 ? wanted.least : wanted.most));
         if (!(top < infinity()))
             top = farthest * (1 + abs(held));
-        // From rest beta_p lies between the two holding loads: it is found there, inside or not.
+        // From rest beta_p lies between the two holding loads, where it is found, admissible or
+        // not.
         top = most < infinity() ? max(top, most) : top;
         guess = first_guess();
         if (!(0 < guess && guess < min(most, top)))
@@ -144,7 +147,7 @@ template <class System, int NB = 0> struct Search {
         plan = without(status, beta_1, pass);
         return true;
     }
-    // Takes the turning point of a pass; returns whether the search is over.
+    // Uses the turning point of an integration; returns whether the search is over.
     HMSA_APART bool found(const Event &event)
     {
         pass++;
@@ -165,14 +168,14 @@ template <class System, int NB = 0> struct Search {
             high = min(high, d);
         double next = d + change;
         if (high == infinity() && pass > newton_passes)
-            // Newton approaches an excess that never ends: stride out to the bound.
+            // Newton's method approaches the bound in ever smaller steps: go on to the bound.
             next = max(next, 4 * d);
-        // Against beta_p, where that is the smaller one: close to a limit.
+        // Relative to beta_p if it is smaller: close to a limit.
         double relative = abs(next - d) / min(d, 1 + abs(beta));
         if (!(low < next && next < high)) {
             const bool lost = high < 8 * least, closed = high - low <= 4e-16 * (abs(held) + high);
             if (tolerance > fine && (lost || closed)) {
-                // Coarse passes have misled the search: begin again.
+                // Coarse integrations have misled the search: start again.
                 tolerance = fine;
                 low = 0, high = most, d = guess;
                 before.went = infinity();
@@ -192,9 +195,9 @@ template <class System, int NB = 0> struct Search {
         }
         const bool near = rough ? relative < 0.1 && next > 1e-3 * abs(guess)
                                 : tolerance <= fine && relative <= enough && abs(miss) <= 1e-6 * move;
-        // Cubics through this turning point and the one before, with both slopes, miss by the square
-        // of the product of both distances, where Newton misses by that of one; by more where Newton
-        // has come nearer by little.
+        // Cubics through this turning point and the previous one, with both slopes, have an error
+        // of the squared product of both distances, Newton's method only that of one distance; the
+        // error is larger if Newton's method has made little progress.
         const double nearer = relative / before.went, squared = nearer * nearer;
         const bool bent = !near && turn && !rough && tolerance <= fine && next == d + change
             && relative * before.went <= enough && squared * before.exact <= fine
@@ -218,7 +221,7 @@ template <class System, int NB = 0> struct Search {
         if (d > top)
             return ended(no_two_step);
         if (relative < 0.1 && tolerance > fine) {
-            // What convergence leaves for the next pass to resolve.
+            // The accuracy that convergence requires of the next integration.
             tolerance = max(fine, min(tolerance, 1e-2 * relative * relative));
             const bool last = turn && !rough && abs(excess) < 0.05 && relative * relative * relative < enough;
             if (last || tolerance < 1e3 * fine) {
@@ -230,9 +233,9 @@ template <class System, int NB = 0> struct Search {
     }
 };
 
-// Whether the response to the target's own load passes the target. Below critical damping it always
-// does. Above, it is followed until it has, or until the linearised motion says: with eigenvalues
-// a < b < 0 and deviation x it stays on its own side unless (v - a x) x < 0.
+// Whether the response to the holding load passes the target. Below critical damping it always
+// does. Above, it is followed until it has, or until the linearised motion decides: with
+// eigenvalues a < b < 0 and deviation x it stays on its side unless (v - a x) x < 0.
 template <class System> HMSA_APART bool crosses(const System &system, const double *m, const Move &move, double rtol)
 {
     const double target = move.target;
@@ -279,7 +282,7 @@ template <class System, int NB = 0> struct Planner {
         while (!search.found(swing.turn(system)));
         return search.plan;
     }
-    // Whether there is something to search; else the plan says why not.
+    // Returns whether a search is needed; otherwise the plan contains the reason.
     HMSA_APART bool begins(const System &system, const double *m, const Move &move, const Wanted &wanted, Plan &plan)
     {
         const double lower = m[lower_at], upper = m[upper_at], target = move.target;
@@ -295,8 +298,8 @@ template <class System, int NB = 0> struct Planner {
         return crosses(system, m, move, max(wanted.rtol, 1e-10));
     }
     // The fastest single intermediate load that ends at rest at the target. There are at most two:
-    // one whose turning point is reached on the way up and one on the way down (Eqs. 13 and 14 from
-    // rest have the direct one only).
+    // one reaches its turning point on the way up and one on the way down (from rest, Eqs. 13 and
+    // 14 have only the direct one).
     HMSA_APART Plan operator()(const System &system, const double *m, const Move &move, const Wanted &wanted)
     {
         Plan plan;
