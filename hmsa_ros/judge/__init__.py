@@ -1,5 +1,5 @@
 """
-Whether an actuator arrived: samples, a setpoint and tolerances in, one finding out.
+Judgement of arrivals: samples, a setpoint and tolerances in, one finding out.
 
-Status, commands, reports, studies and benchmarks all show what `judging.judge` finds.
+Status, commands, reports, studies and benchmarks all show the result of `judging.judge`.
 """

@@ -1,10 +1,9 @@
 """
-Bounds of an offset and of a vibration that samples allow, by profile likelihood.
+Bounds of steady-state error and vibration from samples, by profile likelihood.
 
-An offset with a drift, or with a creep, and a decaying sinusoid are fitted for each frequency and
-decay of a grid.
-Each fit that leaves little more than the best is possible, and the bounds hold for all of these:
-what samples do not tell apart widens them.
+An offset with a drift or creep, and a decaying sinusoid, are fitted for each frequency and decay
+of a grid. Every fit that is nearly as good as the best one is possible, and the bounds include all
+of these: ambiguity widens them.
 """
 
 from collections.abc import Callable
@@ -18,40 +17,40 @@ from numpy.typing import NDArray
 
 from hmsa_ros.model.equations import Array
 
-#: Fewer samples, or fewer periods of the vibration, say nothing about it.
+#: Fewer samples, or fewer periods, do not determine the vibration.
 FEWEST, SHORTEST = 8, 1.4
-# How often the truth may be beyond a bound.
+# Probability that the true value is beyond a bound.
 _BEYOND = 0.005
-# Samples nearer together than this share of a period show the vibration as it is; with others it
-# is looked for near the frequency of the model, of which they show an alias.
+# Sampling interval, in periods, below which the vibration is resolved; otherwise it is aliased,
+# and the search stays near the frequency of the model.
 _DENSE = 0.4
 _NEAR, _MIDDLE, _WIDE = (0.75, 1.3), (0.6, 1.6), (0.3, 2.5)
-# Periods from which on a frequency far from the model's is told from a drift, and a drift at all.
+# Periods above which a frequency far from the model's, and a drift at all, can be identified.
 _FAR, _DRIFTS = 3.0, 3.0
-# Frequencies tried in the time of one period over the span, and around the best one.
+# Frequencies per period in the span, and around the best one, and number of refinements.
 _TRIED, _REFINED, _ROUNDS = 3, 7, 3
-# Decays tried, as shares of the largest, which is this many times the model's, as a ratio to the
-# frequency between these.
+# Decays to try, relative to the largest one, which is a multiple of the model's, within limits
+# given as a ratio to the frequency.
 _DECAYS = np.array([0.0, 0.07, 0.15, 0.27, 0.4, 0.6, 1.0])
 _FASTER, _LEAST, _MOST = 2.0, 0.1, 0.7
-# Time constants by which a vibration may have faded at the first sample.
+# Maximum decay of a vibration before the first sample, in time constants.
 _LONGEST = 20.0
-# Time constants of an exponential creep in spans. It is looked for below this share of independent
-# samples, and shown where it leaves less than this share of the squares.
+# Time constants of exponential creep, in spans. Creep is tried below this fraction of independent
+# samples, and accepted if it leaves less than this fraction of the squares.
 _CREEPS, _INDEPENDENT, _EXPLAINED = np.geomspace(0.07, 3.0, 8), 0.4, 0.5
-# Figures that are fitted: offset, drift, two of the sinusoid, frequency and decay.
+# Number of fitted values: offset, drift, two of the sinusoid, frequency and decay.
 _FITTED = 6
-# Phases at which a vibration is looked at, and how many possible ones.
+# Phases at which a vibration is evaluated, and maximum number of possible fits.
 _PHASES = np.linspace(0.0, 2.0 * math.pi, 32)
 _MOST_POSSIBLE = 200
-# Standard deviations of noise in its median from zero.
+# Ratio of standard deviation to median absolute deviation of normal noise.
 _NORMAL = 1.4826
-# Largest correlation of neighbours that counts.
+# Maximum correlation of neighbouring samples.
 _MOST_ALIKE = 0.98
 
 
 class Figure(NamedTuple):
-    """A figure, its standard deviation and its bounds."""
+    """A value, its standard deviation and its bounds."""
 
     value: float
     std: float
@@ -61,25 +60,25 @@ class Figure(NamedTuple):
 
 @dataclass(frozen=True)
 class Fit:
-    """What samples show."""
+    """Result of a fit of samples."""
 
     offset: Figure
     vibration: Figure  #: peak to peak in the period after time 0
     frequency: float  #: in rad/s
     noise: float  #: standard deviation of a sample
-    usual: float  #: the same of most samples: what happens once does not count
-    independent: float  #: share of the samples that noise which is not white leaves
+    usual: float  #: robust standard deviation, insensitive to single events
+    independent: float  #: fraction of independent samples with coloured noise
 
 
 def fit(
         time: Array, rest: Array, frequency: float, decay: float,
         settles: Callable[[Fit], bool] = lambda _: False) -> Fit | None:
     """
-    Fit samples: times in s, from 0 on and increasing, and how far from the target.
+    Fit samples: times in s, from 0 on and increasing, and deviations from the target.
 
-    Frequency (rad/s) and decay (1/s) are the model's. A fit without creep that ``settles`` what is
-    asked is not compared with those with creep, which take several times as long. None where
-    samples are too few.
+    Frequency (rad/s) and decay (1/s) are those of the model. If ``settles`` accepts the fit
+    without creep, fits with creep, which take several times as long, are skipped. Return None if
+    there are too few samples.
     """
     count, span = len(time), float(time[-1] - time[0]) if len(time) else 0.0
     periods = span * frequency / (2.0 * math.pi)
@@ -89,7 +88,7 @@ def fit(
     dense = interval * frequency < 2.0 * math.pi * _DENSE
     low, high = (x * frequency for x in (
         (_WIDE if periods >= _FAR else _MIDDLE) if dense else _NEAR))
-    # Beyond these the samples show no other vibration.
+    # Other frequencies are indistinguishable in the samples.
     high = min(high, 0.9 * math.pi / interval if dense else low + 2.0 * math.pi / interval)
     omegas: Array = np.linspace(
         low, high, max(int((high - low) * span * _TRIED / (2.0 * math.pi)), _REFINED)
@@ -105,7 +104,7 @@ def fit(
     plain = _bounds(problem, 0, solved.flat(), searched)
     if plain.independent > _INDEPENDENT or settles(plain):
         return plain
-    # What is left is not chance alone: it may creep.
+    # The fit residual is not pure noise: try creep.
     drifts = np.exp(-time / (_CREEPS[:, None] * span))
     fits = _Problems(time, rest, drifts).solve(coarse)
     place = int(np.argmin(np.min(fits.squares, axis=-1)))
@@ -119,15 +118,15 @@ def fit(
     return _bounds(nearest, int(np.argmin(least)), fits.flat().joined(more.flat()), searched)
 
 
-# -- fits of a grid -----------------------------------------------------------------------------
+# -- fits on a grid -----------------------------------------------------------------------------
 
 class _Solved(NamedTuple):
-    """Fits: their residuals, sinusoids, offsets and covariances of unit noise, shape (..., n)."""
+    """Fits: residuals, sinusoids, offsets and covariances for unit noise, shape (..., n)."""
 
     omega: Array
     decay: Array
-    squares: Array  # sum of the squares of what is left
-    pair: Array  # factors of cosine and sine, shape (2, ..., n)
+    squares: Array  # sum of squared residuals
+    pair: Array  # coefficients of cosine and sine, shape (2, ..., n)
     offset: Array
     offset_variance: Array
     pair_variance: Array  # the larger of the two
@@ -136,7 +135,7 @@ class _Solved(NamedTuple):
         return _Solved(*(x[..., places] for x in self))
 
     def flat(self) -> '_Solved':
-        """Return those of all problems together."""
+        """Return the fits of all problems in one row."""
         return _Solved(*(x.reshape(*x.shape[:-2], -1) for x in self))
 
     def joined(self, other: '_Solved') -> '_Solved':
@@ -144,7 +143,7 @@ class _Solved(NamedTuple):
 
 
 class _Sinusoids:
-    """Sinusoids of each of some frequencies and decays, shapes (..., m) and (..., d)."""
+    """Sinusoids for combinations of frequencies and decays, shapes (..., m) and (..., d)."""
 
     def __init__(self, time: Array, omegas: Array, decays: Array) -> None:
         self.omegas, self.decays = omegas, decays
@@ -160,16 +159,16 @@ class _Sinusoids:
 
 
 class _Problems:
-    """Samples, with what an offset and each of some drifts, shape (k, n), explain taken out."""
+    """Samples, after projection onto the complement of an offset and each drift, shape (k, n)."""
 
     def __init__(self, time: Array, rest: Array, drifts: Array | None) -> None:
         self.time, self._rest = time, rest
         level = np.full(len(time), 1.0 / math.sqrt(len(time)))
         self._straight: Array = level[None, None]  # orthonormal, shape (k, 1 or 2, n)
-        # What an offset in the middle is of the coordinates of the straight line.
+        # The offset in the middle as a function of the coordinates of the straight line.
         self._middle: Array = np.full((1, 1), level[0])
         if drifts is not None:
-            # Of an offset they have no part: their means over the time are 0.
+            # Remove the offset from the drifts: their means over time are 0.
             share = np.diff(time) / (time[-1] - time[0])
             drifts = drifts - 0.5 * ((drifts[:, 1:] + drifts[:, :-1]) @ share)[:, None]
             along = drifts @ level
@@ -199,7 +198,7 @@ class _Problems:
         sine = (one * rights[1] - cross * rights[0]) / determinant
         squares = np.sum(self._left**2, axis=1)[:, None, None] - (
             cosine * rights[0] + sine * rights[1])
-        # How far the sinusoid moves the offset, by its two factors.
+        # Shift of the offset by the two coefficients of the sinusoid.
         middle = self._middle[..., None, None]
         by_cosine, by_sine = (np.sum(middle * x, axis=1) for x in (by_cosines, by_sines))
         offset = np.sum(self._middle * self._explained, axis=1)[:, None, None] - (
@@ -216,7 +215,7 @@ class _Problems:
             np.maximum(squares, 0.0), np.stack((cosine, sine)), offset, variance, larger)))
 
     def residuals(self, place: int, omega: float, decay: float, pair: Array) -> Array:
-        """Return what a sinusoid leaves with the best offset and a drift."""
+        """Return the residuals of a sinusoid with the best offset and drift."""
         fading = np.exp(-decay * self.time)
         wave = fading * (pair[0] * np.cos(omega * self.time)
                          + pair[1] * np.sin(omega * self.time))
@@ -225,7 +224,7 @@ class _Problems:
 
 
 def _refined(problems: _Problems, solved: _Solved, coarse: _Sinusoids) -> _Solved:
-    """Add fits about the best one of a grid to those of each problem."""
+    """Add fits around the best one of a grid to those of each problem."""
     omegas, decays = coarse.omegas, coarse.decays
     width, spread = float(omegas[1] - omegas[0]), float(decays[1])
     for _ in range(_ROUNDS):
@@ -241,7 +240,7 @@ def _refined(problems: _Problems, solved: _Solved, coarse: _Sinusoids) -> _Solve
 
 
 def _bounds(problems: _Problems, number: int, tried: _Solved, searched: float) -> Fit:
-    """Return the figures of the best fit, of a problem, and their bounds by all possible ones."""
+    """Return the values of the best fit of a problem, with bounds over all possible fits."""
     count = len(problems.time)
     place = int(np.argmin(tried.squares))
     least = float(tried.squares[place])
@@ -250,25 +249,25 @@ def _bounds(problems: _Problems, number: int, tried: _Solved, searched: float) -
     together = _together(left)
     freedom = max(count - _FITTED, 1)
     variance = least / freedom
-    # Of samples that are not independent there are fewer.
+    # Correlated samples count as fewer.
     of_few = max(freedom / together, 1.0)
     sure = student_quantile(of_few, 1.0 - _BEYOND)
     scale = variance * together
     slack = sure**2 + searched - (tried.squares - least) / max(scale, 1e-300)
     possible = np.flatnonzero(slack >= 0.0)
     if len(possible) > _MOST_POSSIBLE:
-        # Where samples have no noise many fits are as good as the best, which has to stay.
+        # Without noise many fits equal the best one, which has to stay.
         likely = possible[np.argsort(-slack[possible])[:_MOST_POSSIBLE]]
         possible = np.union1d(likely, [place])
     within = tried.taken(possible)
-    # One that was only found by searching is not shown, but it may be.
+    # A vibration found only by the search is not significant, but possible.
     reach = np.sqrt(np.maximum(slack[possible], 0.0) * scale)
     near = np.sqrt(np.maximum(slack[possible] - searched, 0.0) * scale)
     fading = np.exp(-np.outer(within.decay / within.omega, _PHASES))
     waves = fading * (np.outer(within.pair[0], np.cos(_PHASES))
                       + np.outer(within.pair[1], np.sin(_PHASES)))
     swing = np.ptp(waves, axis=1)
-    # The largest that any phase has.
+    # Maximum over all phases.
     factor = 1.0 + np.exp(-math.pi * within.decay / within.omega)
     deviation = np.sqrt(within.pair_variance) * factor
     shift = np.sqrt(within.offset_variance)
@@ -290,10 +289,10 @@ def _bounds(problems: _Problems, number: int, tried: _Solved, searched: float) -
 
 def student_quantile(freedom: float, probability: float) -> float:
     """
-    Return what Student's t exceeds with the rest of a probability above 0.5.
+    Return the quantile of Student's t at a probability above 0.5.
 
-    Degrees of freedom, at least 1, are rounded down below 3. The expansion is Abramowitz and
-    Stegun's 26.7.5; SciPy has the quantile, but loading it takes as long as a planner's start.
+    Degrees of freedom, at least 1, are rounded down below 3. The expansion is 26.7.5 of Abramowitz
+    and Stegun. SciPy provides the quantile, but takes as long to import as a planner to start.
     """
     share = 2.0 * probability - 1.0
     if freedom < 2.0:
@@ -309,14 +308,14 @@ def student_quantile(freedom: float, probability: float) -> float:
 
 
 def _together(left: Array) -> float:
-    """Return of how many samples one is independent: 1 of white noise."""
+    """Return the number of samples per independent one: 1 for white noise."""
     size = float(left @ left)
     if size <= 0.0:
         return 1.0
     total, count = 1.0, len(left)
     next_one = float(left[1:] @ left[:-1]) / size
     if next_one > 2.0 / math.sqrt(count):
-        # What was fitted has taken part of it away.
+        # Compensate for the part that the fit has removed.
         next_one = min(next_one + (1.0 + _FITTED * next_one) / count, _MOST_ALIKE)
         total = (1.0 + next_one) / (1.0 - next_one)
     summed = 1.0

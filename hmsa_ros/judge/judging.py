@@ -1,8 +1,8 @@
 """
-The rule: an equivalence test with three answers.
+The rule of judgement: an equivalence test with three results.
 
-A setpoint is arrived at where samples show offset and vibration to be within their tolerances,
-missed where they show one to be outside, and undecided otherwise.
+A setpoint is arrived at if samples show steady-state error and vibration to be within their
+tolerances, missed if they show one to be outside, and undecided otherwise.
 """
 
 from collections.abc import Callable, Iterator
@@ -29,26 +29,26 @@ from hmsa_ros.model.units import NANOSECONDS
 
 Stamps = NDArray[np.int64]
 
-#: Samples of a look where they are rare.
+#: Samples of a window at low sampling rates.
 ENOUGH = 24
-# Parts of a period of which the samples count as one.
+# Parts of a period, in each of which samples are averaged.
 _KEPT = 32
-# Whatever stays nearer to the target than this share of a tolerance, as a root mean square, is
-# within it.
+# RMS deviation from the target, relative to a tolerance, below which it is always within the
+# tolerance.
 _QUIET = 0.3
-# What a fit leaves is nothing below this share of a tolerance.
+# Fit residual, relative to a tolerance, that counts as zero.
 _NOTHING = 0.01
-# Noise of a period from peak to peak, in standard deviations, that is hardly ever exceeded.
+# Upper bound of the peak-to-peak noise in a period, in standard deviations.
 _PEAKS = 7.0
-# Samples in a period from which on they show how far it moves.
+# Samples per period above which they show the range of motion directly.
 _SEEN = 12
-# Of how many samples the mean is looked at where a motion does not ring.
+# Numbers of samples to average in the test of a motion that does not ring.
 _TOGETHER = (1, 3, 9)
-# How much wider than for an arrival the bounds are for a miss.
+# Factor on the distance of the bounds that a miss requires, relative to an arrival.
 _SURER = 1.5
-# Changes from sample to sample of so small a share of the step are those of a motion that fades.
+# Changes between samples, relative to the step, that belong to a motion that fades.
 _FADED = 1e-9
-# Fewer changes do not show whether a sensor rounds.
+# Number of changes below which the rounding of a sensor is not tested.
 _FEW_CHANGES = 3
 _NO_SENSOR = Sensor()
 
@@ -63,21 +63,21 @@ def judge(
     Parameters
     ----------
     time : array of int
-        Stamps in ns, in any order, shape (n,). Those before the arrival and after the end say
-        what the sensor does.
+        Timestamps in ns, in any order, shape (n,). Samples before the arrival and after the end
+        only serve to check the sensor.
     stretch : array
-        Measured, shape (n,); NaN for what is not.
+        Measured stretch, shape (n,); NaN for missing values.
     setpoint : Setpoint
-        As it was requested.
+        The setpoint as requested.
     tolerances : Tolerances
-        What counts as having arrived.
+        Tolerances for an arrival.
     sensor : Sensor
-        What is known of it.
+        Known properties of the sensor.
 
     Returns
     -------
     Finding
-        The worst that the looks at the hold show.
+        The worst finding of all windows of the hold.
 
     """
     stamps, values, complaint = _usable(time, stretch, setpoint, sensor)
@@ -87,7 +87,7 @@ def judge(
     found = _judged(stamps, values, setpoint, tolerances, sensor, begin)
     if found.arrived or moved is None:
         return found
-    # Not as it was planned at first; perhaps as it was planned anew.
+    # It did not follow the first plan; it may have followed a replanned one.
     again = _judged(stamps, values, setpoint, tolerances, sensor, moved)
     if again.open and not found.open:
         return found
@@ -120,7 +120,7 @@ def _judged(
             _largest(stamps[part], rest, setpoint) - _PEAKS * noise > swing)
         if number and not moves and np.mean(np.square(rest)) <= quiet**2:
             continue
-        # Later looks see the vibration from their own beginning on.
+        # In later windows the vibration counts from their own start.
         origin = int(stamps[part][0]) if number else begin
         seconds = ((stamps[part] - origin) / NANOSECONDS).astype(np.float64)
         decided = partial(
@@ -135,13 +135,13 @@ def _judged(
             alike = min(alike, shown.independent)
         elif not number:
             findings.append(_too_few(setpoint, stamps[part]))
-    # Of equal ones the first look, which shows the vibration; else the one that is farthest off.
+    # Among equal findings prefer the first window, which shows the vibration; else the worst one.
     found = max(
         findings, key=lambda x: (VERDICTS.index(x.verdict), x is findings[0], x.rank[1]))
     most = _largest(*every, setpoint)
     if found.verdict is Code.VIBRATING and most <= swing and (
             len(every[0]) > _SEEN * (every[0][-1] - every[0][0]) / setpoint.period):
-        # Nothing moved as far as what was fitted to it.
+        # The fitted vibration is larger than any motion.
         return replace(found, verdict=Code.UNDECIDED, message=(
             f'{found.message}, but nothing moves by more than {setpoint.words(most)}: it does not '
             'ring like an actuator'))
@@ -163,10 +163,10 @@ def _judged(
 
 
 def _largest(stamps: Stamps, rest: Array, setpoint: Setpoint) -> float:
-    """Return the largest motion from peak to peak in a period of a look."""
+    """Return the largest peak-to-peak motion within a period of a window."""
     period = setpoint.period
     most = 0.0
-    # What half a period shows is in one period or in one that begins half of it later.
+    # A motion within half a period lies in one period of the first or the shifted division.
     for begin in (stamps[0], stamps[0] - period // 2):
         _, first = np.unique((stamps - begin) // period, return_index=True)
         swings = np.maximum.reduceat(rest, first) - np.minimum.reduceat(rest, first)
@@ -179,7 +179,7 @@ def _largest(stamps: Stamps, rest: Array, setpoint: Setpoint) -> float:
 def _usable(
         time: Stamps, stretch: Array, setpoint: Setpoint,
         sensor: Sensor) -> tuple[Stamps, Array, str]:
-    """Return samples that count, by time, as true ones; and why none does."""
+    """Return the valid samples by time, corrected for the sensor, and the reason if none is."""
     stamps = np.asarray(time, dtype=np.int64)
     values = np.asarray(stretch, dtype=np.float64)
     finite = np.isfinite(values)
@@ -202,7 +202,7 @@ def _usable(
 
 
 def _frozen(values: Array, setpoint: Setpoint) -> str:
-    """Say that a sensor shows the same in the end, however it moved before; empty if not."""
+    """Return a message if a sensor is constant at the end after motion; empty if not."""
     changes = np.abs(np.diff(values))
     moved = np.flatnonzero(changes)
     same = len(changes) - int(moved[-1] + 1 if len(moved) else 0) + 1
@@ -213,7 +213,7 @@ def _frozen(values: Array, setpoint: Setpoint) -> str:
         off = abs(float(values[-1]) - setpoint.target) > _QUIET * setpoint.step
         return f'{words}: it is frozen, or nothing moves' if off else ''
     before = changes[:moved[-1] + 1][-FEWEST:]
-    # A motion that fades gets ever slower, and a sensor that rounds moves by whole steps.
+    # A motion that fades becomes ever slower, and a sensor that rounds moves by whole steps.
     step = float(np.min(changes[moved]))
     rounds = np.all(np.abs(changes[moved] / step - np.round(changes[moved] / step)) < 0.01)
     if rounds or np.median(before) < _FADED * setpoint.step:
@@ -232,7 +232,7 @@ def _thinned(
 
 
 def _looks(stamps: Stamps, begin: int, setpoint: Setpoint) -> Iterator[slice]:
-    """Yield the samples of each look: of whole periods at once, then ever more seldom."""
+    """Yield the samples of each window: a few periods at first, then ever longer intervals."""
     length = setpoint.look
     if len(stamps) > 1:
         length = max(length, ENOUGH * round(float(np.median(np.diff(stamps)))))
@@ -255,7 +255,7 @@ def _looks(stamps: Stamps, begin: int, setpoint: Setpoint) -> Iterator[slice]:
 
 
 def _too_few(setpoint: Setpoint, stamps: Stamps) -> Finding:
-    """Return the finding where there are samples, and what more there should be."""
+    """Return the finding for too few samples, with advice."""
     span = float(stamps[-1] - stamps[0]) / NANOSECONDS if len(stamps) else 0.0
     period = 2.0 * math.pi / setpoint.frequency
     least = 2.0 * period
@@ -273,28 +273,28 @@ def _too_few(setpoint: Setpoint, stamps: Stamps) -> Finding:
 # -- the rule -----------------------------------------------------------------------------------
 
 def _settles(found: Fit, *, decided: Callable[[Fit], Finding], nothing: float) -> bool:
-    """Return whether a look is decided, and what its fit leaves changes nothing."""
+    """Return whether a window is decided, and its fit residual is negligible."""
     return found.noise < nothing and not decided(found).open
 
 
 def _decided(
         found: Fit, count: int, setpoint: Setpoint, limits: tuple[float, float],
         sensor: Sensor, moves: bool | None) -> Finding:
-    """Decide on a look by what it shows and, of a later one, whether it is seen to move."""
+    """Decide on a window by its fit; ``moves`` states, in later ones, whether motion was seen."""
     offset, vibration = _widened(found.offset, sensor.std(setpoint.target)), found.vibration
     allowed, swing = limits
-    # One of several looks is enough for a miss, so that each has to be surer.
+    # One of several windows suffices for a miss, so that each has to be more certain.
     off = offset.value - _SURER * (offset.value - offset.low) > allowed or (
         offset.value + _SURER * (offset.high - offset.value) < -allowed)
     vibrates = vibration.value - _SURER * (vibration.value - vibration.low) > swing
-    # What has come to rest is taken to do so until it is seen to move.
+    # After rest, later windows count as rest unless they show motion.
     rests = vibration.high <= swing if moves is None else not moves
     within = max(-offset.low, offset.high) <= allowed and rests
     code = (Code.OFF_TARGET if off else Code.VIBRATING if vibrates
             else Code.ARRIVED if within else Code.UNDECIDED)
     frequency = found.frequency / (2.0 * math.pi) if vibration.low > 0.0 else math.nan
     if vibration.low == 0.0 and vibration.std > swing:
-        # It may be anything.
+        # The vibration is undetermined.
         vibration = vibration._replace(value=math.nan, std=math.nan)
     message = f'{setpoint.where}: rests {_distance(offset.value, setpoint)}'
     if vibrates:
@@ -310,7 +310,7 @@ def _decided(
 
 
 def _widened(figure: Figure, std: float) -> Figure:
-    """Return a figure with what is not known of the sensor."""
+    """Return a value with the uncertainty of the sensor included."""
     if not std:
         return figure
     value, own, low, high = figure
@@ -322,7 +322,7 @@ def _widened(figure: Figure, std: float) -> Figure:
 def _open(
         offset: Figure, vibration: Figure, limits: tuple[float, float], setpoint: Setpoint,
         sensor: Sensor) -> str:
-    """Say what is not shown and what would show it, the rest of a sentence."""
+    """Return which bounds are too wide and how to narrow them, as the rest of a sentence."""
     parts, more = [], 1.0
     for figure, limit, name in zip(
             (offset, vibration), limits, ('an offset', 'a vibration, peak to peak,'), strict=True):
@@ -330,7 +330,7 @@ def _open(
         if most <= limit:
             continue
         parts.append(f'{name} of up to {setpoint.words(most)}')
-        # Bounds shrink with the root of the number of samples.
+        # Bounds shrink with the square root of the number of samples.
         value = 0.0 if math.isnan(figure.value) else abs(figure.value)
         more = max(more, ((most - value) / max(abs(limit - value), 1e-2 * limit))**2)
     mend = (f'{max(more, 1.1):.2g} times as many samples a second, or '

@@ -1,4 +1,4 @@
-"""What is judged, by what, and what is found."""
+"""Records of a judgement: setpoint, tolerances, sensor and finding."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -8,13 +8,13 @@ from hmsa_ros.model.residual import percent, RESOLVED
 from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS
 
-#: Verdicts on a setpoint, the better ones first.
+#: Verdicts on a setpoint, from best to worst.
 VERDICTS = (
     Code.ARRIVED, Code.UNOBSERVED, Code.UNDECIDED, Code.LATE, Code.VIBRATING, Code.OFF_TARGET,
     Code.MISSED)
-#: Periods of the vibration in one look.
+#: Periods of the vibration in one window.
 PERIODS = 6
-# What its figures are called in an estimate.
+# Prefix of the sensor properties in an estimate.
 _SENSOR = 'sensor.'
 # Smaller steps have no percentage.
 _NO_STEP = 1e-9
@@ -25,62 +25,62 @@ class Setpoint:
     """
     A setpoint as it was requested; times in ns.
 
-    Frequency and decay of vibration about the target are those of a model: they say where to look.
+    Frequency and decay of vibration about the target are those of a model, as initial values.
     """
 
     target: float  #: stretch to rest at
     start: float  #: stretch of the setpoint before
-    begins: int  #: from which it holds
-    arrival: int | None  #: planned rest at the target; None where it is only approached
-    end: int | None = None  #: until which it was requested; None for no end
+    begins: int  #: start
+    arrival: int | None  #: planned rest at the target; None if only approached
+    end: int | None = None  #: requested end; None if there is none
     frequency: float = math.nan  #: in rad/s
     decay: float = 0.0  #: in 1/s
-    joint: str = ''  #: empty where there is one
+    joint: str = ''  #: empty for a single joint
     number: int = 1  #: in the request, from 1
-    count: int = 1  #: of setpoints in the request
-    #: Arrival by a plan that was made anew, where it is another.
+    count: int = 1  #: number of setpoints in the request
+    #: Arrival by a replanned motion, if it differs.
     moved: int | None = None
-    #: What a position of the actuator can be.
+    #: Possible range of positions.
     possible: tuple[float, float] = (-math.inf, math.inf)
-    held: bool = False  #: whether it is held on after its end, as the last one is
+    held: bool = False  #: whether it is held after its end, as the last setpoint is
 
     @property
     def period(self) -> int:
-        """Period of vibration about it by the model in ns."""
+        """Period of vibration about the target by the model, in ns."""
         return round(2.0 * math.pi / self.frequency * NANOSECONDS)
 
     @property
     def look(self) -> int:
-        """Length of one look at it in ns."""
+        """Length of one window in ns."""
         return round(PERIODS * (2.0 * math.pi / self.frequency) * NANOSECONDS)
 
     @property
     def rests_from(self) -> int:
-        """Time in ns from which on it is to rest, as it was requested."""
+        """Time in ns from which the actuator should rest, as requested."""
         if self.arrival is not None:
             return self.arrival
-        # Approached: until a vibration of the step has faded to a thousandth.
+        # Approached only: until a vibration of the step has decayed to a thousandth.
         settled = self.begins + round(7.0 / max(self.decay, 1e-9) * NANOSECONDS)
         last = settled if self.end is None else self.end - self.look
         return max(min(settled, last), self.begins)
 
     @property
     def step(self) -> float:
-        """How far the target is from the setpoint before."""
+        """Distance of the target from the previous setpoint."""
         return abs(self.target - self.start)
 
     @property
     def where(self) -> str:
-        """Name it in a sentence."""
+        """Name of the setpoint in a sentence."""
         joint = f'joint {self.joint}, ' if self.joint else ''
         return f'{joint}setpoint {self.number} of {self.count}'
 
     def percent(self, difference: float) -> float:
-        """Return a difference of stretch in % of the step; NaN where there is none."""
+        """Return a difference of stretch in % of the step; NaN without a step."""
         return 100.0 * difference / self.step if self.step > _NO_STEP else math.nan
 
     def words(self, difference: float) -> str:
-        """Return a size in stretch and in % of the step."""
+        """Return a size in stretch and in % of the step, as text."""
         share = self.percent(difference)
         if math.isnan(share):
             return f'{difference:.3g}'
@@ -90,28 +90,28 @@ class Setpoint:
 
 @dataclass(frozen=True)
 class Tolerances:
-    """What counts as having arrived."""
+    """Tolerances for an arrival."""
 
-    arrival: float = 0.02  #: largest offset as a share of the step
-    vibration: float = 0.02  #: largest vibration, peak to peak, as a share of the step
-    stretch: float = 1e-3  #: either may be this large in any case, for small steps
+    arrival: float = 0.02  #: maximum steady-state error as a fraction of the step
+    vibration: float = 0.02  #: maximum vibration, peak to peak, as a fraction of the step
+    stretch: float = 1e-3  #: minimum of both tolerances, for small steps
 
     def of(self, setpoint: Setpoint) -> tuple[float, float]:
-        """Return the largest offset and the largest vibration at a setpoint in stretch."""
+        """Return the maximum steady-state error and vibration at a setpoint, in stretch."""
         return (max(self.arrival * setpoint.step, self.stretch),
                 max(self.vibration * setpoint.step, self.stretch))
 
 
 @dataclass(frozen=True)
 class GoalTolerances(Tolerances):
-    """What counts as having arrived where a goal says so itself, and how late; 0 as otherwise."""
+    """Tolerances of a goal with its own values, and maximum lateness; 0 for the defaults."""
 
-    position: float = 0.0  #: largest error of stretch
-    rate: float = 0.0  #: largest rate that is left, in 1/s
+    position: float = 0.0  #: maximum error of stretch
+    rate: float = 0.0  #: maximum remaining rate, in 1/s
     time: int = 0  #: after the arrival, in ns
 
     def of(self, setpoint: Setpoint) -> tuple[float, float]:
-        """Return the largest offset and the largest vibration at a setpoint in stretch."""
+        """Return the maximum steady-state error and vibration at a setpoint, in stretch."""
         offset, vibration = super().of(setpoint)
         own = [2.0 * self.position] * (self.position > 0.0) + [
             2.0 * self.rate / setpoint.frequency] * (self.rate > 0.0)
@@ -121,10 +121,10 @@ class GoalTolerances(Tolerances):
 @dataclass(frozen=True)
 class Sensor:
     """
-    What is known of the sensor: it shows the bias plus the gain times the stretch, later.
+    Properties of the sensor: it reports bias plus gain times stretch, with a latency.
 
-    What is not known of these is a standard deviation each, and counts; ``together`` is the
-    correlation of bias and gain.
+    Each has a standard deviation, which widens the bounds; ``together`` is the correlation of bias
+    and gain.
     """
 
     bias: float = 0.0
@@ -136,15 +136,15 @@ class Sensor:
     together: float = 0.0
 
     def to_dict(self) -> dict[str, str]:
-        """Return it as the estimate of a planner carries it."""
+        """Return the properties as they are part of a planner's estimate."""
         return {f'{_SENSOR}{key}': f'{x:.9g}' for key, x in asdict(self).items()}
 
     @classmethod
     def of(cls, values: Mapping[str, str]) -> 'Sensor':
         """
-        Return what `to_dict` is of, among other values; what is not there is as given.
+        Return the sensor from values of `to_dict` among others; missing ones have defaults.
 
-        Raises `ValueError` if figures are no numbers, or not finite.
+        Raise `ValueError` if values are no numbers, or not finite.
         """
         own = {x.name: values[_SENSOR + x.name] for x in fields(cls) if _SENSOR + x.name in values}
         found = cls(**{key: float(x) for key, x in own.items()})
@@ -153,7 +153,7 @@ class Sensor:
         return found
 
     def std(self, stretch: float) -> float:
-        """Return how far off a stretch that it shows may be, as a standard deviation."""
+        """Return the standard deviation of a stretch that the sensor reports."""
         by_gain = stretch * self.gain_std
         return math.sqrt(max(
             self.bias_std**2 + by_gain**2 + 2.0 * self.together * self.bias_std * by_gain,
@@ -162,13 +162,13 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Finding:
-    """What samples show of a setpoint; figures in stretch, NaN where they cannot be told."""
+    """Result for a setpoint; values in stretch, NaN if undetermined."""
 
     verdict: Code  #: one of `VERDICTS`
     message: str
     setpoint: Setpoint
     samples: int = 0
-    offset: float = math.nan  #: mean stretch less the target
+    offset: float = math.nan  #: mean stretch minus target
     offset_std: float = math.nan
     vibration: float = math.nan  #: peak to peak in the period after the arrival
     vibration_std: float = math.nan
@@ -177,7 +177,7 @@ class Finding:
 
     @property
     def arrived(self) -> bool:
-        """Whether the setpoint was shown to be arrived at."""
+        """Whether samples show that the setpoint was arrived at."""
         return self.verdict is Code.ARRIVED
 
     @property
@@ -187,18 +187,18 @@ class Finding:
 
     @property
     def failed(self) -> bool:
-        """Whether the setpoint was shown not to be arrived at in time."""
+        """Whether samples show that the setpoint was not arrived at in time."""
         return VERDICTS.index(self.verdict) > VERDICTS.index(Code.UNDECIDED)
 
     @property
     def rank(self) -> tuple[int, float]:
-        """How bad it is, by `VERDICTS`, and how far it is off for its step."""
+        """Severity by `VERDICTS`, then the deviation relative to the step."""
         figures = (abs(self.offset), self.vibration)
         most = max((x for x in figures if math.isfinite(x)), default=0.0)
         return VERDICTS.index(self.verdict), most / max(self.setpoint.step, _NO_STEP)
 
     def to_dict(self) -> dict[str, object]:
-        """Return it as status, reports and ``--json`` carry it; None for what cannot be told."""
+        """Return it as in status, reports and ``--json``; None for undetermined values."""
         return {
             'verdict': str(self.verdict), 'joint': self.setpoint.joint,
             'setpoint': self.setpoint.number, 'setpoints': self.setpoint.count,
@@ -206,7 +206,7 @@ class Finding:
             **{key: x if math.isfinite(x) else None for key, x in self._figures().items()}}
 
     def to_texts(self) -> dict[str, str]:
-        """Return it as a status carries it, by key; what cannot be told is missing."""
+        """Return it as in a status, by key; undetermined values are omitted."""
         figures = {'vibration_p2p': self.vibration, **self._figures()}
         return {
             'measured': str(self.verdict), 'measured_setpoint': str(self.setpoint.number),
@@ -223,12 +223,12 @@ class Finding:
 
 
 def worst(findings: Iterable[Finding]) -> Finding | None:
-    """Return the worst finding, the first of equal ones; None of none."""
+    """Return the worst finding, the first of equal ones; None if there are none."""
     return max(findings, key=lambda x: x.rank, default=None)
 
 
 def unobserved(setpoint: Setpoint, reason: str = '', samples: int = 0) -> Finding:
-    """Return the finding where no samples count, which a reason says."""
+    """Return the finding for a setpoint without valid samples, with a reason."""
     return Finding(
         Code.UNOBSERVED,
         f'{setpoint.where}: {setpoint.target:.6g} is predicted, not measured'
@@ -236,6 +236,6 @@ def unobserved(setpoint: Setpoint, reason: str = '', samples: int = 0) -> Findin
 
 
 def missed(setpoint: Setpoint, reason: str) -> Finding:
-    """Return the finding of a setpoint that was not carried out, which a reason says."""
+    """Return the finding for a setpoint that was not carried out, with a reason."""
     return Finding(
         Code.MISSED, f'{setpoint.where}: {setpoint.target:.6g} was missed: {reason}', setpoint)
