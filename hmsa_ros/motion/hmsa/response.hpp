@@ -187,7 +187,7 @@ template <class C, class System, int NB = most_branches> struct Response {
         int piece = 0, i = 0;
         const int64_t attempts = most_response_steps + int64_t(most_steps_a_sample) * of.count;
         for (int64_t attempt = 0; attempt < attempts; attempt++) {
-            for (; i < of.count && of.times[i] <= t; i++)  // at rest before the start
+            for (; i < of.count && of.times[i] <= t; i++)  // constant rate before the start
                 put(i, y[0] + y[1] * (of.times[i] - t), y[1]);
             if (i == of.count) {
                 for (int b = 0; of.behind_last && b < creeping; b++)
