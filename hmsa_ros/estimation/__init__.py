@@ -1,8 +1,8 @@
 """
-State and parameters of an actuator that is being moved, estimated from samples as they come.
+State and parameters of a moving actuator, estimated from samples in real time.
 
-`Estimator` takes levels and samples, and gives the most probable state and parameters with their
-covariance. Nothing here needs ROS.
+`Estimator` takes levels and samples, and returns the most probable state and parameters with their
+covariance. The package does not depend on ROS.
 """
 
 from hmsa_ros.estimation.estimator import Estimate, Estimator, Options

@@ -1,11 +1,11 @@
 """
-What a course is expected to leave, and whether another one is worth changing to.
+Expected error of a course, and the decision whether to change to another one.
 
-A course is expected to leave, squared, what the most probable motion leaves, and what the
-covariance of state and parameters adds to it under this very course: vibration and distance from
-the target together. A course is corrected only where another one is expected to leave less. Early
-in a move, when little is known, a course that forgives errors so wins against one that is exact
-for parameters which are a guess.
+The expected squared error is that of the most probable motion plus the contribution of the
+covariance of state and parameters under this course; it combines vibration and distance from the
+target. A course is corrected only if the expected error of another one is smaller. Early in a
+move, with large uncertainty, a course that tolerates errors is therefore preferred to one that is
+exact for uncertain parameters.
 """
 
 from collections.abc import Sequence
@@ -21,31 +21,31 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import coordinate_of
 from hmsa_ros.model.units import NANOSECONDS
 
-#: A move that is expected to leave more than this share of its step is given more time.
+#: Expected error, as a fraction of the step, above which a move is given more time.
 TOLERANCE = 5e-3
-#: A correction leaves at most this share of what the course in force leaves, while there is time
-#: for more of them, and at rest.
+#: Maximum error after a correction, relative to that of the present course, while more corrections
+#: are possible, and at rest.
 SHARE, AT_REST = 0.9, 0.5
-#: And of what plans by the parameters given leave.
+#: The same relative to a plan with the given parameters.
 CLEARLY = 0.25
-#: Share of the step that is to be gained before samples have shown an arrival.
+#: Required gain, as a fraction of the step, before samples have shown an arrival.
 MUCH = 0.05
-#: Share of the step up to which what a correction changes is little.
+#: Change, as a fraction of the step, up to which a correction is small.
 LITTLE = 2.5e-3
-# How long in ns a level has been in force that a field has followed.
+# Time in ns of a level before the course, which the field has then reached.
 _LONG = 1000 * NANOSECONDS
-# Time constants of a coil after which it has followed.
+# Time constants of a coil after which its field has settled.
 _LAGS = 10.0
-# Share of the step up to which noise is little.
+# Noise, as a fraction of the step, up to which it is small.
 _QUIET = 0.004
 
 
 def caution(count: int, noise: float) -> float:
     """
-    Return how many times as long a cautious move takes, by the number of estimated parameters.
+    Return the factor on the duration of a cautious move, by the number of estimated parameters.
 
-    Three times as long for three, five times for six; each doubling of the noise of a sample above
-    0.4 % of the step adds one more, up to two.
+    The factor is three for three parameters and five for six; each doubling of the noise of a
+    sample above 0.4 % of the step adds one, up to two.
     """
     more = math.log2(max(noise, _QUIET) / _QUIET)
     return max(3.0, 1.0 + 2.0 * count / 3.0) + min(more, 2.0)
@@ -55,12 +55,12 @@ def caution(count: int, noise: float) -> float:
 class Course:
     """Levels to a target."""
 
-    # Stamp in ns and level in T, by time; the last one holds.
+    # Timestamp in ns and level in T, by time; the last level is held.
     levels: tuple[tuple[int, float], ...]
     arrival: int  # time in ns of rest at the target
     target: float  # stretch
-    before: float = math.nan  # level in T until the first one; NaN where that came long before
-    relaxed: float = math.nan  # level in T that holds it once branches have relaxed; NaN: the last
+    before: float = math.nan  # level in T before the first one; NaN if that came long before
+    relaxed: float = math.nan  # level in T that holds it after relaxation; NaN: the last level
 
     @property
     def holding(self) -> float:
@@ -70,29 +70,29 @@ class Course:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a course is expected to leave."""
+    """Expected error of a course."""
 
-    misses: Array  # as expected: of stretch, of rate, and of the target
-    covariance: Array  # what is not known of these
+    misses: Array  # expected errors of stretch, of rate, and of the target
+    covariance: Array  # of these errors
 
     @property
     def size(self) -> float:
-        """Root of the expected square of vibration and distance from the target together."""
+        """Root of the expected squared vibration and distance from the target together."""
         return math.sqrt(float(self.misses @ self.misses) + float(np.trace(self.covariance)))
 
     def apart(self, other: 'Outcome') -> float:
-        """Return how far what another course leaves is from it."""
+        """Return the distance between the expected errors of two courses."""
         return float(np.linalg.norm(self.misses - other.misses))
 
 
 class Ahead(NamedTuple):
-    """A path as far as it is looked ahead."""
+    """A section of a path to look ahead."""
 
-    times: Array  # in s from when a course may still be changed, shape (n,)
-    stretch: Array  # wanted then, shape (n,)
+    times: Array  # in s from the earliest change of the course, shape (n,)
+    stretch: Array  # desired at these times, shape (n,)
 
 
-#: What a motion leaves that cannot be followed.
+#: Outcome of a motion that cannot be simulated.
 _NOWHERE = Outcome(np.full(3, math.inf), np.zeros((3, 3)))
 
 
@@ -100,19 +100,19 @@ def expect(
         estimate: Estimate, course: Course, slew_limit: float = math.inf,
         until: int = 0) -> Outcome:
     """
-    Return what a course is expected to leave; infinite where the motion cannot be followed.
+    Return the expected error of a course; infinite if the motion cannot be simulated.
 
-    The estimate is of a time from which on the course may still be changed; the course has the
-    level in force then. If it ends before `until`, in ns, that counts: vibration decays meanwhile.
+    The course may be changed from the time of the estimate on, and contains the level at that
+    time. If it ends before `until`, in ns, the decay of vibration until then counts.
     """
     begin = estimate.time
-    # A coil that lags shifts a motion, and leaves nothing once it has arrived too.
+    # A lagging coil shifts the motion, and has no effect after the field has settled.
     lag = estimate.values['coil_time_constant'] + 2.0 * estimate.deviations.get(
         'coil_time_constant', 0.0)
     end = max(course.arrival, begin, until) + round(_LAGS * lag * NANOSECONDS)
     levels = course.levels
     if not math.isnan(course.before):
-        # A level that begins with the course is a step in it.
+        # A first level at the time of the estimate is a step.
         levels = ((min(begin, levels[0][0]) - _LONG, course.before), *(
             (x + (x == begin), y) for x, y in levels))
     motion = _motion(estimate, levels, slew_limit, np.array([(end - begin) / NANOSECONDS]))
@@ -126,7 +126,7 @@ def expect(
     rows[1] = motion.rate_by[0] / frequency
     rows[2, :-2] = by
     if estimate.gain >= 0:
-        # The target is where the sensor shows it.
+        # The target is defined by the reading of the sensor.
         rows[2, estimate.gain] = estimate.values['stretch_gain'] * (
             stretch - coordinate_of(estimate.values['law']).rest)
     return _outcome(estimate, np.array([
@@ -136,7 +136,7 @@ def expect(
 def expect_along(
         estimate: Estimate, levels: Sequence[tuple[int, float]], ahead: Ahead,
         slew_limit: float = math.inf) -> Outcome:
-    """Return how far levels (stamp in ns, T) are expected to lead off a path, in the mean."""
+    """Return the expected RMS deviation of levels (timestamp in ns, T) from a path."""
     motion = _motion(estimate, levels, slew_limit, ahead.times)
     if motion is None:
         return _NOWHERE
@@ -147,7 +147,7 @@ def expect_along(
 def _motion(
         estimate: Estimate, levels: Sequence[tuple[int, float]], slew_limit: float,
         times: Array) -> Motion | None:
-    """Return the motion at times in s after that of an estimate; None if it has none."""
+    """Return the motion at times in s after that of an estimate; None if impossible."""
     return follow(
         estimate.values, estimate.free, (estimate.stretch, estimate.rate),
         Levels(np.array([(x - estimate.time) / NANOSECONDS for x, _ in levels]),
@@ -155,7 +155,7 @@ def _motion(
 
 
 def _outcome(estimate: Estimate, misses: Array, rows: Array) -> Outcome:
-    """Return an outcome by the most probable misses, and how they follow the coordinates."""
+    """Return an outcome from the most probable errors and their derivatives."""
     off = rows @ estimate.off
     return Outcome(misses + off, rows @ estimate.covariance @ rows.T - np.outer(off, off))
 
@@ -164,11 +164,11 @@ def worthwhile(
         before: Outcome, after: Outcome, least: float = 0.0, *, little: float,
         share: float = SHARE) -> bool:
     """
-    Return whether another course leaves enough less, and that by the least gain.
+    Return whether another course has a sufficiently smaller error, and gains at least ``least``.
 
-    Both are compared along the direction by which what they leave differs: what they leave alike
-    besides is no reason to choose. The other one has to leave at most a share; one that changes
-    little, in units of stretch, can do little harm, and only has to leave less.
+    Both are compared along the direction in which their errors differ, since common errors do not
+    matter. The error has to decrease to at most ``share``. A change of less than ``little``, in
+    units of stretch, can do little harm, and only has to be a small improvement.
     """
     if not math.isfinite(before.size + after.size):
         return after.size < before.size

@@ -1,4 +1,4 @@
-"""What is believed of an actuator: samples in, state and parameters out."""
+"""Estimator of an actuator: samples in, state and parameters out."""
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
@@ -32,44 +32,44 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.timeline import ESTIMATED, Model
 from hmsa_ros.planning.timeline import Options as PlannerOptions
 
-# Until the scatter is seen.
+# Initial noise, before it is estimated, and minimum noise.
 _FIRST_NOISE, _LEAST_NOISE = 1e-3, 2e-6
 _FEWEST_FOR_NOISE = 10
-# How fast the estimate of the noise follows the residuals.
+# Gain of the filter that tracks the noise of the residuals.
 _NOISE_GAIN = 0.05
-# Times the prior's spread that an estimate may be off it, and that a parameter may wander in a
-# second.
+# Maximum deviation of an estimate from the prior, and drift of a parameter in a second, relative
+# to the spread of the prior.
 _BOUND, _DRIFT = 4.0, 0.003
-# Share of that from which on an estimate is not believed, but for what may well be so far off.
+# Fraction of this maximum above which an estimate is not trusted, except for uncertain parameters.
 _STRANGE, _FREELY = 0.98, ('damping_coefficient', 'viscoelastic_time')
-# Share of a variance that keeps a parameter where it is.
+# Factor on a variance that keeps a parameter fixed.
 _FIXED = 1e-12
-# Deviation of stretch and, in natural frequencies, of rate of a block at rest, and of one whose
-# state is not known; and the units of time after a change of level from which on it rests.
+# Standard deviations of stretch and rate (in natural frequencies) of a block at rest, and in an
+# unknown state; and time scales after a change of level until rest.
 _AT_REST, _ANYWHERE, _SETTLED = 2e-6, 0.3, 25.0
-# Units of time between changes of level from which on the later one begins another move.
+# Time scales between changes of level above which the later one starts a new move.
 _CALM = 12.0
-# Share of the largest level up to which a change of it corrects a move.
+# Change of level, relative to the largest one, up to which it is a correction of a move.
 _CORRECTS = 0.1
-# So many windows of samples wait at most for an update.
+# Maximum number of windows of samples that wait for an update.
 _WAITING = 10
-#: Deviations from which on a suspected branch of creep is one.
+#: Standard deviations above which a suspected viscoelastic branch is used.
 CREEPS = 2.0
-# What plans take into account by other levels, however little of it there is.
+# Parameters that plans compensate for by other levels, however small they are.
 _AS_IS = ('coil_time_constant', *BRANCHES[0])
-# Window, as a share, that is left when it moves on, its longest span in units of time, and the
-# samples from which on that counts.
+# Fraction of the window that stays when it moves on, its maximum duration in time scales, and the
+# number of samples above which that applies.
 _KEPT, _LONGEST, _FEWEST = 0.5, 200.0, 20
 
 
 @dataclass(frozen=True)
 class Options:
-    """How to estimate."""
+    """Options of the estimator."""
 
-    window: int = 600  # largest number of samples in the horizon
+    window: int = 600  # maximum number of samples in the horizon
     noise: float = 0.0  # standard deviation of a sample of stretch; 0 to estimate it
-    learn: bool = True  # estimate parameters from the first sample on; else the state alone
-    gate: float = 6.0  # deviations of the innovation from which a sample is rejected
+    learn: bool = True  # estimate parameters from the first sample on; else only the state
+    gate: float = 6.0  # standard deviations of the innovation above which a sample is rejected
     slew_limit: float = math.inf  # of the amplifier in T/s; infinite for steps
 
     def __post_init__(self) -> None:
@@ -81,32 +81,32 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What is believed at a time."""
+    """Estimated state and parameters at a time."""
 
     time: int  # in ns
     stretch: float
     rate: float  # of the block in 1/s
     # Of all quantities; see `hmsa_ros.estimation.motion.follow` for branches.
     values: dict[str, Any]
-    free: tuple[str, ...]  # those that are tracked
-    deviations: dict[str, float]  # standard ones of these, in SI
-    covariance: Array  # of the coordinates of these, of stretch and of rate, about the values
-    off: Array  # how far what is expected of them is from the values
-    # As `off` of what plans use, with what shows as much as a gain of the sensor in its place.
+    free: tuple[str, ...]  # tracked quantities
+    deviations: dict[str, float]  # standard deviations of these, in SI units
+    covariance: Array  # of their coordinates, of stretch and of rate, about the values
+    off: Array  # expected minus most probable values
+    # As `off` for plans, where other parameters represent an apparent gain of the sensor.
     instead: Array
     doubt: Doubt
-    gain: int  # place of a suspected gain of the sensor about rest; -1 for none
+    gain: int  # index of a suspected gain of the sensor about rest; -1 for none
     noise: float  # standard deviation of a sample
-    trusted: bool  # whether it may be acted upon
-    trouble: str  # why not; empty if it may
+    trusted: bool  # whether it may be used for plans
+    trouble: str  # reason if not; else empty
 
     @property
     def actuator(self) -> ActuatorParameters:
-        """The block; it creeps where that is known of it."""
+        """The block; with viscoelasticity if it is significant."""
         return self.block(CREEPS)
 
     def block(self, sure: float) -> ActuatorParameters:
-        """Return the block; it creeps where a ratio is known by more than so many deviations."""
+        """Return the block; with viscoelasticity if its ratio exceeds some standard deviations."""
         found, (ratio, time) = actuator_of(self.values), BRANCHES[0]
         value = self.values[ratio]
         if ratio in self.free and value > sure * self.deviations[ratio]:
@@ -115,11 +115,11 @@ class Estimate:
 
     @property
     def doubted(self) -> 'Estimate':
-        """The estimate, were a constant force and the gain of the sensor wrong besides."""
+        """The estimate with possible errors of a constant force and the gain of the sensor."""
         return replace(self, off=self.doubt.off, covariance=self.doubt.covariance)
 
     def sure_of(self, first: int) -> 'Estimate':
-        """Return the estimate, were all that is tracked from the place of a first one on known."""
+        """Return the estimate as if all quantities from index ``first`` on were known."""
         covariance, known = self.covariance, slice(first, -2)
         cross = covariance[:, known]
         left = covariance - cross @ np.linalg.pinv(
@@ -131,10 +131,10 @@ class Estimate:
 
     def model(self, options: PlannerOptions, sure: float = CREEPS) -> Model:
         """
-        Return the model to plan with; estimates take the place of options.
+        Return the model to plan with; estimates replace options.
 
-        It lags by the most probable coil, and creeps as `block` does. Other parameters are those
-        that are expected then over all that may be wrong.
+        The coil is the most probable one, and creep is that of `block`. Other parameters are those
+        expected under these conditions, over all uncertainty.
         """
         block, z = self.block(sure), coordinates(self.values, self.free)
         known = [i for i, x in enumerate(self.free) if x in _AS_IS]
@@ -144,7 +144,7 @@ class Estimate:
             i = self.free.index(BRANCHES[0][0])
             left[i] -= z[i]
         spread = self.covariance[:-2, :-2] - np.outer(off, off)
-        # A lag that is none is none exactly: else plans are for one.
+        # A lag of zero is exact: otherwise plans would compensate for one.
         kept = (z + (instead + left))[known]
         z += instead + spread[:, known] @ np.linalg.pinv(
             spread[np.ix_(known, known)], hermitian=True) @ left[known]
@@ -156,16 +156,16 @@ class Estimate:
 
 
 class Estimator:
-    """Tracks one actuator."""
+    """Estimator of one actuator."""
 
     def __init__(self, prior: Prior, options: Options | None = None) -> None:
         self.prior = prior
         self.options = options or Options()
         self.noise = self.options.noise or _FIRST_NOISE
         self.screening = Screening(self.options.gate, prior.coordinate)
-        # Else parameters stay as they are from the next update on.
+        # If False, parameters stay fixed from the next update on.
         self.learning = self.options.learn
-        # Covariance of the parameters while they stay as they are.
+        # Covariance of the parameters while they are fixed.
         self._fixed: Array | None = None
         self._levels: list[tuple[int, float]] = []
         self._pending: list[tuple[int, float]] = []
@@ -174,28 +174,28 @@ class Estimator:
         self._solution: Solution | None = None
 
     def restart(self) -> None:
-        """Begin with nothing learnt; counts and levels stay."""
+        """Discard all estimates; counts and levels stay."""
         self.screening.restart()
         self._pending.clear()
         self._fixed = self._window = self._solution = None
 
     @property
     def since(self) -> int:
-        """Time in ns from which on levels count."""
+        """Time in ns from which levels count."""
         return self._origin
 
     def count_since(self, stamp: int) -> int:
-        """Return how many samples from a stamp in ns on count."""
+        """Return the number of samples in use from a timestamp in ns on."""
         window = self._window
         return 0 if window is None else int(np.sum(window.time >= self._seconds(stamp)))
 
     def set_levels(self, levels: Sequence[tuple[int, float]]) -> None:
-        """Take in all levels from a time on, by stamps in ns and in T; earlier ones stay."""
+        """Set all levels from a time on (timestamp in ns, T); earlier ones stay."""
         first = levels[0][0]
         self._levels = [x for x in self._levels if x[0] < first] + list(levels)
 
     def sample(self, stamp: int, stretch: float) -> bool:
-        """Take in a stretch measured at a stamp in ns; return whether it can count."""
+        """Add a stretch measured at a timestamp in ns; return whether it can be used."""
         if not self.screening.readable(stretch):
             return False
         if self._window is not None and stamp < self._origin + round(
@@ -208,7 +208,7 @@ class Estimator:
             self.screening.repeated += 1
             return False
         self._pending.insert(place, (stamp, stretch))
-        # Whoever does not ask for updates, as before the first move, needs the newest alone.
+        # Without updates, as before the first move, only the newest samples are kept.
         limit = self.options.window * (1 if self._window is None else _WAITING)
         self.screening.late += len(self._pending[:-limit])
         del self._pending[:-limit]
@@ -216,9 +216,9 @@ class Estimator:
 
     def update(self, time: int) -> Estimate | None:
         """
-        Take samples into account, and predict the state at a time in ns.
+        Process samples, and predict the state at a time in ns.
 
-        Levels until then have been taken in. None before the first sample.
+        Levels until then must have been set. Return None before the first sample.
         """
         self._leave_behind(time)
         if self._window is None and not self._pending:
@@ -243,11 +243,11 @@ class Estimator:
 
     def predict(self, time: int) -> Estimate | None:
         """
-        Return what is believed of a time in ns ahead, without taking in anything.
+        Return the estimate for a future time in ns, without processing samples.
 
-        It is not before that of the last `update`, and levels until then have been taken in.
-        Before the first update it is what the prior says of rest. None if the motion cannot be
-        followed.
+        The time is not before that of the last `update`, and levels until then must have been set.
+        Before the first update, the prior at rest is used. Return None if the motion cannot be
+        simulated.
         """
         window, found = self._window, self._solution
         if window is None:
@@ -271,7 +271,7 @@ class Estimator:
             window.begin, np.array([time]))
 
     def _leave_behind(self, time: int) -> None:
-        """Let samples of long before a time in ns go, and a window that nothing came after."""
+        """Drop samples from long before a time in ns, and a window without later samples."""
         oldest = time - round(_LONGEST * self.prior.values['time_unit'] * NANOSECONDS)
         place = bisect_left(self._pending, oldest, key=lambda x: x[0])
         self.screening.late += place
@@ -286,7 +286,7 @@ class Estimator:
             *(self._pending or [(time, prior.coordinate.rest)])[0], prior)
 
     def _so_far(self, time: int) -> Prior:
-        """Return what is known of parameters at a time in ns, as a prior."""
+        """Return the present knowledge of the parameters at a time in ns, as a prior."""
         found = self._solution
         if found is None:
             return self.prior
@@ -298,7 +298,7 @@ class Estimator:
         return replace(prior, values=values, covariance=known)
 
     def _new_window(self, stamp: int, shown: float, prior: Prior | None = None) -> Window:
-        """Return a window at rest under the level in force, or at what is shown if none is."""
+        """Return a window at rest under the present level, or at the reading if there is none."""
         if not self._levels or self._levels[0][0] > stamp:
             self._levels.insert(0, (stamp, 0.0))
         self._origin = stamp
@@ -327,9 +327,9 @@ class Estimator:
 
     def _take(self, window: Window, levels: Levels, until: float) -> Trial | None:
         """
-        Take what waits into the window, as far as it fits the motion believed.
+        Move waiting samples that fit the estimated motion into the window.
 
-        Returned is what that motion, until a time in s, makes of all samples, if it is known.
+        Return the simulation of that motion for all samples, until a time in s, if known.
         """
         waiting, self._pending = self._pending, []
         times = np.array([self._seconds(x) for x, _ in waiting])
@@ -366,7 +366,7 @@ class Estimator:
         values = found.here.values
         if found.here.motion.behind:
             values = {**values, 'behind': found.here.motion.behind}
-        # A bias may be a force as well, or told from one by the gain of the sensor alone.
+        # A bias may be a force instead, or differ from one only by the gain of the sensor.
         variances = np.where(
             [x == 'stretch_bias' for x in (*self.prior.free, '', '')],
             np.maximum(np.diag(covariance), np.diag(doubt.covariance)), np.diag(covariance))
@@ -383,7 +383,7 @@ class Estimator:
             not trouble, trouble)
 
     def _strange(self, z: Array) -> str:
-        """Say what would have to be implausibly far off for samples to fit; empty for nothing."""
+        """Return a message on implausible parameters that samples would need; else empty."""
         prior = self.prior
         off = np.abs(z[:-2] - coordinates(prior.values, prior.free)) / prior.spread
         names = [x for x, share in zip(prior.free, off.tolist(), strict=True)
@@ -391,10 +391,10 @@ class Estimator:
         return f'samples fit only with an implausible {" and ".join(names)}' if names else ''
 
     def _go_along(self, window: Window, found: Solution, until: float) -> None:
-        """Let the oldest samples go, or, where none come any more, the time."""
+        """Drop the oldest samples or, without new ones, move the window in time."""
         here, count = found.here, len(window.time)
         span = _LONGEST * here.values['time_unit']
-        # A whole move is fitted at once: early in one the fit is no place to sum it up from.
+        # A whole move is fitted at once, since early in one linearisation would be inaccurate.
         before = int(np.searchsorted(window.time, self._seconds(self._move_begins(until))))
         if before > 1:
             place = before - 1
@@ -409,16 +409,16 @@ class Estimator:
             place = max(count - 1, 0)
         else:
             return
-        # After the last sample comes the time asked for.
+        # After the last sample use the requested time.
         time = float(window.time[place]) if place < count else until
         drift = np.zeros(len(window.mean))
-        # Vibration decays to nothing, and a state that is known exactly has no covariance.
+        # Vibration decays to nothing, and an exact state has no covariance.
         drift[-2:] = _AT_REST ** 2, (_AT_REST / here.values['time_unit']) ** 2
         if self._fixed is None:
             drift[:-2] = _DRIFT ** 2 * (time - window.begin) * self.prior.spread ** 2
         shift = round(time * NANOSECONDS)
         seconds = shift / NANOSECONDS
-        # How a rest depends on parameters shows in the motion after it.
+        # Later motion shows how equilibrium depends on parameters.
         at = window.rest if self.learning is (self._fixed is None) and self._unchanged(
             self._origin, self._origin + shift, 0.0) else None
         moved = window.move_on(place, time, found.z, here, self.noise, drift) if at is None else (
@@ -439,11 +439,11 @@ class Estimator:
             off=np.zeros_like(found.off), instead=np.zeros_like(found.off),
             doubt=Doubt(np.zeros_like(found.off), moved.covariance) if at is None else found.doubt)
         first = bisect_right(self._levels, self._origin, key=lambda x: x[0]) - 1
-        # The field of a coil that lags remembers some levels more.
+        # The field of a lagging coil depends on a few levels more.
         del self._levels[:max(first - 8, 0)]
 
     def _fix(self, window: Window, found: Solution) -> None:
-        """Keep the parameters of a window as they are, or let them go again."""
+        """Fix the parameters of a window, or release them."""
         if self.learning is (self._fixed is None):
             return
         known = window.covariance[:-2, :-2].copy() if self._fixed is None else self._fixed
@@ -456,7 +456,7 @@ class Estimator:
         return (stamp - self._origin) / NANOSECONDS
 
     def _taken(self, stamp: int) -> bool:
-        """Return whether the window has a sample of this stamp; its times are rounded."""
+        """Return whether the window has a sample with this timestamp; its times are rounded."""
         if self._window is None:
             return False
         times, time = self._window.time, self._seconds(stamp)
@@ -464,13 +464,13 @@ class Estimator:
         return place < len(times) and float(times[place]) < time + 0.5 / NANOSECONDS
 
     def _unchanged(self, begin: int, end: int, units: float) -> bool:
-        """Return whether no level changed from so many units of time before a begin to an end."""
+        """Return whether no level changed from some time scales before a begin to an end."""
         before = begin - round(units * self.prior.values['time_unit'] * NANOSECONDS)
         return all(
             x[1] == y[1] or not before < y[0] <= end for x, y in itertools.pairwise(self._levels))
 
     def _move_begins(self, until: float) -> int:
-        """Return when in ns, until a time in s, a level changed last that was long in force."""
+        """Return the time in ns of the last change, until a time in s, after a long rest."""
         calm = round(_CALM * self.prior.values['time_unit'] * NANOSECONDS)
         most = max((abs(x) for _, x in self._levels), default=0.0)
         changes = [y[0] for x, y in itertools.pairwise(self._levels)
@@ -486,7 +486,7 @@ class Estimator:
 
 
 def _bounds(prior: Prior) -> Array:
-    """Return the least and the largest coordinate of each parameter that is tracked."""
+    """Return the minimum and maximum coordinate of each tracked parameter."""
     mean = coordinates(prior.values, prior.free)
     bounds: Array = np.stack([mean - _BOUND * prior.spread, mean + _BOUND * prior.spread], axis=1)
     for i, name in enumerate(prior.free):

@@ -1,4 +1,4 @@
-"""The motion under known levels, with its derivatives by parameters and by where it began."""
+"""Motion under known levels, with derivatives by parameters and initial state."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,20 +18,20 @@ from hmsa_ros.motion import theta as places
 
 # Relative tolerance: far below the noise of a sensor.
 _RTOL = 1e-7
-# Time constants after which nothing is left of an earlier field.
+# Time constants after which an earlier field has decayed.
 _FORGOTTEN = 40.0
 
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """What the amplifier is told, over time."""
+    """Commanded levels of the amplifier over time."""
 
     times: Array  # in s, increasing, shape (m,)
     values: Array  # in T, shape (m,)
     slew_limit: float = math.inf  # rate in T/s at which the amplifier ramps; infinite for steps
 
     def field(self, time: float, lag: float) -> float:
-        """Return the field in T at a time in s behind a lag in s."""
+        """Return the field in T at a time in s, with a lag in s."""
         begin = float(max(self.times[0], time - _FORGOTTEN * lag))
         starts, values, slopes = pieces(self.times, self.values, self.slew_limit, begin)
         count = max(int(np.searchsorted(starts, time, side='right')), 1)
@@ -49,9 +49,9 @@ class Motion:
 
     stretch: Array  # shape (n,)
     rate: Array  # in 1/s, shape (n,)
-    by: Array  # by the coordinates of the free parameters, and by stretch and rate at the begin
+    by: Array  # by the coordinates of the free parameters, and by initial stretch and rate
     rate_by: Array
-    #: How far what branches follow is from the elastic force at the last time, in units of G.
+    #: Branch states minus the elastic force at the last time, in units of G.
     behind: tuple[float, ...]
 
 
@@ -59,11 +59,12 @@ def follow(
         values: Mapping[str, Any], free: Sequence[str], state: tuple[float, float],
         levels: Levels, begin: float, times: Array) -> Motion | None:
     """
-    Simulate a motion from stretch and rate (1/s) at a begin in s, uniform before it, to times.
+    Simulate a motion from stretch and rate (1/s) at ``begin`` in s until the given times.
 
-    Where ``creep`` is among the values, ``behind`` says how far what its branches have followed is
-    from the elastic force at the begin, in units of G; without it they have relaxed. Levels before
-    the begin count where the field lags. None if the motion meets the limits of the chains.
+    Before the begin the rate is constant. If ``creep`` is among the values, ``behind`` gives the
+    branch states minus the elastic force at the begin, in units of G; without it branches are
+    relaxed. Earlier levels count if the field lags. Return None if the motion meets the limits
+    of the chains.
     """
     setup = Setup.of(values, free, (places.STRETCH, places.RATE))
     theta, wanted = setup.theta, setup.wanted
@@ -93,7 +94,7 @@ def follow(
 
 
 def followed(values: Mapping[str, Any], stretch: float) -> tuple[float, ...]:
-    """Return what branches have followed at a stretch, in units of G; empty if they relaxed."""
+    """Return the branch states at a stretch, in units of G; empty if relaxed."""
     holds = 'creep' in values or values['viscoelastic_ratio'] > 0.0
     if not (holds and any(values.get('behind', ()))):
         return ()
@@ -104,7 +105,7 @@ def followed(values: Mapping[str, Any], stretch: float) -> tuple[float, ...]:
 def held(
         values: Mapping[str, Any], stretch: float, level: float
 ) -> tuple[float, float, Array] | None:
-    """Return as `rest` where a level would hold the block with what its branches hold now."""
+    """Return the equilibrium, as `rest`, under a level at the present branch states."""
     by = followed(values, stretch)
     if not by:
         return rest(values, (), level)
@@ -120,10 +121,10 @@ def rest(
         values: Mapping[str, Any], free: Sequence[str], level: float
 ) -> tuple[float, float, Array] | None:
     """
-    Return where a level in T holds the block once its branches have relaxed; None if nowhere.
+    Return the equilibrium of a block with relaxed branches under a level in T; None if none.
 
-    That is the stretch, the natural frequency there in 1/s, and the derivatives of the stretch by
-    the coordinates of the free parameters, shape (p,).
+    The result contains the stretch, the natural frequency there in 1/s, and the derivatives of the
+    stretch by the coordinates of the free parameters, shape (p,).
     """
     setup = Setup.of(values, free)
     slopes = np.zeros(len(setup.wanted))

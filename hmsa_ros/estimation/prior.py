@@ -1,4 +1,4 @@
-"""What is known of an actuator before the first sample."""
+"""Knowledge of an actuator before the first sample."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,47 +20,46 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import Coordinate, coordinate_of
 from hmsa_ros.model.parameters import ActuatorParameters
 
-#: Standard deviations where no identification gives any: of the logarithm for parameters that
-#: are sought by it, of the value in SI otherwise. That of the damping and of J_lim is a
-#: share of the value.
+#: Default standard deviations: of the logarithm for parameters that are estimated by it, else of
+#: the value in SI units. Those of damping and J_lim are relative.
 DEVIATIONS = {
     'shear_modulus': 0.15, 'density': 0.1, 'remanence': 0.1, 'time_unit': 0.1,
     'chain_limit': 0.1, 'damping_coefficient': 0.25, 'stretch_bias': 3e-3,
     'stretch_gain': 0.02, 'sensor_latency': 0.05, 'coil_time_constant': 0.05,
     'constant_force': 0.007, 'viscoelastic_ratio': 0.03, 'viscoelastic_time': 1.0}
-# Where there is none, the deviation is a share of that of a usual block.
+# Without a value, the deviation is relative to that of a usual block.
 _LEAST_LIMIT, _LEAST_ZETA = 0.02, 0.1
-# The planner has no parameters of these.
+# Quantities that are no parameters of the planner.
 _SENSED = ('stretch_bias', 'stretch_gain', 'sensor_latency', 'constant_force')
 _NOT_TRACKED = (
     'initial_stretch', 'initial_rate', *(x for x in QUANTITIES if x.startswith('viscoelastic_')))
-#: Tracked unless others are named.
+#: Tracked by default.
 TRACKED = ('shear_modulus', 'damping_coefficient', 'stretch_bias')
-#: What may be wrong besides, and is tracked with these that no one takes it for an error of them.
-#: The gain of the sensor, here about rest without field, is never sought: it looks like another
-#: remanence and chain limit.
+#: Possible other errors, tracked so that they are not mistaken for errors of these. The gain of
+#: the sensor, here about rest without field, is never estimated: it resembles another remanence
+#: and chain limit.
 SUSPECTS = (
     'remanence', 'chain_limit', 'coil_time_constant', 'sensor_latency', 'viscoelastic_ratio',
     'viscoelastic_time', 'constant_force', 'stretch_gain')
-# What is named, and may well be as given.
+# Tracked parameters that may well have their given values.
 _AS_GIVEN = ('shear_modulus', 'damping_coefficient')
-# Relaxation time of a suspected branch in units of time.
+# Relaxation time of a suspected branch in time scales.
 _RELAXATION = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Values and how far each may be off."""
+    """Values and their uncertainty."""
 
-    # Of all quantities, the law, and the branches of an elastomer that creeps.
+    # Of all quantities, the hyperelastic model, and the viscoelastic branches.
     values: dict[str, Any]
-    free: tuple[str, ...]  # what is tracked
+    free: tuple[str, ...]  # tracked quantities
     covariance: Array  # of the coordinates of these, shape (p, p)
-    # Deviations of the coordinates of a block that was never identified, shape (p,); they bound
-    # how far an estimate may go, and how fast, since a block changes after its identification.
+    # Deviations of the coordinates of a block that was never identified, shape (p,); they limit
+    # the range and the drift of estimates, since a block changes after its identification.
     spread: Array
-    suspects: tuple[int, ...] = ()  # places of those that are only suspected
-    named: int = 0  # how many of the first are named
+    suspects: tuple[int, ...] = ()  # indices of suspects
+    named: int = 0  # number of named quantities, which come first
 
     @classmethod
     def nominal(
@@ -68,11 +67,11 @@ class Prior:
             suspects: bool = False, others: Mapping[str, float] | None = None,
             deviations: Mapping[str, float] | None = None) -> 'Prior':
         """
-        Return what is known of a block that was never identified.
+        Return the prior of a block that was never identified.
 
-        With suspects those of `SUSPECTS` are tracked too. Others are values of coil and sensor
-        that are not the defaults, and deviations replace some of `DEVIATIONS`. `BadInputError`
-        contains the name that is unknown or cannot be tracked.
+        With suspects, those of `SUSPECTS` are tracked too. ``others`` are values of coil and
+        sensor that differ from the defaults, and ``deviations`` replace some of `DEVIATIONS`.
+        `BadInputError` contains the name that is unknown or cannot be tracked.
         """
         free = check_free(free, actuator.law)
         wrong = [x for x in free if x in _NOT_TRACKED]
@@ -114,12 +113,12 @@ class Prior:
 
     @property
     def coordinate(self) -> Coordinate:
-        """What samples are."""
+        """Kind of position that samples measure."""
         return coordinate_of(self.values['law'])
 
     def informed(self, known: Known) -> 'Prior':
         """
-        Return the prior of a block that was identified; as before for what was not.
+        Return the prior of a block that was identified; other quantities keep theirs.
 
         Parameters of block and coil keep the values of this prior.
         """
@@ -136,7 +135,7 @@ class Prior:
         covariance[np.ix_(into, into)] = (
             known.covariance[np.ix_(places, places)] / np.outer(scale, scale))
         if 'stretch_gain' in both[self.named:] and 'stretch_bias' in both:
-            # Identified is that about 0, and suspected that about rest.
+            # The identified gain is about 0, the suspected one about rest.
             about = np.eye(len(self.free))
             about[self.free.index('stretch_bias'), self.free.index('stretch_gain')] = (
                 values['stretch_gain'] * self.coordinate.rest)

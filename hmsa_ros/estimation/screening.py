@@ -1,4 +1,4 @@
-"""Samples that cannot be right: no number, a frozen sensor, a jump."""
+"""Rejection of invalid samples: no number, a frozen sensor, a jump."""
 
 from collections.abc import Sequence
 import math
@@ -9,49 +9,49 @@ from numpy.typing import NDArray
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import Coordinate
 
-# So many rejected samples in a row are no outliers: sensor or actuator is not where it was.
+# Rejected samples in a row that are no outliers: sensor or actuator has changed.
 _LOST = 6
-# So many that fit make up for them.
+# Samples that fit in a row after which that is over.
 _FOUND = 12
-# So many equal values in a row, while motion of so many deviations is expected, come from a
-# sensor that is frozen.
+# Equal values in a row that show a frozen sensor, if more motion than this, in standard
+# deviations, is expected.
 _EQUAL, _MOTION = 4, 8.0
-# So many do so at rest, too, after so many samples there of which most went up and down by noise.
+# The same at rest, after a number of samples there, a fraction of which reversed due to noise.
 _STILL, _ENOUGH, _MOST = 8, 20, 0.5
 
 
 class Screening:
     """
-    Rejects samples from so many deviations of the innovation on, and says what is wrong.
+    Rejection of samples beyond some standard deviations of the innovation, with a reason.
 
-    Counts are those of values that are no number, came twice, came after their time was over, had
-    a timestamp that was still to come, did not fit, or were repeated while the actuator moved.
+    Attributes count values that were no number, repeated, too late, had a future timestamp, did
+    not fit, or did not change while the actuator moved.
     """
 
     def __init__(self, gate: float, coordinate: Coordinate) -> None:
         self._gate, self._conceivable = gate, coordinate.conceivable
         self.unreadable = self.repeated = self.late = self.rejected = self.frozen = 0
         self.ahead = 0
-        self.lost = 0  # times that so many in a row did not fit
-        self.last_trouble = ''  # and why
+        self.lost = 0  # times that several in a row did not fit
+        self.last_trouble = ''  # the reason
         self.restart()
 
     def restart(self) -> None:
-        """Forget what was seen; counts stay."""
-        self.trouble = ''  # why nothing should be built on samples
+        """Discard the history; counts stay."""
+        self.trouble = ''  # reason why samples should not be used
         self._in_a_row = self._fitted = 0
         self._last: list[tuple[float, float]] = []
-        # At rest: samples, those of them that turn back, and values equal to the one before.
+        # At rest: number of samples, of reversals, and of values equal to the previous one.
         self._resting = self._turns = self._same = 0
 
     def refuse_ahead(self, seconds: float) -> None:
-        """Refuse a sample whose timestamp lies so far ahead of the clock."""
+        """Reject a sample whose timestamp is ahead of the clock by some seconds."""
         self.ahead += 1
         self._reject(
             f'timestamps of samples lie {seconds:.3g} s ahead of the clock of the planner')
 
     def readable(self, stretch: float) -> bool:
-        """Return whether a value can be a stretch, or what the coordinate is."""
+        """Return whether a value is possible for this kind of position."""
         if self._conceivable[0] < stretch < self._conceivable[1]:
             return True
         self.unreadable += 1
@@ -61,9 +61,9 @@ class Screening:
             self, stretch: Array, residual: Array, by: Array, covariance: Array, noise: float
     ) -> NDArray[np.bool_]:
         """
-        Return which samples fit the motion believed, shape (n,).
+        Return which samples fit the estimated motion, shape (n,).
 
-        Given are what they are off it, and its derivatives by coordinates of some covariance.
+        ``residual`` and its derivatives ``by`` are given for coordinates with a covariance.
         """
         spread = np.sqrt(np.sum(by @ covariance * by, axis=1) + noise ** 2)
         return np.array([
@@ -96,14 +96,14 @@ class Screening:
         return True
 
     def _stands_still(self, values: Sequence[float]) -> bool:
-        """Take in the last values at rest; return whether they have ceased to scatter."""
+        """Record the last values at rest; return whether they no longer scatter."""
         before, last = values[-2:] if len(values) > 1 else (math.nan, values[0])
         self._same = self._same + 1 if last == before else 0
         if self._same:
             return self._same >= _STILL and self._resting >= _ENOUGH and (
                 self._turns > _MOST * self._resting)
         self._resting += 1
-        # Vibration does not turn back from sample to sample.
+        # Vibration does not reverse from sample to sample.
         self._turns += len(values) > 2 and (last - before) * (before - values[-3]) < 0.0
         return False
 

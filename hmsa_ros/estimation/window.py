@@ -1,11 +1,10 @@
 """
-A moving horizon: the most probable motion through the newest samples, by Gauss and Newton.
+Moving horizon estimation: the most probable motion through the newest samples, by Gauss-Newton.
 
-Unknown are the coordinates of the free parameters and stretch and rate at the begin of the window,
-in this order. What came before the window is a Gaussian prior of them: when the window moves on,
-the samples that leave it are taken into the prior at the present estimate, and the prior goes
-along with the motion (C. V. Rao, J. B. Rawlings and D. Q. Mayne, IEEE Trans. Autom. Control 48
-(2003) 246).
+The unknowns are the coordinates of the free parameters, then stretch and rate at the start of the
+window. Earlier data are a Gaussian prior of them: when the window moves on, the samples that leave
+it are added to the prior at the present estimate, and the prior is propagated along the motion
+(C. V. Rao, J. B. Rawlings and D. Q. Mayne, IEEE Trans. Autom. Control 48 (2003) 246).
 """
 
 from collections.abc import Callable
@@ -24,28 +23,28 @@ from hmsa_ros.identification.response import sensed
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import coordinate_of
 
-# Steps of Gauss and Newton at most, halvings of each, and the step, in deviations, that is small.
+# Maximum Gauss-Newton iterations, bisections of each step, and small step in standard deviations.
 _PASSES, _HALVINGS, _SMALL = 4, 4, 0.1
-# How many times as many samples as the last time call for another look at what may be wrong.
+# Growth of the number of samples after which the suspects are examined again.
 _MORE = 1.3
-# How improbable a sample is, at least, in a fit that is poor: half a squared deviation is usual.
+# Mean negative log probability of a sample above which a fit is poor; the usual value is 0.5.
 _POOR = 1.0
-# A coordinate sought by its logarithm goes no further than this in one step.
+# Maximum change per step of a coordinate that is a logarithm.
 _STRIDE = 0.3
 
 
 class Trial(NamedTuple):
-    """What some coordinates make of the samples."""
+    """Simulation of the samples for some coordinates."""
 
     values: dict[str, Any]  # of all quantities
-    motion: Motion  # at the samples, and at the time asked for last
-    residual: Array  # measured less simulated, shape (n,)
-    by: Array  # derivatives of what the sensor shows by the coordinates, shape (n, q)
-    weights: Array  # how far each sample counts, 0 to 1
-    cost: float  # negative logarithm of the probability
+    motion: Motion  # at the samples, and last at the requested time
+    residual: Array  # measured minus simulated, shape (n,)
+    by: Array  # derivatives of the reading by the coordinates, shape (n, q)
+    weights: Array  # weight of each sample, 0 to 1
+    cost: float  # negative log probability
 
     def moved(self, values: dict[str, Any], step: Array) -> 'Trial':
-        """Return what coordinates that are a small step off make of the samples."""
+        """Return the linearised simulation after a small step of the coordinates."""
         motion = replace(
             self.motion, stretch=self.motion.stretch + self.motion.by @ step,
             rate=self.motion.rate + self.motion.rate_by @ step)
@@ -54,36 +53,36 @@ class Trial(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The most probable coordinates of what is sought."""
+    """The most probable values of the estimated coordinates."""
 
     z: Array
     here: Trial
-    matrix: Array  # of the quadratic that the cost is about there
-    gradient: Array  # downwards
-    loose: NDArray[np.bool_]  # what varies
+    matrix: Array  # second derivatives of the cost
+    gradient: Array  # negative first derivatives
+    loose: NDArray[np.bool_]  # which coordinates vary
 
 
 class Doubt(NamedTuple):
-    """What is expected where a constant force and the gain of the sensor are wrong besides."""
+    """Expectation if a constant force and the gain of the sensor may be in error, too."""
 
-    off: Array  # how far coordinates are expected off the most probable ones, shape (q,)
-    covariance: Array  # of these, about the latter, shape (q, q)
+    off: Array  # expected minus most probable coordinates, shape (q,)
+    covariance: Array  # about the most probable ones, shape (q, q)
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
     """The most probable motion."""
 
-    z: Array  # coordinates, stretch and rate at the begin, shape (q,)
-    here: Trial  # what these make of the samples
-    covariance: Array  # of z, about itself
-    off: Array  # how far what is expected is from z, shape (q,)
-    # As `off` of what plans use, with what shows as much as a gain of the sensor in its place.
+    z: Array  # coordinates, initial stretch and rate, shape (q,)
+    here: Trial  # simulation with these
+    covariance: Array  # about z
+    off: Array  # expected values minus z, shape (q,)
+    # As `off` for plans, where other parameters represent an apparent gain of the sensor.
     instead: Array
     doubt: Doubt
 
     def at_end(self) -> tuple[Array, Array, Array, Doubt]:
-        """Return coordinates and state at the time asked for, their covariance, how far off."""
+        """Return coordinates and state at the requested time, their covariance and `off`."""
         motion = self.here.motion
         change = transport(motion, -1)
         state = np.append(self.z[:-2], [motion.stretch[-1], motion.rate[-1]])
@@ -92,7 +91,7 @@ class Solution:
 
 
 def transport(motion: Motion, place: int) -> Array:
-    """Return the derivative of coordinates, stretch and rate at a sample by those at the begin."""
+    """Return the derivative of coordinates and state at a sample by those at the start."""
     size = motion.by.shape[1]
     change = np.eye(size)
     change[-2], change[-1] = motion.by[place], motion.rate_by[place]
@@ -100,33 +99,33 @@ def transport(motion: Motion, place: int) -> Array:
 
 
 class Rest(NamedTuple):
-    """A rest, which depends on parameters, and what was seen of it."""
+    """An equilibrium, which depends on parameters, and its observation."""
 
     level: float  # in T
-    mean: Array  # of the parameters, before it was seen, shape (p,)
+    mean: Array  # of the parameters, before the observation, shape (p,)
     covariance: Array
-    shown: float = 0.0  # what the sensor shows
-    weight: float = 0.0  # information in that
+    shown: float = 0.0  # reading of the sensor
+    weight: float = 0.0  # information in the reading
 
 
 @dataclass(eq=False)
 class Window:
-    """Samples, and what is known besides them; times in s from the same instant."""
+    """Samples and prior of the horizon; times in s from a common origin."""
 
-    values: dict[str, Any]  # of all quantities; those not free stay
-    free: tuple[str, ...]  # what is sought
+    values: dict[str, Any]  # of all quantities; those that are not free stay
+    free: tuple[str, ...]  # estimated quantities
     mean: Array  # of the prior, shape (q,)
     covariance: Array  # of the prior, shape (q, q)
-    bounds: Array  # coordinates are kept in them, shape (p, 2)
-    begin: float  # time of the stretch and rate that are sought
-    time: Array  # of the samples, from the begin on
+    bounds: Array  # of the coordinates, shape (p, 2)
+    begin: float  # time of the estimated stretch and rate
+    time: Array  # of the samples, not before the begin
     stretch: Array
     suspects: Suspects
-    suspected: tuple[int, ...] = ()  # places of suspects that are sought
-    weighed: int = 0  # samples there were when these were chosen
-    others: Others = Others(1.0, *(np.zeros(()),) * 3)  # than these
-    rest: Rest | None = None  # that it begins at
-    information: Array = field(init=False)  # inverse of the covariance, as it was settled
+    suspected: tuple[int, ...] = ()  # indices of suspects that are estimated
+    weighed: int = 0  # number of samples when these were chosen
+    others: Others = Others(1.0, *(np.zeros(()),) * 3)  # effect of other sets
+    rest: Rest | None = None  # equilibrium at the begin
+    information: Array = field(init=False)  # inverse of the covariance
 
     def values_at(self, z: Array) -> dict[str, Any]:
         """Return the values of all quantities for coordinates."""
@@ -134,16 +133,16 @@ class Window:
 
     def settle(self, z: Array, off: float) -> None:
         """
-        Begin at rest, if it does, to within a deviation, as it is about some coordinates.
+        Start at equilibrium, if applicable, to within a deviation, linearised at coordinates.
 
-        Far from them a force shifts it otherwise, so that one would seem to be shown.
+        Far from them a force would shift it differently, which would look like an observation.
         """
         if self.rest is not None:
             self._rest(self.rest, z, off)
         self.information = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
 
     def _rest(self, known: Rest, z: Array, off: float) -> None:
-        """Begin at a rest."""
+        """Start at an equilibrium."""
         values = self.values_at(z)
         at = rest(values, self.free, known.level)
         if at is None:
@@ -166,7 +165,7 @@ class Window:
     def rest_on(
             self, at: Rest, count: int, begin: float, here: Trial, noise: float,
             drift: Array) -> 'Window':
-        """Return the window, all at rest, without the first samples; as `move_on`."""
+        """Return the window, entirely at rest, without the first samples; as `move_on`."""
         before, weights = at.weight, here.weights[:count]
         before /= 1.0 + before * float(np.sum(np.square(here.by[:count][-1:]) @ drift))
         weight = before + float(np.sum(weights)) / noise ** 2
@@ -181,10 +180,10 @@ class Window:
             self, z: Array, levels: Levels, noise: float, until: float, here: Trial | None = None
     ) -> Solution | None:
         """
-        Seek the most probable motion from coordinates on; None if none can be followed from there.
+        Estimate the most probable motion from initial coordinates; None if there is none.
 
-        The noise is the standard deviation of a sample. The motion is wanted until a time that is
-        not before the last sample. What `simulate` says of the coordinates may be given.
+        The noise is the standard deviation of a sample. The motion extends to a time that is not
+        before the last sample. The result of `simulate` at the coordinates may be given.
         """
         def descend(z: Array, here: Trial | None = None) -> Found | None:
             return self._descend(z, here, levels, noise, until)
@@ -195,7 +194,7 @@ class Window:
         if len(self.time) >= _MORE * self.weighed or self._is_poor(found, noise):
             found = self._look(found, descend)
             if self._is_poor(found, noise):
-                # There may be another valley.
+                # There may be another local optimum.
                 before = self.suspected, self.others
                 self.suspected = tuple(
                     i for i in self.suspects.places if i != self.suspects.gain)
@@ -211,19 +210,19 @@ class Window:
             np.broadcast_to(off, z.shape), np.broadcast_to(instead, z.shape), self._doubt(found))
 
     def _doubt(self, found: Found) -> Doubt:
-        """Return what is expected where a constant force and a gain are wrong besides."""
+        """Return the expectation if a constant force and a gain may be in error, too."""
         loose = found.loose | self.suspects.of(('constant_force', GAIN), len(found.loose))
         covariance = inverse(found.matrix, loose)
         off = covariance @ found.gradient
         return Doubt(off, covariance + np.outer(off, off))
 
     def _is_poor(self, found: Found, noise: float) -> bool:
-        """Return whether what is sought explains samples poorly."""
+        """Return whether the estimated quantities explain the samples poorly."""
         return loss(found.here.residual, noise, convex=True) > _POOR * len(self.time)
 
     def _look(
             self, found: Found, descend: Callable[[Array], Found | None]) -> Found:
-        """Choose the suspects to be sought, and return the most probable coordinates then."""
+        """Choose the suspects to estimate, and return the most probable coordinates then."""
         self.weighed, before = len(self.time), self.suspected
         self.suspected, self.others = Look(
             self.suspects, found.z, found.matrix, found.gradient,
@@ -236,7 +235,7 @@ class Window:
             self, z: Array, here: Trial | None, levels: Levels, noise: float, until: float
     ) -> Found | None:
         """
-        Seek the most probable coordinates of what is sought.
+        Search the most probable values of the estimated coordinates.
 
         The last step, which is small, is not simulated.
         """
@@ -266,11 +265,11 @@ class Window:
         return Found(z, here, matrix, gradient, loose)
 
     def _at_ease(self, z: Array) -> Array:
-        """Return coordinates with what is not sought where it is known to be."""
+        """Return coordinates with the given values for those that are not estimated."""
         return self.suspects.at_ease(z, self.suspected)
 
     def _room(self, z: Array) -> tuple[Array, Array]:
-        """Return the least and the largest step that coordinates have to their bounds."""
+        """Return the minimum and maximum step within the bounds."""
         low, high = np.full(len(z), -math.inf), np.full(len(z), math.inf)
         low[:-2], high[:-2] = (self.bounds - z[:-2, None]).T
         return low, high
@@ -282,7 +281,7 @@ class Window:
 
     def _step(
             self, z: Array, matrix: Array, gradient: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the step to the optimum, which goes as far as it may, and what varies there."""
+        """Return the bounded step to the optimum, and which coordinates vary."""
         longest = np.array([
             _STRIDE if QUANTITIES[x].scale == 'log' else math.inf for x in self.free] + [
                 math.inf] * 2)
@@ -293,7 +292,7 @@ class Window:
 
     def simulate(
             self, z: Array, levels: Levels, noise: float, until: float) -> Trial | None:
-        """Return what coordinates make of the samples."""
+        """Return the simulation of the samples for coordinates."""
         values, times = self.values_at(z), np.append(self.time, until)
         motion = follow(
             values, self.free, (float(z[-2]), float(z[-1])), levels, self.begin,
@@ -312,7 +311,7 @@ class Window:
             weights_of(residual, noise, convex=True), cost)
 
     def _about_rest(self, values: dict[str, Any], by: Array) -> Array:
-        """Return derivatives of what the sensor shows by a suspected gain about rest."""
+        """Return derivatives of the reading, with a suspected gain about rest."""
         if self.suspects.gain >= 0:
             by[:, self.suspects.gain] -= (
                 values['stretch_gain'] * coordinate_of(values['law']).rest)
@@ -322,10 +321,10 @@ class Window:
             self, count: int, begin: float, z: Array, here: Trial, noise: float,
             drift: Array) -> 'Window':
         """
-        Return the window without the first samples, and with a prior that knows them.
+        Return the window without the first samples, which become part of the prior.
 
-        It begins at the time of the next sample, or at the time asked for last. The drift is the
-        variance that parameters and state gain on the way, shape (q,).
+        It begins at the next sample, or at the requested time. The drift is the variance that
+        parameters and state gain in between, shape (q,).
         """
         by, weights = here.by[:count], here.weights[:count]
         matrix = self.information + by.T @ (weights[:, None] * by) / noise ** 2

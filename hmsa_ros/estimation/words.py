@@ -1,4 +1,4 @@
-"""What an estimate means, in a sentence."""
+"""Description of an estimate in a sentence."""
 
 from collections.abc import Mapping
 import math
@@ -10,16 +10,16 @@ from hmsa_ros.estimation.estimator import Estimate
 from hmsa_ros.estimation.motion import held
 from hmsa_ros.identification.quantities import modulus_of
 
-# A parameter is another one than the nominal from so many deviations and so large a share on.
+# Standard deviations and relative change above which a parameter differs from the nominal one.
 _SURE, _MATTERS = 3.0, 0.01
-# Offset and vibration that are worth a word, as shares of the step.
+# Minimum steady-state error and vibration to report, as fractions of the step.
 _OFFSET, _RINGING = 0.01, 0.01
-# A bias and a force that hide each other by this correlation, while where the block rests is known
-# no better than this.
+# Correlation above which a bias and a force hide each other, unless the rest position is known to
+# this accuracy.
 _PAIR, _HIDDEN, _UNKNOWN = ('stretch_bias', 'constant_force'), 0.9, 1e-3
-# They shift what samples show alike, unless the block is fast.
+# Quantities with the same effect on samples, unless the block is fast.
 _LATER = ('sensor_latency', 'coil_time_constant')
-# Share of the step that a bias is to be known to.
+# Required accuracy of a bias, as a fraction of the step.
 _BIASED = 0.01
 # Smaller steps have no percentage.
 _STEP = 0.01
@@ -37,16 +37,16 @@ _ABSOLUTE = {
 
 def confounded(estimate: Estimate, least: float = _UNKNOWN) -> bool:
     """
-    Return whether a tracked bias of the sensor and a constant force look alike as yet.
+    Return whether a tracked sensor bias and a constant force are still indistinguishable.
 
-    It matters where the bias is not known to the least share of stretch.
+    This matters if the standard deviation of the bias exceeds ``least``, in stretch.
     """
     if not set(_PAIR) <= set(estimate.free):
         return False
     i, j = (estimate.free.index(x) for x in _PAIR)
     covariance = estimate.covariance
     scale = math.sqrt(covariance[i, i] * covariance[j, j])
-    # Neither is sought, for example, where both are given.
+    # A variance may be 0, for example if both are given.
     if scale == 0.0:
         return False
     together = covariance[i, j] / scale
@@ -54,7 +54,7 @@ def confounded(estimate: Estimate, least: float = _UNKNOWN) -> bool:
 
 
 def differences(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
-    """Return which parameters differ from what was known of them, such as ``G about +20 %``."""
+    """Return the parameters that differ from nominal values, such as ``G about +20 %``."""
     found = []
     hidden = _PAIR if confounded(estimate) else ()
     for name in estimate.free:
@@ -75,7 +75,7 @@ def differences(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
 
 
 def _later(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
-    """Return what is known of latency and lag together, where it is not known which it is."""
+    """Return the sum of latency and lag if they are known only together."""
     apart = {x: estimate.values[x] - nominal[x] for x in _LATER if x in estimate.free}
     if any(abs(y) > _SURE * estimate.deviations[x] for x, y in apart.items()):
         return []
@@ -91,10 +91,10 @@ def sentence(
         estimate: Estimate, nominal: Mapping[str, Any], holding: float, target: float,
         start: float, amplitude: float, use: str) -> str:
     """
-    Return what is wrong, and what is made of it, in a sentence without its stop.
+    Return the errors and their treatment, as a sentence without a full stop.
 
     The level in T holds the target as planned; the amplitude is that of the vibration about rest.
-    What plans make of other parameters is said in so many words, empty where they make nothing.
+    ``use`` describes how plans use other parameters; empty if they do not.
     """
     wrong = []
     at = held(estimate.values, estimate.stretch, holding)
