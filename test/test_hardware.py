@@ -708,6 +708,32 @@ def test_a_coil_that_is_too_warm_goes_off_and_is_obeyed_again_once_it_has_cooled
     assert bench.levels[-1] == 0.15
 
 
+@pytest.mark.parametrize('end', ['switched off', 'rebooted', 'too warm'])
+def test_a_ramp_down_does_not_go_on_once_the_coil_is_off(end):
+    bench, device = driver(
+        bench=Warm(), temperature_limit=80.0, fallback=Fallback(0.01, 'ramp', 0.1))
+    device.receive(0, 0, 0.05)
+    for time in (0, 11, 100):
+        device.advance(START + time * MS)
+    assert 0.0 < bench.levels[-1] < 0.05
+    if end == 'switched off':
+        device.switch_off(START + 101 * MS)
+    elif end == 'rebooted':
+        device.coils[0].lose(StateLostError('brown-out'), START + 101 * MS)
+    else:
+        bench.degrees = 81.0
+    # The temperature is asked for four times a second.
+    for time in range(260, 600):
+        device.advance(START + time * MS)
+    # At the start, and once more.
+    assert (bench.levels.count(0.0), bench.levels[-1]) == (2, 0.0)
+    # Nor does what was commanded before, though it is repeated.
+    bench.degrees = 20.0
+    device.advance(START + 900 * MS)
+    device.receive(0, 0, 0.05)
+    assert '0.05 T was commanded before' in device.notices()[-1].text
+
+
 def test_a_temperature_that_is_none_and_a_limit_without_one_are_refused():
     with pytest.raises(BadInputError, match='Bench reports no temperature: expected 0 for no'):
         driver(temperature_limit=80.0)

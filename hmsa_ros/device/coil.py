@@ -108,7 +108,8 @@ class Coil(GuardedJoint):
         self._synchronise()
 
     def _clear(self) -> None:
-        """Drop all pending levels, with 0 as the present one."""
+        """Drop all pending levels and the ramp, with 0 as the present level."""
+        self._ramp = None
         self._schedule = CommandSchedule(0.0)
         self._wanted = False  # whether a level other than 0 was commanded since then
         self._repeat = False  # whether to pass on a heartbeat
@@ -384,10 +385,11 @@ class Coil(GuardedJoint):
         left = self.level if self.ramps and math.isfinite(self.level) else 0.0
         self.stand_by()
         self.cut_off(now, zero_first=True)
-        if left:
-            self.ramp_down(now, left)
         # This also drops the levels stored by the device.
         self.put(left, now)
+        # No ramp if the hardware has lost its state meanwhile.
+        if self.asked:
+            self.ramp_down(now, left)
 
     def disarm(self) -> None:
         """
@@ -404,7 +406,9 @@ class Coil(GuardedJoint):
             self.instrument.disarm()
 
     def switch_off(self, now: int) -> str:
-        """Switch off; return the reason of a failure in words."""
+        """Switch off and refuse what was commanded; return the reason of a failure in words."""
+        self.stand_by()
+        self.cut_off(now)
         try:
             self.put(0.0, now)
             if self.instrument.off(self.level, self.limit):
