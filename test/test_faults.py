@@ -3,14 +3,17 @@
 import json
 import math
 import random
+import signal
+from threading import Thread
 
+from conftest import wait_until
 import numpy as np
 import pytest
 
 from benchmarks import __main__ as program
 from benchmarks import bench_soak
 from benchmarks.faults import memory, rows
-from benchmarks.faults.rig import settled
+from benchmarks.faults.rig import Rig, settled
 from benchmarks.faults.table import inject, markdown, Outcome, Seen
 from hmsa_ros.bag.writer import BagWriter, Topic
 
@@ -25,6 +28,23 @@ MIB = 2**20
 def test_fault_is_answered_as_expected(fault, ros_domain_id):
     seen = inject(fault, ros_domain_id).seen
     assert seen.met, f'expected {fault.expected}; seen {seen.text} ({seen.figure})'
+
+
+@pytest.mark.ros
+def test_a_rig_is_ready_once_its_relay_has_found_planner_and_plant(ros_domain_id, tmp_path):
+    with Rig(tmp_path, ros_domain_id) as rig:
+        remap = rig.relay()
+        relay = rig.children[-1]
+        relay.send(signal.SIGSTOP)
+        rig.start('plant')
+        rig.start('planner', remap=remap)
+        late = Thread(target=lambda: (
+            wait_until(lambda: rig.diagnostics.keys() > {'plant: time', 'planner: commands'},
+                       'both nodes'), relay.send(signal.SIGCONT)))
+        late.start()
+        rig.ready('plant', 'planner')
+        late.join()
+        assert 'joined' in relay.said
 
 
 def test_every_fault_has_a_name_of_its_own_and_says_what_is_expected():

@@ -5,7 +5,7 @@ Stand between planner and plant: delay, drop, duplicate or reorder commands.
                                       [--swap]
 
 Takes commands from topic IN and sends them to topic OUT. Delays count by steady time, whatever
-the clock of the nodes does.
+the clock of the nodes does. Says "joined" once both are known, and a node that looks on.
 """
 
 import argparse
@@ -27,6 +27,8 @@ from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.runner import spin
 
 _TICK_SECONDS = 0.0005
+# The plant, and a node that looks on.
+_LISTENERS = 2
 
 
 class Relay(Node):
@@ -37,14 +39,15 @@ class Relay(Node):
         super().__init__('relay', enable_rosout=False)
         self._options = options
         self._drop = {int(x) for x in options.drop.split(',') if x}
-        self._count = 0
+        self._count, self._joined = 0, False
         self._held: MagneticField | None = None
         # Stamps of commands that are lost; a heartbeat may repeat one before it applies.
         self._lost: list[Time] = []
         self._waiting: deque[tuple[float, MagneticField]] = deque()
         topic = topics.FLUX_DENSITY_COMMAND
         self._publisher = endpoints.publisher(self, replace(topic, name=options.target))
-        endpoints.subscribe(self, replace(topic, name=options.source), self._on_command)
+        self._commands = endpoints.subscribe(
+            self, replace(topic, name=options.source), self._on_command)
         self.create_timer(
             _TICK_SECONDS, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -70,6 +73,10 @@ class Relay(Node):
         self._on_tick()
 
     def _on_tick(self) -> None:
+        if not self._joined and (self._commands.get_publisher_count() >= 1
+                                 and self._publisher.get_subscription_count() >= _LISTENERS):
+            self._joined = True
+            print('joined')
         # In the order in which they came, unless asked to reorder them.
         while self._waiting and self._waiting[0][0] <= monotonic():
             self._publisher.publish(self._waiting.popleft()[1])

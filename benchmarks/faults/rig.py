@@ -215,7 +215,13 @@ class Rig:
                 lambda: self.verdicts and self._setpoint.get_subscription_count() > 0,
                 'the planner')
         # What is sent before two nodes have found each other is lost. They found us, and a
-        # second round of diagnostics later, at least a second, each other.
+        # second round of diagnostics later, at least a second, each other; a relay that starts
+        # on a busy machine finds them later.
+        for child in self.children:
+            if child.log.stem == 'relay':
+                self.spin_until(
+                    lambda child=child: 'joined' in child.said,  # type: ignore[misc]
+                    'the relay to find planner and plant')
         self._await_diagnostics(names)
 
     def traces(self) -> list[str]:
