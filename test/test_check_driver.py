@@ -2,10 +2,13 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from hmsa_ros.cli import main
 from hmsa_ros.device import conformance
+from hmsa_ros.device.bench import Seen
+from hmsa_ros.device.protocol import Sample
 
 # One class for all: a block at a level, whose state survives its process, in a file.
 BENCH = '''
@@ -41,9 +44,9 @@ BROKEN = {
                'return [(*super().read(now)[0][:2], self.first)]', 'stamps_rise'),
     'future': ('def read(self, now): return [(*super().read(now)[0][:2], time_ns() + 10**9)]',
                'stamps_past'),
-    'staircase': ('def read(self, now): self.count -= self.count % 20 != 0; '
-                  'x = super().read(now)[0]; return [(round(x[0], 3), 0.0, x[2])]',
-                  'samples_new'),
+    'frames': ('def read(self, now): self.n = getattr(self, "n", -1) + 1; '
+               'self.n % 10 or setattr(self, "x", super().read(now)[0]); '
+               'return [(*self.x[:2], time_ns())]', 'samples_new'),
     'polarity': ('def write(self, level, now): super().write(-level, now)', 'polarity'),
     'zero': ('def write(self, level, now): super().write(level or 1e-3, now)', 'off_at_close'),
     'clock': ('def clock(self): sleep(0.01); return time_ns()', 'clock'),
@@ -107,6 +110,35 @@ def test_without_a_sensor_it_says_what_it_could_not_try(lab, capsys):
     assert [x.partition(':')[0] for x in found['untried']] == [
         'samples', 'polarity, and whether the coil is off', 'off_at_close', 'off_at_exception',
         'off_at_sigterm']
+
+
+def phase(stretch):
+    """Return a phase whose samples have these stretches."""
+    return Seen([], [Sample(i, np.array([x]), np.array([0.0]), np.array([0.0]))
+                     for i, x in enumerate(stretch)], [])
+
+
+@pytest.mark.parametrize('noise', [1e-5, 2e-4, 1e-3, 2e-3])
+def test_noise_does_not_decide_whether_a_coil_is_off(noise):
+    dice = np.random.default_rng(1)
+    for _ in range(300):
+        trial = conformance.Trial('', '', {}, level=1e-3, rate=200.0)
+        trial._check_response(*(
+            phase(1.0 + x + noise * dice.standard_normal(120)) for x in (0.0, 1e-3, -1e-3)))
+        assert all(x.passed for x in trial._checks)
+        off = 1.0 + np.mean(noise * dice.standard_normal(120))
+        assert trial._untried or abs(off - trial._rest) < 0.3 * trial._apart
+
+
+@pytest.mark.parametrize(('step', 'tried'), [(1e-3, False), (1e-6, True)])
+def test_a_sensor_that_a_level_moves_by_a_few_steps_is_not_said_to_repeat(step, tried):
+    dice = np.random.default_rng(1)
+    moving = 1.0 + np.repeat([5e-4, 1e-3] * 15, 6) + 1e-5 * dice.standard_normal(180)
+    trial = conformance.Trial('', '', {}, level=1e-3, rate=200.0)
+    seen = phase(step * np.round(moving / step))
+    trial._check_samples([seen], seen)
+    assert ('samples_new' in {x.name for x in trial._checks if x.passed}) is tried
+    assert ('samples_new' in ''.join(trial._untried)) is not tried
 
 
 @pytest.mark.parametrize(('arguments', 'expected'), [

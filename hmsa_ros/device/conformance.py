@@ -35,9 +35,10 @@ _CALL, _LATE, _CLOCK, _REPEATED = 0.02, 2e-3, 1e-3, 0.6
 _HOTTEST = 150.0
 # Fraction of calls that must keep their limit.
 _MOST = 0.95
-# Standard deviations of its mean from which a response is significant, and minimum fraction of the
-# response between rest and either level for 0 T to count as off.
-_SEEN, _DISTINCT = 6.0, 0.1
+# Standard deviations of its mean from which a response is significant, so that noise cannot make
+# the coil seem on or off, and minimum fraction of the response between rest and either level for
+# 0 T to count as off.
+_SEEN, _DISTINCT = 50.0, 0.3
 
 
 class Check(NamedTuple):
@@ -252,16 +253,23 @@ class Trial:
             'stamps_past', ahead, 's', 0.0, f'timestamps are {ahead:.3g} s ahead',
             'take timestamps by the clock of now, or have clock() return that of the device')
         moving = timed.stretch
-        repeated = float(np.mean(np.diff(moving) == 0.0)) if len(moving) > 1 else 0.0
-        self._note(
-            'samples_new', repeated, '', _REPEATED,
-            f'{repeated:.0%} of the samples repeat the value before',
-            'return [] where nothing is new, and batches as a list with a timestamp each')
+        changed = int(np.count_nonzero(np.diff(moving)))
+        repeated = 1.0 - changed / (len(moving) - 1) if len(moving) > 1 else 0.0
+        # A sensor of few steps returns to each of them.
+        if repeated > _REPEATED and 2 * len(np.unique(moving)) < changed:
+            self._untried.append(
+                f'samples_new: +-{self._level:g} T are a few steps of the sensor; a larger '
+                '--limit shows more')
+        else:
+            self._note(
+                'samples_new', repeated, '', _REPEATED,
+                f'{repeated:.0%} of the samples repeat the value before',
+                'return [] where nothing is new, and batches as a list with a timestamp each')
         rate = 1e9 * (len(stamps) - 1) / max(int(stamps[-1] - stamps[0]), 1)
         self._note(
             'samples_lost', max(1.0 - rate / self._rate, 0.0), '', 0.5,
             f'{rate:.3g} samples a second, read at {self._rate:g} Hz',
-            'read must return sooner; the sensor may be slower than it is asked')
+            'read must return sooner, or --rate be that of the sensor')
 
     def _check_response(self, rest: Seen, up: Seen, down: Seen) -> None:
         means = [float(np.mean(x)) if len(x) else math.nan for x in (
