@@ -1,6 +1,5 @@
 """
-What happened in a run: read from a bag, evaluated, and shown as a page or a picture.
+Reports of runs, as pages and figures.
 
-`reading` turns a bag into arrays, `evaluation` measures them, `page` and `picture` show them.
-None of it needs ROS.
+`evaluation` computes the results of a run, `page` and `picture` show them. No module needs ROS.
 """

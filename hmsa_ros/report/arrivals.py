@@ -1,4 +1,4 @@
-"""Runs side by side: when their commands and samples came, and the arrivals of their moves."""
+"""Compare runs: the timing of commands and samples, and the arrivals of the moves."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,41 +15,41 @@ from hmsa_ros.recordings.record import Run, Times
 from hmsa_ros.report.curves import Curve
 from hmsa_ros.report.evaluation import evaluate, Evaluation, MoveResult, verdicts
 
-# A change of level that took effect within so many s of its stamp was in time: the clock of a
-# board that keeps time itself is known to some us.
+# A change of level that took effect within this time in s of its timestamp was on time: the clock
+# of a board with a schedule of its own is known to a few us.
 _PUNCTUAL = 1e-5
-# Clocks further apart than this are different clocks.
+# Clocks that differ by more than this, in s, are different clocks.
 _SAME_CLOCK = 60.0
 
 
 @dataclass(frozen=True)
 class Timing:
-    """When commands and samples came; all arrays are in s."""
+    """Timing of commands and samples; all arrays are in s."""
 
-    commands: tuple[Level, ...]  #: those that change something, in the order received
-    repeats: int  #: how many commands changed nothing
-    #: Shape (m,): how far ahead of its stamp each command was recorded; below 0 for a late one.
-    #: Empty if the recorder kept another clock than the stamps.
+    commands: tuple[Level, ...]  #: commands that change the level, in the order received
+    repeats: int  #: number of commands that repeat the level
+    #: Shape (m,): timestamp minus recording time of each command; below 0 if late. Empty if
+    #: recorder and timestamps used different clocks.
     lead: Array
-    #: Shape (k,): how long after its stamp each change of level took effect, as the plant or the
-    #: driver reported; NaN for one that it did not report. Empty if it reported none.
+    #: Shape (k,): time at which each change of level took effect, as the plant or the driver
+    #: reported, minus its timestamp; NaN if not reported. Empty without any report.
     lateness: Array
-    delay: Array  #: shape (n,): how long after its stamp each sample was recorded; or empty
-    interval: Array  #: shape (n - 1,): between the stamps of two samples
-    arrival_interval: Array  #: shape (n - 1,): between the times of recording
-    missing: int  #: samples that gaps in the stamps have room for
-    unapplied: int  #: changes of level that were due and did not take effect as reported
+    delay: Array  #: shape (n,): recording time minus timestamp of each sample; or empty
+    interval: Array  #: shape (n - 1,): between consecutive timestamps of samples
+    arrival_interval: Array  #: shape (n - 1,): between consecutive recording times
+    missing: int  #: number of samples that would fill the gaps in the timestamps
+    unapplied: int  #: changes of level that were due and were not reported as taking effect
 
     @property
     def late(self) -> int:
-        """Commands that took effect, or else were recorded, after the time they apply from."""
+        """Number of commands that took effect late; without reports, that were recorded late."""
         if len(self.lateness):
             return int(np.count_nonzero(self.lateness > _PUNCTUAL))
         return int(np.count_nonzero(self.lead < 0.0))
 
 
 def timing(run: Run) -> Timing:
-    """Return when commands and samples of a run came."""
+    """Return the timing of the commands and samples of a run."""
     commands, repeats = without_repeats(run.commands)
     delay = (run.logged - run.time) / NANOSECONDS
     interval = np.diff(run.time) / NANOSECONDS
@@ -65,18 +65,18 @@ def timing(run: Run) -> Timing:
         int(np.sum(gaps[gaps > 0.0])) if len(interval) else 0, unapplied)
 
 
-# Of what a panel holds beyond what it shows at first, in durations of the move.
+# Data of an arrival's panel, from the begin of the move, in durations of the move.
 _PANEL_SPAN = 20.0
-# Of an arrival's panel: how long it is in durations of the move, and how many percent of the
-# step it shows at least.
+# Initial view of that panel: its length in durations of the move, and the minimum of its height
+# in percent of the step.
 _SHOWN, _LEAST_PERCENT = 4.0, 5.0
-#: Instead of a residual, which would be 0.
+#: Shown in place of a residual.
 NOT_MOVED = 'did not move'
 
 
 @dataclass(frozen=True)
 class Part:
-    """One run of a report; without a colour it is on its own and its curves differ in theirs."""
+    """One run of a report; a single run has no colour, and its curves have different ones."""
 
     run: Run
     evaluation: Evaluation
@@ -85,12 +85,12 @@ class Part:
 
     @classmethod
     def of(cls, run: Run, colour: str = '', tolerances: Tolerances | None = None) -> 'Part':
-        """Measure a run, and judge it by tolerances, by default those of its planner."""
+        """Evaluate a run with the given tolerances, by default those of its planner."""
         return cls(run, evaluate(run, tolerances), timing(run), colour)
 
 
 def worst(parts: Sequence[Part], most: int) -> list[int]:
-    """Return the numbers, from 0 on, of the setpoints with the largest residuals."""
+    """Return the indices of the setpoints with the largest residual vibration, sorted."""
     count = max((len(x.evaluation.results) for x in parts), default=0)
     ranked = sorted(range(count), key=lambda i: -max(
         (x.residual if x.moved else math.inf for x in results_of(parts, i)
@@ -105,7 +105,7 @@ def results_of(parts: Sequence[Part], number: int) -> list[MoveResult]:
 
 
 def residual_text(results: Sequence[MoveResult], *, least: bool = False) -> str:
-    """Return the largest residual of some moves in words, and the least before it if asked."""
+    """Return the largest residual vibration of several moves as text, or the range with least."""
     if not all(x.moved for x in results):
         return NOT_MOVED
     shares = [x.residual for x in results if math.isfinite(x.residual)]
@@ -116,25 +116,25 @@ def residual_text(results: Sequence[MoveResult], *, least: bool = False) -> str:
 
 
 def left_text(results: Sequence[MoveResult], *, least: bool = False) -> str:
-    """Return what some moves left in words, as a heading has it."""
+    """Return the residual vibration of several moves as text for a heading."""
     text = residual_text(results, least=least)
     return text if text == NOT_MOVED else f'residual {text}'
 
 
 def reach(parts: Sequence[Part], number: int) -> float:
-    """Return how far an arrival's panel reaches from 0, in percent of the step."""
+    """Return the half height of an arrival's panel in percent of the step."""
     return min(150.0, max([_LEAST_PERCENT, *(
         110.0 * x.error for x in results_of(parts, number) if math.isfinite(x.error))]))
 
 
 def around(x: MoveResult, curve: Curve) -> tuple[Array, Array]:
-    """Return a curve about an arrival: s after the move began, and off target in % of the step."""
+    """Return a curve around an arrival: time in the move in s, and error in % of the step."""
     inside = curve.between(x.begin, min(x.end, x.begin + _PANEL_SPAN * max(x.arrival, 1e-9)))
     return inside.time - x.begin, 100.0 * (inside.stretch - x.stretch) / abs(x.step)
 
 
 def span(parts: Sequence[Part], number: int) -> float:
-    """Return how long after its begin an arrival's panel ends, in s."""
+    """Return the length of an arrival's panel in s."""
     return max((
         min(x.end - x.begin, _SHOWN * x.arrival) for x in results_of(parts, number)), default=1.0)
 

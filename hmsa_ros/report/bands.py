@@ -1,4 +1,4 @@
-"""Curves of repeats of a sequence, drawn as a mean and a band."""
+"""Draw the curves of repeated sequences as a mean and a band."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ _POINTS = 400
 
 def draw_bands(
         paths: Sequence[Path], groups: Mapping[str, Sequence[Part]], paper: Paper) -> Any:
-    """Draw each arrival: mean of the repeats of each run, and its standard deviation as a band."""
+    """Draw each arrival: the mean of the repeats of each run, with a band of one std."""
     parts = [x for group in groups.values() for x in group]
     count = max(len(x.evaluation.results) for x in parts)
     columns = min(paper.columns(3), max(count, 1))
@@ -43,7 +43,7 @@ def draw_bands(
 
 
 def _curves(group: Sequence[Part], number: int, grid: Array) -> Array:
-    """Return the error in % of the step of each repeat that has an arrival, NaN where unknown."""
+    """Return the error in % of the step of each repeat, shape (k, n); NaN where unknown."""
     found = []
     for part in group:
         for result in part.evaluation.results[number:number + 1]:

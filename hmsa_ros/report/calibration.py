@@ -1,4 +1,4 @@
-"""Calibrations as pictures: what was measured as points, and the fit as a line."""
+"""Draw calibrations: the measurements as points, and the fit as a line."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from hmsa_ros.report.looks import BLACK
 from hmsa_ros.report.paper import Paper
 
 _LINE = 400
-# Lags after the transport that are shown, and the shortest span in s.
+# End of the figure in lags after the transport delay, and its minimum in s.
 _LAGS, _SHORTEST = 8.0, 2e-3
 
 
@@ -40,7 +40,7 @@ def draw_coil(
 
 
 def draw_delays(paths: Sequence[Path], found: Delays, paper: Paper) -> None:
-    """Draw how a field follows its level, or without a probe how the fit follows the samples."""
+    """Draw the response of the field to its level; without a probe, the stretch and its fit."""
     seen = found.field
     if seen is None:
         motion = found.motion

@@ -1,8 +1,8 @@
 """
-The figures of a report, as plain data for Plotly.
+The figures of a report, as Plotly data.
 
-Curves are thinned out to what a screen can show, peaks kept. Colours are those of
-`hmsa_ros.report.looks`; the page replaces them by lighter ones in dark mode.
+Curves are decimated to screen resolution, keeping peaks. Colours are those of
+`hmsa_ros.report.looks`; in dark mode the page replaces them by lighter ones.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,16 +27,16 @@ MOST_PANELS = 12
 _PANEL_BUCKETS = 300
 _MOST_PHASE_POINTS = 8_000
 _PHASE_GRID = 1000.0
-# Markers are smaller where there are more of them.
+# Above this number, markers are smaller.
 _MANY_MARKERS = 100
 _LONGEST_IN_MS = 2.0
-# Samples are drawn as points where there are so many of them at most.
+# Maximum number of samples that are also drawn as points.
 _MOST_SAMPLES = 500
 
 
 @dataclass(frozen=True)
 class TimeUnit:
-    """Unit of the time axes: its size in s and its name."""
+    """The unit of a time axis: its size in s and its name."""
 
     size: float
     name: str
@@ -48,7 +48,7 @@ class TimeUnit:
 
 @dataclass(frozen=True)
 class Figure:
-    """One figure: what it shows in words, its height in px, and what Plotly takes."""
+    """One figure: its alternative text, height in px, and Plotly's data and layout."""
 
     key: str
     alt: str
@@ -63,17 +63,17 @@ def time_unit(parts: Sequence[Part]) -> TimeUnit:
 
 
 def unit_for(seconds: float, most: float = _LONGEST_IN_MS) -> TimeUnit:
-    """Return the unit for an axis of so many seconds, milliseconds up to a bound."""
+    """Return the unit for an axis of a length in s: milliseconds up to ``most``."""
     return TimeUnit(1e-3, 'ms') if seconds <= most else TimeUnit(1.0, 's')
 
 
 def text(words: str) -> str:
-    """Return words as Plotly shows them, which takes some marks for HTML."""
+    """Return a text escaped for Plotly, which interprets some HTML tags."""
     return html.escape(words, quote=False)
 
 
 def curve(name: str, x: Any, y: Any, mode: str = 'lines', **own: Any) -> dict[str, Any]:
-    """Return a curve, or points, as Plotly takes it."""
+    """Return a Plotly trace of lines or markers."""
     return {
         'type': 'scatter', 'mode': mode, 'x': numbers(x), 'y': numbers(y), 'name': text(name),
         **own}
@@ -83,17 +83,17 @@ def _curve(
         part: Part, what: str, x: Any, y: Any, mode: str = 'lines', *,
         line: Mapping[str, Any] | None = None, **own: Any) -> dict[str, Any]:
     """
-    Return a curve: what it shows of a run.
+    Return the trace of a quantity of a run.
 
-    The colour of the run goes before that of line or marker. The group is what a click in the
-    legend hides.
+    The colour of the run takes precedence over that of line or marker. A click in the legend hides
+    the whole group.
     """
     colour, simulated = part.colour, what in _SIMULATED
     trace = curve(
         f'{part.run.label}: {what}' if colour else what, x, y, mode,
         legendgroup=part.run.label if colour and not simulated else what, **own)
     if 'lines' in mode:
-        # Plotly's own thinning bends lines at rest by a pixel or two.
+        # Plotly's simplification distorts flat lines by a pixel or two.
         trace['line'] = {'simplify': False, **_KINDS.get(what, {}), **(line or {})}
         if simulated and colour:
             trace['visible'] = 'legendonly'
@@ -104,7 +104,7 @@ def _curve(
 
 
 def _grouped(data: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return curves with each group once in the legend, by its own name."""
+    """Return traces with one legend entry for each group, by the name of the group."""
     seen: set[str] = set()
     for trace in data:
         group = trace['legendgroup']
@@ -115,9 +115,9 @@ def _grouped(data: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return data
 
 
-# Of several runs what was recorded is compared; what is simulated is shown on a click.
+# Hidden until a click in the legend when several runs are compared.
 _SIMULATED = ('unshaped steps', 'plan')
-# What each kind of curve looks like, everywhere: colour, and what distinguishes it without.
+# Line properties of each kind of curve.
 _KINDS: dict[str, dict[str, Any]] = {
     'recorded': looks.RECORDED.plotly(), 'unshaped steps': looks.PLAIN.plotly(),
     'plan': looks.PLAN.plotly(), 'field in force': looks.FIELD.plotly(),
@@ -126,18 +126,18 @@ _KINDS: dict[str, dict[str, Any]] = {
 
 
 def label(quantity: str, symbol: str = '', unit: str = '') -> str:
-    """Return the label of an axis: its quantity, symbol, and unit if it has one."""
+    """Return the label of an axis: quantity, symbol, and unit if given."""
     return ' '.join(x for x in (quantity, symbol, f'({unit})' if unit else '') if x)
 
 
 def axis(name: str, **more: Any) -> dict[str, Any]:
-    """Return an axis of Plotly."""
+    """Return a Plotly axis."""
     return {'title': {'text': name}, 'exponentformat': 'power', **more}
 
 
 def _recorded(part: Part, x: Array, y: Array, samples: tuple[Array, Array], *,
               buckets: int = BUCKETS) -> list[dict[str, Any]]:
-    """Return what was recorded: the curve through the samples, and these where they are few."""
+    """Return the recorded curve, and the samples as points if they are few."""
     data = [_curve(part, 'recorded', *decimate(x, y, buckets))]
     if len(samples[0]) < len(x) and len(samples[0]) <= _MOST_SAMPLES:
         data.append(_curve(
@@ -147,7 +147,7 @@ def _recorded(part: Part, x: Array, y: Array, samples: tuple[Array, Array], *,
 
 
 def response(parts: Sequence[Part], unit: TimeUnit) -> Figure:
-    """Return the command, and below it setpoints and response, over time."""
+    """Return the command over time, above setpoints and response."""
     data = []
     for part in parts:
         run, found = part.run, part.evaluation
@@ -180,19 +180,19 @@ def response(parts: Sequence[Part], unit: TimeUnit) -> Figure:
 
 def commanded(part: Part) -> tuple[list[float], list[float]]:
     """
-    Return times in s and shown levels of the command, from the first sample to the last.
+    Return times in s and levels of the command in the unit shown, from first to last sample.
 
-    It begins with the level before the first: as measured, or the one that holds where the block
-    rests.
+    The first level is that in force before the first command: as measured, or the one that holds
+    the initial stretch.
     """
     run, found = part.run, part.evaluation
     times = [found.seconds(x.stamp) for x in found.levels]
     per = run.plant.coordinate.drive.per
     values = [x.flux_density * per for x in found.levels]
-    # The last level holds to the end of the record.
+    # Extend the last level to the end of the recording.
     times.append(max(times[-1], float(found.time[-1])))
     values.append(values[-1])
-    # The step of the first level is drawn too, although the samples may begin with it.
+    # Show the step to the first level even if the samples begin with it.
     before = int(np.searchsorted(found.time, times[0])) - 1
     held = float(run.flux_density[before]) if before >= 0 else math.nan
     if times[0] >= 0.0 and not math.isfinite(held):
@@ -205,7 +205,7 @@ def commanded(part: Part) -> tuple[list[float], list[float]]:
 
 
 def _commands(part: Part, unit: TimeUnit) -> list[dict[str, Any]]:
-    """Return the curves of the flux density."""
+    """Return the traces of the flux density."""
     run, found = part.run, part.evaluation
     drive, data = run.plant.coordinate.drive, []
     in_force = f'{"voltage" if drive.squared else "field"} in force'
@@ -227,22 +227,22 @@ def _commands(part: Part, unit: TimeUnit) -> list[dict[str, Any]]:
             part, in_force, *decimate(unit.of(found.time), run.flux_density * drive.per),
             yaxis='y2'))
     elif run.applied:
-        told = sorted(run.applied, key=lambda x: x.stamp)
-        x = unit.of([*(found.seconds(x.stamp) for x in told), max(
-            found.seconds(told[-1].stamp), float(found.time[-1]))])
-        y = np.array([x.flux_density for x in (*told, told[-1])]) * drive.per
+        applied = sorted(run.applied, key=lambda x: x.stamp)
+        x = unit.of([*(found.seconds(x.stamp) for x in applied), max(
+            found.seconds(applied[-1].stamp), float(found.time[-1]))])
+        y = np.array([x.flux_density for x in (*applied, applied[-1])]) * drive.per
         data.append(_curve(part, in_force, x, y, yaxis='y2', line={'shape': 'hv'}))
     return data
 
 
 def _size(usual: int, results: Sequence[MoveResult]) -> int:
-    """Return the size of markers, one for each result."""
+    """Return the size of the markers of results."""
     return usual if len(results) <= _MANY_MARKERS else usual // 2
 
 
 def phase(parts: Sequence[Part]) -> tuple[Figure, float]:
-    """Return the phase plane with the equilibria, and the smallest share of a run in it."""
-    # What moves on and on fills the plane, so that a part of it is enough.
+    """Return the phase plane with the equilibria, and the smallest fraction of a run shown."""
+    # Long motions would fill the plane, so only their beginning is drawn.
     data, shown = [], 1.0
     for part in parts:
         found = part.evaluation
@@ -267,7 +267,7 @@ def phase(parts: Sequence[Part]) -> tuple[Figure, float]:
 
 
 def _room(data: Sequence[dict[str, Any]], key: str) -> list[float | None]:
-    """Return the range of an axis that leaves room around all curves."""
+    """Return the range of an axis, with a margin around all visible curves."""
     values = [
         x for trace in data if trace.get('visible', True) is True
         for x in trace[key] if x is not None]
@@ -276,7 +276,7 @@ def _room(data: Sequence[dict[str, Any]], key: str) -> list[float | None]:
 
 
 def _orbit(stretch: Array, rate: Array) -> tuple[Array, Array, float]:
-    """Return a curve in the plane without the points that lie on the one before."""
+    """Return a curve in the phase plane without coincident points, and the fraction kept."""
     finite = np.isfinite(stretch) & np.isfinite(rate)
     x, y = stretch[finite], rate[finite]
     if not len(x):
@@ -294,7 +294,7 @@ def _orbit(stretch: Array, rate: Array) -> tuple[Array, Array, float]:
 
 
 def arrival(parts: Sequence[Part], number: int) -> Figure:
-    """Return the zoom on one arrival: distance from the target in percent of the step."""
+    """Return the zoom on one arrival: the error in percent of the step."""
     data = []
     shown = span(parts, number)
     unit = unit_for(shown, 1.0)
@@ -316,7 +316,7 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
     height = reach(parts, number)
     return Figure(
         f'arrival{number}', f'Setpoint {title(parts, number)}', 300, _grouped(data), {
-            # There is no room in every panel for the names of several runs.
+            # The labels of several runs do not fit into every panel.
             'showlegend': len(parts) == 1,
             'xaxis': axis(
                 label('time in the move', unit=unit.name),
@@ -328,7 +328,7 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
 
 
 def residuals(parts: Sequence[Part]) -> Figure:
-    """Return the residuals of all setpoints, shaped against unshaped steps."""
+    """Return the residual vibration of all setpoints, as recorded and for unshaped steps."""
     data = []
     for part in parts:
         results = part.evaluation.results
@@ -337,12 +337,12 @@ def residuals(parts: Sequence[Part]) -> Figure:
                 ('unshaped steps', [x.residual_unshaped for x in results], 'square-open')):
             data.append(_curve(
                 part, what, np.arange(1, len(results) + 1),
-                # Below what is resolved there is nothing to see.
+                # Smaller values are rounding.
                 [100.0 * max(x, RESOLVED) for x in values], mode='markers',
                 marker={
                     'symbol': symbol, 'size': _size(10, results), 'line': {'width': 1.5},
                     'color': _KINDS[what]['color']}))
-            # Here both are results: one click for both.
+            # One click in the legend hides both.
             data[-1]['legendgroup'] = part.run.label if part.colour else what
     count = max((len(x.evaluation.results) for x in parts), default=0)
     numbered = axis('setpoint', range=[0.5, count + 0.5])
@@ -360,7 +360,7 @@ def residuals(parts: Sequence[Part]) -> Figure:
 
 
 def _decades(data: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return range and ticks of a logarithmic axis: whole decades, so that one is named."""
+    """Return range and ticks of a logarithmic axis: whole decades, so at least one has a label."""
     values = [math.log10(x) for trace in data for x in trace['y'] if x is not None]
     if not values:
         return {}
@@ -394,16 +394,16 @@ def timings(parts: Sequence[Part], unit: TimeUnit) -> Figure:
     for part in parts:
         found, timing = part.evaluation, part.timing
         time = unit.of(found.time)
-        told = np.isfinite(timing.lateness)
+        known = np.isfinite(timing.lateness)
         stamps = unit.of([found.seconds(x.stamp) for x in timing.commands])
         markers: dict[str, Any] = {'mode': 'markers', 'yaxis': 'y3', 'cliponaxis': False}
         if len(timing.lead):
             data.append(_curve(
                 part, 'command lead', stamps, timing.lead * 1e3, **markers,
                 marker={'size': 7, 'color': BLUE, 'symbol': 'circle'}))
-        if told.any():
+        if known.any():
             data.append(_curve(
-                part, 'lateness of the command', stamps[told], timing.lateness[told] * 1e3,
+                part, 'lateness of the command', stamps[known], timing.lateness[known] * 1e3,
                 **markers,
                 marker={'size': 8, 'color': VERMILION, 'symbol': 'x-thin-open'}))
         if len(timing.delay):

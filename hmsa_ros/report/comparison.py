@@ -1,4 +1,4 @@
-"""Several runs, compared in numbers."""
+"""Tables that compare runs."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,9 +15,9 @@ from hmsa_ros.table import Column, Table
 
 
 def labelled(runs: list[Run]) -> list[Run]:
-    """Return the runs with labels of their own."""
+    """Return the runs with unique labels."""
     labels = [x.label for x in runs]
-    # Bags of one name lie in different folders, unless one is named twice.
+    # Bags with the same name are in different folders, unless a bag is given twice.
     labels = [
         f'{run.path.resolve().parent.name}/{run.label}'
         if labels.count(run.label) > 1 and run.origin == 'recorded'
@@ -28,14 +28,14 @@ def labelled(runs: list[Run]) -> list[Run]:
 
 
 def parts_of(runs: list[Run]) -> list[Part]:
-    """Return runs, measured, with labels and, of several, colours of their own."""
+    """Return evaluated runs with unique labels and, for several runs, different colours."""
     return [Part.of(run, RUNS[i % len(RUNS)] if len(runs) > 1 else '')
             for i, run in enumerate(labelled(runs))]
 
 
 def comparison(parts: Sequence[Part]) -> Table:
     """
-    Return what was measured of each setpoint in each run, and how far its curve is from the first.
+    Return the results of each setpoint in each run, and its distance from the first run's curve.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def comparison(parts: Sequence[Part]) -> Table:
 
 
 def setpoints(parts: Sequence[Part]) -> Table:
-    """Return what was measured of each setpoint of a run; parts are its joints."""
+    """Return the results of each setpoint of a run; ``parts`` are its joints."""
     return Table(
         (Column('setpoint'), *_MEASURED, Column('frequency', 'Hz', '.3g', 'f'),
          Column('verdict')),
@@ -86,7 +86,7 @@ _CAPTION = (
 
 
 def _measured(part: Part, number: int) -> tuple[float, ...]:
-    """Return the values of `_MEASURED`; NaN for what was not measured."""
+    """Return the values of the columns `_MEASURED`; NaN if not measured."""
     found, result = part.evaluation.findings[number], _result(part, number)
     return (
         found.setpoint.target, *((math.nan, math.nan) if result is None else (
@@ -100,12 +100,12 @@ def _verdict(part: Part, number: int) -> str:
 
 
 def _result(part: Part, number: int) -> MoveResult | None:
-    """Return the result of a setpoint that was reached; None for another."""
+    """Return the result of a setpoint; None without an arrival in the recording."""
     return next((x for x in part.evaluation.results if x.place == number), None)
 
 
 def _apart(first: Part, part: Part, number: int) -> float:
-    """Return the largest distance of two curves about an arrival, in percent of the step."""
+    """Return the largest distance of two curves around an arrival, in percent of the step."""
     reference, move = _result(first, number), _result(part, number)
     if part is first or reference is None or move is None:
         return math.nan
@@ -115,7 +115,7 @@ def _apart(first: Part, part: Part, number: int) -> float:
     if len(other) < 2 or len(time) < 2:
         return math.nan
     inside = (time >= other[0]) & (time <= other[-1])
-    # Each is in percent of its own step, about its own target.
+    # Each curve is in percent of its own step, relative to its own target.
     step = abs(reference.step)
     shift = 100.0 * (move.stretch - reference.stretch) / step
     away = np.interp(time[inside], other, values) * abs(move.step) / step + shift - off[inside]

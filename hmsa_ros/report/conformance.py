@@ -1,4 +1,4 @@
-"""A trial of hardware as one HTML page: checks, and histograms of times."""
+"""The HTML page of a driver check: checks, and histograms of durations."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ _BINS = 40
 
 
 def page(found: Conformance) -> str:
-    """Return the HTML page of a trial."""
+    """Return the HTML page of a driver check."""
     figures = [_histogram(name, x * 1e3) for name, x in found.durations.items() if len(x)]
     failed = sum(not x.passed for x in found.checks)
     return document(

@@ -1,4 +1,4 @@
-"""Curves of a motion: between its samples, and thinned out to what can be seen."""
+"""Curves of a motion: interpolated between samples, and decimated to screen resolution."""
 
 from dataclasses import dataclass
 import math
@@ -8,37 +8,37 @@ import numpy as np
 
 from hmsa_ros.model.equations import Array
 
-#: Intervals of a curve of which the least and the largest value are kept: more than a screen
-#: has columns.
+#: Intervals of which decimation keeps the minimum and the maximum: more than the columns of a
+#: screen.
 BUCKETS = 2000
-# A motion is drawn with this many points a period of the actuator at least, up to so many.
+# Minimum points per natural period of a drawn motion, and maximum of all points.
 _POINTS_A_PERIOD, _MOST_POINTS = 100, 2_000_000
-# Between samples further apart than this share of a period, nobody knows what happened.
+# Fraction of a natural period: a longer interval between samples is a gap.
 _GAP = 0.5
 _DIGITS = 9
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A motion at some times; NaN, of which curves are drawn without a line, where unknown."""
+    """A motion over time; NaN where unknown, which leaves a gap in the drawn line."""
 
     time: Array  #: in s, shape (n,)
     stretch: Array  #: shape (n,)
     rate: Array  #: in 1/s, shape (n,)
 
     def between(self, begin: float, end: float) -> 'Curve':
-        """Return the part between two times, both included."""
+        """Return the part between two times, inclusive."""
         inside = (self.time >= begin) & (self.time <= end)
         return Curve(self.time[inside], self.stretch[inside], self.rate[inside])
 
     def at(self, time: Array) -> 'Curve':
-        """Return it at some of its own times."""
+        """Return the curve at a subset of its times."""
         places = np.searchsorted(self.time, time)
         return Curve(time, self.stretch[places], self.rate[places])
 
 
 def fine(time: Array, period: float) -> Array:
-    """Return times (n,) with more between them where they are too few for a period's motion."""
+    """Return times (n,), with more in between if they are too coarse to draw a period."""
     if len(time) < 2:
         return time
     spacing = max(period / _POINTS_A_PERIOD, (time[-1] - time[0]) / _MOST_POINTS)
@@ -49,9 +49,9 @@ def fine(time: Array, period: float) -> Array:
 
 def through(samples: Curve, period: float) -> Curve:
     """
-    Return the curve through samples of stretch and rate: cubics, as Hermite's interpolation.
+    Return the cubic Hermite curve through samples of stretch and rate.
 
-    It has a gap where samples are further apart than half a period (in s).
+    The curve has a gap wherever samples are more than half a period (in s) apart.
     """
     finite = np.isfinite(samples.stretch) & np.isfinite(samples.rate)
     time, stretch, rate = (
@@ -60,7 +60,7 @@ def through(samples: Curve, period: float) -> Curve:
     if len(time) < 2 or grid is time:
         return Curve(time, stretch, rate)
     places = np.searchsorted(time, grid)
-    # SciPy's cubics take longer to import than all of a report.
+    # Importing SciPy's interpolation takes longer than the whole report.
     after = np.clip(places, 1, None)
     width = np.diff(time)[after - 1]
     share = (grid - time[after - 1]) / width
@@ -78,9 +78,9 @@ def through(samples: Curve, period: float) -> Curve:
 
 def decimate(x: Array, y: Array, buckets: int = BUCKETS) -> tuple[Array, Array]:
     """
-    Thin out a curve, keeping its ends and the extremes of intervals of many points.
+    Decimate a curve, keeping its ends and the minimum and maximum of each interval.
 
-    Where values are missing (NaN) inside, one of each gap stays, so that no line crosses it.
+    One NaN of each interior gap is kept, so that no line crosses the gap.
     """
     known, missing = np.flatnonzero(np.isfinite(y)), np.flatnonzero(~np.isfinite(y))
     kept = known[_extremes(y[known], buckets)] if len(known) else known
@@ -90,7 +90,7 @@ def decimate(x: Array, y: Array, buckets: int = BUCKETS) -> tuple[Array, Array]:
 
 
 def _extremes(y: Array, buckets: int) -> Any:
-    """Return where the ends and the extremes of each interval are, or all of few places."""
+    """Return the indices of the ends and of each interval's extremes; of a short curve all."""
     size = -(-len(y) // buckets)
     if size <= 2:
         return slice(None)
@@ -101,6 +101,6 @@ def _extremes(y: Array, buckets: int) -> Any:
 
 
 def numbers(values: Any) -> list[float | None]:
-    """Return numbers for JSON, to nine digits; None for what is not finite."""
+    """Return numbers for JSON, rounded to nine digits; None if not finite."""
     return [float(f'{x:.{_DIGITS}g}') if math.isfinite(x) else None
             for x in np.asarray(values, dtype=np.float64).tolist()]

@@ -1,7 +1,7 @@
 """
-The evaluation of a run: its setpoints, residual vibration, and prediction.
+Evaluate a run: its setpoints, residual vibration, and prediction.
 
-Times are in s from the first level of the run; stamps stay integer nanoseconds.
+Times are in s from the first level of the run; timestamps stay integer nanoseconds.
 """
 
 from collections.abc import Sequence
@@ -33,23 +33,23 @@ from hmsa_ros.recordings.setpoints import Requested, SAME, setpoints_of, start_o
 from hmsa_ros.report.curves import Curve, fine, through
 from hmsa_ros.report.outcome import findings_of
 
-#: Samples a period below which peaks are missed.
+#: With fewer samples per period, peaks are missed.
 FEW_SAMPLES = 10
-# Of the step: a block that covers less did not move.
+# Fraction of the step; a block that covers less did not move.
 _MOVED = 0.1
 
 
 @dataclass(frozen=True)
 class Move:
-    """One setpoint, as it was commanded; stamps in ns."""
+    """One setpoint as it was commanded; timestamps in ns."""
 
     stretch: float  #: target
     start: float  #: stretch before
     begin: int  #: of the first command
-    arrival: int  #: of planned rest at the target
-    end: int  #: until when the target was held
-    flux_densities: tuple[float, ...]  #: levels in T, the last one holds the target
-    place: int = 0  #: of the setpoint among all that were requested, from 0
+    arrival: int  #: planned rest at the target
+    end: int  #: end of the hold at the target
+    flux_densities: tuple[float, ...]  #: levels in T; the last one holds the target
+    place: int = 0  #: index among all requested setpoints
 
 
 @dataclass(frozen=True)
@@ -58,65 +58,64 @@ class MoveResult:
 
     stretch: float  #: target
     start: float  #: stretch before
-    #: first and last level and the time between begin and arrival, nondimensional as in the paper
+    #: first and last level and duration of the move, nondimensional as in the paper
     b_p: float
     tau_p: float
     b_1: float
     begin: float  #: in s of the run
-    arrival: float  #: of planned rest at the target, in s from the begin
+    arrival: float  #: planned rest at the target, in s from the begin
     end: float  #: in s of the run
-    error: float  #: largest distance from the target after arrival, as a share of the step
-    #: peak-to-peak stretch after arrival as a share of the step: recorded, and simulated for
-    #: unshaped steps on the same plant; NaN where there are no samples, and of a block that did
-    #: not move
+    error: float  #: largest distance from the target after arrival, as a fraction of the step
+    #: peak-to-peak stretch after arrival as a fraction of the step: recorded, and simulated for
+    #: unshaped steps of the same plant; NaN without samples, and for a block that did not move
     residual: float
     residual_unshaped: float
-    #: whether the block covered a tenth of the step at least, on the mean after arrival
+    #: whether the mean after arrival lies at least a tenth of the step from the start
     moved: bool
-    place: int = 0  #: of the setpoint among all that were requested, from 0
+    place: int = 0  #: index among all requested setpoints
 
     @property
     def step(self) -> float:
-        """How far it was to go, with its sign."""
+        """Target minus start."""
         return self.stretch - self.start
 
     @property
     def rests(self) -> float:
-        """Time of planned rest in s of the run."""
+        """Planned rest at the target in s of the run."""
         return self.begin + self.arrival
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A run, measured."""
+    """The results of a run."""
 
-    #: stamp in ns of time 0: the first level of the run, or the first sample without one
+    #: timestamp in ns of time 0: the first level of the run, or the first sample without levels
     zero: int
     time: Array  #: times of the samples in s, shape (n,)
     start: float  #: stretch at rest before the first move
-    levels: tuple[Level, ...]  #: commands that came into force and changed the level, by stamp
+    levels: tuple[Level, ...]  #: commands that took effect and changed the level, by timestamp
     moves: tuple[Move, ...]  #: setpoints
-    results: tuple[MoveResult, ...]  #: one a move
+    results: tuple[MoveResult, ...]  #: one per move
     recorded: Curve  #: through the samples
-    #: simulated for unshaped steps; NaN without a move, and where they are too large to follow
+    #: simulated for unshaped steps; NaN without a move, and for steps too large to simulate
     plain: Curve
-    plan: tuple[Level, ...]  #: changes of level that were planned and not replanned, by stamp
-    #: by the plan, at the samples and between them; NaN before and without one
+    plan: tuple[Level, ...]  #: planned changes of level that were not replanned, by timestamp
+    #: predicted by the plan, at the samples and between them; NaN before and without a plan
     planned: Curve
-    findings: tuple[Finding, ...] = ()  #: one a setpoint that was requested
+    findings: tuple[Finding, ...] = ()  #: one per requested setpoint
 
     def seconds(self, stamp: int) -> float:
-        """Return a stamp in s of the run."""
+        """Return a timestamp in s of the run."""
         return (stamp - self.zero) / NANOSECONDS
 
 
 def judged_from(finding: Finding) -> float:
-    """Return from when on samples were judged, in s from the start of the move."""
+    """Return the time of the first judged sample in s from the start of the move."""
     return (finding.setpoint.rests_from - finding.setpoint.begins) / NANOSECONDS
 
 
 def verdicts(evaluations: Sequence[Evaluation], number: int) -> str:
-    """Return the verdicts on a move in all runs that have it, each after a comma; or nothing."""
+    """Return the different verdicts on a move in several runs, each after a comma."""
     places = [(x.findings, x.results[number].place) for x in evaluations
               if number < len(x.results)]
     return ''.join(f', {x}' for x in dict.fromkeys(
@@ -124,14 +123,14 @@ def verdicts(evaluations: Sequence[Evaluation], number: int) -> str:
 
 
 def _verdict(finding: Finding) -> str:
-    """Return a verdict, and from when on it holds where that is after the move."""
+    """Return a verdict in words, with the time of arrival if that is after the move."""
     words = str(finding.verdict).replace('_', ' ')
     late = finding.setpoint.arrival is None and finding.arrived
     return f'{words} after {1e3 * judged_from(finding):.3g} ms' if late else words
 
 
 def evaluate(run: Run, tolerances: Tolerances | None = None) -> Evaluation:
-    """Measure a run, and judge it by tolerances, by default those of its planner."""
+    """Evaluate a run with the given tolerances, by default those of its planner."""
     levels = in_force((x,) for x in without_repeats(run.commands)[0])
     plan = in_force(run.plans)
     asked = setpoints_of(run)
@@ -155,7 +154,7 @@ def evaluate(run: Run, tolerances: Tolerances | None = None) -> Evaluation:
 
 
 def _first(run: Run, levels: Sequence[Level], asked: Sequence[Requested]) -> int:
-    """Return when the first level of a run begins, in ns; of an earlier run one may still hold."""
+    """Return the begin of the first level in ns, skipping the level that an earlier run left."""
     begins = asked[0].setpoint.begins if asked else int(run.time[0])
     later = [x for x in levels if x.stamp >= begins]
     if not later:
@@ -167,7 +166,7 @@ def _first(run: Run, levels: Sequence[Level], asked: Sequence[Requested]) -> int
 
 
 def find_moves(run: Run, levels: Sequence[Level], setpoints: Sequence[Requested]) -> list[Move]:
-    """Return how setpoints were commanded that were reached before the recording ended."""
+    """Return the moves whose planned arrival lies within the recording."""
     last = int(run.time[-1])
     moves = []
     for place, asked in enumerate(setpoints):
@@ -177,7 +176,7 @@ def find_moves(run: Run, levels: Sequence[Level], setpoints: Sequence[Requested]
         if asked.missed or setpoint.step <= SAME or not inside:
             continue
         if arrival is None:
-            # An unshaped step has none: half a period on, when a shaped one would arrive.
+            # An unshaped step has no arrival: take half a period, that of a two-step command.
             arrival = inside[0].stamp + round(math.pi / setpoint.frequency * NANOSECONDS)
             inside = [x for x in inside if x.stamp <= arrival]
         if arrival < end:
@@ -200,7 +199,7 @@ def _plain(
     margin = 1e-6 * (min(upper, 2.0) - lower)
     start = min(max(start, lower + margin), upper - margin)
     try:
-        # By the same amplifier, coil and elastomer as in the run.
+        # With the amplifier, coil and elastomer of the run.
         stretch, rate, _ = response(
             replace(run.plant, creep=creep_of(run.parameters, run.joint)),
             _delivery(run, run.plant, 'plant'), begins,
@@ -212,7 +211,7 @@ def _plain(
 
 
 def _delivery(run: Run, actuator: ActuatorParameters, node: str) -> Delivery:
-    """Return how levels reach the coil of a node."""
+    """Return slew limit and lag between the levels of a node and the field."""
     unit = actuator.time_unit
     return Delivery(
         slew=run.number(f'{node}.slew_limit') / actuator.flux_density_unit * unit or math.inf,
@@ -220,7 +219,7 @@ def _delivery(run: Run, actuator: ActuatorParameters, node: str) -> Delivery:
 
 
 def _measure(run: Run, time: Array, plain: Curve, move: Move, zero: int) -> MoveResult:
-    """Measure one setpoint."""
+    """Evaluate one setpoint."""
     step = move.stretch - move.start
     begin, arrival, end = (
         (x - zero) / NANOSECONDS for x in (move.begin, move.arrival, move.end))
@@ -246,13 +245,13 @@ def _measure(run: Run, time: Array, plain: Curve, move: Move, zero: int) -> Move
 
 
 def _predict(run: Run, plan: Sequence[Level], stamps: Times) -> tuple[Array, Array]:
-    """Return what the plan predicts for some stamps: stretch and rate, from point to point."""
+    """Return the stretch and rate that the plan predicts, simulated from point to point."""
     predicted = np.full((2, len(stamps)), np.nan)
     actuator: ActuatorParameters = run.planner
     creep = creep_of(run.parameters, run.joint, PLANNER)
     material = replace(actuator, creep=creep).nondimensional
     lower, upper = stretch_limits(material)
-    # No block can be where the others are; a message of anything may have been recorded.
+    # A recorded message can contain impossible stretches.
     plan = [x for x in plan if lower < x.stretch < upper]
     if not plan:
         return predicted[0], predicted[1]
@@ -273,31 +272,31 @@ def _predict(run: Run, plan: Sequence[Level], stamps: Times) -> tuple[Array, Arr
             state = follow(
                 (level,), state, (until - point.stamp) / NANOSECONDS / unit, material, delivery)
         except HmsaError:
-            # A plan of other parameters than are known here: nothing to compare.
+            # The plan was made with other parameters than the run contains.
             continue
     return predicted[0], predicted[1] / unit
 
 
 @dataclass(frozen=True)
 class PlanPoint:
-    """A change of level in the plan, and what was recorded there; NaN for what is not."""
+    """A change of level in the plan and the recorded values there; NaN if not recorded."""
 
     time: float  #: in s of the run
     planned: float  #: flux density in T
-    commanded: float  #: with the same stamp, in T
-    stretch: float  #: predicted for the first sample from then on
-    rate: float  #: likewise, in 1/s
-    recorded_stretch: float  #: that sample
+    commanded: float  #: command with the same timestamp, in T
+    stretch: float  #: predicted for the first sample at or after the change
+    rate: float  #: predicted likewise, in 1/s
+    recorded_stretch: float  #: of that sample
     recorded_rate: float
-    deviation: float  #: largest of the recorded from the predicted stretch until the next
+    deviation: float  #: largest difference of recorded and predicted stretch until the next point
 
 
 def plan_points(run: Run, evaluation: Evaluation) -> list[PlanPoint]:
-    """Compare the plan of a run with what was recorded, by time."""
+    """Compare the plan of a run with the recorded motion, by time."""
     commanded = {x.stamp: x.flux_density for x in evaluation.levels}
     planned = evaluation.planned.at(evaluation.time)
     stretch, rate = planned.stretch, planned.rate
-    # Of each point the first sample, and behind the last point the end.
+    # The first sample of each point, then the end.
     firsts = [int(np.searchsorted(run.time, x.stamp)) for x in evaluation.plan]
     firsts.append(len(run.time))
     points = []

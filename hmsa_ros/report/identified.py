@@ -1,4 +1,4 @@
-"""An identification as one HTML page: data, fit, residuals, intervals, what is confounded."""
+"""The HTML page of an identification: data, fit, residuals, intervals and correlations."""
 
 import math
 from typing import Any
@@ -16,7 +16,7 @@ from hmsa_ros.report.page import document
 from hmsa_ros.table import Column, Table
 
 _LAGS = 60
-# Points of the fitted curve, in time units, and how many at most.
+# Spacing of the fitted curve in time scales, and its maximum number of points.
 _FINE, _MOST_FINE = 0.05, 20_000
 _HEADINGS = {
     'identified': 'identified', 'not_identifiable': 'not identifiable',
@@ -42,7 +42,7 @@ def page(found: Identification) -> str:
 
 def _samples(found: Identification, name: str, y: Array, inside: Any = slice(None),
              mode: str = 'markers') -> dict[str, Any]:
-    """Return a quantity at the samples, over time."""
+    """Return the trace of a quantity at the samples, over time."""
     time = _unit(found).of(found.recording.time)
     return curve(name, *decimate(time[inside], y[inside]), mode, marker={
         'size': 3 if len(time) > 200 else 6, 'color': BLUE}, line={'color': BLUE, 'width': 1.0})
@@ -79,7 +79,7 @@ def _motion(found: Identification) -> Figure:
 
 
 def _fitted(found: Identification) -> tuple[Array, Array]:
-    """Return times in s and stretch of the fit, between few samples too."""
+    """Return times in s and stretch of the fit, interpolated between sparse samples."""
     recording = found.recording
     begin, end = recording.time[[0, -1]]
     step = _FINE * found.values['time_unit']
@@ -94,7 +94,7 @@ def _fitted(found: Identification) -> tuple[Array, Array]:
 
 
 def _residuals(found: Identification) -> Figure:
-    """Return the residuals over time, outliers apart."""
+    """Return the residuals over time, with outliers marked."""
     out, residual = found.fit.weights == 0.0, found.fit.residual
     data = [_samples(found, 'residual', residual, ~out)]
     if np.any(out):

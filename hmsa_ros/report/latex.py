@@ -1,4 +1,4 @@
-"""Pictures that LaTeX inputs, written without LaTeX."""
+"""Write PGF figures for LaTeX without a LaTeX installation."""
 
 import io
 from pathlib import Path
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 
 class _Words(RendererPgf):
-    """Measures words as the other pictures do, so that no LaTeX is needed to write a file."""
+    """A PGF renderer that measures text with Agg instead of LaTeX."""
 
     def __init__(self, figure: Figure, file: Any) -> None:
         super().__init__(figure, file)  # type: ignore[no-untyped-call]
@@ -26,7 +26,7 @@ class _Words(RendererPgf):
 
 
 class _File(io.StringIO):
-    """A text in memory with the name of a file, beside which images of the picture go."""
+    """A text buffer with a file name; the backend writes images of the figure next to it."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -34,7 +34,7 @@ class _File(io.StringIO):
 
 
 def pgf(figure: Figure, path: Path) -> str:
-    """Return a picture that LaTeX inputs; images in it are written beside the path."""
+    """Return a figure as PGF; images in it are written next to the path."""
     file = _File(path)
     width, height = (float(x) for x in figure.get_size_inches())
     file.write(

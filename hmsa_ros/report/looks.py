@@ -1,8 +1,8 @@
 """
-What each kind of curve looks like, on every page and in every picture.
+Line styles of each kind of curve, for all pages and figures.
 
-Curves differ in colour and in dash or marker. The colours are distinct for deuteranopia and
-protanopia, too.
+Curves differ in colour and in dash or marker. The colours remain distinct with deuteranopia and
+protanopia.
 """
 
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from typing import Any
 BLACK, GREY, BLUE, VERMILION = '#000000', '#717171', '#0072B2', '#D55E00'
 GREEN, SKY_BLUE, ORANGE, PURPLE = '#264825', '#58BFFC', '#FFA900', '#590058'
 INDIGO, SILVER = '#2B098B', '#B0B0B0'
-#: Colours that have another where the background is dark.
+#: Replacements of colours in dark mode.
 DARK = {
     BLUE: '#4DABE8', ORANGE: '#F2B93B', GREEN: '#7DB07C', PURPLE: '#E08FE0',
     SKY_BLUE: '#B5E2FF', VERMILION: '#FF8A4A', BLACK: '#F0F0F0', GREY: '#9A9A9A'}
@@ -19,22 +19,22 @@ DARK = {
 
 @dataclass(frozen=True)
 class Look:
-    """How a curve is drawn."""
+    """The style of a curve."""
 
     colour: str
     width: float = 1.4  #: in pt
-    dash: tuple[float, ...] = ()  #: on and off in widths of the line; solid without
-    marker: str = ''  #: as matplotlib names it
-    order: int = 2  #: what is drawn later lies above
+    dash: tuple[float, ...] = ()  #: on and off in line widths; empty for a solid line
+    marker: str = ''  #: matplotlib's name
+    order: int = 2  #: curves of higher order are drawn on top
 
     def line(self, **more: Any) -> dict[str, Any]:
-        """Return the line as matplotlib takes it, without the marker."""
+        """Return matplotlib's line properties, without the marker."""
         return {
             'color': self.colour, 'linewidth': self.width, 'zorder': self.order,
             'linestyle': (0, self.dash) if self.dash else '-', **more}
 
     def plotly(self) -> dict[str, Any]:
-        """Return the line as Plotly takes it."""
+        """Return Plotly's line properties."""
         dash = ','.join(f'{x * max(self.width, 1.0):g}px' for x in self.dash)
         return {'color': self.colour, 'width': 1.3 * self.width} | (
             {'dash': dash} if dash else {})
@@ -47,7 +47,7 @@ FIELD = Look(ORANGE, 1.1, (6.0, 1.5, 1.0, 1.5))
 TARGET = Look(GREY, 0.9, (2.0, 2.0), order=1)
 ARRIVAL = Look(BLACK, 0.8, (1.0, 1.5), order=1)
 
-#: Of the shapers, by name; `ordered` has those of several orders.
+#: Styles of the shapers, by name.
 SHAPERS = {
     'two_step': Look(BLUE, 1.8, (), 'o', 6),
     'robust': Look(GREEN, 1.3, (5.0, 1.5), 's', 5),
@@ -60,14 +60,14 @@ SHAPERS = {
     'ei': Look(BLACK, 1.0, (6.0, 1.0, 1.0, 1.0, 1.0, 1.0), '>', 3),
     'umzv': Look(PURPLE, 1.2, (1.0, 2.5), 'p', 3),
 }
-#: Curves without a name of their own, such as those of several runs, one after the other.
+#: Styles of unnamed curves, such as those of several runs, in order.
 CASES = tuple(SHAPERS[x] for x in (
     'two_step', 'step', 'robust', 'minimum_time', 'umzv', 'ei', 'minimax', 'zvd'))
 RUNS = tuple(x.colour for x in CASES)
 
 
 def case(number: int) -> Look:
-    """Return the look of a curve by its number from 0: of `CASES`, then of those dashed anew."""
+    """Return the style of a curve by its index: `CASES`, then the same with other dashes."""
     turn, place = divmod(number, len(CASES))
     other = CASES[(place + 3 * turn) % len(CASES)]
     return replace(CASES[place], dash=other.dash, marker=other.marker)

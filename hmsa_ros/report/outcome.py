@@ -1,4 +1,4 @@
-"""What samples of a run show: of each setpoint as it was requested, and of each level."""
+"""Results of each requested setpoint and of each level of a run."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,16 +18,16 @@ from hmsa_ros.table import Column, Table
 
 _LEFT_OUT = 'no time was left for it'
 _SENSOR = Sensor()
-# Later than any stamp, in ns.
+# Later than any timestamp, in ns.
 _END = 2**62
-# Rows of the table of levels.
+# Maximum number of rows in the table of levels.
 _MOST_LEVELS = 12
 
 
 def findings_of(
         run: Run, tolerances: Tolerances | None = None, *,
         asked: Sequence[Requested] | None = None) -> list[Finding]:
-    """Judge each setpoint that was requested, by default as the planner of the run did."""
+    """Judge each requested setpoint, by default with the tolerances of the run's planner."""
     if tolerances is None:
         own = {x: number_of(of_joint(run.parameters, run.joint, f'planner.{x}_tolerance'))
                for x in ('arrival', 'vibration', 'stretch')}
@@ -36,14 +36,14 @@ def findings_of(
 
 
 def _judged(run: Run, asked: Requested, tolerances: Tolerances) -> Finding:
-    """Judge a setpoint as the planner does while samples and plans come in."""
+    """Judge a setpoint as the planner does, with samples and plans in order of arrival."""
     joints = run.parameters.get('planner.joints')
     several = isinstance(joints, list) and len(joints) > 1
     hold = Hold(replace(
         asked.setpoint, joint=run.joint if several else '', held=asked.last))
     moves, sensors = list(asked.moves), list(run.sensors)
     sensor = _SENSOR
-    # Beside a planner the clock of the samples is held against the recorder's.
+    # How far the clock of the samples is ahead of the recorder's; only plans need it.
     ahead = max(int(np.median(run.time - run.logged)), 0) if run.plans else 0
 
     def move_until(sent: float) -> None:
@@ -72,7 +72,7 @@ def _judged(run: Run, asked: Requested, tolerances: Tolerances) -> Finding:
     move_until(math.inf)
     patience = _END
     while not hold.over:
-        # No more samples are to come.
+        # All samples have been added.
         hold.judge(_END, patience, tolerances, sensor, observable=False)
         patience *= 2
     return hold.found or unobserved(hold.setpoint)
@@ -80,22 +80,22 @@ def _judged(run: Run, asked: Requested, tolerances: Tolerances) -> Finding:
 
 @dataclass(frozen=True)
 class LevelResult:
-    """A level of the field, measured."""
+    """The measured stretch at one level of the field."""
 
-    joint: str  #: empty if it is not known
+    joint: str  #: empty if unknown
     flux_density: float  #: in T
-    times: int  #: how often it was in force; the one at the end of the run counts apart
-    duration: float  #: in s, of all times
-    #: stretch that it holds by the parameters in the run; NaN beyond the law of the block
+    times: int  #: number of intervals; the last interval of the run has a row of its own
+    duration: float  #: total, in s
+    #: equilibrium stretch according to the run's parameters; NaN outside the model's range
     rest: float
-    #: measured stretch while it was in force; NaN without samples
+    #: measured stretch in these intervals; NaN without samples
     mean: float
     least: float
     greatest: float
 
 
 def level_results(run: Run) -> list[LevelResult]:
-    """Measure each level of a run, equal ones together, in the order in which they came first."""
+    """Return the results of each level in order of first use, combining equal levels."""
     levels = [x for x in run.levels if x.stamp <= run.time[-1]]
     ends = [*(x.stamp for x in levels[1:]), int(run.time[-1]) + 1]
     groups: dict[tuple[float, bool], list[tuple[int, int]]] = {}
@@ -117,7 +117,7 @@ def level_results(run: Run) -> list[LevelResult]:
 
 
 def level_table(levels: Sequence[LevelResult], drive: Drive = FLUX) -> Table:
-    """Return the table of the levels that were in force for the longest."""
+    """Return the table of the levels with the longest durations."""
     longest = sorted(levels, key=lambda x: -x.duration)[:_MOST_LEVELS]
     chosen = [x for x in levels if x in longest or x is levels[-1]]
     short = len(levels) - len(chosen)

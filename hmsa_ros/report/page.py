@@ -1,7 +1,7 @@
 """
-A report as one HTML page that needs nothing else: no network, no other file.
+A report as one self-contained HTML page.
 
-What the page may load is nailed down in its content security policy, too.
+The page needs no network and no other file; its content security policy enforces this.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -31,15 +31,23 @@ from hmsa_ros.report.evaluation import FEW_SAMPLES, plan_points
 from hmsa_ros.table import Column, Table
 
 _FOLDER = Path(__file__).parent
-# Plans and requests of long runs are cut here; the figures show all of them.
+# Maximum rows of the tables of plan and requests; figures show all of them.
 _MOST_ROWS = 1000
 _MOST_FINDINGS = 8
-# Stamps beyond this many seconds are dates.
+# Larger timestamps, in s, are dates; smaller ones are simulated time.
 _A_DATE = 1e8
 
 
 def page(parts: Sequence[Part]) -> str:
-    """Return a report on one run or several, as HTML; fails if Plotly is not installed."""
+    """
+    Return the report of one run or several as HTML.
+
+    Raises
+    ------
+    HmsaError
+        If Plotly is not installed.
+
+    """
     unit = charts.time_unit(parts)
     phase, shown = charts.phase(parts)
     drawn = {'response': charts.response(parts, unit), 'phase': phase}
@@ -72,7 +80,7 @@ def page(parts: Sequence[Part]) -> str:
 
 
 def document(template: str, title: str, figures: Sequence[Figure], **values: Any) -> str:
-    """Return a page, as HTML, from a template that places the figures; it needs nothing else."""
+    """Return a self-contained HTML page from a template that places the figures."""
     data = json.dumps(
         {'figures': [
             {'key': x.key, 'height': x.height, 'data': x.data, 'layout': x.layout}
@@ -86,18 +94,18 @@ def document(template: str, title: str, figures: Sequence[Figure], **values: Any
         title=title, version=__version__, figures=figures, plotly=_plotly(),
         style=(_FOLDER / 'page.css').read_text(encoding='utf-8'),
         script=(_FOLDER / 'page.js').read_text(encoding='utf-8'),
-        # Inside a script "</" could end it, and "<!--" keep it from ending.
+        # In a script, "</" could close it, and "<!--" could keep it open.
         data=data.replace('<', '\\u003c'), **values)
 
 
 def _numeric(table: Table) -> list[bool]:
-    """Return of each column whether it has numbers."""
+    """Return whether each column contains numbers."""
     return [any(not isinstance(row[i], str) for row in table.rows)
             for i in range(len(table.columns))]
 
 
 def _plotly() -> str:
-    """Return the library that draws."""
+    """Return the source of Plotly.js."""
     try:
         from plotly.offline import get_plotlyjs  # type: ignore[import-untyped]
 
@@ -106,12 +114,12 @@ def _plotly() -> str:
         raise HmsaError(
             f'the page cannot be drawn without Plotly ({error}): install it with '
             '"pip install plotly"') from error
-    # The closing tag may stand in its strings; in JavaScript the two spellings are one.
+    # Its strings may contain the closing tag; in JavaScript both spellings mean the same.
     return script.replace('</script', '<\\/script')
 
 
 def _time(nanoseconds: int) -> str:
-    """Return a time as a date, or as seconds where it is simulated."""
+    """Return a time as a date, or in seconds if simulated."""
     seconds = nanoseconds / NANOSECONDS
     if seconds < _A_DATE:
         return f'{seconds:.6f} s (simulated time)'
@@ -119,13 +127,13 @@ def _time(nanoseconds: int) -> str:
 
 
 def _source(run: Run) -> tuple[str, ...]:
-    """Return where a run is from: label, path, topic of its samples, start and length in s."""
+    """Return the source of a run: label, path, topic of its samples, start, and length in s."""
     return (run.label, str(run.path), run.topics.get('joint_states', run.origin),
             _time(int(run.time[0])), f'{(run.time[-1] - run.time[0]) / NANOSECONDS:.6g}')
 
 
 def _summary(parts: Sequence[Part]) -> list[tuple[str, str]] | Table:
-    """Return the figures that say most: of one run with their names, of several as a table."""
+    """Return the key figures: pairs of value and name for one run, a table for several."""
     def largest(values: Iterable[float]) -> float:
         return max((x for x in values if math.isfinite(x)), default=math.nan)
 
@@ -148,14 +156,14 @@ def _summary(parts: Sequence[Part]) -> list[tuple[str, str]] | Table:
 
 
 def _notes(parts: Sequence[Part]) -> list[str]:
-    """Return what a reader should know."""
+    """Return the remarks on all runs."""
     return [
         f'{x.run.label}: {note}' if len(parts) > 1 else note
         for x in parts for note in _notes_of(x)]
 
 
 def _notes_of(part: Part) -> Iterable[str]:
-    """Return the notes on one run."""
+    """Yield the remarks on one run."""
     yield from part.run.notes
     yield from [x.message for x in part.evaluation.findings if not x.arrived][:_MOST_FINDINGS]
     if part.run.commands and not part.evaluation.results:
@@ -186,7 +194,7 @@ def _notes_of(part: Part) -> Iterable[str]:
 # Tables --------------------------------------------------------------------------------------
 
 def _table(columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]) -> Table:
-    """Return a table by headings with formats; a run on its own needs no name in every row."""
+    """Return a table from headings with formats; for a single run without the column of labels."""
     names = tuple(Column(name, form=form) for name, form in columns.items())
     if names[0].name in ('run', 'bag') and len({row[0] for row in rows}) <= 1:
         names, rows = names[1:], [row[1:] for row in rows]
@@ -194,7 +202,7 @@ def _table(columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]) -> Table
 
 
 def _setpoints(parts: Sequence[Part]) -> Table:
-    """Return the table of the setpoints and their results."""
+    """Return the table of setpoints and results."""
     rows: list[tuple[Any, ...]] = []
     for part in parts:
         moves = {x.place: (x, y) for x, y in zip(
@@ -256,7 +264,7 @@ def _plan(parts: Sequence[Part], unit: TimeUnit) -> Table:
 
 
 def _timing(parts: Sequence[Part]) -> Table:
-    """Return the table of times."""
+    """Return the table of leads, delays and intervals."""
     rows = [
         (part.run.label, name, len(values), *np.quantile(values, [0.0, 0.5, 0.99, 1.0]) * 1e3,
          np.std(values) * 1e3)
@@ -272,7 +280,7 @@ def _timing(parts: Sequence[Part]) -> Table:
 
 
 def _losses(parts: Sequence[Part]) -> Table:
-    """Return the table of topics, those of each bag once."""
+    """Return the table of topics, once for each bag."""
     bags = {x.run.path: x.run for x in reversed(parts)}
     return _table({
         'bag': '', 'topic': '', 'type': '', 'messages': 'd', 'a second': '.1f', 'lost': 'd'}, [
@@ -284,7 +292,7 @@ def _losses(parts: Sequence[Part]) -> Table:
 
 
 def _given(value: object) -> float | str:
-    """Return a constant of a law as a cell shows it; Gent has none."""
+    """Return a constant of a hyperelastic model as shown in a cell; '-' if it has none."""
     if isinstance(value, list) and len(value) > 6:
         return f'{len(value)} values, {min(value):.6g} to {max(value):.6g}'
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""What a picture is made for: its width on paper, the size of its letters, and its format."""
+"""The width, font size and format of a figure."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,19 +6,19 @@ from pathlib import Path
 
 from hmsa_ros.errors import BadInputError
 
-#: Formats of pictures: pixels, lines as PDF and SVG, and commands for LaTeX.
+#: Formats of figures; ``pgf`` is for LaTeX.
 KINDS = ('png', 'pdf', 'svg', 'pgf')
-#: What journals ask for, in mm: a column, one and a half, and two.
+#: Widths of journal figures in mm: one, one and a half, and two columns.
 WIDTHS = (85.0, 120.0, 183.0)
 _INCH = 25.4
-# Width in mm that a panel needs at least, at 8 pt.
+# Minimum width of a panel in mm, at 8 pt.
 _PANEL = 55.0
 
 
 @dataclass(frozen=True)
 class Paper:
     """
-    The size of a picture, and whether its data is written beside it.
+    The size of a figure, and whether its data is written to a CSV file.
 
     Raises
     ------
@@ -28,9 +28,9 @@ class Paper:
     """
 
     width: float = WIDTHS[-1]  #: in mm, 40 to 400
-    letters: float = 8.0  #: size of the letters in pt, 4 to 24
+    letters: float = 8.0  #: font size in pt, 4 to 24
     dpi: float = 600.0  #: of PNG, 50 to 1200
-    data: bool = False  #: whether what is drawn is written as CSV, too
+    data: bool = False  #: whether the plotted data are also written as CSV
 
     def __post_init__(self) -> None:
         for name, value, unit, least, most in (
@@ -48,22 +48,22 @@ class Paper:
         return self.width / _INCH
 
     def columns(self, most: int) -> int:
-        """Return how many panels fit beside each other, 1 to ``most``."""
+        """Return how many panels fit side by side, 1 to ``most``."""
         return max(1, min(most, int(self.width * 8.0 / self.letters // _PANEL)))
 
 
-#: Of the pictures that a page of the documentation shows.
+#: Figures of the documentation.
 SCREEN = Paper(dpi=200.0)
 
 
 def kind_of(path: Path) -> str:
     """
-    Return the format of a picture by the end of its name.
+    Return the format of a figure by the suffix of its path.
 
     Raises
     ------
     BadInputError
-        If it is none of `KINDS`.
+        If the suffix is not one of `KINDS`.
 
     """
     kind = path.suffix.lower().removeprefix('.')
@@ -76,7 +76,7 @@ def kind_of(path: Path) -> str:
 
 def kinds_in(text: str) -> tuple[str, ...]:
     """
-    Return the formats in a text with commas between them.
+    Return the formats in a comma-separated list.
 
     Raises
     ------
@@ -88,5 +88,5 @@ def kinds_in(text: str) -> tuple[str, ...]:
 
 
 def named(folder: Path, name: str, kinds: Sequence[str]) -> list[Path]:
-    """Return the files of a picture in a folder, one for each format."""
+    """Return the paths of a figure in a folder, one for each format."""
     return [folder / f'{name}.{x}' for x in kinds]

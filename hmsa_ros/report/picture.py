@@ -1,4 +1,4 @@
-"""Runs as pictures: command, response, phase plane, and the arrivals with most residual."""
+"""Draw runs: command, response, phase plane, and the arrivals with the largest residuals."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,19 +22,19 @@ from hmsa_ros.report.charts import commanded, time_unit, TimeUnit
 from hmsa_ros.report.curves import Curve, decimate
 from hmsa_ros.report.paper import Paper
 
-# Samples are drawn as points where there are so many in a panel at most.
+# Maximum number of samples in a panel that are also drawn as points.
 _MOST_SAMPLES = 200
-# Dashes of more periods than these in a panel would run into each other.
+# Maximum number of periods in a panel for dashed lines; above it, lines are solid and thin.
 _DASHED, _THIN = 25.0, 0.6
-# What follows the last arrival is shown for so many durations of its move where nothing but rest,
-# within a share of the step, follows.
+# Time shown after the last arrival, in durations of the move, if only rest follows: deviations
+# within this fraction of the step.
 _REST, _STILL = 8.0, 0.02
 
 
 def draw(
         paths: Path | Sequence[Path], parts: Sequence[Part],
         paper: Paper | None = None) -> style.Picture:
-    """Draw runs, as many arrivals as fit beside each other; return the figure."""
+    """Draw runs with as many arrivals as fit side by side; return the figure."""
     paper = paper or Paper()
     unit = time_unit(parts)
     columns = paper.columns(3)
@@ -45,7 +45,7 @@ def draw(
         rows = [[x] * 6 for x in ('command', 'response', 'phase')]
     heights = [1.0, 1.45, 1.6][:len(rows)]
     if shown:
-        # Where there are fewer, they are wider.
+        # Fewer arrivals get wider panels.
         rows.append([f'arrival{i}' for i in shown for _ in range(6 // len(shown))])
         heights.append(1.3)
     letters = paper.letters / 8.0
@@ -54,7 +54,7 @@ def draw(
         axes: dict[str, Axes] = figure.subplot_mosaic(
             rows, height_ratios=heights)  # type: ignore[arg-type]
         for number, part in enumerate(parts):
-            # The first is solid: those that agree with it lie above, and are seen in its gaps.
+            # The first run is solid: dashed curves on top of it remain distinguishable.
             look = looks.RECORDED if len(parts) == 1 else replace(
                 looks.case(number), order=looks.RECORDED.order)
             _draw_run(axes, part, unit, look, times, alone=len(parts) == 1)
@@ -83,7 +83,7 @@ def draw(
                 style.axis('error', unit='% of step') if i == shown[0] else '', letter)
             panel.set_title(_title(parts, i), loc='right', fontsize='small')
         figure.align_ylabels([axes['command'], axes['response']])
-        # Where curves are dense they lose their dashes, so that the response comes last.
+        # The response comes last because dense curves lose their dashes.
         style.legend_below(
             figure, *(x for key, x in axes.items() if key not in ('command', 'response')),
             axes['response'])
@@ -91,7 +91,7 @@ def draw(
 
 
 def _shown_times(parts: Sequence[Part]) -> tuple[float, float]:
-    """Return from when to when a run is shown, in s: without what is at rest at both ends."""
+    """Return the range of times to show in s, without the rest at both ends."""
     begins, ends = [], []
     for part in parts:
         found = part.evaluation
@@ -102,7 +102,7 @@ def _shown_times(parts: Sequence[Part]) -> tuple[float, float]:
             after = found.recorded.between(quiet, end).stretch
             if len(after) and np.nanmax(np.abs(after - last.stretch)) <= _STILL * abs(last.step):
                 end = quiet
-        # The first level is a step, which needs room before it.
+        # Leave room for the step to the first level.
         begins.append(max(begin, -0.06 * end) if end > 0.0 else begin)
         ends.append(end)
     begin, end = min(*begins, -0.02 * max(ends)), max(ends)
@@ -112,7 +112,7 @@ def _shown_times(parts: Sequence[Part]) -> tuple[float, float]:
 def _draw_recorded(
         panel: Axes, part: Part, curve: tuple[Any, Any], samples: tuple[Any, Any],
         look: looks.Look, *, alone: bool, **more: Any) -> None:
-    """Draw the curve through the samples, and these where they are few."""
+    """Draw the curve through the samples, and the samples as points if they are few."""
     label = part.run.origin if alone else part.run.label
     panel.plot(*curve, **{**look.line(), **more}, label=label)
     exact = part.run.origin == 'simulated' and not part.run.number('plant.stretch_noise')
@@ -141,7 +141,7 @@ def _draw_run(
     dense: dict[str, Any] = {} if times[1] - times[0] <= _DASHED * run.plant.period else {
         'linestyle': '-', 'linewidth': _THIN}
     if alone:
-        # Several runs are compared by what was recorded.
+        # Of several runs only the recorded curves are compared.
         for panel, x, y, more in (
                 ('response', *decimate(unit.of(plain.time), plain.stretch), dense),
                 ('phase', plain.stretch, plain.rate, {})):
@@ -176,7 +176,7 @@ def _draw_arrival(
     _draw_recorded(
         panel, part, decimate(*shown(found.recorded)),
         shown(Curve(found.time, part.run.stretch, part.run.rate)), look, alone=alone)
-    # Of an unshaped step it is when a shaped one would have arrived.
+    # For an unshaped step, the arrival of a two-step command.
     panel.axvline(1e3 * result.arrival, **style.ARRIVAL, label='end of the move')
 
 

@@ -1,4 +1,4 @@
-"""Repeats of a sequence: mean and spread of what they left."""
+"""Statistics of repeated sequences: vibration and steady-state error."""
 
 from collections.abc import Mapping, Sequence
 import math
@@ -21,7 +21,7 @@ def repeats_in(folder: Path) -> list[Path]:
 
 
 def statistics(each: Sequence[Sequence[Finding]]) -> list[dict[str, Any]]:
-    """Return mean, standard deviation and largest size of what repeats left, by setpoint."""
+    """Return mean, standard deviation and largest of vibration and offset, by setpoint."""
     found = []
     for group in zip(*each, strict=False):
         row: dict[str, Any] = {
@@ -41,7 +41,7 @@ def statistics(each: Sequence[Sequence[Finding]]) -> list[dict[str, Any]]:
 
 def statistics_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> Table:
     """
-    Return the statistics of one or more runs by label, setpoint by setpoint.
+    Return a table of the statistics of one or more runs, by setpoint and label.
 
     Raises
     ------
