@@ -1,1 +1,1 @@
-"""Sessions: node processes started together, and a client that talks to the planner."""
+"""Sessions of node processes, and a client of the planner."""

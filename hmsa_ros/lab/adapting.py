@@ -1,8 +1,8 @@
 """
-The demonstration's second act: an actuator that is not as planned, open loop and adapting.
+Second part of the demo: an actuator that differs from its model, in open loop and adapting.
 
-Planner and simulated plant run in one loop, as in ``hmsa controller`` but without ROS and in
-simulated time. The block is ten times as long as that of the first act, so that a camera sees its
+Planner and simulated plant run in one loop, as in ``hmsa controller``, but without ROS and in
+simulated time. The block is ten times as long as in the first part, so that a camera resolves its
 first move.
 """
 
@@ -21,11 +21,11 @@ from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Options, Planner
 
-#: Factor on the shear modulus that the planner does not know.
+#: Error factor of the shear modulus, unknown to the planner.
 FACTOR = 1.2
 _TARGETS, _HOLD = (1.4, 1.1), 0.8
 _MS, _JOINT = 1_000_000, 'actuator'
-# A camera of 200 Hz, 10 ms late, with noise and bias of stretch; and how far ahead commands go.
+# A camera at 200 Hz with 10 ms delay, noise and bias of the stretch; lead time of commands.
 _PERIOD, _DELAY, _LEAD = 5 * _MS, 10 * _MS, 2 * _MS
 _ERRORS = SensorErrors(stretch_noise=1e-3, stretch_bias=1e-3)
 _LIMIT = 0.5
@@ -33,7 +33,7 @@ _LIMIT = 0.5
 
 @dataclass(frozen=True)
 class AdaptingResult:
-    """One move: vibration after its arrival, and rest beside the target, as shares of the step."""
+    """Residual vibration and steady-state error of one move, as fractions of the step."""
 
     feedback: str
     stretch: float
@@ -44,7 +44,7 @@ class AdaptingResult:
 
 def _carry_out(
         block: ActuatorParameters, feedback: str) -> tuple[Array, list[AdaptingResult]]:
-    """Make the moves; return time in s with true stretch, and what is left of each."""
+    """Make the moves; return time in s with true stretch, and the result of each move."""
     true = replace(block, shear_modulus=FACTOR * block.shear_modulus)
     planner = Planner(block, Options(
         flux_density_min=-_LIMIT, flux_density_max=_LIMIT, lead_time=_LEAD))
@@ -58,7 +58,7 @@ def _carry_out(
     for target in _TARGETS:
         begin = loop.now
         loop.runtime.request(Target(_JOINT, target))
-        # As planned before anything is corrected.
+        # The arrival as planned, before any correction.
         arrival = (planner.plan.segments[-1].arrival or begin) * 1e-9
         while loop.now < begin + _HOLD * 1e9:
             loop.run(loop.now + _MS)
@@ -73,7 +73,7 @@ def _carry_out(
 
 
 def second_act(picture: Path) -> tuple[AdaptingResult, ...]:
-    """Run it with feedback off and adapt, and draw both."""
+    """Run the moves with feedback off and adapt, and plot both."""
     from hmsa_ros.report import style
     from hmsa_ros.report.paper import SCREEN
 

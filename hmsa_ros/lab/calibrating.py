@@ -1,4 +1,4 @@
-"""Guided runs on a bench: how late field and samples are, and what a slow staircase holds."""
+"""Guided runs on a bench: delays of field and samples, and a slow staircase of levels."""
 
 from collections.abc import Callable, Sequence
 import math
@@ -18,19 +18,19 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.units import NANOSECONDS
 
-Tell = Callable[[str, float], None]
-# Durations of levels in periods of the actuator, and at least in s.
+Progress = Callable[[str, float], None]
+# Duration of levels in periods of the actuator, and minimum in s.
 _PERIODS, _SHORTEST = (0.8, 1.6), 0.12
-# Levels as shares of the limit: in turn one of the first and one of the second range.
+# Ranges of levels as fractions of the limit, used alternately.
 _HIGH, _LOW = (0.6, 1.0), (-0.4, 0.2)
-# In s, between readings of a probe that does not wait for one itself.
+# Time in s between readings of a non-blocking probe.
 _PAUSE = 2e-4
-# How often samples of a level are waited for.
+# Number of further waits for samples at a level.
 _PATIENCE = 10
 
 
 class _Reader:
-    """Reads a probe all the time, in a thread; times in ns, field in T."""
+    """Read a probe continuously in a thread; times in ns, field in T."""
 
     def __init__(self, probe: Any) -> None:
         self._probe, self._over = probe, Event()
@@ -47,12 +47,12 @@ class _Reader:
                 middle = (begun + time_ns()) // 2
                 self.seen += [(middle if x.stamp is None else x.stamp, x.stretch)
                               for x in readings(answer)]
-            except BaseException as error:  # whatever a laboratory's class raises
+            except BaseException as error:  # any error of the laboratory's class
                 self.failure = f'{type(self._probe).__name__}.read raised {described(error)}'
                 return
 
     def close(self) -> Array:
-        """Stop; return what was read, shape (n, 2); a probe that failed is an `HmsaError`."""
+        """Stop; return the readings, shape (n, 2); raise `HmsaError` if the probe failed."""
         self._over.set()
         self._thread.join()
         if self.failure:
@@ -62,7 +62,7 @@ class _Reader:
 
 
 def steps_of(actuator: ActuatorParameters, limit: float, count: int) -> list[tuple[float, float]]:
-    """Return levels in T and how long each is held in s, so that all phases of samples occur."""
+    """Return levels in T with durations in s that cover all phases of the samples."""
     random, period = np.random.default_rng(0), actuator.period
     return [(limit * random.uniform(*(_LOW if i % 2 else _HIGH)),
              max(period * random.uniform(*_PERIODS), _SHORTEST * random.uniform(1.0, 1.5)))
@@ -71,34 +71,34 @@ def steps_of(actuator: ActuatorParameters, limit: float, count: int) -> list[tup
 
 def measure_delays(
         bench: Bench, steps: Sequence[tuple[float, float]], probe: Any,
-        actuator: ActuatorParameters, lag: float | None, progress: Tell) -> Delays:
+        actuator: ActuatorParameters, lag: float | None, progress: Progress) -> Delays:
     """
-    Step through levels, and tell transport, lag and latency apart.
+    Step through levels, and determine transport delay, lag and latency.
 
     Parameters
     ----------
     bench : Bench
-        With what is measured.
+        Bench with the hardware.
     steps : sequence of (float, float)
-        Levels in T, and how long each is held in s.
+        Levels in T, and their durations in s.
     probe : object or None
         Has ``read``, which returns a field in T, or a list of (field in T, NaN, time in ns).
     actuator : ActuatorParameters
-        As far as it is known.
+        Approximate parameters.
     lag : float or None
         Known lag of the field in s.
     progress : callable
-        Called with what is going on and the share that is done.
+        Called with the current activity and the completed fraction.
 
     Returns
     -------
     Delays
-        As far as they can be told apart.
+        The delays, as far as they can be separated.
 
     Raises
     ------
     HmsaError
-        If hardware or probe fail, or the recording shows too little.
+        If hardware or probe fail, or the recording is insufficient.
 
     """
     seen = Seen([], [], [])
@@ -136,31 +136,31 @@ def measure_delays(
 
 def hold_staircase(
         bench: Bench, limit: float, steps: int, settle: float,
-        gauge: Callable[[float], float] | None, progress: Tell
+        gauge: Callable[[float], float] | None, progress: Progress
 ) -> tuple[Array, Array, Array, float]:
     """
-    Hold a slow staircase of levels up, down and back.
+    Apply a slow staircase of levels up, down and back.
 
     Parameters
     ----------
     bench : Bench
-        With what is measured.
+        Bench with the hardware.
     limit : float
         Largest level in T.
     steps : int
-        Levels on each quarter.
+        Number of levels in each quarter.
     settle : float
-        Time in s at each level, of which the second half counts.
+        Duration in s of each level, of which the second half is evaluated.
     gauge : callable or None
         Called with a level in T; returns the length of the actuator.
     progress : callable
-        Called with what is going on and the share that is done.
+        Called with the current activity and the completed fraction.
 
     Returns
     -------
     (ndarray, ndarray, ndarray, float)
-        Levels in T, stretches, lengths (NaN without a gauge), and by how much the stretch still
-        went at the end of a level at most, as a share of the range.
+        Levels in T, stretches, lengths (NaN without a gauge), and the largest remaining drift of
+        the stretch at the end of a level, as a fraction of the range.
 
     Raises
     ------
@@ -179,7 +179,7 @@ def hold_staircase(
                      for y in (0.5, 0.75)]
             if parts[1]:
                 break
-            # On a busy machine samples are late.
+            # Samples are late on a busy machine.
             seen = seen.joined(bench.hold(LEAD, []))
         if not parts[1]:
             raise HmsaError(

@@ -1,4 +1,4 @@
-"""A client of the planner: sends a sequence, reads the verdict, follows the progress."""
+"""A client of the planner: sends a sequence, receives the verdict, tracks the progress."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -29,22 +29,22 @@ from hmsa_ros.nodes.presence import LATELY_SECONDS, Presence
 from hmsa_ros.nodes.service_call import ServiceCall
 from hmsa_ros.nodes.visitor import SLICE_SECONDS, Visitor
 
-# How long a planner whose node is there may take to listen: it configures itself in a fraction of
-# a second, which a machine that is busy with much else stretches.
+# Time in s for an existing planner node to subscribe: configuration takes a fraction of a second,
+# much longer on a busy machine.
 _LISTENS_SECONDS = 60.0
-# To come to rest, perhaps in slow motion; and until a planner that does not answer is gone.
+# Time limits in s for coming to rest, perhaps in slow motion, and for a planner without answer.
 _STOP_SECONDS = 15.0
 _GONE_SECONDS = 3.0
-# How long a recorder is seen before it is taken to hear.
+# Time in s from discovery of a recorder until it is assumed to receive.
 _SETTLED_SECONDS = 1.0
-# Until all nodes of the host are seen.
+# Time in s until all nodes of the host are discovered.
 _DISCOVERY_SECONDS = 0.6
 _OTHERS = (
     'another planner, plant or driver is running, which a simulated run must not command: stop '
     'it, or set another ROS_DOMAIN_ID')
-# Nodes that were killed have left the graph after this time.
+# Time in s after which killed nodes have left the graph.
 _FORGOTTEN_SECONDS = 22.0
-# Whoever carries out commands may not have been found yet.
+# Time in s to discover the subscriber of the commands.
 _UNHEARD_SECONDS = 3.0
 
 
@@ -53,7 +53,7 @@ _SILENCE = Verdict(0, 'no reply from the planner yet', '', '', '', 0, 0)
 
 class PlannerClient(Visitor):
     """
-    Talks to one planner; a context manager.
+    A client of one planner; a context manager.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class PlannerClient(Visitor):
     joints : sequence of str
         Names of its joints.
     timeout : float
-        Patience with a silent planner in s.
+        Time in s to wait for the planner.
 
     """
 
@@ -73,9 +73,9 @@ class PlannerClient(Visitor):
         self._begin = monotonic()
         self._joints = tuple(joints)
         self._namespace = namespace
-        #: What the planner said last.
+        #: Last verdict of the planner.
         self.verdict: Verdict = _SILENCE
-        #: The request that was sent last.
+        #: Name of the last request.
         self.requested = ''
         endpoints.subscribe(self.node, topics.STATUS, self._on_status, topics.PLANNER)
         self._publisher = endpoints.publisher(
@@ -85,7 +85,7 @@ class PlannerClient(Visitor):
         self.verdict = Verdict.read(message)
 
     def find_planner(self, each: Callable[[], None] | None = None) -> None:
-        """Wait until a planner listens and its status has arrived, and call ``each`` meanwhile."""
+        """Wait until a planner subscribes and its status has arrived; call ``each`` meanwhile."""
         where = self._namespace or '/'
         failure = (
             f'no planner in namespace {where}; start one with hmsa planner, with the same '
@@ -95,7 +95,7 @@ class PlannerClient(Visitor):
             return (self.verdict is not _SILENCE
                     and self._publisher.get_subscription_count() > 0)
 
-        # One whose node is there but does not listen yet is still starting.
+        # A node that does not subscribe yet is still starting.
         self.spin_until(lambda: found() or self._is_there(topics.PLANNER), failure, each)
         state = ServiceCall(
             self.node, GetState, f'{topics.PLANNER}/get_state', GetState.Request())
@@ -103,7 +103,7 @@ class PlannerClient(Visitor):
         def settled() -> bool:
             if found() or not self._is_there(topics.PLANNER):
                 return True
-            # It answers as soon as it is not busy with its start.
+            # The answer arrives once the startup is complete.
             answer = state.answer()
             if answer is not None and answer.current_state.label == 'unconfigured':
                 raise HmsaError(
@@ -124,25 +124,25 @@ class PlannerClient(Visitor):
 
     def check_alone(self, *, own: bool = False) -> None:
         """
-        Make sure that there are no two planners, plants or drivers, as far as can be seen.
+        Check that there is only one planner, plant and driver, as far as can be discovered.
 
         Parameters
         ----------
         own : bool
-            Whether those that are there should be ours: a request for simulated ones must never
-            reach others. Then none may be seen beside them.
+            Whether they are expected to be started by the caller. A request for simulated nodes
+            must never reach others, so any other node is an error then.
 
         Raises
         ------
         HmsaError
-            If there are; it names them.
+            If there are several; it names them.
 
         """
         self.pass_time(self._begin + _DISCOVERY_SECONDS - monotonic())
         presence = Presence(self.node)
         try:
             end = monotonic() + (_FORGOTTEN_SECONDS if own else LATELY_SECONDS)
-            # Killed ones are still seen, but not heard.
+            # Killed nodes are still discovered, but inactive.
             while presence.crowded(self._joints, topics.PLANNER) and monotonic() < end:
                 presence.look()
                 if found := presence.planners(topics.PLANNER) or presence.devices(self._joints):
@@ -154,19 +154,19 @@ class PlannerClient(Visitor):
             presence.close()
 
     def pass_time(self, seconds: float) -> None:
-        """Serve callbacks for some time."""
+        """Serve callbacks for a time in s."""
         end = monotonic() + seconds
         while monotonic() < end:
             ENDING.check()
             self._executor.spin_once(timeout_sec=min(SLICE_SECONDS, max(end - monotonic(), 0.0)))
 
     def find_recorder(self) -> None:
-        """Wait until somebody who records subscribes to what is sent, and with it to all else."""
+        """Wait until a recorder subscribes to the requests, and so to all other topics."""
         since = math.inf
 
         def recorded() -> bool:
-            # The recorder learns of this publisher a little later than the other way round, and
-            # drops what comes before.
+            # The recorder discovers this publisher slightly later than the other way round, and
+            # misses earlier messages.
             nonlocal since
             since = min(since, monotonic()) if subscribed() else math.inf
             return monotonic() - since >= _SETTLED_SECONDS
@@ -180,12 +180,12 @@ class PlannerClient(Visitor):
             recorded, f'no recorder of {self._publisher.topic_name}; start one with hmsa recorder')
 
     def find_plant(self) -> None:
-        """Wait until the commands reach somebody, for a short time: the planner reports it."""
+        """Wait briefly until the commands have a subscriber; the planner reports failure."""
         with suppress(HmsaError):
             self.spin_until(lambda: not self.unheard(), 'no plant', timeout=_UNHEARD_SECONDS)
 
     def unheard(self) -> list[str]:
-        """Return the topics of commands that nobody but recorders subscribes to."""
+        """Return the command topics without subscribers other than recorders."""
         return graph.unheard(self.node, self._namespace, self._joints)
 
     def send(
@@ -193,17 +193,17 @@ class PlannerClient(Visitor):
             levels: Sequence[tuple[float, float]] = (),
             path: Sequence[Sequence[float]] = ()) -> Verdict:
         """
-        Send a sequence that begins now and wait for the verdict.
+        Send a sequence that begins now, and wait for the verdict.
 
         Parameters
         ----------
         setpoints : sequence of (float or sequence of float, float)
-            Stretch, of all joints or one a joint, and span in s.
+            Stretch, common or for each joint, and duration in s.
         levels : sequence of (float, float)
-            Instead, with no setpoints: time in s from now, and flux density in T of all joints
+            Alternative without setpoints: time in s from now, and flux density in T of all joints
             from then on.
         path : sequence of sequence of float
-            Instead: time in s from now, stretch of all joints, rate in 1/s and acceleration in
+            Alternative: time in s from now, stretch of all joints, rate in 1/s and acceleration in
             1/s^2, ending at rest. The planner's trajectory_mode must be path.
 
         Returns
@@ -214,9 +214,10 @@ class PlannerClient(Visitor):
         Raises
         ------
         BadInputError
-            If the stretches are not as many as the joints, or the planner refuses the sequence.
+            If the number of stretches does not match the joints, or the planner refuses the
+            sequence.
         HmsaError
-            If it does not answer.
+            If the planner does not answer.
 
         """
         deadline = monotonic() + self._timeout
@@ -227,7 +228,7 @@ class PlannerClient(Visitor):
                 'the planner did not reply with a verdict')
             if self.verdict.level < DiagnosticStatus.ERROR[0]:
                 return self.verdict
-            # A planner that has just started may not have heard the time yet.
+            # A planner that has just started may not have received the time yet.
             if self.verdict.code != 'no_time' or monotonic() > deadline:
                 raise BadInputError(f'the planner refused: {self.verdict.message}')
             self._executor.spin_once(timeout_sec=SLICE_SECONDS)
@@ -243,7 +244,7 @@ class PlannerClient(Visitor):
         Raises
         ------
         BadInputError
-            If the stretches are not as many as the joints, or the sequence is too long.
+            If the number of stretches does not match the joints, or the sequence is too long.
 
         """
         check_stretches(setpoints, self._joints)
@@ -261,34 +262,34 @@ class PlannerClient(Visitor):
 
     @property
     def listened(self) -> bool:
-        """Whether somebody subscribes to what is sent."""
+        """Whether the requests have a subscriber."""
         return bool(self._publisher.get_subscription_count())
 
     def follow(
             self, verdict: Verdict, *, each: Callable[[Verdict], None] | None = None,
             timeout: float) -> Verdict:
         """
-        Wait until a sequence has been carried out, and all of it judged where it is measured.
+        Wait until a sequence has been carried out and, if measured, judged completely.
 
         Parameters
         ----------
         verdict : Verdict
-            As `send` returned it.
+            The verdict returned by `send`.
         each : callable, optional
             Called about 20 times a second with the newest verdict.
         timeout : float
-            Patience in s; in simulated ones where that time is published and runs slower.
+            Time limit in s, of simulated time if that is published and slower.
 
         Returns
         -------
         Verdict
-            The last one; its ``failure`` says whether all setpoints arrived.
+            The last one; its ``failure`` is empty if all setpoints arrived.
 
         Raises
         ------
         HmsaError
-            If another request took its place, nobody carries out the commands, or it takes too
-            long.
+            If another request replaces the sequence, the commands are not carried out, or the time
+            limit is exceeded.
 
         """
         heard = monotonic()
@@ -304,7 +305,7 @@ class PlannerClient(Visitor):
                 now.setpoint == now.setpoints and now.state in ('at_rest', 'settling')
                 and not now.watching)
             if now.state == 'idle' and now.level >= DiagnosticStatus.ERROR[0]:
-                # Dropped: nothing more comes of it.
+                # Dropped: there will be no further result.
                 return True
             if not now.unheard:
                 heard = monotonic()
@@ -324,13 +325,13 @@ class PlannerClient(Visitor):
         return self.verdict
 
     def stop(self) -> bool:
-        """Have the planner come to rest, signals or not; return whether it says that it rests."""
+        """Stop the planner, ignoring signals; return whether it reports rest."""
         stop = endpoints.call(self.node, topics.STOP, topics.PLANNER, Trigger.Request())
         begin = monotonic()
         answer = None
         while monotonic() - begin < _STOP_SECONDS:
             self._executor.spin_once(timeout_sec=SLICE_SECONDS)
-            # What was sent last may be on its way: the stop must come after it.
+            # The last request may still be in transit, and the stop must follow it.
             patient = monotonic() - begin < _GONE_SECONDS
             if answer is None and (self.verdict.request == self.requested or not patient):
                 answer = stop.answer()
@@ -342,7 +343,7 @@ class PlannerClient(Visitor):
 
 
 def newest_time(clock: RawSubscription) -> float | None:
-    """Return the newest simulated time in s that has come on /clock; None without a new one."""
+    """Return the newest simulated time in s received on /clock; None without a new one."""
     for taken in clock.take()[-1:]:
         with suppress(BadInputError):
             return from_time(decode(taken.data, Clock).clock) / NANOSECONDS
@@ -351,7 +352,7 @@ def newest_time(clock: RawSubscription) -> float | None:
 
 @contextmanager
 def _slower_time(node: Node, timeout: float) -> Iterator[Callable[[], float]]:
-    """Give a clock in s of simulated time that is no faster than the wall's; silence counts."""
+    """Yield a clock in s of simulated time, at most as fast as real time; gaps count."""
     if not node.count_publishers(topics.CLOCK_TOPIC.name):
         yield monotonic
         return
@@ -365,7 +366,7 @@ def _slower_time(node: Node, timeout: float) -> Iterator[Callable[[], float]]:
             if seconds > before:
                 passed += min(seconds - before, now - heard)
             heard, before = now, seconds
-        # Where nobody publishes it any more the wall's counts.
+        # Real time counts once the publisher has disappeared.
         return passed + max(now - heard - timeout, 0.0)
 
     try:

@@ -1,8 +1,8 @@
 """
-The paper's sequence on real ROS 2 processes, recorded and evaluated.
+The sequence of the paper with real ROS 2 processes, recorded and evaluated.
 
-Planner, plant and recorder run as processes of their own and talk over DDS on this host. The
-plant is the authority on time and runs in slow motion: the whole sequence lasts 0.13 s for the
+Planner, plant and recorder run as separate processes and communicate over DDS on this host. The
+plant publishes the time and runs in slow motion, since the whole sequence lasts 0.13 s for the
 silicone block of `paper_actuator`.
 """
 
@@ -21,14 +21,14 @@ from hmsa_ros.recordings.levels import without_repeats
 from hmsa_ros.report.evaluation import MoveResult
 from hmsa_ros.report.outcome import findings_of
 
-#: The paper's first expansion sequence, (stretch, span) in nondimensional time (Figs. 4, 5).
+#: First expansion sequence of the paper: (stretch, duration) in dimensionless time (Figs. 4, 5).
 SEQUENCE = ((1.10, 10.0), (1.20, 10.0), (1.40, 10.0))
 REAL_TIME_FACTOR = 0.02
 PUBLISH_RATE = 20_000.0
 LEAD_TIME = 0.05
-#: Largest residual vibration, as a share of the step, of a setpoint that counts as held.
+#: Largest residual vibration, as a fraction of the step, of a setpoint that counts as reached.
 LARGEST_RESIDUAL = 1e-6
-# Time stands still until all are ready.
+# Time is paused until all nodes are ready.
 _NODES = (
     NodeProcess('plant', {
         'publish_clock': True, 'start_paused': True, 'real_time_factor': REAL_TIME_FACTOR,
@@ -38,30 +38,30 @@ _NODES = (
 
 @dataclass(frozen=True)
 class SetpointResult(MoveResult):
-    """The result of one setpoint from the bag, with what was found of it within a tolerance."""
+    """Result of one setpoint from the bag, with its finding for given tolerances."""
 
     finding: dict[str, object] = field(default_factory=dict)
 
     @property
     def reached(self) -> bool:
-        """Whether it arrived, and was held, within `LARGEST_RESIDUAL`."""
+        """Whether the setpoint arrived and was held within `LARGEST_RESIDUAL`."""
         return self.finding['verdict'] == 'arrived'
 
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What the demo found: setpoints, exit statuses by process, files, and the second act."""
+    """Results of the demo: setpoints, exit statuses by process, files, and the second part."""
 
     setpoints: tuple[SetpointResult, ...]
     exits: dict[str, int]
     bag: Path
     picture: Path
     adapting: tuple[AdaptingResult, ...]
-    second: Path  #: picture of these
+    second: Path  #: figure of the second part
 
     @property
     def succeeded(self) -> bool:
-        """Whether every setpoint was reached and held and every process ended cleanly."""
+        """Whether every setpoint was reached and every process ended without error."""
         return all(x.reached for x in self.setpoints) and not any(self.exits.values())
 
     def as_json(self) -> dict[str, object]:
@@ -74,7 +74,7 @@ class DemoResult:
 
 
 def run_demo(folder: Path, progress: Callable[[str, float], None]) -> DemoResult:
-    """Run the paper's sequence in a prepared folder and read the result back from the bag."""
+    """Run the sequence of the paper in a prepared folder, and evaluate the bag."""
     experiment = Experiment(folder, [
         ((stretch,), span * paper_actuator().time_unit) for stretch, span in SEQUENCE], _NODES)
     exits = conduct(experiment, progress).exits
@@ -86,7 +86,7 @@ def run_demo(folder: Path, progress: Callable[[str, float], None]) -> DemoResult
 
 
 def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
-    """Read the run back from the bag, measure it and draw it."""
+    """Read the run from the bag, evaluate and plot it."""
     from hmsa_ros.report.arrivals import Part
     from hmsa_ros.report.paper import SCREEN
     from hmsa_ros.report.picture import draw

@@ -1,8 +1,7 @@
 """
-An experiment: nodes started where they are wanted, a sequence sent and recorded, and the end.
+An experiment: start nodes if requested, send and record a sequence, and end.
 
-However it ends, the planner has been asked to come to rest if anything was sent, and the bag is
-closed.
+In any case, the planner is stopped if a sequence was sent, and the bag is closed.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -31,15 +30,15 @@ if TYPE_CHECKING:
     from hmsa_ros.lab.watch import Watch
 
 Setpoints = Sequence[tuple[Sequence[float], float]]
-Tell = Callable[[str, float], None]
-#: How long nodes may take to start, and time may stand still.
+Progress = Callable[[str, float], None]
+#: Time limit in s for the start of nodes, and for time that does not advance.
 START_SECONDS = 20.0
 
 
 def check_stretches(
         setpoints: Sequence[tuple[float | Sequence[float], float]],
         joints: Sequence[str]) -> None:
-    """Refuse, by `BadInputError`, stretches that are not as many as the joints, or one for all."""
+    """Raise `BadInputError` unless there is one stretch, or one for each joint."""
     for stretch, _ in setpoints:
         if np.size(stretch) not in (1, len(joints)):
             raise BadInputError(
@@ -49,14 +48,14 @@ def check_stretches(
 
 @dataclass(frozen=True)
 class Experiment:
-    """What is done."""
+    """Description of an experiment."""
 
     folder: Path  #: existing folder for the bag ``run`` and the logs
-    #: stretch of all joints, or one a joint, and span in s; empty where there are levels
+    #: stretch, common or for each joint, and duration in s; empty if there are levels
     setpoints: Setpoints
-    #: to start besides the recorder, among them a paused plant that leads time, or none
+    #: nodes to start besides the recorder, including a paused plant that publishes time, or none
     nodes: tuple[NodeProcess, ...] = ()
-    #: of planner and plant
+    #: namespace of planner and plant
     namespace: str = ''
     joints: tuple[str, ...] = ('actuator',)
     #: parameters of running nodes by ``'node.name'``, from a parameter file
@@ -70,7 +69,7 @@ class Experiment:
 
     @property
     def duration(self) -> float:
-        """Length in s of the sequence."""
+        """Duration of the sequence in s."""
         return sum(x for _, x in self.setpoints) + sum(
             x[-1][0] for x in (self.levels, self.path) if x)
 
@@ -94,26 +93,26 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Conducted:
-    """What became of an experiment."""
+    """Result of an experiment."""
 
-    exits: dict[str, int]  #: by process
-    measured: bool  #: whether samples came
+    exits: dict[str, int]  #: exit statuses by process
+    measured: bool  #: whether there were samples
     notes: tuple[str, ...]
-    verdict: Verdict  #: what the planner said last
-    seconds: dict[str, float]  #: what took how long, of our time
-    pace: float  #: of the nodes' time, as a share of ours
+    verdict: Verdict  #: last verdict of the planner
+    seconds: dict[str, float]  #: real durations by phase
+    pace: float  #: speed of the nodes' time relative to real time
 
 
 def prepare(folder: Path) -> None:
     """
-    Make the output folder, or take one that does not hold an earlier run.
+    Create the output folder, or accept an existing one without a run.
 
     Raises
     ------
     BadInputError
-        If it cannot be used.
+        If the folder cannot be used.
     ModuleNotFoundError
-        If there is no ROS, which nothing has imported yet.
+        If ROS is not available; nothing has imported it before.
 
     """
     if find_spec('rclpy') is None:
@@ -125,16 +124,16 @@ def prepare(folder: Path) -> None:
     make_folder(folder)
 
 
-def conduct(experiment: Experiment, progress: Tell) -> Conducted:
+def conduct(experiment: Experiment, progress: Progress) -> Conducted:
     """
     Carry out an experiment.
 
     Parameters
     ----------
     experiment : Experiment
-        In a prepared folder.
+        Experiment with a prepared folder.
     progress : callable
-        Called with what is going on and the share of the sequence that is done.
+        Called with the current activity and the completed fraction of the sequence.
 
     Returns
     -------
@@ -144,10 +143,10 @@ def conduct(experiment: Experiment, progress: Tell) -> Conducted:
     Raises
     ------
     HmsaError
-        If a check or a process fails, or the sequence does not come to its end.
+        If a check or a process fails, or the sequence is not completed.
     KeyboardInterrupt
-        If the end was asked for. As in every other case, the planner has come to rest if a
-        sequence was sent, the bag is closed, and all processes that were started have ended.
+        If the end was requested. As in all other cases, the planner has come to rest if a sequence
+        was sent, the bag is closed, and all processes started have ended.
 
     """
     times = [monotonic()]
@@ -157,7 +156,7 @@ def conduct(experiment: Experiment, progress: Tell) -> Conducted:
             for node in (*experiment.nodes, recorder_of(experiment, True)):
                 ENDING.check()
                 session.start(node)
-        # ROS is imported here, while the nodes do the same.
+        # ROS is imported here, while the nodes import it too.
         from hmsa_ros.lab.watch import Watch
 
         with Watch(experiment, session.check) as watch:
@@ -194,7 +193,7 @@ def conduct(experiment: Experiment, progress: Tell) -> Conducted:
 
 
 def _begin(experiment: Experiment, session: Session, watch: 'Watch') -> None:
-    """Check what runs, and wait for the recorder."""
+    """Check the running nodes, and wait for the recorder."""
     watch.find_planner(session.check)
     watch.read_parameters()
     if not experiment.nodes:
@@ -210,14 +209,14 @@ def _begin(experiment: Experiment, session: Session, watch: 'Watch') -> None:
 
 
 def recorder_of(experiment: Experiment, simulated: bool) -> NodeProcess:
-    """Return the recorder of an experiment, in simulated time if so."""
+    """Return the recorder of an experiment, in simulated time if ``simulated``."""
     return NodeProcess(topics.RECORDER, {
         'use_sim_time': simulated, 'storage.uri': str(experiment.bag),
         'record.topics': experiment.topics()}, experiment.namespace)
 
 
-def _carry_out(experiment: Experiment, watch: 'Watch', progress: Tell) -> Verdict:
-    """Send the sequence, and wait until the last setpoint has been watched for its span."""
+def _carry_out(experiment: Experiment, watch: 'Watch', progress: Progress) -> Verdict:
+    """Send the sequence, and wait until the duration of the last setpoint is over."""
     verdict = watch.send(experiment.setpoints, experiment.levels, experiment.path)
     begin = watch.now
     lead = watch.parameter('planner.lead_time')
@@ -238,8 +237,8 @@ def _carry_out(experiment: Experiment, watch: 'Watch', progress: Tell) -> Verdic
     return verdict
 
 
-# Samples a period of the actuator, and samples that plant and recorder pass on in a second of
-# ours: where there are more of them, simulated time runs slower.
+# Samples per period of the actuator, and limit on samples per second of real time for plant and
+# recorder, above which simulated time is slowed down.
 _SAMPLES_A_PERIOD = 25.0
 _SAMPLES_A_SECOND = 4000.0
 
@@ -247,11 +246,11 @@ _SAMPLES_A_SECOND = 4000.0
 def simulated_node(
         settings: Mapping[str, object], params_file: str, namespace: str) -> NodeProcess:
     """
-    Return a planner and a paused plant that leads its time.
+    Return a planner and a paused plant that publishes the time.
 
-    They are one process, since time waits for the planner, however busy the machine is.
+    They share one process, in which time waits for the planner on a busy machine.
     """
-    # What the parameter file sets goes before what is chosen here.
+    # Settings of the parameter file take precedence.
     block = actuator_from(values_of(settings, PLANT, BLOCK))
     rate = _number(settings, 'publish_rate', max(1000.0, _SAMPLES_A_PERIOD / block.period))
     factor = _number(settings, 'real_time_factor', min(1.0, _SAMPLES_A_SECOND / rate))
@@ -266,6 +265,6 @@ def simulated_node(
 
 
 def _number(settings: Mapping[str, object], name: str, default: float) -> float:
-    """Return what the file sets for the plant, as the node reads a number."""
+    """Return the plant's setting in the file, as a number."""
     value = settings.get(f'{PLANT}.{name}')
     return float(value) if isinstance(value, (int, float)) else default

@@ -1,4 +1,4 @@
-"""Who takes the commands of a planner, by the graph of ROS."""
+"""Subscribers of a planner's commands in the ROS graph."""
 
 from collections.abc import Sequence
 
@@ -9,21 +9,21 @@ from hmsa_ros.nodes.endpoints import publishers_of, subscribers_of
 
 
 def unheard(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
-    """Return a planner's topics of commands that nobody but recorders subscribes to."""
+    """Return a planner's command topics without subscribers other than recorders."""
     leave_out = recorders(node)
     return [x for x in _commands(node, namespace, joints)
             if leave_out.issuperset(subscribers_of(node, x).values())]
 
 
 def recorders(node: Node) -> set[str]:
-    """Return the full names of recorders; rosbag2's, too, offer to split the bag."""
+    """Return the full names of recorders, including those of rosbag2, which also split bags."""
     return {
         service.rpartition('/')[0] for service, _ in node.get_service_names_and_types()
         if service.endswith('/split_bagfile')}
 
 
 def _commands(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
-    """Return the topics on which the planner commands joints, whatever they are called."""
+    """Return the topics on which the planner commands joints, including remapped ones."""
     planner = f'/{namespace.strip("/")}/{topics.PLANNER}'.replace('//', '/')
     named = [
         topic for topic, types in node.get_topic_names_and_types()

@@ -1,8 +1,7 @@
 """
-What the launch files start: processes and their arguments, decided without ``launch``.
+Contents of the launch files: processes and their arguments, without the package ``launch``.
 
-`DEMO` and `REPLAY` are wrapped by the files in ``launch/``, by way of
-`hmsa_ros.lab.ros_launch`.
+The files in ``launch/`` wrap `DEMO` and `REPLAY` through `hmsa_ros.lab.ros_launch`.
 """
 
 from collections.abc import Callable, Mapping
@@ -15,15 +14,15 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.lab.processes import NodeProcess
 
 _YES_OR_NO = ('true', 'false')
-# Discovery and the start of the nodes take their time; a plant that dies ends all.
+# Time limit for discovery and start of the nodes; a failing plant ends all processes.
 _START_SECONDS = 600.0
-# For the recorder to find the topics of a plant that has just become active.
+# Time for the recorder to find the topics of a plant that has just become active.
 _RECORDER_NANOSECONDS = 500_000_000
 
 
 @dataclass(frozen=True)
 class Argument:
-    """An argument of a launch file; without a default it must be given."""
+    """An argument of a launch file; required if it has no default."""
 
     name: str
     description: str
@@ -33,7 +32,7 @@ class Argument:
 
 @dataclass(frozen=True)
 class Started:
-    """The processes of a launch; if one fails, or ``last`` ends cleanly, all end."""
+    """Processes of a launch, which end together if one fails or ``last`` ends normally."""
 
     nodes: tuple[NodeProcess, ...]
     rviz: NodeProcess | None
@@ -42,19 +41,19 @@ class Started:
 
 @dataclass(frozen=True)
 class LaunchFile:
-    """Arguments of a launch file; ``start`` gets their values and the folder of ``config``."""
+    """A launch file; ``start`` is called with argument values and the installed folder."""
 
     arguments: tuple[Argument, ...]
     start: Callable[[Mapping[str, str], Path], Started]
 
     def evaluate(self, given: Mapping[str, str], share: Path) -> Started:
         """
-        Return what the given arguments start; ``share`` is the package's installed folder.
+        Return the processes for the given arguments; ``share`` is the package's installed folder.
 
         Raises
         ------
         BadInputError
-            If an argument is missing or no choice, or a file does not exist.
+            If an argument is missing or not one of its choices, or a file does not exist.
 
         """
         values = {}
@@ -91,7 +90,7 @@ _COMMON = (
 
 def _nodes(values: Mapping[str, str], file: str, parameters: Mapping[str, Mapping[str, object]]) \
         -> tuple[NodeProcess, ...]:
-    """Return the nodes with what they have in common."""
+    """Return the nodes with their common settings."""
     return tuple(
         NodeProcess(name, given, values['namespace'], file, values['log_level'])
         for name, given in parameters.items() if name != 'recorder' or values['record'] == 'true')
@@ -113,7 +112,7 @@ def _start_demo(values: Mapping[str, str], share: Path) -> Started:
     hardware = values['hardware']
     plant = values['plant'] == 'true' and not hardware
     simulated = plant if values['use_sim_time'] == 'auto' else values['use_sim_time'] == 'true'
-    # On the wall clock the nodes' defaults are right; the file is for slow motion.
+    # In real time, the defaults of the nodes apply; the file is for slow motion.
     file = values['params_file'] or (
         str(share / 'config' / 'demo.yaml') if simulated and plant else '')
     parameters: dict[str, Mapping[str, object]] = {'recorder': {
@@ -139,15 +138,15 @@ def _start_replay(values: Mapping[str, str], share: Path) -> Started:
         'plant': {'use_sim_time': True, 'publish_clock': False},
         'player': {
             'use_sim_time': False, 'storage.uri': values['bag'], 'play.rate': rate,
-            # Finer than the planner's lead_time, so that commands arrive ahead.
+            # Shorter than the planner's lead_time, so that commands arrive in time.
             'play.clock_publish_frequency': 4000.0,
             'play.topics_to_filter': command,
-            # Not any subscriber: a recorder hears the commands too.
+            # Not any subscriber, since a recorder subscribes to the commands too.
             'play.wait_for_subscribers': command,
             'play.wait_for_nodes': ['plant'],
             'play.wait_for_recorder': 'recorder' if values['record'] == 'true' else '',
             'play.wait_for_subscribers_timeout': _START_SECONDS,
-            # On a busy machine the plant is behind the clock when the last command is sent.
+            # On a busy machine, the plant lags behind the clock when the last command is sent.
             'play.wait_for_samples': ['joint_states'],
             'play.delay.nsec': _RECORDER_NANOSECONDS}}
     return Started(
@@ -170,7 +169,7 @@ DEMO = LaunchFile((
         'bag', 'Folder of the bag, which must not exist yet; default hmsa_ plus date and time'),
     *_COMMON), _start_demo)
 
-#: A bag's commands to a fresh plant. The player publishes ``/clock`` from the bag.
+#: Play the commands of a bag to a new plant. The player publishes ``/clock`` from the bag.
 REPLAY = LaunchFile((
     Argument('bag', 'Folder of the bag to play', None),
     Argument(
@@ -182,7 +181,7 @@ REPLAY = LaunchFile((
 
 
 def failure(name: str, status: int, ending: bool) -> str:
-    """Return a sentence about a process that failed, else none; signals are fine while all end."""
+    """Return a message about a failed process, else empty; signals are normal while ending."""
     # A process that had to be killed has failed.
     if not status or (ending and status in (-signal.SIGINT, -signal.SIGTERM)):
         return ''

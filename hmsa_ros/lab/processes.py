@@ -1,4 +1,4 @@
-"""Node processes: started together, ended in order, never left behind."""
+"""Node processes that are started together and ended in order."""
 
 from collections.abc import Mapping
 import ctypes
@@ -16,7 +16,7 @@ from hmsa_ros.interfaces.topics import RECORDER
 from hmsa_ros.middleware import RANGE
 
 _PR_SET_PDEATHSIG = 1
-# Long enough for a recorder to write what it holds on a slow disk.
+# Enough for a recorder to write its messages to a slow disk.
 _PATIENCE_SECONDS = 15.0
 
 
@@ -32,7 +32,7 @@ class NodeProcess:
     options: tuple[str, ...] = ()
 
     def ros_arguments(self) -> list[str]:
-        """Return what follows ``--ros-args``; parameters take precedence over the file."""
+        """Return the words after ``--ros-args``; parameters take precedence over the file."""
         words = []
         if self.namespace:
             words += ['-r', f'__ns:=/{self.namespace.lstrip("/")}']
@@ -52,9 +52,9 @@ class NodeProcess:
 
 class Session:
     """
-    Node processes, each with its log in a folder; a context manager that ends them.
+    Node processes with log files in a folder; a context manager that ends them.
 
-    Their environment is that of this process, which must live in the same ROS domain.
+    They inherit the environment, and so the ROS domain, of this process.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -68,27 +68,27 @@ class Session:
         self.stop()
 
     def start(self, node: NodeProcess) -> None:
-        """Start a node whose name is not in use yet."""
+        """Start a node with a new name."""
         with open(self.log(node.name), 'wb') as log:
-            # A session of its own: Ctrl-C in the terminal reaches only us, and we end the
-            # nodes in order. Should we be killed, the kernel ends them.
+            # A separate session: Ctrl-C in the terminal only reaches this process, which ends the
+            # nodes in order. If this process is killed, the kernel ends them.
             self._processes[node.name] = subprocess.Popen(
                 node.command(), stdin=subprocess.DEVNULL, stdout=log, stderr=log,
                 start_new_session=True,
                 preexec_fn=_die_with_parent)  # noqa: PLW1509 - only calls the kernel
 
     def log(self, name: str) -> Path:
-        """Return the file of a node's output, in the session's folder."""
+        """Return the log file of a node."""
         return self._folder / f'{name}.log'
 
     def check(self) -> None:
         """
-        Make sure that all started nodes run.
+        Check that all started nodes are running.
 
         Raises
         ------
         HmsaError
-            If one has ended; with its last words.
+            If one has ended, with the last line of its log.
 
         """
         for name, process in self._processes.items():
@@ -98,12 +98,12 @@ class Session:
                     f'{self.last_words(name)}')
 
     def last_words(self, name: str) -> str:
-        """Return the last line of a node's log with the log's place."""
+        """Return the last line of a node's log, with the path of the log."""
         lines = self.log(name).read_text(errors='replace').strip().splitlines()
         return f'{lines[-1] if lines else "it printed nothing"} (log: {self.log(name)})'
 
     def stop(self) -> dict[str, int]:
-        """End the recorder, then all other nodes together; return exit status by node."""
+        """End the recorder, then all other nodes together; return exit statuses by node."""
         names = sorted(self._processes, key=lambda x: x != RECORDER)
         first = [x for x in names if x == RECORDER]
         for group in (first, names[len(first):]):
@@ -121,21 +121,21 @@ class Session:
 
 
 def _die_with_parent() -> None:
-    """Ask the kernel to interrupt this process when its parent is gone."""
-    # The shell of a background job may have told its children to ignore SIGINT.
+    """Have the kernel interrupt this process when its parent has ended."""
+    # A shell may start background jobs with SIGINT ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
 
 
 def stay_local() -> None:
-    """Have this process and its nodes talk to this host only; before anything of ROS is there."""
-    # The ROS domain is the caller's where ROS_DOMAIN_ID is set, and otherwise one that other runs
-    # on this host are unlikely to use.
+    """Restrict this process and its nodes to this host; to be called before ROS is imported."""
+    # The ROS domain is that of ROS_DOMAIN_ID if set, otherwise one that other runs on this host
+    # are unlikely to use.
     os.environ[RANGE] = 'LOCALHOST'
     # Domains above 101 collide with the ephemeral ports of Linux.
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 101))
 
 
 def dated(base: Path | str) -> Path:
-    """Return a folder in another one, named by date and time."""
+    """Return a subfolder of ``base`` named by date and time."""
     return Path(base) / datetime.now().strftime('%Y-%m-%d_%H-%M-%S')

@@ -1,4 +1,4 @@
-"""Parameters of a running node, read and changed while its caller waits."""
+"""Blocking access to the parameters of a running node."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -24,7 +24,7 @@ from hmsa_ros.nodes.visitor import Visitor
 def _ask(
         visitor: Visitor, name: str, kind: Any, service: str,
         each: Callable[[], None] | None = None, **request: Any) -> Any:
-    """Return the response of a node to a request."""
+    """Return a node's response to a request."""
     return visitor.ask(
         ServiceCall(visitor.node, kind, f'{name}/{service}', kind.Request(**request)),
         f'no node {name} in namespace {visitor.node.get_namespace()} replies: expected '
@@ -36,16 +36,16 @@ def parameters_of(
         visitor: Visitor, name: str, names: Sequence[str] = (),
         each: Callable[[], None] | None = None) -> dict[str, Any]:
     """
-    Return parameters of a node by name, all of them unless some are named; None without a value.
+    Return parameters of a node by name, by default all of them; None if not set.
 
-    ``each`` is called meanwhile.
+    ``each`` is called while waiting.
 
     Raises
     ------
     BadInputError
-        If the node has no parameter of a name.
+        If the node lacks one of the parameters.
     HmsaError
-        If it does not reply.
+        If the node does not reply.
 
     """
     known = list(_ask(visitor, name, ListParameters, 'list_parameters', each).result.names)
@@ -58,7 +58,7 @@ def parameters_of(
     wanted = sorted(names or known)
     types = _ask(
         visitor, name, GetParameterTypes, 'get_parameter_types', each, names=wanted).types
-    # rclpy gives none at all where one has no value.
+    # rclpy returns nothing at all if one of them is not set.
     there = [x for x, kind in zip(wanted, types, strict=True)
              if kind != ParameterType.PARAMETER_NOT_SET]
     values = _ask(visitor, name, GetParameters, 'get_parameters', each, names=there).values
@@ -75,14 +75,14 @@ class RemoteNode(Visitor):
     name : str
         Name of the node.
     namespace : str
-        Its namespace.
+        Namespace of the node.
     timeout : float
-        Patience in s.
+        Time limit in s.
 
     Raises
     ------
     BadInputError
-        If no node can have that name.
+        If the name is not a valid node name.
 
     """
 
@@ -97,7 +97,7 @@ class RemoteNode(Visitor):
         self._name = name
 
     def get(self, names: Sequence[str] = ()) -> dict[str, Any]:
-        """Return parameters by name, all of them unless some are named; see `parameters_of`."""
+        """Return parameters by name, by default all of them; see `parameters_of`."""
         return parameters_of(self, self._name, names)
 
     def set(self, name: str, text: str) -> tuple[Any, Any]:
@@ -107,14 +107,14 @@ class RemoteNode(Visitor):
 
     def set_all(self, texts: Mapping[str, str]) -> dict[str, Any]:
         """
-        Change parameters to values as in YAML, all or none; return the values before.
+        Change parameters to values in YAML syntax, all or none; return the previous values.
 
         Raises
         ------
         BadInputError
             If the node refuses them, with its reason.
         HmsaError
-            If it does not reply.
+            If the node does not reply.
 
         """
         if not texts:
@@ -131,7 +131,7 @@ class RemoteNode(Visitor):
 
 
 def _value(text: str, before: Any) -> Any:
-    """Return a value of the type before: 1 and 5e3, no word of YAML, for numbers."""
+    """Return a value of the previous type, also for numbers that YAML reads otherwise."""
     value = get_parameter_value(text)
     if isinstance(before, str):
         value.type, value.string_value = ParameterType.PARAMETER_STRING, text

@@ -1,4 +1,4 @@
-"""The launch files as ROS 2's ``launch`` wants them; imported by it alone."""
+"""The launch files in the form required by ROS 2's ``launch``."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -13,12 +13,12 @@ from hmsa_ros.errors import HmsaError
 from hmsa_ros.lab.launching import failure, LaunchFile, Started
 from hmsa_ros.lab.processes import NodeProcess
 
-# Before SIGTERM and SIGKILL: long enough for a recorder to write what it holds on a slow disk.
+# Before SIGTERM and SIGKILL: enough for a recorder to write its messages to a slow disk.
 _PATIENCE = {'sigterm_timeout': '30', 'sigkill_timeout': '30'}
 
 
 def description(file: LaunchFile) -> LaunchDescription:
-    """Return a launch file's arguments and processes; one that fails ends all with status 1."""
+    """Return a launch file's arguments and processes; a failing one ends all with status 1."""
     def start(context: Any) -> list[Any]:
         share = Path(FindPackageShare('hmsa_ros').perform(context))
         return _actions(file.evaluate(context.launch_configurations, share))
@@ -31,7 +31,7 @@ def description(file: LaunchFile) -> LaunchDescription:
 
 
 def _actions(started: Started) -> list[Any]:
-    # RViz first: where it is not installed, nothing has been started when launch finds out.
+    # RViz first: if it is not installed, launch fails before anything is started.
     rviz = [] if started.rviz is None else [_action(started.rviz, 'rviz2', None)]
     return rviz + [
         _action(x, 'hmsa_ros', _ended(x.name, x.name == started.last)) for x in started.nodes]
@@ -44,7 +44,7 @@ def _action(process: NodeProcess, package: str, on_exit: Any) -> Node:
 
 
 def _ended(name: str, last: bool) -> Callable[[Any, Any], Any]:
-    """Return what to do when a node has ended."""
+    """Return the reaction to the end of a node."""
     def ended(event: Any, context: Any) -> Any:
         sentence = failure(name, event.returncode, context.is_shutdown)
         if sentence:

@@ -1,8 +1,8 @@
 """
-From an actuator as its data sheet has it to moves without vibration, as one guided run.
+Guided run from an actuator's data sheet to moves without vibration.
 
-Moves as they are, an excitation, an identification, a choice among the shapers, a parameter file,
-and the same moves again.
+It makes the moves with the initial parameters, an excitation, an identification, a choice of the
+shaper, a parameter file, and the same moves again.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ from hmsa_ros.identification.result import Identification
 from hmsa_ros.identification.runs import recording_of
 from hmsa_ros.interfaces.topics import PLANNER
 from hmsa_ros.judge.records import worst
-from hmsa_ros.lab.experiment import conduct, Experiment, prepare, Tell
+from hmsa_ros.lab.experiment import conduct, Experiment, prepare, Progress
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.recordings.bags import read_run
 from hmsa_ros.recordings.parameters import Entries
@@ -36,37 +36,37 @@ from hmsa_ros.report.looks import RUNS
 if TYPE_CHECKING:
     from hmsa_ros.lab.processes import NodeProcess
 
-# Vibration, as a share of the step, below which the quickest shaper is taken.
+# Largest vibration, as a fraction of the step, with which the fastest shaper is chosen.
 _QUIET = 0.01
-# Identifications, each with what the one before has named.
+# Limit on identifications, each with the parameters named by the previous one.
 _MOST_TRIES = 4
 _DELAYS = ('coil_time_constant', 'sensor_latency')
-# How far beyond the setpoints the excitation goes, as a share of their range.
+# Range of the excitation beyond the setpoints, as a fraction of their range.
 _BEYOND = 0.5
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """What is tuned, and how."""
+    """Settings of the tuning."""
 
-    folder: Path  #: for the bags of all runs
+    folder: Path  #: folder for the bags of all runs
     setpoints: tuple[tuple[tuple[float, ...], float], ...]  #: stretch and duration in s
     out: Path  #: parameter file to write
-    entries: Entries  #: what is known, as in a parameter file
-    node: 'NodeProcess | None' = None  #: planner and plant to start; none where nodes run
+    entries: Entries  #: given parameters, as in a parameter file
+    node: 'NodeProcess | None' = None  #: planner and plant to start; None if they are running
     namespace: str = ''
-    duration: float | None = None  #: of the excitation in s
-    stretch_min: float | None = None  #: of the excitation; default somewhat below the setpoints
-    stretch_max: float | None = None  #: default somewhat above them
-    free: str = ''  #: as ``hmsa identify`` takes it
-    known: Mapping[str, float] = field(default_factory=dict)  #: in SI
+    duration: float | None = None  #: duration of the excitation in s
+    stretch_min: float | None = None  #: limit of the excitation; default below the setpoints
+    stretch_max: float | None = None  #: default above the setpoints
+    free: str = ''  #: as for ``hmsa identify``
+    known: Mapping[str, float] = field(default_factory=dict)  #: known values in SI
     uncertain: Mapping[str, float] = field(default_factory=dict)  #: standard deviations of these
-    accept: bool = False  #: whether to go on with a small defect that is named
+    accept: bool = False  #: whether to accept a small, named defect
 
 
 @dataclass(frozen=True, eq=False)
 class Tuned:
-    """What has become of it; what comes after a failure is empty."""
+    """Results of the tuning; those after a failure are empty."""
 
     before: Part
     identified: Identification
@@ -77,14 +77,14 @@ class Tuned:
 
     @property
     def parts(self) -> list[Part]:
-        """The runs of the setpoints."""
+        """The runs with the setpoints."""
         runs = [self.before, *([] if self.after is None else [self.after])]
         return [replace(x, colour=y) for x, y in zip(runs, RUNS, strict=False)] if (
             len(runs) > 1) else runs
 
     @property
     def verdict(self) -> tuple[str, str]:
-        """The verdict on the whole, and why, with what to do next."""
+        """Overall verdict, and its reason with the next step."""
         if self.after is None:
             return self.identified.verdict, self.identified.reason
         found = worst(self.after.evaluation.findings)
@@ -101,26 +101,26 @@ class Tuned:
             'hmsa run --feedback adapt')
 
 
-def tune(tuning: Tuning, progress: Tell) -> Tuned:
+def tune(tuning: Tuning, progress: Progress) -> Tuned:
     """
-    Carry it out.
+    Carry out a tuning.
 
     Parameters
     ----------
     tuning : Tuning
-        In a folder that can be made.
+        Settings, with a folder that can be created.
     progress : callable
-        Called with what is going on and the share of it that is done.
+        Called with the current activity and its completed fraction.
 
     Returns
     -------
     Tuned
-        Without a file and moves after it where the actuator was not identified.
+        Without a file and the second moves if the identification failed.
 
     Raises
     ------
     HmsaError
-        If a run does not come to its end, or the planner does not take what was found.
+        If a run is not completed, or the planner refuses the identified parameters.
 
     """
     belief = read_belief(None, tuning.entries)
@@ -149,12 +149,12 @@ def tune(tuning: Tuning, progress: Tell) -> Tuned:
 
 def known_to(namespace: str) -> Entries:
     """
-    Return the parameters of the only actuator of the running planner, as in a parameter file.
+    Return the parameters of the running planner's only actuator, as in a parameter file.
 
     Raises
     ------
     BadInputError
-        If it has several.
+        If it has several actuators.
     HmsaError
         If there is no planner.
 
@@ -171,7 +171,7 @@ def known_to(namespace: str) -> Entries:
 
 
 def _of_planner(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the planner has of an actuator among all that a file may hold."""
+    """Return the planner's parameters of an actuator among those of a file."""
     from hmsa_ros.nodes.planning import OWN
 
     own = {x.name for x in OWN}
@@ -179,9 +179,9 @@ def _of_planner(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _run(
-        tuning: Tuning, name: str, progress: Tell, settings: Mapping[str, Any],
+        tuning: Tuning, name: str, progress: Progress, settings: Mapping[str, Any],
         levels: Sequence[tuple[float, float]] = ()) -> Run:
-    """Carry out setpoints, or levels, with settings of the planner where one is started."""
+    """Run setpoints, or levels, with settings of the planner if it is started here."""
     parameters = {f'{PLANNER}:{x}': y for x, y in _of_planner(settings).items()}
     experiment = Experiment(
         tuning.folder / name, () if levels else tuning.setpoints,
@@ -193,14 +193,14 @@ def _run(
     if not done.measured:
         raise HmsaError(
             'no node publishes joint_states: expected a plant, or a driver with a sensor')
-    # That an unknown actuator does not come to rest where predicted is no failure.
+    # An unknown actuator that does not come to rest as predicted is not a failure.
     if levels and done.verdict.failure and not done.verdict.measured:
         raise HmsaError(f'the excitation failed: {done.verdict.failure}')
     return replace(read_run(experiment.bag), label=name)
 
 
 def excitation(tuning: Tuning, belief: Belief, rate: float) -> list[tuple[float, float]]:
-    """Return the levels to record, time in s and T, for a sensor of a rate in Hz."""
+    """Return the levels to record, time in s and T, for a sensor rate in Hz."""
     rest = belief.actuator.rest
     stretches = [rest, *(x[0] for x, _ in tuning.setpoints)]
     beyond = _BEYOND * (max(stretches) - min(stretches))
@@ -217,7 +217,7 @@ def excitation(tuning: Tuning, belief: Belief, rate: float) -> list[tuple[float,
 def identified(
         tuning: Tuning, belief: Belief, recording: Recording, block: ActuatorParameters,
         coil: Mapping[str, float]) -> Identification:
-    """Identify, with what residuals name added to what is free (see `recording_of`)."""
+    """Identify, with parameters indicated by the residuals added (see `recording_of`)."""
     known = {**coil, **belief.others, **tuning.known}
 
     def fit(free: tuple[str, ...]) -> Identification:
@@ -235,7 +235,7 @@ def identified(
             x for x in named.remedy.split(',') if x not in free and x not in tuning.known)
         if found.verdict == 'identified' or not more:
             break
-        # A lag and a latency look alike until one of them is there, or both.
+        # Lag and latency are hard to distinguish, so each is tried alone and both together.
         ways = [more, *([*((x,) for x in _DELAYS if x not in (*more, *free, *tuning.known)),
                          tuple(x for x in _DELAYS if x not in (*free, *tuning.known))]
                         if set(more) & set(_DELAYS) else [])]
@@ -245,7 +245,7 @@ def identified(
             min(tried, key=lambda x: x[1].residual_rms))
         free = (*free, *added)
     if found.verdict == 'not_identifiable' and not tuning.free:
-        # Moves that hardly feel the limit of the chains are planned as well with the one given.
+        # Moves hardly affected by J_lim can be planned with its given value.
         without = tuple(x for x in free if x != 'chain_limit')
         found = min(
             found, fit(without), key=lambda x: (x.verdict != 'identified', not x.acceptable))
@@ -255,19 +255,19 @@ def identified(
 def chosen(
         tuning: Tuning, belief: Belief, found: Identification
 ) -> tuple[list[Expected], dict[str, Any]]:
-    """Return how the shapers compare, and the settings of a planner with what was found."""
+    """Return the comparison of the shapers, and the planner's settings after identification."""
     learnt = belief_in(file_text(found, belief, '', datetime.now().astimezone()))
     shapers = compare_shapers(
         Actuator.from_parameters(learnt.settings),
         [(x[0], span) for x, span in tuning.setpoints], learnt.known)
-    # What an accepted model lacks, such as hysteresis, disturbs a smooth move least.
+    # Defects of an accepted model, such as hysteresis, affect a smooth move least.
     smooth = [x for x in shapers if x.shaper == 'smooth' and not x.reason
               and found.verdict != 'identified']
     return shapers, {**learnt.settings, 'shaper': choose(smooth or shapers, _QUIET).shaper}
 
 
 def _apply(tuning: Tuning, settings: Mapping[str, Any]) -> None:
-    """Give the running planner what was found."""
+    """Set the identified parameters on the running planner."""
     from hmsa_ros.lab.remote import RemoteNode
 
     with RemoteNode(PLANNER, tuning.namespace) as planner:
@@ -275,7 +275,7 @@ def _apply(tuning: Tuning, settings: Mapping[str, Any]) -> None:
         changed = {x: y for x, y in settings.items() if x in before and before[x] != y
                    and not x.startswith(PREFIX)}
         try:
-            # Together: branches that creep have a ratio and a time each.
+            # Set together, since each viscoelastic branch has a ratio and a time.
             planner.set_all({x: y if isinstance(y, str) else yaml_text(y)
                              for x, y in changed.items()})
         except BadInputError as error:

@@ -1,4 +1,4 @@
-"""What an experiment looks at: who is there, the recorder's readiness, and the time."""
+"""Monitoring of an experiment: its nodes, the recorder, and the time."""
 
 from collections.abc import Callable
 from time import monotonic, time
@@ -16,20 +16,20 @@ from hmsa_ros.lab.experiment import Experiment, START_SECONDS
 from hmsa_ros.lab.remote import parameters_of
 from hmsa_ros.nodes import endpoints
 
-# How long the end of a sequence may keep us waiting after its time is over.
+# Time limit in s for a sequence to be completed after its duration.
 _GRACE_SECONDS = 20.0
-# How long a recorder may take at the end to read the parameters of the nodes.
+# Time limit in s for a recorder to store the parameters of the nodes.
 _STORED_SECONDS = 10.0
-# Between two looks at who is there.
+# Interval in s of checks of the nodes.
 _LOOK_SECONDS = 0.5
 _SAME = 1e-9
 
 
 class Watch(PlannerClient):
     """
-    A client of the planner that looks at the nodes of an experiment as well.
+    A client of the planner that also monitors the nodes of an experiment.
 
-    ``check_nodes`` raises if one of those that were started has ended.
+    ``check_nodes`` raises an error if a started node has ended.
     """
 
     def __init__(self, experiment: Experiment, check_nodes: Callable[[], None]) -> None:
@@ -37,24 +37,24 @@ class Watch(PlannerClient):
             namespace=experiment.namespace, joints=experiment.joints, timeout=START_SECONDS)
         self._experiment, self._check_nodes = experiment, check_nodes
         self.notes: list[str] = []
-        # Topics of which the recorder has found a publisher, by what it says.
+        # Number of topics for which the recorder reports a publisher.
         self._matched = 0
-        # Nodes whose parameters are in the bag.
+        # Number of nodes whose parameters are in the bag.
         self._stored = 0
         self._time = 0.0
         self._looked = 0.0
-        # The time, and when it last went on.
+        # The time, and the moment at which it last advanced.
         self._seen = 0.0, monotonic()
         self._over: float | None = None
         self._parameters: dict[str, Any] = {}
         endpoints.subscribe(self.node, topics.DIAGNOSTICS, self._on_diagnostics)
-        # Only the newest counts: the executor would call for each of thousands a second.
+        # Only the newest message is read, since a callback for thousands a second is too slow.
         self._clock = endpoints.listen(self.node, topics.CLOCK_TOPIC)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             values = {x.key: x.value for x in status.values}
-            # Others may record too.
+            # Ignore other recorders.
             if values.get('bag') == str(self._experiment.bag):
                 self._matched = whole(values.get('matched'))
                 self._stored = whole(values.get('parameters_of'))
@@ -70,12 +70,12 @@ class Watch(PlannerClient):
 
     @property
     def recorder_ready(self) -> bool:
-        """Whether the recorder hears everything that somebody sends."""
+        """Whether the recorder is matched with all published topics."""
         sent = [x for x in self._experiment.topics() if self.node.count_publishers(x)]
         return self._matched >= len(sent)
 
     def wait_for_parameters(self) -> None:
-        """Wait until parameters of planner and plant are in the bag, or note that they are not."""
+        """Wait until the bag contains parameters of planner and plant, or note their absence."""
         count = len({x.partition('.')[0] for x in self._parameters})
         try:
             self.spin_until(
@@ -87,16 +87,16 @@ class Watch(PlannerClient):
 
     @property
     def measured(self) -> bool:
-        """Whether somebody publishes samples."""
+        """Whether there is a publisher of samples."""
         return bool(self.node.count_publishers(topics.JOINT_STATES.name))
 
     # -- checks --------------------------------------------------------------------------------
 
     def read_parameters(self) -> None:
         """
-        Ask planner and plant for their parameters; a driver of hardware may have none.
+        Request the parameters of planner and plant; there may be no plant, but a driver.
 
-        Nodes that were started answer when they have created all that they publish.
+        Nodes that were started answer once all their publishers exist.
         """
         for name in (topics.PLANNER, topics.PLANT):
             if name == topics.PLANNER or self._experiment.nodes or self._is_there(name):
@@ -104,19 +104,19 @@ class Watch(PlannerClient):
                     self, name, each=self._check_nodes).items()}
 
     def parameter(self, name: str) -> object:
-        """Return a parameter of a node by ``'node.name'``; None if it has none."""
+        """Return a parameter of a node by ``'node.name'``; None if it does not exist."""
         return self._parameters.get(name)
 
     def check(self) -> None:
         """
-        Make sure that what runs can do what is asked.
+        Check that the running nodes can carry out the experiment.
 
         Raises
         ------
         BadInputError
-            If a node's parameters are not those of the parameter file.
+            If a node's parameters differ from the parameter file.
         HmsaError
-            If nobody takes the commands.
+            If the commands have no subscriber.
 
         """
         wrong = [
@@ -150,12 +150,12 @@ class Watch(PlannerClient):
 
     def look(self, end: float) -> None:
         """
-        Make sure that the nodes are there and time goes on; the sequence is over at ``end`` s.
+        Check that the nodes exist and time advances; the sequence is over at ``end`` s.
 
         Raises
         ------
         HmsaError
-            If something has gone.
+            If a check fails.
 
         """
         self._check_nodes()
@@ -181,7 +181,7 @@ class Watch(PlannerClient):
                     f'the sequence has not come to its end {_GRACE_SECONDS:g} s after its time')
 
     def unpause(self) -> None:
-        """Let simulated time run."""
+        """Resume simulated time."""
         call = endpoints.call(
             self.node, topics.SET_PAUSED, topics.PLANT, SetBool.Request(data=False))
         for condition, failure in (
