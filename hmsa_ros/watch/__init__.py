@@ -1,6 +1,6 @@
 """
 The live view in the terminal.
 
-`listener` gathers from ROS what goes on, into the records of `scene`; `chart` and `screen` show
-them as text and know no ROS.
+`listener` collects data from ROS into the records of `scene`. `screen` formats them as text and
+does not depend on ROS.
 """

@@ -1,8 +1,8 @@
 """
-Gathers what goes on from ROS, by looking a few times a second.
+Collect the state of running nodes by polling a few times a second.
 
-No executor serves the subscriptions: what has arrived is taken from the middleware at each look,
-so that a thousand samples a second wake nobody up.
+Subscriptions have no executor: messages are taken from the middleware at each look, so that a
+thousand samples a second cause no callbacks.
 """
 
 from collections import Counter
@@ -29,25 +29,25 @@ from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.visitor import leave, visit
 from hmsa_ros.watch.scene import History, Joint, Report, Scene
 
-# Of the samples since the last look no more than these are kept: all of them at 1 kHz.
+# Number of samples kept since the last look: all of them at 1 kHz.
 _SAMPLES = 200
 _SAMPLE_QOS = topics.Quality(_SAMPLES, reliable=False)
 _REPORT_QOS = topics.Quality(100, reliable=False)
-# Joints times samples that are read at one look: all of them up to ten joints at 1 kHz.
+# Limit on joints times samples read at one look: all of them for up to ten joints at 1 kHz.
 _MOST_READ = 1000
-# Between two looks at the graph, and how long discovery may take before its result counts.
+# Interval of looks at the graph, and time for discovery, in s.
 _GRAPH_SECONDS = 1.0
 _DISCOVERY_SECONDS = 1.5
-# Samples that stay away for so long are waited for, and the window of their rate.
+# Time in s without samples after which they are reported as missing; window of their rate.
 _QUIET_SECONDS = 2.0
 _RATE_SECONDS = 1.0
-# Reports of nodes that have ended, and of messages left aside, are dropped after a while.
+# Time in s after which reports of ended nodes and of unreadable messages are dropped.
 _FORGET_SECONDS = 30.0
 
 
 @dataclass
 class _Source:
-    """A subscription, and what arrived on it that could not be read."""
+    """A subscription, with a count of its unreadable messages."""
 
     topic: str
     kind: type[Any]
@@ -57,7 +57,7 @@ class _Source:
     complained: float = -math.inf
 
     def read(self, taken: Iterable[Taken]) -> Iterator[Any]:
-        """Yield the messages that can be read."""
+        """Yield the readable messages."""
         for one in taken:
             try:
                 yield decode(one.data, self.kind)
@@ -67,15 +67,15 @@ class _Source:
                 self.complained = monotonic()
 
     def new(self) -> Iterator[Any]:
-        """Yield the messages that have arrived and can be read."""
+        """Yield the readable messages that have arrived."""
         return self.read(self.subscription.take())
 
 
 class Listener:
     """
-    Looks at the nodes of one namespace; a context manager.
+    Monitor the nodes of one namespace; a context manager.
 
-    Without ``joints`` it shows all; the charts reach ``span`` seconds back.
+    All joints are shown by default; the charts cover the last ``span`` seconds.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class Listener:
         return source
 
     def look(self) -> Scene:
-        """Return what is seen now, with what has arrived since the last look."""
+        """Return the present scene, including messages since the last look."""
         now = monotonic()
         if now - self._graph_at >= _GRAPH_SECONDS:
             self._graph_at = now
@@ -150,7 +150,7 @@ class Listener:
             progress=self._progress(), waiting=self._waiting(now, len(shown)),
             reports=self._reports(now))
 
-    # -- what is taken -------------------------------------------------------------------------
+    # -- messages ------------------------------------------------------------------------------
 
     def _look_at_graph(self) -> None:
         node = self._node
@@ -179,7 +179,7 @@ class Listener:
             self._plan_span = (start, start + max(times)) if times else None
         for message in self._status.new():
             values = texts(message)
-            # One joint has no name there; of several each has its own.
+            # Keys of a single joint have no joint name; those of several have.
             self._name_coordinates(message.hardware_id, values)
             self._targets = {
                 key.rpartition('.')[0] or printable(message.hardware_id): real(value)
@@ -192,7 +192,7 @@ class Listener:
             if now - self._arrived > _QUIET_SECONDS:
                 self._rate, self._counted = math.nan, None
             return
-        # Of many joints not every sample can be read in passing.
+        # With many joints, not every sample can be read in time.
         every = max(1, math.ceil(len(arrived) * len(self._joints) / _MOST_READ))
         taken: dict[tuple[str, ...], list[JointState]] = {}
         for message in self._samples.read(arrived[::-1][::every][::-1]):
@@ -235,14 +235,14 @@ class Listener:
         for name, (source, schedule) in self._commands.items():
             for message in source.new():
                 schedule.insert(from_time(message.header.stamp), message.magnetic_field.z)
-            # Where no sample has the time, the newest counts.
+            # Without the time of a sample, the newest command applies.
             value = schedule.apply_until(math.inf if self._stamp is None else self._stamp)
             joint = self._joints.get(name or self._only_joint())
             if joint is not None:
                 joint.commanded = value
 
     def _only_joint(self) -> str:
-        """Return the joint that topics without its name are of."""
+        """Return the joint of topics without a joint name."""
         for names in (self._planned_joints, tuple(self._joints)):
             if len(names) == 1:
                 return names[0]
@@ -252,7 +252,7 @@ class Listener:
         for message in self._diagnostics.new():
             for status in message.status:
                 name = printable(status.name.partition(':')[0].strip().rpartition('/')[2])
-                # A robot's diagnostics are of many other things.
+                # Diagnostics of a robot cover many other components.
                 if name not in topics.NODES and status.hardware_id not in self._joints:
                     continue
                 values = texts(status)
@@ -266,14 +266,14 @@ class Listener:
             if now - when <= _FORGET_SECONDS}
 
     def _name_coordinates(self, joint: str, values: Mapping[str, str]) -> None:
-        """Note what the positions of joints are called, from a status; one joint has no name."""
+        """Record coordinate names from a status, whose keys have no joint name for one joint."""
         for key, value in values.items():
             name, _, last = key.rpartition('.')
             if last == 'coordinate' and value in COORDINATES:
                 self._coordinates[name or printable(joint)] = value
 
     def _reports(self, now: float) -> list[Report]:
-        """Return what each node says: the worst of its reports, and all of its counters."""
+        """Return the worst report of each node, with all of its counters."""
         by_node: dict[str, list[tuple[float, Report]]] = {}
         for (name, _, _), said in sorted(self._heard.items(), key=lambda x: x[0]):
             by_node.setdefault(name, []).append(said)
@@ -288,7 +288,7 @@ class Listener:
                 now - max(when for when, _ in heard)))
         return reports
 
-    # -- what follows --------------------------------------------------------------------------
+    # -- derived values ------------------------------------------------------------------------
 
     def _progress(self) -> float:
         if self._plan_span is None or self._stamp is None:
@@ -299,7 +299,7 @@ class Listener:
         return min(max((self._stamp - begin) / (end - begin), 0.0), 1.0)
 
     def _waiting(self, now: float, shown: int) -> list[str]:
-        """Return what is missing, with what may be the reason."""
+        """Return what is missing, with the possible reason."""
         if now - self._begin < _DISCOVERY_SECONDS:
             return self._crowd or ([] if shown or self._request else ['looking around'])
         where = f'on domain {self._domain}'

@@ -1,4 +1,4 @@
-"""What is seen of a run at one moment."""
+"""State of a run at one moment."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,14 +11,14 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import drive_of, POSITION
 from hmsa_ros.model.units import Drive
 
-#: Of a chart.
+#: Number of slots of a chart.
 SLOTS = 480
-#: What diagnostics and verdicts call their levels.
+#: Names of the levels of diagnostics and verdicts.
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 
 
 class History:
-    """The least and largest value in each slot of the last ``span`` seconds; peaks are kept."""
+    """Minimum and maximum in each slot of the last ``span`` seconds, so that peaks are kept."""
 
     def __init__(self, span: float, slots: int = SLOTS) -> None:
         self._slot = span / slots
@@ -27,7 +27,7 @@ class History:
         self._newest = 0
 
     def put(self, before: float, now: float, values: Array) -> None:
-        """Take in samples that arrived between two looks (times in s), evenly as far as known."""
+        """Add samples from between two looks (times in s), assumed evenly spaced."""
         self._advance(now)
         count = len(self._low)
         times = before + (now - before) * np.arange(1, len(values) + 1) / max(len(values), 1)
@@ -37,7 +37,7 @@ class History:
         np.fmax.at(self._high, slots[kept] % count, values[kept])
 
     def hold(self, before: float, now: float, value: float) -> None:
-        """Take in a value that held between two looks (times in s)."""
+        """Add a value that was constant between two looks (times in s)."""
         before = max(before, now - self._slot * (len(self._low) + 1))
         self.put(before, now, np.full(math.ceil((now - before) / self._slot) + 1, value))
 
@@ -48,12 +48,12 @@ class History:
         self._newest = max(newest, self._newest)
 
     def ranges(self, now: float, columns: int) -> tuple[Array, Array]:
-        """Return least and largest values by column up to ``now`` in s; NaN for none."""
+        """Return minima and maxima by column up to ``now`` in s; NaN if empty."""
         self._advance(now)
         count = len(self._low)
         order = np.arange(self._newest - count + 1, self._newest + 1) % count
         begins = np.linspace(0, count, columns, endpoint=False).astype(np.int64)
-        # NaN is skipped; a column without any value gives NaN.
+        # NaN is ignored; a column without values gives NaN.
         return np.fmin.reduceat(self._low[order], begins), np.fmax.reduceat(
             self._high[order], begins)
 
@@ -61,9 +61,9 @@ class History:
 @dataclass
 class Joint:
     """
-    One actuator: newest sample, target and command (in SI, NaN if not known), and its charts.
+    One actuator: newest sample, target and command (in SI, NaN if unknown), and its charts.
 
-    ``coordinate`` is what its position is called, as far as known.
+    ``coordinate`` is the name of its position coordinate, as far as known.
     """
 
     name: str
@@ -79,13 +79,13 @@ class Joint:
 
     @property
     def drive(self) -> Drive:
-        """What moves it, as far as known."""
+        """The quantity that drives it, as far as known."""
         return drive_of(self.coordinate)
 
 
 @dataclass
 class Report:
-    """What a node says of its health, `LEVELS` by index, and how long ago in s."""
+    """Report of a node's health, with the index in `LEVELS`, and its age in s."""
 
     name: str
     level: int
@@ -97,11 +97,11 @@ class Report:
 @dataclass
 class Scene:
     """
-    What is seen at one moment; numbers are NaN where they are not known.
+    State at one moment; unknown numbers are NaN.
 
-    ``now`` is the time of this look in s of a clock that only goes on, ``stamp`` that of the
-    newest sample, which arrived ``age`` s ago; ``progress`` is the share of the plan that is done,
-    ``waiting`` what is waited for, a sentence each.
+    ``now`` is the steady time of this look in s, ``stamp`` the time of the newest sample, which
+    arrived ``age`` s ago. ``progress`` is the completed fraction of the plan, ``waiting`` contains
+    a sentence for each missing item.
     """
 
     where: str

@@ -1,4 +1,4 @@
-"""The scene as text: a screen for a terminal, a line for a log, or JSON for a program."""
+"""A scene as text: a screen for a terminal, a line for a log, or JSON for a program."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from hmsa_ros.model.laws.coordinate import drive_of, shared_name
 from hmsa_ros.model.status import Code
 from hmsa_ros.watch.scene import Joint, LEVELS, Report, Scene
 
-# Bits of a Braille cell, by row from above and column.
+# Bits of a Braille cell, by row from the top and by column.
 _BITS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
 _BRAILLE = 0x2800
 
@@ -23,9 +23,9 @@ _BRAILLE = 0x2800
 @dataclass(frozen=True)
 class Strip:
     """
-    A chart of one value and its target, by rows from above.
+    A chart of one value and its target, by rows from the top.
 
-    ``targets`` are the columns of each row that show the target alone, for another colour.
+    ``targets`` contains the columns of each row that only show the target, for another colour.
     """
 
     rows: tuple[str, ...]
@@ -33,12 +33,12 @@ class Strip:
 
 
 def dots(braille: bool) -> tuple[int, int]:
-    """Return how many columns and rows of dots a character has."""
+    """Return the number of columns and rows of dots in a character."""
     return (2, 4) if braille else (1, 1)
 
 
 def limits(*values: Array, least: float) -> tuple[float, float]:
-    """Return the ends of an axis, with some room around the values; NaN values do not count."""
+    """Return the limits of an axis with a margin around the values; NaN is ignored."""
     known = np.concatenate([x[np.isfinite(x)] for x in values])
     if not len(known):
         return 1.0 - 0.5 * least, 1.0 + 0.5 * least
@@ -50,14 +50,14 @@ def limits(*values: Array, least: float) -> tuple[float, float]:
 def strip(
         value: tuple[Array, Array], target: tuple[Array, Array], height: int,
         edges: tuple[float, float], *, braille: bool) -> Strip:
-    """Draw the least and largest value in each column of dots (NaN for none) between two edges."""
+    """Draw minimum and maximum in each column of dots (NaN for none) between two edges."""
     across, down = dots(braille)
     columns = len(value[0])
     lines = height * down
     width = -(-columns // across)
     low, high = edges
 
-    # Padded to whole characters; of each kind which dots are set.
+    # Set dots of value and target, padded to whole characters.
     shown = np.zeros((2, lines, width * across), dtype=bool)
     place = np.arange(lines)[:, None]
     for kind, (least, largest) in enumerate((value, target)):
@@ -70,13 +70,13 @@ def strip(
         else:
             hit = (place == top) | (place == bottom)
             if braille:
-                # Broken, so that it is told apart without colour.
+                # Dashed, to be distinguishable without colour.
                 hit &= np.arange(columns) % 3 > 0
         shown[kind, :, :columns] = hit & known
     cells = shown.reshape(2, height, down, width, across)
     ours, theirs = cells[0].any(axis=(1, 3)), cells[1].any(axis=(1, 3))
     if braille:
-        # Where both meet, the value is what is seen.
+        # The value covers the target.
         dot = np.where(ours[:, None, :, None], cells[0], cells[1])
         codes = _BRAILLE + np.einsum('hdwa,da->hw', dot, np.array(_BITS))
         rows = [''.join(map(chr, row)) for row in codes.tolist()]
@@ -88,31 +88,31 @@ def strip(
         tuple(rows), tuple(tuple(np.flatnonzero(x).tolist()) for x in alone))
 
 
-#: Counters of trouble: shown before the others, and in a line.
+#: Counters of problems, which are shown first, and in the line.
 TROUBLES = ('late', 'replanned', 'lost', 'refused', 'failed', 'timeouts')
-# Levels by word and colour, never by colour alone.
+# Levels are shown by word and colour, never by colour alone.
 _STYLES = ('green', 'yellow', 'bold red', 'yellow')
 _VALUE, _TARGET, _SOFT, _WAITING = 'cyan', 'magenta', 'dim', 'bold yellow'
 # Width of the axis beside a chart.
 _GUTTER = 10
-# Rows of a joint with a chart of its own: of text and axis, and at least so many of the chart.
+# Rows of a joint with its own chart: text and axis, minimum and maximum of the chart.
 _TEXT_ROWS, _CHART_ROWS, _MOST_CHART_ROWS = 3, 3, 24
-# What is around the lines of a table: its head, and how many joints are not shown.
+# Extra lines of a table: its header, and the number of joints not shown.
 _ENDS = 2
-# Of a position and its name in a table.
+# Width of a position and its name in a table.
 _WIDE = 10
 # Smallest range of a chart's axis.
 _LEAST_RANGE = 1e-3
 _MOST_REPORTS = 4
-# A warning may take this share of the rows, other words two; what comes before them is a name
-# and a level.
+# Maximum height of a warning as a fraction of the rows, and of other messages in rows; indent by
+# the name and the level.
 _SHARE, _WORDS, _INDENT = 6, 2, 15
-# A node that reports once a second and has not for so long is silent, in s.
+# Time in s without a report, normally one a second, after which a node is silent.
 SILENT_AFTER = 3.5
 
 
 def number(value: float, form: str = '.5f') -> str:
-    """Return a number as text; a question mark where it is not known."""
+    """Return a number as text; a question mark if unknown."""
     return f'{value:{form}}' if math.isfinite(value) else '?'
 
 
@@ -125,7 +125,7 @@ def _off(joint: Joint) -> str:
 
 
 class Screen:
-    """Shows scenes on a terminal; charts of ``span`` seconds, in ASCII unless ``unicode``."""
+    """Format scenes for a terminal, with charts of ``span`` seconds, in ASCII or Unicode."""
 
     def __init__(self, span: float, *, unicode: bool = True) -> None:
         self._span = span
@@ -220,11 +220,11 @@ class Screen:
         return [first, second, *lines, self._axis(width)]
 
     def _axis(self, width: int) -> Text:
-        """Return the axis of time below a chart: how many s ago, up to now."""
+        """Return the time axis below a chart, in s before now."""
         rule, corner = ('─', '└') if self._unicode else ('.', '+')
         across = max(width - _GUTTER, 1)
         drawn = [rule] * across
-        # A label begins where its time is, the last ends there; those that overlap are left out.
+        # Labels begin at their time, and the last one ends there; overlapping ones are omitted.
         for place, label in [(across - len('now'), 'now'), *(
                 (i * across // 4, f'{-self._span * (1.0 - i / 4.0):g} s') for i in (0, 2, 1, 3))]:
             if place >= 0 and all(x == rule for x in drawn[place:place + len(label) + 1]):
@@ -234,7 +234,7 @@ class Screen:
     def _chart(
             self, joint: Joint, now: float, width: int, rows: int
     ) -> tuple[list[Text], tuple[float, float]]:
-        """Return a chart, and the values at its lower and upper edge."""
+        """Return a chart, and its lower and upper limits."""
         columns = width * dots(self._unicode)[0]
         value, target = (x.ranges(now, columns) for x in (joint.stretches, joint.targets))
         edges = limits(*value, *target, least=_LEAST_RANGE)
@@ -255,7 +255,7 @@ class Screen:
             f'{"joint":<{wide}} {name:>{_WIDE}} {"target":>8} {"off":>8} {level:>13}',
             style=_SOFT)]
         if room <= _ENDS:
-            # Too small for more than the joints themselves.
+            # No room for a header.
             lines = []
         shown = list(scene.joints)
         if len(shown) > room - len(lines):
@@ -277,7 +277,7 @@ class Screen:
 
 
 def _fitted(width: int, parts: Sequence[tuple[str, str]]) -> Text:
-    """Return the parts of a line, each with its style, that fit whole; always the first."""
+    """Return the parts of a line, each with its style, that fit completely; at least the first."""
     line = Text()
     for words, style in parts:
         gap = '  ' if line.plain else ''
@@ -288,7 +288,7 @@ def _fitted(width: int, parts: Sequence[tuple[str, str]]) -> Text:
 
 
 def _judged(name: str, level: int, message: str, width: int, rows: int) -> list[Text]:
-    """Return a level and its message; what is not OK takes up to some rows."""
+    """Return a level and its message, which may take several rows if it is not OK."""
     level = min(max(level, 0), len(LEVELS) - 1)
     first = Text(f'{name:<8} ')
     first.append(f'{LEVELS[level]:<5} ', style=_STYLES[level])
@@ -308,7 +308,7 @@ def _wrapped(sentence: str, width: int, rows: int | None = None) -> list[str]:
 
 
 def _time(stamp: float) -> str:
-    """Return a stamp: of a wall clock as the time of day, of a simulation in seconds."""
+    """Return a timestamp as the time of day, or in seconds for simulated time."""
     if stamp < 1e8:
         return f'{stamp:.3f} s (simulated)'
     from datetime import datetime
@@ -316,7 +316,7 @@ def _time(stamp: float) -> str:
 
 
 def line(scene: Scene) -> str:
-    """Return a scene as one line of plain text, without a line end."""
+    """Return a scene as one line of plain text, without a newline."""
     parts = [] if math.isnan(scene.stamp) else [_time(scene.stamp)]
     parts += [
         f'{x.name} {number(x.stretch)} (target {number(x.target)}, '
@@ -336,7 +336,7 @@ def line(scene: Scene) -> str:
 
 
 def as_json(scene: Scene) -> dict[str, Any]:
-    """Return a scene for JSON, None for what is not known."""
+    """Return a scene for JSON, with None for unknown values."""
     request = scene.request
     found: dict[str, Any] = finite({
         'where': scene.where, 'stamp': scene.stamp, 'age': scene.age,
