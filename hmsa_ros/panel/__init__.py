@@ -1,6 +1,6 @@
 """
-A page in the browser to drive the running nodes.
+A web page to operate the running nodes.
 
-`server` gives the page to whoever knows its address, without ROS; `desk` carries out what the
-page asks for, in the thread that holds the nodes; `recording` records and reports.
+`server` serves the page to holders of its address, without ROS. `desk` carries out the commands of
+the page in the thread of the nodes. `recording` records and reports.
 """

@@ -1,4 +1,4 @@
-"""What the panel does with ROS, in one thread that never waits for an answer."""
+"""The panel's access to ROS, in one thread that never blocks."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
@@ -31,9 +31,10 @@ from hmsa_ros.watch.listener import Listener
 from hmsa_ros.watch.scene import History, LEVELS, Scene, SLOTS
 from hmsa_ros.watch.screen import as_json
 
-# Between two frames; of each chart one has the last slots, and all of them while a page is new.
+# Frame interval in s; number of chart slots in a frame, and time in s for which a new page gets
+# all.
 _PERIOD, _TAIL, _NEW_SECONDS = 0.02, 24, 1.0
-# Until a page that is loaded again is back, and until a planner counts as gone.
+# Time in s for a page to be reloaded, and after which a planner counts as gone.
 _RELOAD_SECONDS, _GONE_SECONDS = 1.0, 10.0
 _ASK_SECONDS = 1.0
 _RESTING = ('at_rest', 'idle')
@@ -41,20 +42,20 @@ _RESTING = ('at_rest', 'idle')
 
 class Desk:
     """
-    Carries out what the pages of a server ask for, and tells them what is seen.
+    Carry out the commands of a server's pages, and send them the present state.
 
     Parameters
     ----------
     server : Server
-        That gives the page.
+        Server of the page.
     parse : callable
         Returns one setpoint from its text.
     out : Path
         Folder of recordings.
     namespace, joints : str, tuple of str
-        What it drives.
+        Planner and joints to operate.
     span : float
-        Of the charts in s.
+        Duration of the charts in s.
     stop_on_close : bool
         Whether to come to rest when the last page is closed.
 
@@ -78,15 +79,15 @@ class Desk:
         self._estimates: dict[str, dict[str, Any]] = {}
         self._known: Mapping[str, Any] = {}
         self._next_ask = 0.0
-        # The request sent last, when, and whether the planner has received it, or never will.
+        # The last request, its time, and whether the planner has received it or never will.
         self._request, self._sent, self._received = '', -math.inf, True
-        # When stopping began, and whether that request was known to have come before.
+        # Time of a stop, and whether the last request had arrived before it.
         self._stopping, self._sure = -math.inf, False
         self._pages, self._news, self._left = 0, -math.inf, math.inf
         self._note: dict[str, Any] = {'number': 0, 'level': 'OK', 'text': ''}
 
     def run(self) -> None:
-        """Serve until the process is told to end; the actuator rests then, the bag is closed."""
+        """Serve until the end is requested; then stop the actuator and close the bag."""
         try:
             while not ENDING.asked:
                 self._client.pass_time(_PERIOD)
@@ -105,7 +106,7 @@ class Desk:
         self._received = self._received or self._client.verdict.request == self._request
         if not self._received and now - self._sent > _GONE_SECONDS:
             self._received = True
-            self._tell('the planner did not reply to the request: send it again', 2)
+            self._notify('the planner did not reply to the request: send it again', 2)
         self._look_at_pages(now)
         if self._server.stop.is_set():
             self._server.stop.clear()
@@ -117,23 +118,23 @@ class Desk:
         except Empty:
             pass
         self._follow_rest(now)
-        # A page that comes later gets none that is old by then.
+        # No outdated frame for a page that opens later.
         self._server.frame = json.dumps(
             finite(self._frame(scene, now)), separators=(',', ':')) if self._pages else ''
 
-    def _tell(self, text: str, level: int = 0) -> None:
+    def _notify(self, text: str, level: int = 0) -> None:
         self._note = {
             'number': self._note['number'] + 1, 'level': LEVELS[level], 'text': printable(text)}
 
     @property
     def _moves(self) -> bool:
-        """Whether what the panel sent is under way, as far as known."""
+        """Whether a request of the panel is being carried out, as far as known."""
         verdict = self._client.verdict
         return not self._received or (
             verdict.request == self._request != '' and verdict.state not in _RESTING)
 
     def _look_at_pages(self, now: float) -> None:
-        """Notice new pages, and that the last one is closed."""
+        """Detect new pages, and that the last one was closed."""
         pages = len(self._server.pages)
         if pages > self._pages:
             self._news = now
@@ -151,21 +152,21 @@ class Desk:
 
     def _begin_stop(self, now: float) -> None:
         self._stopping, self._sure = now, self._received
-        self._tell('stopping', 1)
+        self._notify('stopping', 1)
 
     def _follow_stop(self, now: float) -> None:
-        """Ask until an answer comes to a call that was made after the last request arrived."""
+        """Repeat the stop until a call made after the arrival of the last request is answered."""
         if self._stopping == -math.inf:
-            # So that its server is known when it counts.
+            # Discovers the server of the stop in advance.
             self._stop.ready  # noqa: B018
         elif (answer := self._stop.answer()) is not None and self._sure:
             self._stopping = -math.inf
-            self._tell(answer.message, 0 if answer.success else 2)
+            self._notify(answer.message, 0 if answer.success else 2)
         elif answer is not None:
             self._sure = self._received
         elif now - self._stopping > _GONE_SECONDS:
             self._stopping = -math.inf
-            self._tell('the planner does not answer the stop: look after the coil', 2)
+            self._notify('the planner does not answer the stop: look after the coil', 2)
 
     # -- commands ------------------------------------------------------------------------------
 
@@ -178,14 +179,14 @@ class Desk:
                     self._set_feedback(mode)
                 case {'do': 'record', 'on': True}:
                     self._recording.start(bool(self._known.get('use_sim_time')))
-                    self._tell('recording')
+                    self._notify('recording')
                 case {'do': 'record', 'on': False}:
                     self._recording.stop()
                 case _:
                     raise BadInputError(
                         f'unknown command {str(command.get("do"))[:40]!r}: reload the page')
         except HmsaError as error:
-            self._tell(str(error), 2)
+            self._notify(str(error), 2)
 
     def _send(self, words: str, now: float) -> None:
         if self._stopping > -math.inf:
@@ -196,7 +197,7 @@ class Desk:
         if not self._client.listened:
             raise HmsaError('no planner listens: start one with hmsa planner')
         self._request, self._sent, self._received = self._client.publish(setpoints), now, False
-        self._tell(f'sent {" ".join(words.split())}')
+        self._notify(f'sent {" ".join(words.split())}')
 
     def _set_feedback(self, mode: str) -> None:
         if self._set is not None:
@@ -207,13 +208,13 @@ class Desk:
             SetParameters.Request(parameters=[Parameter(name='feedback', value=value)]))
 
     def _follow_rest(self, now: float) -> None:
-        """Take answers of the parameters' services, and look after the recorder."""
+        """Process responses of the parameter services, and check the recorder."""
         if self._set is not None and (answer := self._set.answer()) is not None:
             self._set.close()
             self._set, self._next_ask = None, 0.0
             for result in answer.results[:1]:
                 if not result.successful:
-                    self._tell(f'the planner refused: {result.reason}', 2)
+                    self._notify(f'the planner refused: {result.reason}', 2)
         if not (self._get.ready and self._client.listened):
             self._known = {}
         elif now >= self._next_ask and (answer := self._get.answer()) is not None:
@@ -222,13 +223,13 @@ class Desk:
             self._next_ask = now + _ASK_SECONDS
         self._recording.check()
         if self._recording.trouble:
-            self._tell(self._recording.trouble, 2)
+            self._notify(self._recording.trouble, 2)
             self._recording.trouble = ''
 
     def _on_estimate(self, message: DiagnosticArray) -> None:
         for status in message.status:
             values = texts(status)
-            # Of one joint or of several, whose names are known.
+            # For one joint or several, whose names are known.
             if status.hardware_id in self._joints:
                 self._estimates[status.hardware_id] = {
                     'joint': status.hardware_id, 'level': LEVELS[min(status.level[0], 3)],
@@ -240,7 +241,7 @@ class Desk:
     # -- frames --------------------------------------------------------------------------------
 
     def _frame(self, scene: Scene, now: float) -> dict[str, Any]:
-        """Return what a page shows, for JSON."""
+        """Return the contents of a page, for JSON."""
         recording, feedback = self._recording, self._known.get('feedback', '')
         reports = self._server.reports
         if recording.report is not None:
@@ -248,7 +249,7 @@ class Desk:
         tail = SLOTS if now - self._news < _NEW_SECONDS else _TAIL
         seen = as_json(scene)
         if scene.request is not None:
-            # What was measured in words; anybody may send figures.
+            # The finding in words, since figures come from an untrusted message.
             seen['request']['finding'] = scene.request.finding
         return {
             **seen,
@@ -269,5 +270,5 @@ class Desk:
 
 
 def _tail(history: History, now: float, count: int) -> list[list[float]]:
-    """Return the least and largest values in the last slots of a history."""
+    """Return minima and maxima in the last slots of a history."""
     return [np.round(side[-count:], 7).tolist() for side in history.ranges(now, SLOTS)]

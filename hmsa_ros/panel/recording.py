@@ -1,4 +1,4 @@
-"""A recording that is switched on and off, and its report."""
+"""A recording that can be switched on and off, and its report."""
 
 from pathlib import Path
 import subprocess
@@ -14,9 +14,9 @@ from hmsa_ros.lab.processes import dated, Session
 
 class Recording:
     """
-    Records to new folders in ``base``, in a process of its own; another makes the report.
+    Record to new folders in ``base``, in a separate process; another one makes the report.
 
-    ``state`` is off, on, closing or reporting; ``trouble`` says what went wrong last.
+    ``state`` is off, on, closing or reporting; ``trouble`` contains the last error.
     """
 
     def __init__(self, base: Path, namespace: str, joints: tuple[str, ...]) -> None:
@@ -31,7 +31,7 @@ class Recording:
         self._ending = False
 
     def start(self, simulated: bool) -> None:
-        """Begin, in simulated time if so; raise `HmsaError` if it cannot."""
+        """Start, in simulated time if ``simulated``; raise `HmsaError` if that is impossible."""
         if self.state != 'off':
             raise HmsaError(f'the recording is {self.state}: expected none')
         folder = dated(self._base).resolve()
@@ -44,7 +44,7 @@ class Recording:
         self.trouble, self.report = '', None
 
     def check(self) -> None:
-        """Note where the recorder has ended by itself."""
+        """Detect an early end of the recorder."""
         try:
             if self.state == 'on' and self._session is not None:
                 self._session.check()
@@ -52,7 +52,7 @@ class Recording:
             self.state, self.trouble = 'off', str(error)
 
     def stop(self) -> None:
-        """Close the bag and make its report; return at once."""
+        """Close the bag and make its report, without waiting."""
         if self.state == 'on' and self._session is not None and self.bag is not None:
             self.state = 'closing'
             self._worker = threading.Thread(
@@ -60,7 +60,7 @@ class Recording:
             self._worker.start()
 
     def close(self) -> None:
-        """Close the bag, if there is one open, and wait for it; a report is not waited for."""
+        """Close an open bag and wait for that, but not for a report."""
         self._ending = True
         self.stop()
         while self._worker is not None and self.state == 'closing':

@@ -1,9 +1,9 @@
 """
-The panel's server: a page and its socket, on this host, for whoever knows the address.
+The panel's server: a page and its socket, on this host, for holders of the address.
 
-It answers only requests whose address has the token and whose ``Host`` is its own, so that a
-foreign name that resolves to this host (DNS rebinding) reaches nothing. ``Origin``, which a socket
-must have, is its own too, so that no other page in the same browser reaches it.
+It only answers requests whose address contains the token and whose ``Host`` is its own, which
+excludes foreign names that resolve to this host (DNS rebinding). A socket must also have its own
+``Origin``, which excludes other pages in the same browser.
 """
 
 import asyncio
@@ -33,7 +33,7 @@ _FILES = {
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src data:; "
     "connect-src 'self' ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'")
-# A report has its scripts inside, and comes from a bag: it gets no origin and no network.
+# A report contains scripts and comes from a bag, so it gets neither origin nor network access.
 _REPORT_POLICY = (
     "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline'; "
     "style-src 'unsafe-inline'; img-src data: blob:; frame-ancestors 'none'")
@@ -41,18 +41,19 @@ _HEADERS = {
     'Cache-Control': 'no-store', 'Referrer-Policy': 'no-referrer',
     'X-Content-Type-Options': 'nosniff', 'Cross-Origin-Opener-Policy': 'same-origin',
     'Cross-Origin-Resource-Policy': 'same-origin', 'Server': 'hmsa'}
-# Longest message of a page in bytes, and commands that wait at most.
+# Maximum length of a page's message in bytes, and number of waiting commands.
 _LONGEST, _MOST = 4096, 64
-# Between two looks for a new frame, and until a page that does not answer counts as closed, in s.
+# Polling interval for a new frame, and timeout for a page without answer, in s.
 _LOOK, _PING = 0.01, 3.0
 
 
 class Server:
     """
-    A server in a thread of its own; a context manager.
+    A server in a separate thread; a context manager.
 
-    ``frame`` is the text that pages get as soon as it changes, ``reports`` has the pages of
-    recordings by name. What pages ask for waits in ``commands``, but that ``stop`` is set at once.
+    ``frame`` is the text sent to the pages when it changes. ``reports`` contains the reports of
+    recordings by name. Commands of the pages wait in ``commands``, except that ``stop`` is set
+    immediately.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ class Server:
 
     def __init__(self, port: int = 0) -> None:
         for name in ('access', 'general'):
-            # Requests that are refused are no news.
+            # Refused requests are not logged.
             logging.getLogger(f'tornado.{name}').addHandler(logging.NullHandler())
         if not 0 <= port <= 65535:
             raise BadInputError(f'port is {port}: expected 0 to 65535')
@@ -91,7 +92,7 @@ class Server:
 
     @property
     def address(self) -> str:
-        """What opens the page; secret."""
+        """Secret address of the page."""
         return f'http://{self.host}/{self.token}/'
 
     def __enter__(self) -> 'Server':
@@ -122,7 +123,7 @@ class Server:
         await server.close_all_connections()
 
     def take(self, message: str | bytes) -> None:
-        """Take what a page asks for; what is no command is passed over."""
+        """Accept a message of a page; ignore invalid commands."""
         with suppress(ValueError, RecursionError, Full):
             command = json.loads(message)
             if isinstance(command, dict):
@@ -133,7 +134,7 @@ class Server:
 
 
 class _Guarded(RequestHandler):
-    """Refuses what is not for us; of its own it has nothing to give."""
+    """Refuse requests without valid token, host and origin; serves no content itself."""
 
     origin_needed = False
 
@@ -146,7 +147,7 @@ class _Guarded(RequestHandler):
         self.set_header('Content-Security-Policy', "default-src 'none'; frame-ancestors 'none'")
 
     def prepare(self) -> None:
-        """Raise `HTTPError` unless the request is for us."""
+        """Raise `HTTPError` unless token, host and origin are valid."""
         server, headers = self.server, self.request.headers
         token = self.path_args[0] if self.path_args else ''
         origins = headers.get_list('Origin')
@@ -162,7 +163,7 @@ class _Guarded(RequestHandler):
 
 class _Page(_Guarded):
     def get(self, _: str, name: str) -> None:
-        """Give a file of the page; raise `HTTPError` where there is none."""
+        """Send a file of the page; raise `HTTPError` if it does not exist."""
         if name not in _FILES:
             raise HTTPError(404)
         file, kind = _FILES[name]
@@ -173,7 +174,7 @@ class _Page(_Guarded):
 
 class _Report(_Guarded):
     def get(self, _: str, name: str) -> None:
-        """Give a report; raise `HTTPError` where there is none."""
+        """Send a report; raise `HTTPError` if it does not exist."""
         path = self.server.reports.get(name)
         if path is None or not path.is_file():
             raise HTTPError(404)
@@ -189,7 +190,7 @@ class _Socket(_Guarded, WebSocketHandler):
         self._feeding = asyncio.create_task(self._feed())
 
     async def _feed(self) -> None:
-        """Send each new frame, the newest one to a page that is slow."""
+        """Send each new frame; a slow page only gets the newest one."""
         sent = ''
         with suppress(WebSocketClosedError):
             while True:
