@@ -1,1 +1,1 @@
-"""What nodes, bags, files and reports agree on: topics, parameters, units, defaults."""
+"""Definitions shared by nodes, bags, files and reports: topics, parameters, units, defaults."""

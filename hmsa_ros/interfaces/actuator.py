@@ -1,4 +1,4 @@
-"""The actuator that a set of parameters describes."""
+"""The actuator described by a set of parameters."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def completed(values: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Return the constants of a law that are in a file which the parameters name.
+    Return the constants of a law from a file named by the parameters, if any.
 
     Raises
     ------
@@ -33,9 +33,9 @@ def completed(values: Mapping[str, Any]) -> dict[str, Any]:
 def actuator_from(
         values: Mapping[str, Any], modulus: float | None = None) -> ActuatorParameters:
     """
-    Return the block of ``actuator.*``, ``mismatch.*`` if any, and its law unless Gent.
+    Return the block of ``actuator.*``, times any ``mismatch.*``, with its law unless Gent.
 
-    A modulus takes the place of the one that follows from the constants of a law.
+    ``modulus`` replaces the shear modulus that follows from the constants of a law.
     """
     numbers = {name: values[f'actuator.{name}'] for name in ACTUATOR_FIELDS}
     law, elastic = LAWS[values.get(LAW_NAME.name, 'gent')], None
@@ -52,8 +52,8 @@ def actuator_from(
 
 def model_from(
         values: Mapping[str, Any], modulus: float | None = None, period: int = 0) -> 'Model':
-    """Return what the parameters `PLANNED` plan with, on a grid of a period in ns."""
-    from hmsa_ros.planning.timeline import Model, Options  # not all need plans
+    """Return the planning model of the parameters `PLANNED`, on a command grid in ns."""
+    from hmsa_ros.planning.timeline import Model, Options  # not always needed
 
     return Model(planned_from(values, modulus), Options(
         flux_density_min=values['flux_density_min'], flux_density_max=values['flux_density_max'],
@@ -64,12 +64,12 @@ def model_from(
 
 def planned_from(
         values: Mapping[str, Any], modulus: float | None = None) -> ActuatorParameters:
-    """Return the block that a planner plans for: with its branches, if any."""
+    """Return the block for planning, including its viscoelastic branches."""
     return replace(actuator_from(values, modulus), creep=creep_from(values))
 
 
 def creep_from(values: Mapping[str, Any]) -> Creep:
-    """Return the branches of ``viscoelastic.*``; none where there is no such value."""
+    """Return the branches of ``viscoelastic.*``; none if there are no such values."""
     given = {x.name: values.get(x.name, x.default) for x in VISCOELASTIC}
     flow = given['viscoelastic.flow']
     constants = FLOWS[flow].constants if flow in FLOWS else ()
@@ -79,7 +79,7 @@ def creep_from(values: Mapping[str, Any]) -> Creep:
 
 
 def parameters_of(actuator: ActuatorParameters) -> dict[str, Any]:
-    """Return the parameters that describe a block, the inverse of `actuator_from`."""
+    """Return the parameters of a block, the inverse of `actuator_from`."""
     values: dict[str, Any] = {
         f'actuator.{name}': value for name, value in actuator.numbers.items()}
     if actuator.law is None:

@@ -1,7 +1,7 @@
 """
-Parameters that nodes, files and reports share: name, default, unit, range and description.
+Parameters shared by nodes, files and reports: name, default, unit, range and description.
 
-`ParameterSpec` is one entry. What only one node has is declared with that node.
+`ParameterSpec` is one entry. Parameters of a single node are declared in its module.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,14 +13,14 @@ from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.flows import CONSTANTS, FLOWS
 from hmsa_ros.model.laws import LAWS
 
-#: Words that YAML reads as false or true where nobody quotes them.
+#: Words that YAML reads as false or true unless quoted.
 WORDS = {False: ('off', 'no'), True: ('on', 'yes')}
 
 Value = bool | int | float | str | list[str] | list[float]
 
 
 def number_of(value: object) -> float | None:
-    """Return a number as a float; None for anything else, NaN or a number too large."""
+    """Return a number as a float; None for other types, NaN and numbers that are too large."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return None
     try:
@@ -33,11 +33,12 @@ def number_of(value: object) -> float | None:
 @dataclass(frozen=True)
 class ParameterSpec:
     """
-    One parameter: name in snake case, default, and what it may be.
+    One parameter: name in snake case, default, and permitted values.
 
-    The default's type is the parameter's; ``items`` is what a list holds. The description is a
-    sentence without the unit, which is empty for a dimensionless value. Numbers, those of a list
-    too, may have a closed range and strings choices; a ``read_only`` one is fixed at the start.
+    The type of the default is that of the parameter; ``items`` is the type of list items. The
+    description is a sentence without the unit, which is empty for a dimensionless value. Numbers
+    and list items may have a closed range, strings may have choices. A ``read_only`` parameter is
+    fixed at startup.
     """
 
     name: str
@@ -52,14 +53,14 @@ class ParameterSpec:
 
     def taken(self, value: Any) -> Any:
         """
-        Return a value of ROS or a file, checked, as the nodes use it; one item is a list of one.
+        Check a value and return it as used by the nodes; a single list item becomes a list.
 
-        An unquoted word that YAML reads as a truth value is the choice of that name.
+        An unquoted word that YAML reads as a boolean is interpreted as the choice of that name.
 
         Raises
         ------
         BadInputError
-            If it is of another type, outside the range or not one of the choices.
+            If it has the wrong type, is outside the range or is not one of the choices.
 
         """
         if isinstance(self.default, list):
@@ -99,7 +100,7 @@ class ParameterSpec:
 
     def check(self, value: Any) -> None:
         """
-        Refuse a value outside the range or the choices.
+        Check the range or the choices of a value.
 
         Raises
         ------
@@ -135,7 +136,7 @@ class ParameterSpec:
 def duration_specs(
         name: str, seconds: int, description: str, least: int = 0, most: int | None = None, *,
         nanoseconds: int = 0) -> tuple[ParameterSpec, ParameterSpec]:
-    """Return a duration as rosbag2 names it: whole seconds, and nanoseconds to add to them."""
+    """Return a duration in the style of rosbag2: whole seconds plus nanoseconds."""
     return (
         ParameterSpec(f'{name}.sec', seconds, description, 's', least, most),
         ParameterSpec(
@@ -150,10 +151,10 @@ def duration_from(values: Mapping[str, Any], name: str) -> int:
     return -1 if seconds < 0 else seconds * 10**9 + nanoseconds
 
 
-#: zeta of the example block, which nobody can look up for a block of their own.
+#: zeta of the example block.
 ZETA = 0.2
 
-#: The block that planner and plant have in common; the defaults are the example block's.
+#: Parameters of the block, common to planner and plant; the defaults are the example block's.
 ACTUATOR = (
     ParameterSpec(
         'actuator.shear_modulus', 1e4, 'Shear modulus G.', 'Pa',
@@ -180,7 +181,7 @@ ACTUATOR = (
 
 
 def _of_laws() -> tuple[ParameterSpec, ...]:
-    """Return the constants of all laws; a name that two laws have is one parameter."""
+    """Return the constants of all laws; laws share constants of the same name."""
     texts: dict[str, list[str]] = {}
     found: dict[str, ParameterSpec] = {}
     for law in LAWS.values():
@@ -203,20 +204,20 @@ LAW_NAME = ParameterSpec(
 #: The elastic law of the block and its constants.
 LAW = (LAW_NAME, *_of_laws())
 
-# Names of earlier versions. ROS tools cannot show a value and a group of values of one name.
+# Names in earlier versions. ROS tools cannot show a value and a group with the same name.
 _FORMER = {'law': LAW_NAME.name}
 
 
 def present_name(name: str) -> str:
-    """Return the name of a parameter, perhaps of one joint, that older files may have another."""
+    """Return the present name of a parameter with an earlier name, also of a joint."""
     joint, dot, rest = name.rpartition('.')
     return f'{joint}{dot}{_FORMER.get(rest, rest)}'
 
 
-#: Constants of laws that are read once, when a node starts.
+#: Constants of laws that are only read at startup.
 FIXED = frozenset(x.name for law in LAWS.values() for x in law.constants if x.fixed)
 
-#: All that describes a block.
+#: All parameters of a block.
 BLOCK = (*ACTUATOR, *LAW)
 
 JOINT = ParameterSpec(
@@ -245,10 +246,10 @@ COIL_TIME_CONSTANT = ParameterSpec(
     'coil_time_constant', 0.0, 'Time constant of the first-order coil lag; 0 for none.', 's',
     0.0, 1e3)
 
-#: What a plan depends on.
+#: Parameters that affect a plan.
 PLANNED = (*BLOCK, FLUX_DENSITY_MIN, FLUX_DENSITY_MAX, SLEW_LIMIT, COIL_TIME_CONSTANT)
 
-#: Branches beside the elastic law.
+#: Viscoelastic branches in addition to the elastic law.
 VISCOELASTIC = (
     ParameterSpec(
         'viscoelastic.ratio', [],
@@ -267,7 +268,7 @@ VISCOELASTIC = (
         x.maximum, items=float) for x in CONSTANTS.values()),
 )
 
-#: How well parameters are known, as ``hmsa identify --out`` and ``~/save_estimate`` write it.
+#: Uncertainty of parameters, as written by ``hmsa identify --out`` and ``~/save_estimate``.
 KNOWN = (
     ParameterSpec(
         'identification.names', [],
@@ -289,7 +290,7 @@ CREEP_TOLERANCE = ParameterSpec(
 PUBLISH_RATE = ParameterSpec(
     'publish_rate', 1000.0, "Sample rate, in the plant's own time.", 'Hz', 1e-3, 1e6)
 
-#: Factors on the actuator's parameters, by which a plant differs from what the planner knows.
+#: Factors by which the plant's parameters differ from the planner's.
 MISMATCH = tuple(
     ParameterSpec(
         f'mismatch.{spec.name.partition(".")[2]}', 1.0,
@@ -297,5 +298,5 @@ MISMATCH = tuple(
         '', 1e-3, 1e3)
     for spec in ACTUATOR)
 
-#: Fields of `hmsa_ros.model.parameters.ActuatorParameters`, as the parameters name them.
+#: Fields of `hmsa_ros.model.parameters.ActuatorParameters` that are parameters.
 ACTUATOR_FIELDS = tuple(spec.name.partition('.')[2] for spec in ACTUATOR)

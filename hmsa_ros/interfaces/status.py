@@ -1,4 +1,4 @@
-"""What diagnostics say, and the planner's verdict among them."""
+"""Contents of diagnostics, in particular the planner's verdict."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -11,7 +11,7 @@ from typing import Any
 from hmsa_ros.errors import printable
 from hmsa_ros.model.status import Code
 
-# Anybody may send a status; Python refuses to read numbers of thousands of digits.
+# A status may come from any publisher; Python refuses to parse integers of thousands of digits.
 _WHOLE = re.compile('[0-9]{1,18}')
 _WARN = 1
 # Warnings of a plan that ends as requested.
@@ -24,12 +24,12 @@ def texts(status: Any) -> dict[str, str]:
 
 
 def whole(text: str | None) -> int:
-    """Return the whole number in a status, 0 where it has none."""
+    """Return a whole number from a status, 0 if there is none."""
     return int(text) if text and _WHOLE.fullmatch(text) else 0
 
 
 def real(text: str | None) -> float:
-    """Return the number in a status, NaN where it has none."""
+    """Return a number from a status, NaN if there is none."""
     try:
         return float(text or '')
     except ValueError:
@@ -37,7 +37,7 @@ def real(text: str | None) -> float:
 
 
 def _object(text: str) -> Mapping[str, object]:
-    """Return a JSON object, empty where a text is none."""
+    """Return a JSON object, or an empty mapping if a text is not one."""
     with suppress(ValueError, RecursionError):
         found = json.loads(text)
         if isinstance(found, dict):
@@ -48,14 +48,15 @@ def _object(text: str) -> Mapping[str, object]:
 @dataclass(frozen=True)
 class Verdict:
     """
-    What the planner says of its last request, named as it was sent.
+    The planner's verdict on its last request.
 
-    The level is 0 OK, 1 WARN or 2 ERROR, the code one of `Code`. ``state`` is idle, waiting,
-    moving, holding, settling or at_rest, on the way to ``setpoint``, from 1. While ``watching``,
-    setpoints that have begun are still to be judged by samples; the worst that was ``measured``
-    is a code, with its sentence ``finding`` and its ``figures``. Samples have come lately while
-    ``measuring``, and so many commands were ``late`` since the planner began. ``unheard`` says
-    why nobody carries out commands.
+    ``level`` is 0 OK, 1 WARN or 2 ERROR, ``code`` is one of `Code`. ``request`` is the name given
+    by the sender. ``state`` is idle, waiting, moving, holding, settling or at_rest, during the
+    move to ``setpoint``, counted from 1. While ``watching``, started setpoints are still to be
+    judged by samples. ``measured`` is the code of the worst finding, ``finding`` its message and
+    ``figures`` its values. ``measuring`` indicates recent samples, and ``late`` is the number of
+    late commands since the planner started. ``unheard`` is the reason why commands are not carried
+    out.
     """
 
     level: int
@@ -75,28 +76,28 @@ class Verdict:
 
     @property
     def failure(self) -> str:
-        """Why a request that has come to its end counts as failed; empty if it does not."""
+        """Why a completed request counts as failed; empty if it does not."""
         if self.level > _WARN:
             return self.message
         if self.measured == Code.ARRIVED:
             return ''
         if self.measured and (self.measured != Code.UNOBSERVED or self.measuring):
             return self.finding
-        # Nobody measures: a prediction counts as long as it is kept to.
+        # Without samples, a prediction counts as long as the plan is followed.
         if self.level == _WARN and self.code not in _HARMLESS:
             return f'{self.message}; what comes of it is not measured'
         return ''
 
     @property
     def basis(self) -> str:
-        """What the state is known from, in words."""
+        """Whether the result is measured or predicted, or its failure, in words."""
         if self.measured == Code.ARRIVED:
             return 'measured'
         return self.failure or 'predicted, not measured'
 
     @classmethod
     def read(cls, status: Any) -> 'Verdict':
-        """Read a DiagnosticStatus that the planner publishes."""
+        """Read a DiagnosticStatus published by the planner."""
         values = texts(status)
         return cls(
             status.level[0], printable(status.message), values.get('code', ''),

@@ -1,9 +1,9 @@
 """
-Names, types, quality of service and meaning of every topic and service, without ROS.
+Names, types, quality of service and meaning of all topics and services, without ROS.
 
 All names are relative or private, so that namespaces and remapping work; only ``/clock`` and
-``/diagnostics`` are absolute, as ROS has them. `hmsa_ros.nodes.endpoints` takes this page to
-rclpy; the reference in the documentation is made from it.
+``/diagnostics`` are absolute, as usual in ROS. `hmsa_ros.nodes.endpoints` creates them with rclpy,
+and the reference documentation is generated from this module.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 @dataclass(frozen=True)
 class Quality:
-    """How many messages are kept, if lost ones are sent again, if late subscribers get them."""
+    """Queue depth, retransmission of lost messages, and delivery to late subscribers."""
 
     depth: int
     reliable: bool = True
@@ -20,14 +20,14 @@ class Quality:
 
 
 RELIABLE = Quality(10)
-# A plan may be sent as one burst of commands; none of them may be overwritten unread.
+# A plan may be sent as one burst of commands, none of which may be overwritten before reading.
 COMMAND = Quality(1000)
-# Samples at 1 kHz and more: deep enough for a reader that pauses for some seconds.
+# Samples at 1 kHz or more: deep enough for a reader that pauses for some seconds.
 SAMPLES = Quality(5000)
 LATCHED = Quality(1, latched=True)
-# News that is of no use any more when it is late.
+# Messages that are useless when late.
 NEWEST = Quality(1, reliable=False)
-# The changes of level that took effect last, for late subscribers, and for a recorder that pauses.
+# The last changes of level, for late subscribers and for a recorder that pauses.
 CHANGES = Quality(1000, latched=True)
 CLOCK = Quality(1, reliable=False)
 
@@ -35,10 +35,10 @@ CLOCK = Quality(1, reliable=False)
 @dataclass(frozen=True)
 class Topic:
     """
-    A topic by its relative or private name, and the nodes of this package that send and take it.
+    A topic by its relative or private name, with its publishers and subscribers in this package.
 
-    The type is one like ``'sensor_msgs/msg/JointState'``; publishers and subscribers share the
-    quality of service.
+    The type is in the form ``'sensor_msgs/msg/JointState'``. Publishers and subscribers use the
+    same quality of service.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Service:
-    """A service by its private name and type, and what a call does by the node that serves it."""
+    """A service by its private name and type, with its effect by serving node."""
 
     name: str
     type: str
@@ -61,9 +61,9 @@ class Service:
 @dataclass(frozen=True)
 class Action:
     """
-    An action by its private name and type, the node that serves it, and what a goal is.
+    An action by its private name and type, with its server and the meaning of a goal.
 
-    It and the topic of its state are there where their types are installed.
+    The action and its state topic exist if their types are installed.
     """
 
     name: str
@@ -209,7 +209,7 @@ SPLIT_BAGFILE = Service('~/split_bagfile', _TRIGGER, {
 
 
 def of_joint(topic: Topic, joint: str, joints: Sequence[str]) -> Topic:
-    """Return the topic of a joint, which is in its name if there are several joints."""
+    """Return the topic of a joint, whose name it contains if there are several joints."""
     if len(joints) == 1:
         return topic
     start = '~/' if topic.name.startswith('~/') else ''
@@ -217,5 +217,5 @@ def of_joint(topic: Topic, joint: str, joints: Sequence[str]) -> Topic:
 
 
 def from_outside(name: str, node: str) -> str:
-    """Return ``'~/stop'`` as ``'planner/stop'``; other names, and without a node, unchanged."""
+    """Return ``'~/stop'`` as ``'planner/stop'``; other names, or without a node, unchanged."""
     return f'{node}/{name[2:]}' if node and name.startswith('~/') else name
