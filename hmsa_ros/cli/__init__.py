@@ -2,9 +2,9 @@
 The ``hmsa`` command.
 
 Each command is a module with ``add_parser(subparsers)`` and ``run(arguments)``, listed in
-`COMMANDS`: of this package or, for studies, of another one. Its docstring is the help. One with
-commands below it has a function each instead of ``run``. Modules import what is slow (rclpy,
-SciPy, matplotlib) inside these, so that ``hmsa --help`` answers at once.
+`COMMANDS`; those of studies are in another package. Its docstring is the help. A command with
+subcommands has a function for each instead of ``run``. Slow modules (rclpy, SciPy, matplotlib) are
+imported within these functions, so that ``hmsa --help`` answers immediately.
 """
 
 import argparse
@@ -30,7 +30,7 @@ COMMANDS = (
 
 
 class _Help(argparse.HelpFormatter):
-    """Leaves examples as they are written, so that they can be copied."""
+    """Keep the line breaks of examples, so that they can be copied."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         before, example, rest = text.partition('example: ')
@@ -41,12 +41,12 @@ class _Help(argparse.HelpFormatter):
 
 
 class Parser(argparse.ArgumentParser):
-    """Argument parser that answers bad input with one line and exit status 2."""
+    """Argument parser that reports bad input in one line, with exit status 2."""
 
     def __init__(self, **settings: Any) -> None:
-        """Take argparse's settings."""
+        """Pass settings to argparse."""
         super().__init__(**{'formatter_class': _Help, **settings})
-        # A setpoint such as -0.2:1 is no option.
+        # A setpoint such as -0.2:1 is not an option.
         self._negative_number_matcher = re.compile(r'-\.?\d')
 
     def error(self, message: str) -> NoReturn:
@@ -55,7 +55,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def build_parser(commands: Sequence[str] = COMMANDS) -> Parser:
-    """Return the parser of the command line, with one subparser a command."""
+    """Return the parser of the command line, with one subparser for each command."""
     parser = Parser(
         prog='hmsa',
         description='Plan and send magnetic-field commands that take hard-magnetic soft actuators '
@@ -77,10 +77,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     Run the ``hmsa`` command; return its exit status.
 
-    0 is done, 1 the run failed, 2 bad input, 130 interrupted (SIGINT; 143 SIGTERM, 129 SIGHUP).
+    0: success, 1: failed run, 2: bad input, 130: interrupted (SIGINT; 143 SIGTERM, 129 SIGHUP).
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    # A command starts without the modules of all others.
+    # A command is started without importing the modules of the others.
     name = 'node' if words and words[0] in NODES else ''.join(words[:1]).replace('-', '_')
     parser = build_parser([x for x in COMMANDS if x.endswith(f'.{name}')] or COMMANDS)
     arguments, unknown = parser.parse_known_args(split_ros_args(words))
@@ -104,27 +104,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return ENDING.status
     except BrokenPipeError:
-        # The reader of our output (head, less) has gone: there is nobody left to report to.
+        # The reader of the output (head, less) has ended, so nothing can be reported.
         sys.stderr.close()
         return 0
     except OSError as error:
         if error.filename is not None:
             raise
-        # What could not be written is tried again at the end of Python otherwise.
+        # Otherwise Python would try to write the remaining output again at its end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return complain(HmsaError(
             f'cannot write to standard output ({error.strerror}): expected free space'), 1)
 
 
 def of_ros(error: ImportError) -> bool:
-    """Return whether a module of ROS is missing, or cannot find its libraries."""
+    """Return whether a module of ROS is missing, or cannot load its libraries."""
     name = (error.name or '').partition('.')[0]
     return name.endswith(('_msgs', '_srvs', '_interfaces')) or name.startswith(
         ('rcl', 'rosidl', 'ament_', 'rpyutils')) or 'rclpy' in str(error)
 
 
 def split_ros_args(words: list[str]) -> list[str]:
-    """Return what comes before ``--ros-args`` of a node's command: argparse does not read on."""
+    """Return the words before ``--ros-args`` of a node's command, for argparse."""
     if '--ros-args' in words and words[0] in NODES:
         return words[:words.index('--ros-args')]
     return words

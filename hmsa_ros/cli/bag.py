@@ -102,7 +102,7 @@ def _verify(arguments: argparse.Namespace) -> int:
     problems = list(runs[0].summary.problems) if runs[0].summary else []
     for problem in problems:
         print(f'hmsa: note: {printable(problem)}', file=sys.stderr)
-    # What cannot be read whole is not verified, and a command that nobody applied is a loss.
+    # A bag that is not completely readable is not verified, and an unapplied command is a loss.
     passed = not problems and all(
         x.largest_difference <= arguments.tolerance and not x.unapplied_count for x in results)
     show(

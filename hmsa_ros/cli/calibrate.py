@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from hmsa_ros.device.bench import Bench
     from hmsa_ros.model.equations import Array
 
-# Readings of a probe that are averaged.
+# Number of readings of a probe that are averaged.
 _READINGS = 20
 _SIMULATED = 'hmsa_ros.device.simulated_bench:'
-# Share of the range that is not worth a model.
+# Fraction of the range below which hysteresis is negligible.
 _NO_HYSTERESIS = 1e-4
-# Share of the range by which a stretch may still go at the end of a level.
+# Largest remaining drift of the stretch at the end of a level, as a fraction of the range.
 _SETTLED = 0.01
 
 _SET: Row = ('--set', 'KEY=VALUE', str, 'a setting of the hardware, as hardware.KEY of hmsa '
@@ -185,7 +185,7 @@ def _readings(arguments: argparse.Namespace) -> 'tuple[Array, Array]':
                 'and a CoilModel (hmsa_ros.device.assembly); for another class, give a CSV of '
                 'readings with the columns current and flux_density')
         levels = loop(arguments.limit, arguments.steps)
-        # Nothing is drawn over what is typed.
+        # No progress is shown over typed input.
         with progress('starting') if arguments.probe else nullcontext() as update:
             for i, level in enumerate(levels):
                 bench.hold(arguments.settle, [level])
@@ -201,7 +201,7 @@ def _readings(arguments: argparse.Namespace) -> 'tuple[Array, Array]':
 
 
 def _typed(current: float) -> float:
-    """Ask for a reading until there is one; the end of the input is a `HmsaError`."""
+    """Ask until a reading is valid; raise `HmsaError` at the end of the input."""
     while True:
         try:
             return number_of(
@@ -213,7 +213,7 @@ def _typed(current: float) -> float:
 
 
 def _probe(name: str) -> 'Callable[[float], float]':
-    """Return what reads a probe, some times; `BadInputError` if there is none."""
+    """Return a function that averages readings of a probe; raise `BadInputError` if invalid."""
     from hmsa_ros.device.hardware import described
 
     probe = _made(name, '--probe')
@@ -229,13 +229,13 @@ def _probe(name: str) -> 'Callable[[float], float]':
 
 
 def _made(name: str, option: str) -> Any:
-    """Return a probe or gauge that answers; `BadInputError` if there is none."""
+    """Return a probe or gauge that can be read; raise `BadInputError` if there is none."""
     from hmsa_ros.device.hardware import described, imported
 
     try:
         found = imported(name)()
         found.read()
-    except BaseException as error:  # whatever a laboratory's module raises
+    except BaseException as error:  # any error of the laboratory's module
         raise BadInputError(
             f'{option} {name} does not start ({described(error)}): expected MODULE:NAME that, '
             'called without arguments, returns an object with the method read') from error
@@ -243,7 +243,7 @@ def _made(name: str, option: str) -> Any:
 
 
 def _write_table(out: Path, columns: 'dict[str, Array]') -> Path:
-    """Write columns beside a parameter file; return where."""
+    """Write columns to a table next to a parameter file; return its path."""
     from hmsa_ros.recordings.tables import write_table
 
     table = out.with_suffix('.csv')
@@ -252,7 +252,7 @@ def _write_table(out: Path, columns: 'dict[str, Array]') -> Path:
 
 
 def _write_parameters(out: Path, words: str, nodes: 'dict[str, dict[str, Any]]') -> None:
-    """Write parameters by node, below a line of words."""
+    """Write parameters by node, below a comment."""
     lines = [f'# {words}']
     for node, values in nodes.items():
         if values:
@@ -262,7 +262,7 @@ def _write_parameters(out: Path, words: str, nodes: 'dict[str, dict[str, Any]]')
 
 
 def _checked(arguments: argparse.Namespace, least: int) -> str:
-    """Return the name of what is to be calibrated, of valid options, in so many steps at least."""
+    """Check the options, with a minimum number of steps; return the name of the hardware."""
     check_targets(arguments.out)
     if arguments.simulate is (arguments.source is not None):
         raise BadInputError('expected either MODULE:NAME of hardware or --simulate')
@@ -274,14 +274,14 @@ def _checked(arguments: argparse.Namespace, least: int) -> str:
 
 
 def _bench(name: str, arguments: argparse.Namespace, rate: float = 1000.0) -> 'Bench':
-    """Return hardware in force, whose sensor is read at a rate in Hz."""
+    """Return running hardware whose sensor is read at a rate in Hz."""
     from hmsa_ros.device.bench import Bench
 
     return Bench(name, settings_of(arguments), arguments.limit, rate)
 
 
 def _scale(bench: 'Bench') -> 'SensorScale | None':
-    """Return what the readings of a sensor mean; None where it does not say."""
+    """Return the scale of a sensor; None if the hardware does not have one."""
     from hmsa_ros.device.assembly import SensorScale
 
     found = getattr(bench.coil.instrument.hardware, 'scale', None)

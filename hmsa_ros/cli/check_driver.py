@@ -38,12 +38,12 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """
-    Try it, and show what was found.
+    Test the hardware, and print the results.
 
     Raises
     ------
     BadInputError
-        If the page's folder does not exist, or a setting is none.
+        If the folder of the page does not exist, or a setting is invalid.
 
     """
     from hmsa_ros.device.conformance import Trial
@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def settings_of(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return keyword arguments, each value read as in YAML; what is none is a `BadInputError`."""
+    """Return keyword arguments with YAML values; raise `BadInputError` if one is invalid."""
     import yaml
 
     found = {}

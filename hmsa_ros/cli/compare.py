@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _compare_repeats(
         arguments: argparse.Namespace, groups: 'list[list[Path]]', paper: 'Paper') -> int:
-    """Compare runs that were repeated, or some of which were."""
+    """Compare runs of which at least one was repeated."""
     from hmsa_ros.recordings.bags import read_run
     from hmsa_ros.report.arrivals import Part
     from hmsa_ros.report.repeats import statistics, statistics_table

@@ -16,7 +16,7 @@ from typing import Any
 
 from hmsa_ros.cli.options import add_command
 
-# Options whose values are checked later than by the parser, those of a shaper.
+# Options for a shaper, whose values are not checked by the parser.
 _OF_SHAPERS = ('--shaper', '--shapers')
 _FILES = ('FILE', 'FILE.csv', 'BAG')
 _FOLDERS = ('DIR',)
@@ -36,15 +36,15 @@ class Option:
 class Command:
     """A command, or the program itself."""
 
-    path: str  # its words without the program's name, with spaces between
+    path: str  # its words without the program's name
     options: tuple[Option, ...]
-    # Commands or choices that its positional arguments may be, and what they mean.
+    # Commands or choices of its positional arguments, with their descriptions.
     words: dict[str, str]
     files: bool  # whether positional arguments are files
 
     @property
     def offered(self) -> dict[str, str]:
-        """Words and options, and what they mean."""
+        """Words and options with their descriptions."""
         return {**self.words, **{x: option.text for option in self.options for x in option.names}}
 
 
@@ -57,7 +57,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the script, from the template for the shell beside this file."""
-    import jinja2  # no other command needs it
+    import jinja2  # only needed by this command
 
     from hmsa_ros.cli import build_parser
 
@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def commands_of(parser: argparse.ArgumentParser, path: str = '') -> Iterator[Command]:
-    """Yield a parser and its subparsers as commands, the outer ones first."""
+    """Yield a parser and its subparsers as commands, outer ones first."""
     options: list[Option] = []
     words: dict[str, str] = {}
     inner: dict[str, argparse.ArgumentParser] = {}
@@ -98,7 +98,7 @@ def _option(action: argparse.Action) -> Option:
     text = ' '.join(((action.help or '') % vars(action)).split())
     choices = tuple(map(str, action.choices or ()))
     if names[-1] in _OF_SHAPERS:
-        from hmsa_ros.planning.shapers import SHAPERS  # imports NumPy, which not all commands need
+        from hmsa_ros.planning.shapers import SHAPERS  # imports NumPy
 
         choices = tuple(SHAPERS)
     return Option(names, text, (
@@ -107,5 +107,5 @@ def _option(action: argparse.Action) -> Option:
 
 
 def _quote(text: str) -> str:
-    """Return a text in single quotes, as all three shells read it."""
+    """Return a text in single quotes that all three shells accept."""
     return "'" + text.replace("'", '’') + "'"

@@ -47,7 +47,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Design, write and print."""
+    """Design, write and print a sequence."""
     from hmsa_ros.identification.excitation import Bounds, excite
     from hmsa_ros.identification.files import read_belief
     from hmsa_ros.identification.quantities import free_of
@@ -77,7 +77,7 @@ def _record(program: 'Program') -> dict[str, Any]:
 
 
 def _lines(found: 'Excitation', actuator: 'ActuatorParameters') -> tuple[str, Table]:
-    """Return what the sequence is, and what it tells compared with others."""
+    """Return a description of the sequence, and its comparison with others."""
     from hmsa_ros.identification.quantities import modulus_of
 
     best, gains = found.best, found.gains

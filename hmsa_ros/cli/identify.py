@@ -144,7 +144,7 @@ def known_of(text: str) -> tuple[dict[str, float], dict[str, float]]:
 
 def _read(
         arguments: argparse.Namespace, belief: 'Belief') -> 'tuple[Recording, Belief]':
-    """Return the recording, and what is known with what the bag says of it."""
+    """Return the recording, and the prior knowledge with values from the bag."""
     path: Path = arguments.recording
     if path.is_dir() or path.suffix == '.mcap':
         from hmsa_ros.identification.runs import read_bag

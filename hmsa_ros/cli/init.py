@@ -46,23 +46,23 @@ if TYPE_CHECKING:
     from hmsa_ros.model.parameters import ActuatorParameters
 
 _JOINT = 'actuator'
-# What is of the coil, and what the actuator takes by another name.
+# Quantities of the coil, and those with another name in `Actuator`.
 _COIL = ('flux_max', 'flux_min', 'slew_limit')
-# Those of which nothing but a form of its own has sizes and constants.
+# Forms with their own sizes and constants.
 _OF_THEIR_OWN = ('beam', 'dielectric')
 _ARGUMENTS = {'j_lim': 'chain_limit', 'damping': 'damping_coefficient'}
-# In place of which the damping coefficient may be given.
+# The damping coefficient may be given instead of these.
 _DAMPED = ('zeta', 'damping_ratio')
 _FILE = Path('actuator.yaml')
 _FOLLOWS = {'half_thickness': 'as --half-length', 'flux_min': 'minus --flux-max'}
-# What differs much from one elastomer to another, and no data sheet gives.
+# Quantities that vary between elastomers and are missing in data sheets.
 _GUESSES = ('zeta', 'j_lim', 'damping_ratio')
-# Deflection under its own weight, over the length, from which on a beam must not lie.
+# Deflection under its own weight, over the length, from which a beam must not lie flat.
 _SAG = 0.02
 _GRAVITY = 9.81
-# Samples a second that one plant keeps up with, beside its planner, on two cores.
+# Sample rate in Hz that one plant sustains, together with its planner, on two cores.
 _KEPT_UP = 4000.0
-# The coil's reach that is hardly a motion.
+# Reachable change of the stretch that is hardly visible.
 _HARDLY = 0.01
 
 
@@ -100,7 +100,7 @@ def _option(quantity: Quantity) -> Row:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Ask, write and print; raise `BadInputError` for what cannot be used."""
+    """Ask, write and print; raise `BadInputError` for invalid input."""
     path: Path = arguments.out
     if not arguments.force and path.exists():
         raise BadInputError(f'{path} exists: name another file with --out, or add --force')
@@ -153,7 +153,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _asked(arguments: argparse.Namespace) -> tuple[str, tuple[Quantity, ...]]:
-    """Return what the actuator is and what is to be given; a law has constants of its own."""
+    """Return form and quantities of the actuator; a hyperelastic model has its own constants."""
     forms = [x for x in _OF_THEIR_OWN if getattr(arguments, x)]
     if len(forms) > 1:
         raise BadInputError('both --beam and --dielectric are given: expected one of them')
@@ -175,7 +175,7 @@ def _asked(arguments: argparse.Namespace) -> tuple[str, tuple[Quantity, ...]]:
 def _given(
         arguments: argparse.Namespace, form: str,
         asked: Sequence[Quantity]) -> dict[str, float]:
-    """Return the values of the options, checked against each other."""
+    """Return the values of the options, after checking their combination."""
     given = {x.key: value for x in (*EVERY, DAMPING)
              if (value := getattr(arguments, x.key)) is not None}
     for key in _DAMPED:
@@ -200,13 +200,13 @@ def _given(
 
 
 def _known(key: str, given: Mapping[str, float]) -> bool:
-    """Return whether a value is given, or the damping coefficient in its place."""
+    """Return whether a value is given, or the damping coefficient instead."""
     return key in given or (key in _DAMPED and DAMPING.key in given)
 
 
 def _ask(
         asked: Sequence[Quantity], answers: dict[str, float], joints: list[str]) -> list[str]:
-    """Add answers to what is given, and return the joints."""
+    """Add answers to the given values, and return the joints."""
     print(
         'Numbers are in the unit shown unless another unit follows: 10 mm, 50 kPa. Press Enter '
         'for the value in brackets.', file=sys.stderr)
@@ -229,7 +229,7 @@ def _ask(
                 continue
             doubt = quantity.doubt(value)
             if doubt and text:
-                # Once more, with the number as it is for what Enter takes.
+                # Ask once more, with this number as the default.
                 print(f'  {doubt}', file=sys.stderr)
                 default = value
             else:
@@ -244,7 +244,7 @@ def _ask(
 
 
 def _answer(question: str) -> str:
-    """Ask on the terminal; what is printed there is no result."""
+    """Ask on the terminal, on standard error, since the question is not a result."""
     print(question, end='', file=sys.stderr, flush=True)
     line = sys.stdin.readline()
     if not line:
@@ -257,7 +257,7 @@ def _actuator(form: str, given: Mapping[str, float], law: str | None) -> 'Actuat
     """Return the actuator with its coil."""
     from hmsa_ros.api.actuator import Actuator
 
-    # Either of them, as it is given.
+    # Only the one that is given.
     damping = (DAMPING.key,) if DAMPING.key in given else _DAMPED
     values: dict[str, Any] = {
         _ARGUMENTS.get(x, x): given[x]
@@ -274,7 +274,7 @@ def _actuator(form: str, given: Mapping[str, float], law: str | None) -> 'Actuat
 
 
 def _doubts(form: str, given: Mapping[str, float], made: 'Actuator') -> list[str]:
-    """Return what is implausible, a sentence each."""
+    """Return a sentence about each implausible value."""
     found = made.scales
     values = {**given, 'zeta': found.zeta, 'damping_ratio': found.zeta / found.critical_zeta}
     doubts = [x for quantity in FORMS[form]
@@ -309,7 +309,7 @@ def _doubts(form: str, given: Mapping[str, float], made: 'Actuator') -> list[str
 
 
 def _lines(form: str, parameters: Mapping[str, Any]) -> list[str]:
-    """Return the nodes' parameters in YAML, each below what it is."""
+    """Return the nodes' parameters in YAML, each below its description."""
     texts = {x.name: (x.description.rstrip('.'), x.unit) for x in LAW} | {
         x.parameter: (x.text, x.unit) for x in (*QUANTITIES, DAMPING)}
     if form == 'beam':
@@ -332,7 +332,7 @@ def _lines(form: str, parameters: Mapping[str, Any]) -> list[str]:
 
 
 def _joints(joints: list[str], block: 'ActuatorParameters') -> list[str]:
-    """Return the lines of the joints' names."""
+    """Return the lines with the joint names."""
     if len(joints) == 1:
         return ['    # Name of the joint in trajectories and joint states.',
                 f'    joint: {yaml_text(joints[0])}']
@@ -343,11 +343,11 @@ def _joints(joints: list[str], block: 'ActuatorParameters') -> list[str]:
 
 
 def _sampling(actuator: 'ActuatorParameters') -> list[str]:
-    """Return lines with the plant's sample rate, if its default misses the actuator's peaks."""
+    """Return lines with the plant's sample rate if the default misses the actuator's peaks."""
     from hmsa_ros.device.health import enough_samples
 
     default, largest = cast(float, PUBLISH_RATE.default), cast(float, PUBLISH_RATE.maximum)
-    # Twice what just shows the peaks, as far as a plant keeps up with real time.
+    # Twice the rate that just resolves the peaks, if a plant sustains it in real time.
     least = enough_samples(actuator)
     enough = max(least, min(2.0 * least, _KEPT_UP))
     if enough <= default:
@@ -369,6 +369,6 @@ def _parameters(made: 'Actuator') -> dict[str, Any]:
     if made.law == 'dielectric':
         del values['actuator.remanence'], values['slew_limit']
     elif made.block.law is not None:
-        # They follow from the others, or have no effect.
+        # They follow from other parameters, or have no effect.
         del values['actuator.shear_modulus'], values['actuator.chain_limit']
     return values

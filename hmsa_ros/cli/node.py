@@ -1,4 +1,4 @@
-"""``hmsa planner`` and its like: run a node, or planner and device in one process."""
+"""``hmsa planner`` and similar: run a node, or planner and device in one process."""
 
 import argparse
 from importlib import import_module
@@ -27,7 +27,7 @@ _EXAMPLES = {
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add one command a node."""
+    """Add one command for each node."""
     for name, summary in NODES.items():
         parser = subparsers.add_parser(
             name, help=f'run the {name} node: {summary}',
@@ -39,8 +39,8 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the node until it is asked to end."""
-    # Asked to end while ROS is imported, it has nothing to put in order.
+    """Run the node until the end is requested."""
+    # A request to end while ROS is imported needs no clean-up.
     if arguments.node == 'recorder':
         ENDING.leave(1, 'the recorder was told to end before its bag was open: no bag is written')
     else:

@@ -1,4 +1,4 @@
-"""Options of commands, as rows of tables."""
+"""Options of commands as table rows."""
 
 import argparse
 from collections.abc import Callable, Iterable
@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 from hmsa_ros.errors import BadInputError, excerpt
 
 T = TypeVar('T')
-#: Names, metavar, type, help and, where there are any, other settings of argparse; of a flag name
-#: and help, of a group its title and a list of its rows.
+#: Names, metavar, type, help and any further settings of argparse; for a flag, name and help; for
+#: a group, its title and a list of its rows.
 Row = tuple[Any, ...]
 
 JSON: Row = ('--json', 'print one JSON object')
@@ -22,7 +22,7 @@ EXAMPLE: Row = (
     '--params-file', 'YAML', Path, 'parameter file of the actuator (default: the example block)')
 TIMEOUT: Row = (
     '--timeout', 'S', float, 'seconds to wait for a reply (default 10 s)', {'default': 10.0})
-#: Dimensionless parameters of a block: option, metavar and meaning.
+#: Dimensionless parameters of a block: option, metavar and description.
 MATERIAL = (
     ('--zeta', 'Z', 'dimensionless damping, at least 0 (default 0.2)'),
     ('--j-lim', 'J', 'Gent limiting extensibility J_lim, above 0 (default 5)'),
@@ -36,7 +36,7 @@ LAW_OPTION: Row = (
 
 
 def law_of(text: str) -> tuple[str, dict[str, Any]]:
-    """Return name and constants of `LAW_OPTION`; `BadInputError` for what is none."""
+    """Return name and constants of `LAW_OPTION`; raise `BadInputError` if invalid."""
     from hmsa_ros.cli.quantities import number_of
     from hmsa_ros.model.laws import LAWS
 
@@ -55,7 +55,7 @@ def law_of(text: str) -> tuple[str, dict[str, Any]]:
         constants[key] = value if kind is str else [
             number_of(x, unit, key) for x in value.split('/')] if kind is list else number_of(
                 value, unit, key)
-    # Where there are others, as of a beam, a parameter file has them.
+    # Other constants, such as those of a beam, are in a parameter file.
     if known and not constants and {x.unit for x in known.values()} <= {'Pa', ''}:
         raise BadInputError(
             f'--law {name} has no constants: expected {", ".join(known)}, as in --law '
@@ -64,7 +64,7 @@ def law_of(text: str) -> tuple[str, dict[str, Any]]:
 
 
 def argument(read: Callable[[str], T]) -> Callable[[str], T]:
-    """Return what reads an argument, so that argparse shows its `BadInputError` as it is."""
+    """Return an argument type for argparse that shows a `BadInputError` unchanged."""
     def read_argument(text: str) -> T:
         try:
             return read(text)
@@ -75,7 +75,7 @@ def argument(read: Callable[[str], T]) -> Callable[[str], T]:
 
 
 def of_unit(option: str, unit: str, text: str) -> Row:
-    """Return an option that is a number above 0 in an SI unit or with a unit of its own."""
+    """Return an option for a number above 0, in SI or with another unit."""
     def read(words: str) -> float:
         from hmsa_ros.cli.quantities import number_of
 
@@ -88,7 +88,7 @@ def of_unit(option: str, unit: str, text: str) -> Row:
 
 
 def timeout_of(arguments: argparse.Namespace) -> float:
-    """Return the patience in s, or raise `BadInputError`."""
+    """Return the time limit in s; raise `BadInputError` if invalid."""
     timeout: float = arguments.timeout
     if not timeout > 0.0:
         raise BadInputError(f'timeout is {timeout:g}: expected a number of seconds above 0')
@@ -99,12 +99,12 @@ def add_command(
         subparsers: Any, name: str, text: str | None, *rows: Row,
         run: Callable[[argparse.Namespace], int] | None = None) -> Any:
     """
-    Add a command with arguments that a docstring describes, and return its parser.
+    Add a command described by a docstring, and return its parser.
 
-    ``run`` carries out one below a command; that of a module is its function of this name.
+    ``run`` carries out a subcommand; a module has a function of that name.
 
-    The first line of the docstring is the help among other commands, and its last paragraph, which
-    begins with ``example:``, is left as it is written. The end of a module's name will do as name.
+    The first line of the docstring is the help in the list of commands. Its last paragraph, which
+    begins with ``example:``, keeps its line breaks. ``name`` may be the name of a module.
     """
     what, _, rest = inspect.cleandoc(text or '').partition('\n\n')
     description, _, example = rest.rpartition('example: ')
@@ -119,7 +119,7 @@ def add_command(
 
 
 def bags(name: str) -> Row:
-    """Return the arguments that are one or more bags."""
+    """Return the argument for one or more bags."""
     return name, 'BAG', Path, 'folder of a bag, or an .mcap file', {'nargs': '+'}
 
 
@@ -139,7 +139,7 @@ def add_options(parser: Any, *rows: Row) -> None:
 def show(
         arguments: argparse.Namespace, record: dict[str, Any], *lines: object,
         written: Iterable[Path | None] = ()) -> int:
-    """Print a result, its record with --json, else lines and the files written; return 0."""
+    """Print a result as JSON with --json, otherwise as lines with the files written; return 0."""
     from hmsa_ros.files import json_text
 
     for line in [json_text(record)] if arguments.json else [

@@ -36,7 +36,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serve until told to end; raise `BadInputError` if an option cannot be used."""
+    """Serve until the end is requested; raise `BadInputError` if an option is invalid."""
     span: float = arguments.span
     if not 0.1 <= span <= 3600.0:
         raise BadInputError(f'span is {span:g}: expected 0.1 to 3600')

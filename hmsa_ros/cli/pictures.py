@@ -1,4 +1,4 @@
-"""The options that every command has that draws pictures."""
+"""Options common to all commands that draw figures."""
 
 import argparse
 from pathlib import Path
@@ -12,16 +12,16 @@ _ENDS = f'{", ".join(f".{x}" for x in KINDS[:-1])} or .{KINDS[-1]}'
 def picture_options(
         named: str = '', *, formats: str = '', data: bool = True) -> tuple[Row, ...]:
     """
-    Return the options of pictures.
+    Return the options for figures.
 
     Parameters
     ----------
     named : str
-        What ``--picture`` is said to draw; without it there is no such option.
+        Description of the figures in the help of ``--picture``; without it, the option is omitted.
     formats : str
-        Formats by default of pictures that go into a folder; without them there is no option.
+        Default formats of figures in a folder; without them, the option is omitted.
     data : bool
-        Whether there is ``--data``; a command that always writes it needs none.
+        Whether to add ``--data``, which a command that always writes the data does not need.
 
     """
     standard = Paper()
@@ -46,7 +46,7 @@ def picture_options(
 
 
 def paper_of(arguments: argparse.Namespace) -> Paper:
-    """Return what the options ask for; raise `BadInputError` for what no picture can be."""
+    """Return the paper format of the options; raise `BadInputError` if invalid."""
     for picture in getattr(arguments, 'picture', ()):
         kind_of(picture)
     return Paper(arguments.width, arguments.font_size, arguments.dpi,
@@ -54,5 +54,5 @@ def paper_of(arguments: argparse.Namespace) -> Paper:
 
 
 def formats_of(arguments: argparse.Namespace) -> tuple[str, ...]:
-    """Return the formats of pictures in a folder; raise `BadInputError` for unknown ones."""
+    """Return the formats of figures in a folder; raise `BadInputError` for unknown ones."""
     return kinds_in(arguments.format)

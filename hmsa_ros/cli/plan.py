@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 
     Nominal = tuple[NondimensionalParameters, Limits, Delivery, Units]
 
-# Units of time and load of the paper, as messages and tables name them.
+# Units of time and load in the paper, as shown in messages and tables.
 _TIME, _LOAD = 'L sqrt(rho/G)', 'mu0 G/Br'
-# What the options say of a coil.
+# Options that describe a coil.
 _WINDING = ('inductance', 'resistance', 'tesla_per_ampere')
 
 
@@ -88,9 +88,9 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """
-    Plan and print, in seconds and tesla for the actuator of a parameter file.
+    Plan and print, in seconds and tesla if a parameter file is given.
 
-    Without one, a file of levels to write is a `BadInputError`.
+    Raises `BadInputError` for a file of levels without one.
     """
     si = arguments.params_file is not None
     if bool(arguments.setpoints) == (arguments.path is not None) or arguments.path and not si:
@@ -192,7 +192,7 @@ def _without_dimension(arguments: argparse.Namespace) -> int:
 
 
 def nominal(arguments: argparse.Namespace) -> 'Nominal':
-    """Return what options or a file plan with; raise `BadInputError` if both say something."""
+    """Return the model for planning; raise `BadInputError` if file and options conflict."""
     from hmsa_ros.model.delivery import Delivery
     from hmsa_ros.model.moves import Limits
     from hmsa_ros.model.units import Units
@@ -204,7 +204,7 @@ def nominal(arguments: argparse.Namespace) -> 'Nominal':
 
 
 def _actuator(arguments: argparse.Namespace) -> 'Actuator':
-    """Return the actuator of the file; options beside it that it sets are a `BadInputError`."""
+    """Return the actuator of the file; raise `BadInputError` for options that the file sets."""
     from hmsa_ros.api.actuator import Actuator
 
     fixed = [f'--{x.replace("_", "-")}' for x in ('zeta', 'j_lim', 'c1', 'law')
@@ -217,7 +217,7 @@ def _actuator(arguments: argparse.Namespace) -> 'Actuator':
 
 
 def _along(actuator: 'Actuator', arguments: argparse.Namespace) -> 'Plan':
-    """Plan to follow the path of a file; options of moves beside it are a `BadInputError`."""
+    """Plan a path from a file; raise `BadInputError` for options of moves."""
     from hmsa_ros.api.paths import read_path
 
     if extra := [f'--{x}' for x in ('shaper', 'start', 'amplifier') if getattr(arguments, x)]:
@@ -226,14 +226,14 @@ def _along(actuator: 'Actuator', arguments: argparse.Namespace) -> 'Plan':
 
 
 def _more(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return how to plan, as `Actuator.plan` takes it."""
+    """Return the planning options for `Actuator.plan`."""
     return {
         'start': arguments.start, 'order': arguments.order, 'errors': _errors(arguments),
         'periods': arguments.periods, 'max_rate': arguments.max_rate}
 
 
 def _group(arguments: argparse.Namespace) -> 'NondimensionalParameters':
-    """Return the parameters that options give."""
+    """Return the dimensionless parameters given by options."""
     from hmsa_ros.interfaces.parameters import LAW
     from hmsa_ros.model.laws import LAWS
     from hmsa_ros.model.parameters import NondimensionalParameters
@@ -252,14 +252,14 @@ def _group(arguments: argparse.Namespace) -> 'NondimensionalParameters':
         if law.endless:
             given['j_lim'] = math.inf
         elif law.scaled is not None:
-            # Without a dimension only ratios of moduli count.
+            # In a dimensionless plan, only ratios of moduli matter.
             given['law'] = law.scaled({x.name: x.default for x in LAW} | {
                 'actuator.remanence': 1.0} | {f'law.{x}': y for x, y in constants.items()})[1]
     return NondimensionalParameters(**given)
 
 
 def _errors(arguments: argparse.Namespace) -> list[float] | None:
-    """Return the errors for which minimax plans, if they are given."""
+    """Return the parameter errors for minimax, if given."""
     if arguments.errors is None:
         return None
     try:
@@ -272,7 +272,7 @@ def _errors(arguments: argparse.Namespace) -> list[float] | None:
 
 def _si_row(
         segment: 'Segment', units: 'Units', per_ampere: float | None) -> dict[str, Any]:
-    """Return a segment with its times in s, its flux densities in T and currents in A as well."""
+    """Return a segment with times in s, flux densities in T and any currents in A."""
     row: dict[str, Any] = _row(segment)
     levels = [[x.time * units.time, units.level(x.load)] for x in segment.move.levels]
     first, last = levels[0][1] if segment.shaped else None, units.level(segment.held)
@@ -287,7 +287,7 @@ def _si_row(
 
 
 def _row(segment: 'Segment') -> dict[str, float | str | None]:
-    """Return a segment as the JSON output shows it; null where there is no such number."""
+    """Return a segment for the JSON output, with null for undefined numbers."""
     from hmsa_ros.model.equations import signed_root
 
     move, shaped = segment.move, segment.shaped

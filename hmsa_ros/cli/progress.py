@@ -1,4 +1,4 @@
-"""Progress of what takes more than a moment: on a terminal, on standard error, gone at the end."""
+"""Progress of long operations, on standard error if it is a terminal, removed at the end."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -7,7 +7,7 @@ import sys
 
 @contextmanager
 def progress(what: str = 'starting') -> Iterator[Callable[[str, float | None], None]]:
-    """Yield what shows progress: called with what is going on, and the share done or None."""
+    """Yield a function of the current activity and the completed fraction or None."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -15,9 +15,9 @@ def progress(what: str = 'starting') -> Iterator[Callable[[str, float | None], N
     with Progress(
             TextColumn('{task.description:<28}'), BarColumn(), TextColumn('{task.fields[share]}'),
             TimeElapsedColumn(), console=console, transient=True,
-            # Asked of the file: notebooks have Rich take any for a terminal (FORCE_COLOR).
+            # Tested with the file, since FORCE_COLOR in notebooks makes Rich assume a terminal.
             disable=not sys.stderr.isatty() or console.is_dumb_terminal) as shown:
-        # Without a total the bar only says that something goes on.
+        # Without a total, the bar only shows activity.
         task = shown.add_task(what, total=None, share='     ')
 
         def update(what: str, share: float | None) -> None:

@@ -1,7 +1,7 @@
 """
-What ``hmsa init`` asks for: names, units, defaults, limits, and what is usual.
+Quantities of ``hmsa init``: names, units, defaults, limits, and usual ranges.
 
-Nothing slow is imported here, since the options of the command line are made of it.
+The options of the command line depend on this module, so it imports nothing slow.
 """
 
 from collections.abc import Mapping
@@ -45,7 +45,7 @@ _ZHAO = 'Zhao et al., J. Mech. Phys. Solids 124 (2019) 244'
 
 def number_of(text: str, unit: str, words: str) -> float:
     """
-    Read a number of what some words name, in an SI unit or with a unit of its own.
+    Read a number with or without a unit, and return it in SI units; ``words`` name it in messages.
 
     Raises `BadInputError` for any other text.
     """
@@ -64,25 +64,25 @@ def number_of(text: str, unit: str, words: str) -> float:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A number that the user gives."""
+    """A number given by the user."""
 
     key: str  # name in the code and, with hyphens, of the option
     parameter: str  # name of the nodes' parameter
     text: str
     unit: str  # SI; empty for a dimensionless number
-    default: float | None  # None where it follows from another, see `default_of`
-    least: float  # what the nodes take
+    default: float | None  # None if it follows from another, see `default_of`
+    least: float  # limits of the nodes
     largest: float
-    usual: tuple[float, float]  # beyond it a warning is given
-    source: str  # why that is usual
-    hints: tuple[tuple[float, float, str], ...] = ()  # ranges, and what may have gone wrong there
+    usual: tuple[float, float]  # range without a warning
+    source: str  # source of the usual range
+    hints: tuple[tuple[float, float, str], ...] = ()  # ranges with the likely mistake
 
     @classmethod
     def of(
             cls, key: str, spec: ParameterSpec, text: str, usual: tuple[float, float],
             source: str, hints: tuple[tuple[float, float, str], ...] = (), *,
             follows: bool = False) -> 'Quantity':
-        """Return the quantity that a parameter of the nodes is; `follows` others by default."""
+        """Return the quantity of a node parameter; its default may follow from others."""
         default = spec.default if isinstance(spec.default, float) and not follows else None
         return cls(
             key, spec.name, text, spec.unit, default,
@@ -91,11 +91,11 @@ class Quantity:
 
     @property
     def option(self) -> str:
-        """Return the option's name."""
+        """Name of the option."""
         return '--' + self.key.replace('_', '-')
 
     def parse(self, text: str) -> float:
-        """Read a number in SI units or with a unit, ``'10 mm'``, or raise `BadInputError`."""
+        """Read a number in SI or with a unit, ``'10 mm'``; raise `BadInputError` if invalid."""
         value = number_of(text, self.unit, self.words)
         if not self.least <= value <= self.largest:
             raise BadInputError(
@@ -105,7 +105,7 @@ class Quantity:
 
     @property
     def words(self) -> str:
-        """Return the name as words."""
+        """Name as words."""
         return self.key.replace('_', ' ')
 
     @property
@@ -117,7 +117,7 @@ class Quantity:
         return f'{value:g}{self._unit}'
 
     def doubt(self, value: float) -> str | None:
-        """Return why a value in SI units is implausible, with the usual range and its source."""
+        """Return why a value in SI units is implausible and the usual range, None if it is not."""
         low, high = self.usual
         if low <= value <= high:
             return None
@@ -179,7 +179,7 @@ QUANTITIES: tuple[Quantity, ...] = (
 )
 BY_KEY: Mapping[str, Quantity] = {x.key: x for x in QUANTITIES}
 _STRIPS = f'from printed strips to fingers in {_REVIEW}'
-#: Of a beam: sizes are whole ones.
+#: Quantities of a beam, whose sizes are full ones.
 BEAM: tuple[Quantity, ...] = (
     Quantity(
         'length', 'actuator.half_length', 'free length of the beam, from clamp to tip', 'm', 0.025,
@@ -202,7 +202,7 @@ BEAM: tuple[Quantity, ...] = (
         1e3, (0.005, 0.9), 'of silicone strips in air'),
     *(BY_KEY[x] for x in ('flux_max', 'flux_min', 'slew_limit')),
 )
-#: Of a dielectric elastomer; the layers of a stack share its sides.
+#: Quantities of a dielectric elastomer; the layers of a stack have the same sides.
 DIELECTRIC: tuple[Quantity, ...] = (
     replace(BY_KEY['half_length'], text='half length L, along the electrodes'),
     replace(BY_KEY['half_thickness'], text='half thickness H of the layer or of the whole stack'),
@@ -220,28 +220,28 @@ DIELECTRIC: tuple[Quantity, ...] = (
         (10.0, 2e4), 'of amplifiers for dielectric elastomers',
         ((0.0, 10.0, 'did you mean kV?'),)),
 )
-#: What is asked by what the actuator is, a block unless named.
+#: Quantities by form of the actuator, by default a block.
 FORMS: Mapping[str, tuple[Quantity, ...]] = {
     'beam': BEAM, 'dielectric': DIELECTRIC, 'block': QUANTITIES}
-#: All of them, each once.
+#: All quantities, each once.
 EVERY = tuple({x.key: x for form in (DIELECTRIC, BEAM, QUANTITIES) for x in form}.values())
-#: In place of zeta.
+#: Alternative to zeta.
 DAMPING = Quantity.of(
     'damping', _BLOCK['damping_coefficient'], 'damping coefficient c', (0.0, math.inf), '',
     follows=True)
-#: What the user need not know: all others are given, or entered, or left to --yes.
+#: Quantities with a default; all others are given, asked for, or set by --yes.
 OPTIONAL = ('flux_min', 'slew_limit')
 
 
 def default_of(quantity: Quantity, given: Mapping[str, float]) -> float:
-    """Return a default in SI units: a cube, and a coil as strong in either direction."""
+    """Return a default in SI units: a cube, and a coil with symmetric limits."""
     if quantity.default is not None:
         return quantity.default
     return given['half_length'] if quantity.key == 'half_thickness' else -abs(given['flux_max'])
 
 
 def joint_names(text: str) -> list[str]:
-    """Read names of joints, none from an empty text; raise `BadInputError` for a wrong one."""
+    """Read joint names, an empty list from an empty text; raise `BadInputError` if invalid."""
     names = text.replace(',', ' ').split()
     for name in names:
         if not _NAME.fullmatch(name):

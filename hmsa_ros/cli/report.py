@@ -40,7 +40,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read, evaluate and write; refuse files that cannot be written with `BadInputError`."""
+    """Read, evaluate and write; raise `BadInputError` if a file cannot be written."""
     out = arguments.out or Path(f'{arguments.bags[0].resolve().stem}_report.html')
     pictures: list[Path] = arguments.picture
     paper = paper_of(arguments)

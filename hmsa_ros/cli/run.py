@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from hmsa_ros.report.outcome import LevelResult
 
 NOT_MEASURED = 'predicted, not measured'
-# What is slower than this share of real time is said to be.
+# Fraction of real time below which simulated time is reported as slow.
 _SLOW = 0.9
 _MOST_REPEATS = 10_000
 
@@ -66,7 +66,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Carry out the experiment as often as asked for; a bad number is a `BadInputError`."""
+    """Run the experiment as often as requested; raise `BadInputError` for an invalid number."""
     tolerances = _tolerances(arguments)
     if not 1 <= arguments.repeat <= _MOST_REPEATS:
         raise BadInputError(
@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
         stay_local()
     from hmsa_ros.lab.experiment import prepare
 
-    # Each repeat has a folder of its own.
+    # Each repeat has its own folder.
     folders = [folder] if arguments.repeat == 1 else [
         folder / str(i + 1) for i in range(arguments.repeat)]
     experiments = [_experiment(arguments, x) for x in folders]
@@ -120,10 +120,10 @@ def _carried_out(
         arguments: argparse.Namespace, experiment: 'Experiment', tolerances: 'Tolerances | None',
         update: 'Callable[[str, float | None], None]'
 ) -> 'tuple[Conducted, list[Part], Path | None]':
-    """Conduct an experiment, and judge the setpoints of each joint by its bag."""
+    """Conduct an experiment, and judge the setpoints of each joint from its bag."""
     from hmsa_ros.lab.experiment import conduct
 
-    done = conduct(experiment, partial(_tell, update))
+    done = conduct(experiment, partial(_show, update))
     ENDING.check()
     if not done.measured:
         return done, [], None
@@ -142,8 +142,8 @@ def _carried_out(
     return done, parts, report
 
 
-def _tell(update: 'Callable[[str, float | None], None]', what: str, share: float) -> None:
-    """Show what is going on; while the nodes are busy with the sequence, prepare its end."""
+def _show(update: 'Callable[[str, float | None], None]', what: str, share: float) -> None:
+    """Show the current activity; import modules of the evaluation during the sequence."""
     update(what, share)
     if share > 0.0:
         import_module('hmsa_ros.report.outcome')
@@ -151,7 +151,7 @@ def _tell(update: 'Callable[[str, float | None], None]', what: str, share: float
 
 
 def _tolerances(arguments: argparse.Namespace) -> 'Tolerances | None':
-    """Return the tolerances, None for the planner's; refuse what cannot be used."""
+    """Return the tolerances, None for the planner's; raise `BadInputError` if invalid."""
     from hmsa_ros.judge.records import Tolerances
 
     tolerance = arguments.tolerance
@@ -187,7 +187,7 @@ def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
 
 def _verdict(
         experiment: 'Experiment', findings: 'list[Finding]', done: 'Conducted') -> tuple[str, str]:
-    """Return the verdict on all setpoints, or on the end of levels, and why."""
+    """Return the verdict on all setpoints, or on the end of levels, and its reason."""
     from hmsa_ros.judge.records import worst
 
     if not experiment.setpoints or not done.measured:

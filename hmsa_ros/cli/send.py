@@ -34,7 +34,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Send and, if asked to, wait; raise `HmsaError` if the sequence is not carried out."""
+    """Send and, if requested, wait; raise `HmsaError` if the sequence is not carried out."""
     from hmsa_ros.lab.client import PlannerClient
 
     timeout = timeout_of(arguments)

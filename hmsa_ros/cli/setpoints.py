@@ -1,4 +1,4 @@
-"""Setpoints as words on the command line."""
+"""Setpoints on the command line."""
 
 import argparse
 import math
@@ -14,8 +14,8 @@ def sequence_of(
     """
     Return times in s and flux densities in T of --levels, and the points of --path.
 
-    A point is a time in s, stretch, rate and acceleration. Unless exactly one of setpoints, levels
-    and a path is given, and can be used, it is a `BadInputError`.
+    Each point contains time in s, stretch, rate and acceleration. Raises `BadInputError` unless
+    exactly one of setpoints, levels and path is given and valid.
     """
     given = [x for x, y in (
         ('setpoints', arguments.setpoints), ('--levels', arguments.levels),
@@ -44,7 +44,7 @@ def sequence_of(
 
 
 def setpoint(text: str) -> tuple[float, float]:
-    """Read stretch and time from ``'1.10:10'``; raise `BadInputError` for anything else."""
+    """Read stretch and duration from ``'1.10:10'``; raise `BadInputError` if invalid."""
     stretches, span = setpoint_of_joints(text)
     if len(stretches) > 1:
         raise _no_setpoint(text)
@@ -52,7 +52,7 @@ def setpoint(text: str) -> tuple[float, float]:
 
 
 def setpoint_of_joints(text: str) -> tuple[tuple[float, ...], float]:
-    """Read stretches and time from ``'1.10,1.20:10'``, or raise `BadInputError`."""
+    """Read stretches and duration from ``'1.10,1.20:10'``; raise `BadInputError` if invalid."""
     stretches, _, span = text.partition(':')
     try:
         found = [Setpoint(float(stretch), float(span)) for stretch in stretches.split(',')]
@@ -69,7 +69,7 @@ def _no_setpoint(text: str) -> BadInputError:
     return BadInputError(f'{text!r}: expected STRETCH:DURATION, two numbers such as 1.10:10')
 
 
-#: What says what to send: setpoints, or a file of levels or of a path.
+#: Options for the sequence: setpoints, or a file of levels or of a path.
 SEQUENCE: tuple[Row, ...] = (
     ('setpoints', 'STRETCH:SECONDS', argument(setpoint_of_joints),
      'target stretch, or deflection of a beam, and its duration in s (move plus hold); with '

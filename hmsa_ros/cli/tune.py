@@ -63,7 +63,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Carry it out; refuse setpoints of several joints with `BadInputError`."""
+    """Tune an actuator; raise `BadInputError` for setpoints of several joints."""
     if any(len(x) > 1 for x, _ in arguments.setpoints):
         raise BadInputError(
             'setpoints name several joints: expected one stretch each; tune one joint at a time, '
@@ -117,7 +117,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _nodes(arguments: argparse.Namespace) -> 'tuple[Entries, NodeProcess | None]':
-    """Return what is known, and planner and plant to start where that is asked for."""
+    """Return the given parameters, and planner and plant to start, if requested."""
     from hmsa_ros.lab.experiment import simulated_node
     from hmsa_ros.lab.tuning import known_to
     from hmsa_ros.recordings.parameters import entries_of, read_parameter_file
@@ -126,6 +126,6 @@ def _nodes(arguments: argparse.Namespace) -> 'tuple[Entries, NodeProcess | None]
     entries = [] if path is None else entries_of(path)
     if not arguments.simulate:
         return known_to(arguments.namespace) if path is None else entries, None
-    # What the plant really is the tuning does not know.
+    # The tuning must not use the true parameters of the plant.
     return [x for x in entries if x[0] != 'plant'], simulated_node(
         {} if path is None else read_parameter_file(path), str(path or ''), arguments.namespace)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from hmsa_ros.watch.listener import Listener
     from hmsa_ros.watch.scene import Scene
 
-# Between two lines where there is no terminal, and between two looks meanwhile, in s.
+# Interval of lines without a terminal, and of looks in between, in s.
 _LINE_SECONDS = 1.0
 _LOOK_SECONDS = 0.1
 
@@ -50,7 +50,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Watch until told to end; raise `BadInputError` if an option is out of range."""
+    """Watch until the end is requested; raise `BadInputError` if an option is out of range."""
     for name, least, largest in (('span', 0.1, 3600.0), ('rate', 0.1, 30.0),
                                  ('timeout', 0.0, 1e6)):
         value = getattr(arguments, name)
@@ -75,12 +75,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _once(
         listener: 'Listener', console: 'Console', arguments: argparse.Namespace) -> int:
-    """Print one view as soon as everything is there, or when the time is over."""
+    """Print one view once it is complete, or after the timeout."""
     from hmsa_ros.watch.screen import as_json
 
     end = monotonic() + arguments.timeout
     scene = listener.look()
-    # Two looks, so that the samples' rate can be told.
+    # At least two looks, to determine the sample rate.
     while not (scene.joints and scene.request and scene.sample_rate > 0.0):
         if monotonic() >= end or ENDING.asked:
             break
@@ -109,7 +109,7 @@ def _lines(listener: 'Listener', as_objects: bool) -> int:
 
 
 def _screen(console: 'Console', span: float) -> 'Callable[[Scene], list[Text]]':
-    """Return what lays a scene out for the size that the terminal has by then."""
+    """Return a function that formats a scene for the present size of the terminal."""
     from hmsa_ros.watch.screen import Screen
 
     screen = Screen(span, unicode=console.encoding.lower().startswith('utf'))
@@ -140,7 +140,7 @@ def _live(
 
 @contextmanager
 def _keys() -> Iterator[Any]:
-    """Give keys as they are pressed, without showing them; the terminal is left as it was."""
+    """Yield a function that reads pressed keys without echo; restore the terminal afterwards."""
     if not sys.stdin.isatty():
         yield sleep
         return
@@ -150,7 +150,7 @@ def _keys() -> Iterator[Any]:
     before = termios.tcgetattr(file)
     settings = termios.tcgetattr(file)
     settings[3] &= ~(termios.ICANON | termios.ECHO)
-    # A stopped process would leave its screen behind.
+    # Suspending would leave the alternate screen behind.
     settings[6][termios.VSUSP] = b'\0'
 
     def key(seconds: float) -> str:
@@ -158,7 +158,7 @@ def _keys() -> Iterator[Any]:
         if not ready:
             return ''
         pressed = os.read(file, 1)
-        # A terminal that is gone ends the view, too.
+        # A terminal that has disappeared also ends the view.
         return pressed.decode('ascii', 'ignore') if pressed else 'q'
 
     try:

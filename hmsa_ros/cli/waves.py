@@ -42,7 +42,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print what can be reached, plan and write; what is no wave is a `BadInputError`."""
+    """Print the possible range, plan and write; raise `BadInputError` for an invalid wave."""
     from hmsa_ros.api.actuator import Actuator
     from hmsa_ros.api.paths import read_path, SHAPES
 
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _write_path(arguments: argparse.Namespace, actuator: 'Actuator', shape: Any) -> None:
-    """Write the points of the wave; a square wave is a `BadInputError`."""
+    """Write the points of the wave; raise `BadInputError` for a square wave."""
     from hmsa_ros.api.paths import wave_of, wave_path, wave_points
     from hmsa_ros.recordings.tables import write_table
 
