@@ -13,10 +13,10 @@ stretch  duration (s)  first level (T)  move time (s)  last level (T)  status
       1           0.5         0.062155     0.00165032               0  two_step
 >>> motion = plan.simulate(truth=block.scaled(shear_modulus=1.02), noise=1e-4)
 
-``hmsa_ros.model`` is the actuator, ``hmsa_ros.planning`` the commands that move it, and
-``hmsa_ros.device`` the simulated plant and drivers of hardware, all without ROS. ``hmsa_ros.bag``
-reads and writes recordings, ``hmsa_ros.nodes`` is the ROS 2 edge and ``hmsa_ros.cli`` the command
-line.
+``hmsa_ros.model`` is the actuator, ``hmsa_ros.planning`` plans the commands that move it, and
+``hmsa_ros.device`` contains the simulated plant and drivers of hardware, all without ROS.
+``hmsa_ros.bag`` reads and writes recordings, ``hmsa_ros.nodes`` contains the ROS 2 nodes, and
+``hmsa_ros.cli`` is the command line.
 """
 
 from importlib import import_module
@@ -36,7 +36,7 @@ __all__ = [
     'Actuator', 'BadInputError', 'HmsaError', 'Identified', 'Motion', 'Plan', 'Table', 'compare',
     'identify', 'read']
 
-# Where each name is, so that it is loaded with its first use.
+# Module of each name, which is imported on first use.
 _HOMES = {
     'Actuator': 'api.actuator', 'BadInputError': 'errors', 'HmsaError': 'errors',
     'Identified': 'api.identified', 'Motion': 'api.motion', 'Plan': 'api.plan', 'Table': 'table',

@@ -1,8 +1,7 @@
 /*
-Ends this process after a time in which it ran, even where no Python runs.
+Ends this process after some running time, even if Python is blocked.
 
-A thread counts ticks. It counts none while the process is stopped: by then, a timer of the system
-would be over.
+A thread counts ticks. It does not count while the process is stopped, unlike a system timer.
 */
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
@@ -17,7 +16,7 @@ would be over.
 
 enum { TICK_MS = 10, WRITE_MS = 50, LONGEST = 500, DEADLINES = 2 };
 
-/* Ticks left, 0 for no deadline; the status to end with; and a line for the error output. */
+/* Ticks left, 0 for no deadline; exit status; and a line for the error output. */
 static struct {
     atomic_long left;
     atomic_int status;
@@ -27,7 +26,7 @@ static struct {
 
 static int counting = 0;
 
-/* A reader that hangs must not keep the process: a line is written where there is room for it. */
+/* A blocked reader must not delay the end: the line is only written if there is room for it. */
 static void end(int number) {
     struct pollfd error_output = {STDERR_FILENO, POLLOUT, 0};
     if (deadlines[number].length && poll(&error_output, 1, WRITE_MS) > 0) {
@@ -59,7 +58,7 @@ static void forget(void) {
     }
 }
 
-/* Signals are for the threads of Python. */
+/* Signals are handled by the threads of Python. */
 static int start(void) {
     sigset_t all, before;
     pthread_t thread;
@@ -88,7 +87,7 @@ static PyObject *set(PyObject *self, PyObject *arguments) {
         return PyErr_SetFromErrno(PyExc_OSError);
     }
     atomic_store(&deadlines[number].status, status);
-    /* A tick that is under way does not count. */
+    /* The tick under way does not count. */
     atomic_store(&deadlines[number].left, seconds > 0.0 ? (long)(1e3 * seconds / TICK_MS) + 2 : 0);
     Py_RETURN_NONE;
 }
@@ -110,12 +109,12 @@ static PyObject *say(PyObject *self, PyObject *arguments) {
 }
 
 static PyMethodDef methods[] = {
-    {"set", set, METH_VARARGS, "set(number, seconds, status): end after some seconds; 0 for never."},
-    {"say", say, METH_VARARGS, "say(number, text): have this line written then."},
+    {"set", set, METH_VARARGS, "set(number, seconds, status): End after some seconds; 0 for never."},
+    {"say", say, METH_VARARGS, "say(number, text): Set the line to write at the deadline."},
     {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef module = {
-    PyModuleDef_HEAD_INIT, "_deadline", "Ends this process after a time in which it ran.", -1, methods,
+    PyModuleDef_HEAD_INIT, "_deadline", "Ends this process after some running time.", -1, methods,
     NULL, NULL, NULL, NULL};
 
 PyMODINIT_FUNC PyInit__deadline(void) {

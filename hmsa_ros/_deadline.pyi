@@ -1,5 +1,5 @@
-# Of the compiled module: ends this process after a time in which it ran, or 0 s for never.
-LONGEST: int  # of a line in bytes
+# Compiled module: ends this process after some running time, or 0 s for never.
+LONGEST: int  # maximum length of a line in bytes
 
 def set(number: int, seconds: float, status: int, /) -> None: ...
 def say(number: int, text: bytes, /) -> None: ...

@@ -1,4 +1,4 @@
-"""Columns of numbers out of CSV files, with what is wrong in them said."""
+"""Columns of numbers from CSV files, with precise error messages."""
 
 import csv
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 _SEPARATORS = (';', '\t', ',', '|')
 _LARGEST_FILE = 512 * 1024 * 1024
-# The first unit of each is that where the header has none.
+# The first unit of each quantity is the default.
 _UNITS = {
     'time': {'s': 1.0, 'sec': 1.0, 'seconds': 1.0, 'ms': 1e-3, 'us': 1e-6, 'µs': 1e-6,
              'ns': 1e-9},
@@ -37,12 +37,12 @@ _HEADER = re.compile(r'\s*([A-Za-z_µ ]+?)\s*(?:[\[(/]\s*([^\])]*?)\s*[\])]?)?\s
 class Table:
     """Columns of a CSV file by name."""
 
-    columns: dict[str, Array]  # in SI; NaN where a cell was empty or no number
-    lines: Array  # number of each row's line
-    notes: tuple[str, ...]  # what was converted
+    columns: dict[str, Array]  # in SI; NaN for an empty cell
+    lines: Array  # line number of each row
+    notes: tuple[str, ...]  # conversions
 
     def check_complete(self, path: Path, because: str = '') -> None:
-        """Raise `BadInputError`, which may say why, unless every cell has a finite number."""
+        """Raise `BadInputError`, with a reason if given, unless all cells have finite numbers."""
         bad = ~np.all([np.isfinite(x) for x in self.columns.values()], axis=0)
         if np.any(bad):
             raise BadInputError(
@@ -62,7 +62,7 @@ def _text(path: Path, kind: str) -> str:
 
 
 def _decoded(content: bytes) -> str:
-    """Return text as a spreadsheet wrote it: by its mark, or in western Windows' code page."""
+    """Return decoded text, by its byte order mark, as UTF-8 or as code page 1252."""
     if content.startswith((b'\xff\xfe', b'\xfe\xff')):
         return content.decode('utf-16')
     try:
@@ -77,9 +77,9 @@ def read_table(path: Path, wanted: tuple[str, ...], *, kind: str = 'a CSV') -> T
     """
     Read the wanted columns of a CSV file, in SI.
 
-    Separators are found out; so are units behind a name, as in ``flux_density [mT]``. Messages say
-    that ``kind`` was expected. Raises `BadInputError` if the file cannot be read, has no header,
-    or a column is missing.
+    Separators are detected, and so are units after a name, as in ``flux_density [mT]``. ``kind``
+    is the expected kind of file in messages. Raises `BadInputError` if the file cannot be read or
+    has no header, or if a column is missing.
     """
     rows = [(i, x) for i, x in enumerate(_text(path, kind).splitlines(), 1)
             if x.strip() and not x.lstrip().startswith('#')]
@@ -131,12 +131,12 @@ def _split(text: str, separator: str | None) -> list[str]:
         return text.split()
     try:
         return [x.strip() for x in next(csv.reader(io.StringIO(text), delimiter=separator))]
-    except csv.Error:  # a NUL or an endless cell, of which no number is made
+    except csv.Error:  # a NUL or an overlong cell, which is not a number
         return [text]
 
 
 def _number(text: str, separator: str | None) -> float | None:
-    """Return the number in a cell, NaN for an empty one; None for what is none."""
+    """Return the number in a cell, NaN for an empty one, None for other text."""
     if text.lower() in ('', 'nan', 'na', 'n/a', 'null', 'none'):
         return math.nan
     try:
@@ -148,7 +148,7 @@ def _number(text: str, separator: str | None) -> float | None:
 def _places(
         path: Path, cells: list[str], names: tuple[str, ...]
 ) -> tuple[dict[str, tuple[int, float]], list[str]]:
-    """Return place and factor of each column that is known, and notes."""
+    """Return place and factor of each known column, and notes about conversions."""
     places: dict[str, tuple[int, float]] = {}
     notes = []
     for place, cell in enumerate(cells):

@@ -1,11 +1,11 @@
 """
-How a process ends when a signal asks it to.
+End of a process on a signal.
 
-Python answers SIGINT with an exception wherever it happens to be: a traceback while modules are
-imported, and nothing at all in a destructor or the callback of a weak reference, which drop it
-(each import runs one). It answers SIGTERM and SIGHUP, and every signal while it shuts down, by
-dying. So an entry point takes all three over before it imports anything slow, and a process that
-has something to put in order only notes them, and looks where it is safe to end.
+Python responds to SIGINT with an exception at an arbitrary point. This prints a traceback while
+modules are imported, and is dropped in a destructor or the callback of a weak reference, which
+every import runs. SIGTERM and SIGHUP, and all signals during shutdown, end Python immediately. An
+entry point therefore installs handlers for all three before it imports slow modules. A process
+that needs to clean up only records signals, and checks them where it is safe to end.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,23 +20,23 @@ from typing import Any
 from hmsa_ros import _deadline
 
 _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-# How long a process may take to end when all is done, in s.
+# Time limit in s for a process to end after its clean-up.
 _LAST_SECONDS = 3
-# Deadlines of a process: of a call, and of its own end.
+# Deadlines of a process: for a call, and for its end.
 _CALL, _END = 0, 1
 
 
 class Ending:
-    """Whether a signal `asked` this process to end, and the exit `status` that shells expect."""
+    """Whether a signal `asked` this process to end, and the exit `status` expected by shells."""
 
     def __init__(self) -> None:
-        """Leave signals as they are."""
+        """Leave the signal handlers unchanged."""
         self.asked = False
         self.status = 128 + signal.SIGINT
         self._respond: Callable[[], object] | None = None
 
     def leave(self, status: int | None = None, text: str = '') -> None:
-        """End the process at once from now on, with a sentence: nothing has been done yet."""
+        """End the process immediately on a signal from now on, without clean-up but a message."""
         def respond() -> None:
             if text:
                 with suppress(OSError):
@@ -45,19 +45,19 @@ class Ending:
         self._take_over(respond)
 
     def interrupt(self) -> None:
-        """Raise KeyboardInterrupt from now on, if the signals have been taken over."""
+        """Raise KeyboardInterrupt on a signal from now on, if the handlers are installed."""
         if self._taken:
             self._take_over(_raise)
             signal.signal(signal.SIGALRM, lambda *_: _raise())
             sys.unraisablehook = _raise_again
 
     def note(self) -> None:
-        """Only note signals from now on; the process calls `check`, or looks at `asked`."""
+        """Only record signals from now on; the process calls `check`, or reads `asked`."""
         self._take_over(None)
 
     @contextmanager
     def by_default(self) -> Iterator[None]:
-        """Have signals end the process at once meanwhile, even where no Python runs."""
+        """Let signals end the process immediately meanwhile, even if Python is blocked."""
         if not self._taken or threading.current_thread() is not threading.main_thread():
             yield
             return
@@ -70,32 +70,32 @@ class Ending:
                 signal.signal(number, handler)
 
     def go_on(self) -> None:
-        """Pass over Ctrl-Z from now on: nobody would watch what the process has switched on."""
+        """Ignore Ctrl-Z from now on, since a stopped process cannot monitor its hardware."""
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTSTP, signal.SIG_IGN)
 
     def ignore(self) -> None:
-        """Pass over signals from now on: the process is about to end anyway."""
+        """Ignore signals from now on, since the process is about to end."""
         if self._taken:
             for number in _NUMBERS:
                 signal.signal(number, signal.SIG_IGN)
 
     def finish(self, status: int) -> None:
         """
-        Have the process end with a status, soon, even if a library hangs in its clean-up.
+        End the process with a status soon, even if a library blocks in its clean-up.
 
-        Fast DDS 2.14 may never come back from the end of a participant: it waits, without
-        letting go, for a thread that has just received the end of another one.
+        Fast DDS 2.14 may never return from the deletion of a participant: it waits, while holding
+        a lock, for a thread that has just received the end of another participant.
         """
         _deadline.set(_END, _LAST_SECONDS, status)
         if 'rclpy' in sys.modules:
-            # What refers to itself, as nodes do, would keep the participant until after Python's
-            # end, where Fast DDS takes it away while a thread may still read from it.
+            # Reference cycles, as of nodes, would keep the participant until after the end of
+            # Python, where Fast DDS deletes it while a thread may still read from it.
             gc.unfreeze()
             gc.collect()
 
     def check(self) -> None:
-        """Raise KeyboardInterrupt if the end has been asked for."""
+        """Raise KeyboardInterrupt if the end was requested."""
         if self.asked:
             _raise()
 
@@ -106,8 +106,8 @@ class Ending:
     def _take_over(self, respond: Callable[[], object] | None) -> None:
         self._respond = respond
         for number in _NUMBERS:
-            # A shell has its background jobs ignore SIGINT, nohup SIGHUP. A process that notes
-            # signals is one to be ended by them, and SIGINT is the usual one.
+            # Background jobs of a shell ignore SIGINT, and jobs of nohup ignore SIGHUP. A process
+            # that records signals must still respond to SIGINT, the usual one.
             if signal.getsignal(number) is not signal.SIG_IGN or (
                     respond is None and number == signal.SIGINT):
                 signal.signal(number, self._on_signal)
@@ -124,7 +124,7 @@ def _raise() -> None:
 
 
 def _raise_again(dropped: Any) -> None:
-    """Raise an interrupt that Python has dropped a little later; show what else it drops."""
+    """Raise an interrupt dropped by Python again after a moment; show other dropped errors."""
     if issubclass(dropped.exc_type, KeyboardInterrupt):
         signal.setitimer(signal.ITIMER_REAL, 0.001)
     else:
@@ -132,25 +132,25 @@ def _raise_again(dropped: Any) -> None:
 
 
 def encoded(text: str) -> bytes:
-    """Return a sentence as `Deadline` takes it."""
+    """Return a message in the form required by `Deadline`."""
     return f'hmsa: error: {text}'.encode()[:_deadline.LONGEST - 1] + b'\n'
 
 
 class Deadline:
     """
-    Ends the process with a sentence, even where no Python runs: something took too long.
+    Ends the process with a message after a time, even if Python is blocked.
 
-    There is one in a process. Time in which the process is stopped does not count.
+    There is one for each process. Time while the process is stopped does not count.
     """
 
-    def say(self, text: bytes) -> None:
-        """Say this, as `encoded` makes it, when the time is over."""
+    def set_text(self, text: bytes) -> None:
+        """Set the message, in the form of `encoded`, to print at the deadline."""
         _deadline.say(_CALL, text)
 
     def set(self, seconds: float) -> None:
-        """Say it, and end the process with status 1, after some seconds; 0 for not at all."""
+        """End the process with the message and status 1 after some seconds; 0 cancels that."""
         _deadline.set(_CALL, seconds, 1)
 
 
-#: Of this process.
+#: The ending of this process.
 ENDING = Ending()

@@ -1,12 +1,12 @@
 """
-Entry points of all processes: signals are taken over before anything slow is imported.
+Entry points of all processes, which install signal handlers before slow imports.
 
-What is imported here is there as soon as Python has started. While that starts it answers a
-signal itself, with a traceback of its module ``site`` at worst: only who starts it with signals
+The modules imported here are loaded when Python starts. Until then, Python handles a signal
+itself, at worst with a traceback of its module ``site``; only a parent that starts it with signals
 blocked could prevent that.
 """
 
-# Beneath `signal`, which imports more than all of this.
+# The basis of `signal`, which imports more than all of this.
 import _signal  # type: ignore[import-not-found]
 from collections.abc import Callable
 import os
@@ -16,8 +16,8 @@ import sys
 def main(argv: list[str] | None = None) -> int:
     """Run the ``hmsa`` command; return its exit status."""
     _take_over()
-    # The matrices here are small: threads of a linear algebra library wait longer for each other
-    # than they compute, and a node would wait for them.
+    # The matrices here are small: threads of a linear algebra library would wait longer for each
+    # other than they compute.
     os.environ.setdefault('OMP_NUM_THREADS', '1')
     from hmsa_ros.ending import ENDING
     ENDING.leave()
@@ -25,21 +25,21 @@ def main(argv: list[str] | None = None) -> int:
     try:
         status = command(argv)
     finally:
-        # Python's own end takes a while, in which it would answer signals by dying.
+        # Signals during the shutdown of Python, which takes a while, would end it immediately.
         ENDING.ignore()
     ENDING.finish(status)
     return status
 
 
 def _take_over() -> None:
-    """End the process at once on a signal, until `Ending` is there to answer it."""
+    """Let a signal end the process immediately, until `Ending` handles it."""
     for number in (_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP):
         if _signal.getsignal(number) != _signal.SIG_IGN:
             _signal.signal(number, lambda number, _: os._exit(128 + number))
 
 
 def _node(name: str) -> Callable[[], int]:
-    """Return what runs ``hmsa NAME`` as a program of its own."""
+    """Return an entry point that runs ``hmsa NAME``."""
     return lambda: main([name, *sys.argv[1:]])
 
 

@@ -1,15 +1,15 @@
 """
-Errors that a user can meet.
+Errors shown to the user.
 
-Every message is one sentence that says what was wrong, what was got, what was expected and,
-where it is not obvious, how to mend it.
+Every message is one sentence with the problem, the value found, the value expected and, if not
+obvious, the remedy.
 """
 
 from collections.abc import Iterable
 import reprlib
 import sys
 
-# Long enough for what a user may have mistyped, too short to flood a log.
+# Long enough for a mistyped value, short enough not to flood a log.
 _EXCERPT = reprlib.Repr()
 _EXCERPT.maxstring = _EXCERPT.maxother = 80
 _EXCERPT.maxlist = 4
@@ -17,18 +17,18 @@ _EXCERPT.maxlist = 4
 
 class HmsaError(Exception):
     """
-    Base of all errors raised by this package.
+    Base class of all errors raised by this package.
 
-    A run that failed for a reason outside the caller's input raises this class itself or a
-    subclass other than `BadInputError`; the command line answers it with exit status 1.
+    A run that fails for a reason other than its input raises this class or a subclass other than
+    `BadInputError`; the exit status of the command line is 1.
     """
 
 
 class BadInputError(HmsaError, ValueError):
     """
-    Input that cannot be used as given.
+    Invalid input.
 
-    The command line answers it with exit status 2.
+    The exit status of the command line is 2.
     """
 
 
@@ -46,7 +46,7 @@ def complain(error: Exception, status: int | None = None) -> int:
 
 
 def printable(text: str) -> str:
-    """Return a text with control characters, and what is no character, written as codes."""
+    """Return a text with control and invalid characters replaced by escape codes."""
     if text.isprintable():
         return text
     return ''.join(
@@ -55,12 +55,12 @@ def printable(text: str) -> str:
 
 
 def listed(names: Iterable[str], most: int = 4) -> str:
-    """Return names for a sentence, the first of many."""
+    """Return the first names of a list for a message, and the number of the others."""
     every = list(names)
     more = f' and {len(every) - most} more' if len(every) > most else ''
     return ', '.join(every[:most]) + more
 
 
 def excerpt(value: object) -> str:
-    """Return a value's ``repr`` in one line, its middle left out where it is long."""
+    """Return a value's ``repr`` in one line, shortened in the middle."""
     return ' '.join(_EXCERPT.repr(value).split())

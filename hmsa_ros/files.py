@@ -1,4 +1,4 @@
-"""Writing files: complete under their name, or not at all."""
+"""Write files completely or not at all."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -16,10 +16,10 @@ from hmsa_ros.errors import BadInputError
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """
-    Yield a file beside a name, to be renamed once it is complete; if writing fails, the old stays.
+    Yield a temporary file that replaces ``path`` once complete; on failure, keep the old file.
 
-    A link is followed, a device written to directly. Raises `BadInputError` if the file cannot be
-    written, or is a link to nothing.
+    Links are followed, devices are written to directly. Raises `BadInputError` if the file cannot
+    be written, or is a broken link.
     """
     try:
         if path.is_symlink() and not path.exists():
@@ -29,7 +29,7 @@ def replacing(path: Path) -> Iterator[Path]:
         if target.exists() and not stat.S_ISREG(target.stat().st_mode):
             yield target
             return
-        # Processes of two hosts may have the same number.
+        # Processes on two hosts may have the same number.
         beside = target.with_name(f'.{target.name}.{uuid.uuid4().hex}.part')
         try:
             yield beside
@@ -43,13 +43,13 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text as UTF-8 (replacement characters for names that are not), or change nothing."""
+    """Write a text as UTF-8, replacing invalid characters, or change nothing."""
     with replacing(path) as beside:
         beside.write_bytes(text.encode('utf-8', 'replace'))
 
 
 def check_targets(*targets: Path | None, sources: Iterable[Path | None] = ()) -> None:
-    """Refuse by `BadInputError` what cannot be written, or is read, before a command begins."""
+    """Raise `BadInputError` for a target that cannot be written, or is also a source."""
     read = [x.resolve() for x in sources if x is not None]
     for target in filter(None, targets):
         why = ('it is a folder; expected a file' if target.is_dir() else
@@ -61,7 +61,7 @@ def check_targets(*targets: Path | None, sources: Iterable[Path | None] = ()) ->
 
 
 def make_folder(folder: Path) -> None:
-    """Make the folder that a command writes to, unless it exists, or raise `BadInputError`."""
+    """Create an output folder unless it exists; raise `BadInputError` if it is not writable."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / '.writable'
@@ -74,12 +74,12 @@ def make_folder(folder: Path) -> None:
 
 
 def json_text(document: object) -> str:
-    """Return a document as JSON: paths as texts, null for each number that is not finite."""
+    """Return a document as JSON, with paths as text and null for non-finite numbers."""
     return json.dumps(finite(document), indent=2, allow_nan=False)
 
 
 def finite(value: Any) -> Any:
-    """Return what JSON can say of a document: None for each number that is not finite."""
+    """Return a document with values that JSON can represent, None for non-finite numbers."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
@@ -91,7 +91,7 @@ def finite(value: Any) -> Any:
 
 
 def read_at_most(path: Path, size: int, expected: str) -> bytes:
-    """Return the content, of a device as far as allowed; raise `BadInputError` if it is larger."""
+    """Return the content of a file or device; raise `BadInputError` if it is too large."""
     with path.open('rb') as file:
         content = file.read(size + 1)
     if len(content) > size:
@@ -112,7 +112,7 @@ def require_arrow() -> tuple[Any, Any]:
 
 
 def yaml_text(value: Any) -> str:
-    """Return a value as every reader of YAML takes it, numbers with a point."""
+    """Return a value in YAML that all readers interpret alike; floats have a decimal point."""
     if isinstance(value, bool):
         return 'true' if value else 'false'
     if isinstance(value, float):

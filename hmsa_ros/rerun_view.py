@@ -1,9 +1,9 @@
 """
 Show a bag in the Rerun viewer: ``python -m hmsa_ros.rerun_view BAG``.
 
-Needs rerun-sdk (``pip install rerun-sdk``). Rerun's own reader of MCAP files takes stretch, rate
-and flux density from the bag; the markers, which it does not know, are turned into its boxes and
-arrows here. `blueprint` says what is shown where.
+Requires rerun-sdk (``pip install rerun-sdk``). Rerun reads stretch, rate and flux density from
+MCAP files itself. It does not support markers, which are converted to boxes and arrows here.
+`blueprint` defines the layout.
 """
 
 import argparse
@@ -25,10 +25,10 @@ APPLICATION = 'hmsa_ros'
 JOINT_STATES = topics.JOINT_STATES.name
 MARKERS = tuple(
     topics.from_outside(topics.MARKERS.name, node) for node in topics.MARKERS.publishers)
-#: Rerun's timeline of the times at which messages were received.
+#: Rerun's timeline of reception times.
 TIMELINE = 'message_log_time'
 
-# As visualization_msgs has them; the messages themselves need a ROS installation.
+# Constants of visualization_msgs, whose messages would need a ROS installation.
 _ARROW, _CUBE, _TEXT, _TRIANGLES = 0, 1, 9, 11
 _ADD, _DELETE, _DELETE_ALL = 0, 2, 3
 
@@ -50,7 +50,7 @@ def _root(namespace: str) -> str:
 
 
 def views(namespace: str = '', coordinate: str = STRETCH.name) -> dict[str, str]:
-    """Return the entity path of each view by its title, which names what a position is."""
+    """Return the entity path of each view by title, which contains the coordinate name."""
     root = _root(namespace)
     return {
         coordinate.capitalize(): f'{root}/{JOINT_STATES}/position',
@@ -60,7 +60,7 @@ def views(namespace: str = '', coordinate: str = STRETCH.name) -> dict[str, str]
 
 
 def blueprint(namespace: str = '', coordinate: str = STRETCH.name) -> Any:
-    """Return the layout of the viewer: the actuators on the left, their curves on the right."""
+    """Return the layout of the viewer: actuators on the left, curves on the right."""
     rrb = _rerun().blueprint
     *curves, (title, path) = views(namespace, coordinate).items()
     return rrb.Blueprint(
@@ -74,7 +74,7 @@ def blueprint(namespace: str = '', coordinate: str = STRETCH.name) -> Any:
 
 
 def show(bag: str | os.PathLike[str], recording: Any, namespace: str = '') -> None:
-    """Log a bag and the blueprint; raise `BadInputError` without samples in that namespace."""
+    """Log a bag and the blueprint; raise `BadInputError` if the namespace has no samples."""
     root = _root(namespace)
     reader = BagReader(bag)
     found = set(reader.topics)
@@ -93,7 +93,7 @@ def show(bag: str | os.PathLike[str], recording: Any, namespace: str = '') -> No
 
 
 def _coordinate(custom_data: Mapping[str, str], root: str) -> str:
-    """Return what the positions in a namespace are called, as the recorded parameters say."""
+    """Return the coordinate name in a namespace, according to the recorded parameters."""
     parameters = recorded(custom_data, root)
     joints = next((x for node in (topics.PLANT, topics.PLANNER)
                    if isinstance(x := parameters.get(f'{node}.joints'), list) and x), [''])
@@ -101,7 +101,7 @@ def _coordinate(custom_data: Mapping[str, str], root: str) -> str:
 
 
 def _log_marker(recording: Any, root: str, marker: Any) -> None:
-    """Log a marker as what Rerun knows."""
+    """Log a marker as a shape of Rerun."""
     rr = _rerun()
     if marker.action == _DELETE_ALL:
         recording.log(root, rr.Clear(recursive=True))
@@ -112,7 +112,7 @@ def _log_marker(recording: Any, root: str, marker: Any) -> None:
 
 
 def _shape(rr: Any, marker: Any) -> Any:
-    """Return what Rerun shows for a marker; None for nothing."""
+    """Return Rerun's shape of a marker; None if there is none."""
     colour = [round(255 * x) for x in (
         marker.color.r, marker.color.g, marker.color.b, marker.color.a)]
     position, scale, *points = (
@@ -126,7 +126,7 @@ def _shape(rr: Any, marker: Any) -> Any:
             colors=[colour])
     if marker.type == _TRIANGLES:
         corners = position + points
-        # Without normals nothing is shaded.
+        # Without normals, there is no shading.
         a, b, c = corners[0::3], corners[1::3], corners[2::3]
         normals = np.cross(b - a, c - a)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -159,7 +159,7 @@ def main(args: Sequence[str] | None = None) -> int:
         show(given.bag, recording, given.namespace)
         recording.flush()
         if given.save is not None:
-            # Only then does the file get its index.
+            # Disconnecting writes the index of the file.
             recording.disconnect()
     except HmsaError as error:
         return complain(error)

@@ -1,4 +1,4 @@
-"""Tables of results: text in a terminal, HTML in a notebook, columns for whoever goes on."""
+"""Tables of results: text in a terminal, HTML in a notebook, columns for further use."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ from hmsa_ros.errors import BadInputError
 
 @dataclass(frozen=True)
 class Column:
-    """A column: its name, unit (empty without one), and the format of its numbers."""
+    """A column: its name, unit (or empty), and number format."""
 
     name: str
     unit: str = ''
-    form: str = '.6g'  #: of `format`; ``'%'``, perhaps after a sign, for percent of a step
-    head: str = ''  #: shown in place of the name where room is short
+    form: str = '.6g'  #: as for `format`; ``'%'``, optionally after a sign, for percent of a step
+    head: str = ''  #: shorter heading that replaces the name
 
     @property
     def title(self) -> str:
@@ -27,7 +27,7 @@ class Column:
         return f'{name} ({self.unit})' if self.unit and name != '±' else name
 
     def shown(self, value: object) -> str:
-        """Return a value as text: a dash where there is none."""
+        """Return a value as text, a dash for a missing one."""
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return '–' if value is None else str(value)
         if math.isnan(value):
@@ -46,14 +46,14 @@ class Table:
     """
     Rows of results.
 
-    Printing it aligns the columns, and a notebook shows it as HTML. ``table['arrival']`` is a
-    column by its name without the unit, and `to_pandas` makes a DataFrame.
+    Printing aligns the columns, and a notebook shows HTML. ``table['arrival']`` returns a column
+    by its name without the unit, and `to_pandas` returns a DataFrame.
     """
 
     columns: tuple[Column, ...]
     rows: tuple[tuple[Any, ...], ...]
     caption: str = ''
-    notes: tuple[str, ...] = ()  #: a sentence each
+    notes: tuple[str, ...] = ()  #: one sentence each
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -66,7 +66,7 @@ class Table:
         return [row[names.index(name)] for row in self.rows]
 
     def __repr__(self) -> str:
-        return str(self)  # what a prompt shows
+        return str(self)  # shown at a prompt
 
     def __str__(self) -> str:
         cells = [[x.title for x in self.columns], *self._texts()]
@@ -97,12 +97,12 @@ class Table:
             yield [x.shown(value) for x, value in zip(self.columns, row, strict=True)]
 
     def records(self) -> list[dict[str, Any]]:
-        """Return each row as a mapping from names of columns."""
+        """Return each row as a mapping from column names."""
         return [dict(zip((x.name for x in self.columns), row, strict=True)) for row in self.rows]
 
     def to_pandas(self) -> Any:
         """
-        Return a DataFrame, its columns named with their units.
+        Return a DataFrame whose column names contain the units.
 
         Raises
         ------
@@ -115,7 +115,7 @@ class Table:
 
 
 def frame(columns: dict[str, Any]) -> Any:
-    """Return columns as a DataFrame; without pandas a `BadInputError`."""
+    """Return columns as a DataFrame; raise `BadInputError` if pandas is not installed."""
     try:
         import pandas
     except ImportError as error:

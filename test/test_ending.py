@@ -80,7 +80,7 @@ IN_A_CALL = """
 import sys
 from hmsa_ros.ending import Deadline, encoded
 deadline = Deadline()
-deadline.say(encoded('it takes too long'))
+deadline.set_text(encoded('it takes too long'))
 deadline.set(0.5)
 print('armed', flush=True)
 sys.stdin.readline()

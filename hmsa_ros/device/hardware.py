@@ -193,7 +193,7 @@ class Calls:
         """Call a method of hardware; ``name`` is its name in messages."""
         self.make_ready()
         if self._deadline is not None:
-            self._deadline.say(_last_words(name, self.limit + _GRACE))
+            self._deadline.set_text(_last_words(name, self.limit + _GRACE))
         begun = monotonic()
         self._begun = (name,)
         try:
@@ -212,7 +212,7 @@ class Calls:
     def give_up(self, seconds: float) -> None:
         """End the process after some seconds, unless the blocked call returns."""
         if self._deadline is not None:
-            self._deadline.say(encoded('the driver hangs while it ends'))
+            self._deadline.set_text(encoded('the driver hangs while it ends'))
             self._deadline.set(seconds)
 
     @property
