@@ -13,7 +13,7 @@ stretch  duration (s)  first level (T)  move time (s)  last level (T)  status
       1           0.5         0.062155     0.00165032               0  two_step
 >>> motion = plan.simulate(truth=block.scaled(shear_modulus=1.02), noise=1e-4)
 
-``hmsa_ros.model`` is the actuator, ``hmsa_ros.planning`` plans the commands that move it, and
+``hmsa_ros.model`` models the actuator, ``hmsa_ros.planning`` plans the commands that move it, and
 ``hmsa_ros.device`` contains the simulated plant and drivers of hardware, all without ROS.
 ``hmsa_ros.bag`` reads and writes recordings, ``hmsa_ros.nodes`` contains the ROS 2 nodes, and
 ``hmsa_ros.cli`` is the command line.

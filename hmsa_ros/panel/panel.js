@@ -1,4 +1,4 @@
-// What hmsa panel sends is shown; what is pressed is sent. Nothing is kept or asked elsewhere.
+// Shows the frames of hmsa panel and sends its commands; stores nothing, requests nothing else.
 'use strict';
 
 const $ = id => document.getElementById(id);
@@ -24,8 +24,7 @@ function number(value, digits) {
   return value === null || value === undefined ? '?' : value.toFixed(digits).replace('-', '\u2212');
 }
 
-// Nothing that arrives is taken as HTML.
-// Has as many children as there are items, each filled with its item.
+// Gives the parent one child for each item, filled with its item. Received text is never HTML.
 function list(parent, items, make, fill) {
   while (parent.children.length > items.length) parent.lastElementChild.remove();
   while (parent.children.length < items.length) parent.append(make());
@@ -38,7 +37,7 @@ function make(name, className) {
   return element;
 }
 
-// What arrives -------------------------------------------------------------------------------
+// Received frames -----------------------------------------------------------------------------
 
 function take(next) {
   frame = next;
@@ -48,7 +47,7 @@ function take(next) {
       const sides = kept[kind] ??= [[], []];
       const ends = chart[kind], first = frame.slot - ends[0].length + 1;
       for (let side = 0; side < 2; side++) {
-        // Slots of which nothing came are empty.
+        // Slots without data are empty.
         const from = Math.max(kept.newest + 1, frame.slot - frame.slots + 1);
         for (let slot = from; slot < first; slot++) sides[side][slot % frame.slots] = null;
         ends[side].forEach((x, i) => { sides[side][(first + i) % frame.slots] = x; });
@@ -58,7 +57,7 @@ function take(next) {
   }
 }
 
-// What is shown --------------------------------------------------------------------------------
+// Display -------------------------------------------------------------------------------------
 
 function show() {
   requestAnimationFrame(show);
@@ -180,7 +179,7 @@ function draw(canvas, lines, scale, least, label) {
       const slot = (frame.slot - count + 1 + i) % count;
       if (lows[slot] === null || lows[slot] === undefined) continue;
       const x = GUTTER + i * across;
-      // Where nothing came for a while there is a gap.
+      // A gap in the data is a gap in the curve.
       if (i - before < count / 40) pen.lineTo(x, place(scale * lows[slot]));
       else pen.moveTo(x, place(scale * lows[slot]));
       if (highs[slot] !== lows[slot]) pen.lineTo(x, place(scale * highs[slot]));
@@ -216,7 +215,7 @@ function controls() {
     put(item.firstElementChild, `report of ${name}`);
     item.firstElementChild.href = `report/${encodeURIComponent(name)}`;
   });
-  // A recorder that we have ended is not missed.
+  // A recorder that the panel has ended is not reported as silent.
   const missed = x => x.age < SILENT_S || x.name !== 'recorder';
   list($('nodes'), frame.reports.filter(missed), () => {
     const item = make('li');
@@ -231,7 +230,7 @@ function controls() {
   });
 }
 
-// A sentence, what differs from what was given, and the rest folded away.
+// The message, the parameters that differ from the given ones, and the others folded away.
 function estimate(place, seen) {
   if (!place.children.length) {
     place.innerHTML = '<p class="soft"></p><div></div><details><summary></summary><div></div></details>';
@@ -252,7 +251,7 @@ function bar() {
   return item;
 }
 
-// A value with two standard deviations to both sides, and the given one, on an axis around both.
+// A value with two standard deviations on both sides, and the given one, on a common axis.
 function fill(item, [name, value, deviation, given]) {
   put(item.children[0], name.replaceAll('_', ' '));
   const digits = deviation > 0 ? Math.min(Math.max(1 - Math.floor(Math.log10(deviation)), 0), 7) : 4;
@@ -272,7 +271,7 @@ function fill(item, [name, value, deviation, given]) {
   dot.setAttribute('cy', 8);
 }
 
-// What is pressed ------------------------------------------------------------------------------
+// Controls ------------------------------------------------------------------------------------
 
 $('stop').onclick = () => send({do: 'stop'});
 addEventListener('keydown', event => { if (event.key === 'Escape') send({do: 'stop'}); });
