@@ -1,4 +1,4 @@
-"""Bags held against rosbags, a reader that knows nothing of this package."""
+"""Comparison of bags with rosbags, an independent reader."""
 
 from collections import Counter
 from pathlib import Path
@@ -11,7 +11,7 @@ from hmsa_ros.errors import HmsaError
 
 
 def hold_against_rosbags(folder):
-    """Hold every bag in a folder that is whole against what rosbags reads, topic by topic."""
+    """Compare every complete bag in a folder with what rosbags reads, topic by topic."""
     for path in Path(folder).rglob(FILE_NAME):
         try:
             reader = BagReader(path.parent)
@@ -21,7 +21,7 @@ def hold_against_rosbags(folder):
         if reader.problems or not reader.complete:
             continue
         if reader.metadata is not None and reader.metadata.version < 4:
-            # rosbags matches topics by their profiles, which such metadata do not have.
+            # rosbags matches topics by their profiles, which such metadata lack.
             continue
         with Reader(path.parent) as other:
             found = Counter(connection.topic for connection, _, _ in other.messages())

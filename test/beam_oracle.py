@@ -1,4 +1,4 @@
-"""A beam of one mode, by the equations of docs/explanation/beam.md and SciPy alone."""
+"""A beam of one mode, from the equations of docs/explanation/beam.md with SciPy only."""
 
 from functools import cache
 import math
@@ -20,7 +20,7 @@ AREA, BENDING = WIDTH * THICKNESS, YOUNGS * WIDTH * THICKNESS ** 3 / 12.0
 
 
 def silicone(**changes: float) -> ActuatorParameters:
-    """Return the strip, with some parameters of another value."""
+    """Return the strip, with changed parameters."""
     return actuator_from({x.name: x.default for x in BLOCK} | {
         'law.name': 'beam', 'law.youngs_modulus': YOUNGS, 'law.width': WIDTH,
         'actuator.half_length': LENGTH / 2, 'actuator.half_thickness': THICKNESS / 2,
@@ -70,7 +70,7 @@ def _series():
 
 
 def slope(modulus=1.0, damping=1.0, remanence=1.0, force=0.0):
-    """Return the right-hand side by the angle, for factors on parameters and a force in N."""
+    """Return the right-hand side in the angle, for parameter factors and a force in N."""
     (mass, lever, across), stiffness = _series()
     by_angle = across.deriv()
     change, held = mass.deriv(), damping * DAMPING * (LENGTH * by_angle(0.0)) ** 2
@@ -81,7 +81,7 @@ def slope(modulus=1.0, damping=1.0, remanence=1.0, force=0.0):
 
 
 def follow(deflection, pieces):
-    """Return deflection and rate after pieces of (s, T), from rest, by the angle of the tip."""
+    """Return deflection and rate after pieces of (s, T), from rest, using the tip angle."""
     across = _series()[0][2]
     end = np.array([brentq(lambda q: across(q) - deflection, -1.5, 1.5, xtol=1e-15), 0.0])
     for duration, flux in pieces:
@@ -92,7 +92,7 @@ def follow(deflection, pieces):
 
 
 def sampled(times, level_times, levels, **changes):
-    """Return deflections at times under levels in T, from rest, without noise."""
+    """Return noise-free deflections at times under levels in T, from rest."""
     motion = slope(**changes)
     rest = brentq(lambda q: motion(0.0, [q, 0.0], levels[0])[1], -1.5, 1.5, xtol=1e-15)
     across = _series()[0][2]

@@ -1,4 +1,4 @@
-"""A laboratory in virtual time: a planner's runtime, and an actuator that SciPy integrates."""
+"""A laboratory in virtual time: a planner runtime, and an actuator integrated with SciPy."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,12 +18,12 @@ from hmsa_ros.planning.planner import Options, Planner
 
 MS = 1_000_000
 START = 1000 * MS
-# How far ahead the motion is integrated, in ns.
+# Integration ahead of the present time, in ns.
 _AHEAD = 200 * MS
 
 
 def slow(block: ActuatorParameters) -> ActuatorParameters:
-    """Return a block of ten times the size: its unit of time is 44 ms."""
+    """Return a block of ten times the size, with a time scale of 44 ms."""
     return replace(
         block, half_length=10.0 * block.half_length, half_thickness=10.0 * block.half_thickness,
         damping_coefficient=100.0 * block.damping_coefficient)
@@ -35,13 +35,13 @@ class Plant:
 
     block: ActuatorParameters
     time: int = START
-    lag: float = 0.0  # of the coil in s
-    ratio: float = 0.0  # of a branch that creeps
-    tau: float = 0.1  # its relaxation time in s
-    limit: float = math.inf  # of the amplifier in T
+    lag: float = 0.0  # lag of the coil in s
+    ratio: float = 0.0  # ratio of a viscoelastic branch
+    tau: float = 0.1  # relaxation time of the branch in s
+    limit: float = math.inf  # limit of the amplifier in T
 
     def __post_init__(self):
-        self.levels = [(self.time, 0.0)]  # that are or will be in force
+        self.levels = [(self.time, 0.0)]  # present and future levels
         self.state = np.array([1.0, 0.0, 0.0, 0.0])
         self.begin, self.end, self.solution = self.time, self.time, None
 
@@ -89,7 +89,7 @@ class Plant:
 
 
 class Bench:
-    """A runtime, a plant and a sensor; `sense` makes samples (stamp, stretch) of what is true."""
+    """A runtime, a plant and a sensor; `sense` returns samples (timestamp, stretch) of it."""
 
     def __init__(
             self, plant: Plant, nominal: ActuatorParameters, noise: float, *, lead: int = 2 * MS,
@@ -98,7 +98,7 @@ class Bench:
         self.random = np.random.default_rng(seed)
         self.sense: Callable = lambda time, stretch: [(time, stretch)]
         self.report = report
-        self.effort: Callable = lambda: math.nan  # field in T that the device shows
+        self.effort: Callable = lambda: math.nan  # field in T reported by the device
         self.wire = []
         self.estimates, self.sent, self.codes = [], [], []
         self.runtime = PlannerRuntime(
@@ -118,12 +118,12 @@ class Bench:
         return self.estimates[-1].message
 
     def rest(self, span):
-        """Let time pass in which nothing moves, nobody looks and no samples come."""
+        """Skip time without motion, observers or samples."""
         self.now += span
         self.plant.time, self.plant.solution = self.now, None
 
     def pass_time(self, span):
-        """Let time pass in steps of 1 ms; return times in ns and true stretches."""
+        """Advance in steps of 1 ms; return times in ns and true stretches."""
         seen, end = [], self.now + span
         while self.now < end:
             for x in self.runtime.tick(self.now):
@@ -149,7 +149,7 @@ class Bench:
         return np.array(seen)
 
     def move(self, target, hold):
-        """Go to a target; return vibration and offset in % of the step."""
+        """Move to a target; return vibration and steady-state error in % of the step."""
         planner, before = self.planner, self.now
         start = planner.plan.segments[-1].stretch if planner.plan.segments else 1.0
         self.runtime.request(Target('a', target))

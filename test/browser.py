@@ -1,4 +1,4 @@
-"""A headless Chromium, driven through a pipe by its own protocol: no other package needed."""
+"""A headless Chromium, controlled through a pipe with its own protocol."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import sys
 import time
 from typing import Any
 
-# The protocol is spoken on descriptors 3 and 4.
+# The protocol uses file descriptors 3 and 4.
 _LAUNCH = """
 import os
 import sys
@@ -24,7 +24,7 @@ os.dup2(ours[1], 4)
 os.execv(sys.argv[3], sys.argv[3:])
 """
 NAMES = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable')
-# Limit of every wait: generous, since it is only reached when a test fails.
+# Limit of every wait: generous, since only failing tests reach it.
 WAIT_SECONDS = 60.0
 
 
@@ -99,12 +99,12 @@ class Browser:
     def open(
             self, path: Path | str, *, width: int = 1280, height: int = 900, dark: bool = False,
             mobile: bool = False) -> Page:
-        """Open a file or an address of this host and wait until it is loaded."""
+        """Open a file or an address of this host, and wait until it is loaded."""
         return Page(self, path, width, height, dark, mobile)
 
 
 class Page:
-    """A page in a tab of its own."""
+    """A page in a separate tab."""
 
     def __init__(
             self, browser: Browser, path: Path | str, width: int, height: int, dark: bool,
@@ -123,7 +123,7 @@ class Page:
             {'name': 'prefers-color-scheme', 'value': 'dark' if dark else 'light'},
             {'name': 'pointer', 'value': 'coarse' if mobile else 'fine'}])
         url = path if isinstance(path, str) else path.resolve().as_uri()
-        # What the page may ask for: of a server, what is there.
+        # Permitted requests: those to the server of the page, if any.
         self._own = ('file:', 'data:', 'blob:', *(
             [url, url.replace('http:', 'ws:')] if isinstance(path, str) else []))
         self.call('Page.navigate', url=url)
@@ -134,14 +134,14 @@ class Page:
         return self._browser.call(method, self._session, **parameters)
 
     def evaluate(self, expression: str) -> Any:
-        """Return the value of an expression, or of the promise that it gives."""
+        """Return the value of an expression, or of its promise."""
         result = self.call(
             'Runtime.evaluate', expression=expression, returnByValue=True, awaitPromise=True)
         assert 'exceptionDetails' not in result, result
         return result['result'].get('value')
 
     def wait_for(self, expression: str) -> Any:
-        """Wait until an expression is true and return its value."""
+        """Wait until an expression is true, and return its value."""
         end = time.monotonic() + WAIT_SECONDS
         while not (value := self.evaluate(f'Boolean({expression}) && ({expression})')):
             assert time.monotonic() < end, expression
@@ -155,13 +155,13 @@ class Page:
                 button='none' if kind == 'mouseMoved' else 'left', clickCount=count)
 
     def screenshot(self, path: Path, *, whole: bool = False) -> None:
-        """Write a picture of what is seen, or of the whole page."""
+        """Write a screenshot of the visible part, or of the whole page."""
         data = self.call('Page.captureScreenshot', captureBeyondViewport=whole)['data']
         path.write_bytes(base64.b64decode(data))
 
     @property
     def complaints(self) -> list[Any]:
-        """Return what the page has complained of, and what it has asked the network for."""
+        """Return the errors reported by the page, and its network requests."""
         found = []
         for event in self._browser.events:
             if event.get('sessionId') != self._session:

@@ -1,7 +1,7 @@
 """
-What tests share: a ROS domain of their own, processes, and waiting on a condition.
+Shared fixtures: a separate ROS domain for each test, processes, and waiting on a condition.
 
-Tests that do not ask for one of these fixtures need no ROS.
+Tests without these fixtures need no ROS.
 """
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -26,31 +26,31 @@ import pytest
 from hmsa_ros.middleware import PROFILES
 
 ROOT = Path(__file__).resolve().parent.parent
-# Limit of every wait: generous, since it is only reached when a test fails.
+# Limit of every wait: generous, since only failing tests reach it.
 WAIT_SECONDS = 60.0
 POLL_SECONDS = 0.02
-# Between two looks at a condition while callbacks are served.
+# Interval of checks of a condition while callbacks are served.
 SPIN_SECONDS = 0.01
 DOMAINS = range(1, 102)
 _turns = itertools.count(os.getpid())
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Excuse what ROS itself does, which no change here can mend."""
+    """Ignore warnings of ROS itself, which cannot be fixed here."""
     for warning in (
             'ignore:module .sre_:DeprecationWarning',  # lark, imported by rosidl_parser
-            # A client that has gone, or that the server does not know of yet, which asks again.
+            # A client that has gone, or that the server has not discovered yet and that retries.
             'ignore:failed to send response:RuntimeWarning',
     ):
         config.addinivalue_line('filterwarnings', warning)
-    # The gate uses the same examples in each run, so a failure comes from the change; `make full`
-    # draws new ones.
+    # The gate uses the same examples in each run, so that a failure is due to the change;
+    # `make full` draws new ones.
     for name, same in (('gate', True), ('full', False)):
         settings.register_profile(
             name, derandomize=same,
-            # A deadline for an example would be a measure of this machine's speed.
+            # A deadline for an example would measure the speed of this machine.
             deadline=None, suppress_health_check=[HealthCheck.too_slow],
-            # To explain an example, Python's lines are traced: integrations take minutes then.
+            # Explaining an example traces the lines of Python: integrations then take minutes.
             phases=[x for x in Phase if x is not Phase.explain])
     settings.load_profile(config.getoption('--hypothesis-profile') or 'gate')
 
@@ -58,7 +58,7 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(
         item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Show what the processes of a failed test have printed."""
+    """Show the output of the processes of a failed test."""
     report = yield
     starter = getattr(item, 'funcargs', {}).get('start')
     if report.failed and isinstance(starter, Starter):
@@ -70,7 +70,7 @@ def pytest_runtest_makereport(
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Return three workers for two cores: a test with nodes mostly waits for them."""
+    """Return three workers for two cores, since a test with nodes mostly waits for them."""
     return max(3 * (os.cpu_count() or 1) // 2, 2)
 
 
@@ -78,7 +78,7 @@ def pytest_xdist_auto_num_workers() -> int:
 def pytest_make_collect_report(
         collector: pytest.Collector
 ) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
-    """Let each worker begin with other modules: what one has compiled, the others only read."""
+    """Let each worker begin with other modules, so that each kernel is compiled only once."""
     report = yield
     worker = os.environ.get('PYTEST_XDIST_WORKER', 'gw0')
     if isinstance(collector, pytest.Directory):
@@ -90,7 +90,7 @@ def pytest_make_collect_report(
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Look for no garbage among what stays: modules and tests while they are found, nor later."""
+    """Disable garbage collection during collection, and exempt its objects from later ones."""
     gc.disable()
     result = yield
     gc.enable()
@@ -101,10 +101,10 @@ def pytest_collection() -> Generator[None, object, object]:
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """
-    Say what each worker takes at once: a test that runs nodes, or all others of a module.
+    Assign tests to workers in groups: a test that runs nodes, or all others of a module.
 
-    Long tests begin first. The others alternate, so that while nodes are waited for, something is
-    computed; and end with those that run nodes, since they are short.
+    Long tests begin first. The others alternate, so that computations run while nodes are waited
+    for. Short tests with nodes come last.
     """
     items.sort(key=lambda item: item.path)
     for item in items:
@@ -124,7 +124,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def bound(kind: Any, qos: Any = 1000) -> tuple[Any, Any]:
-    """Return message class and profile, of rclpy or as `hmsa_ros.interfaces` names them."""
+    """Return message class and profile, from rclpy objects or `hmsa_ros.interfaces` names."""
     from hmsa_ros.nodes import endpoints
     from hmsa_ros.nodes.endpoints import interface_class
     return (interface_class(kind) if isinstance(kind, str) else kind,
@@ -134,7 +134,7 @@ def bound(kind: Any, qos: Any = 1000) -> tuple[Any, Any]:
 def wait_until(
         condition: Callable[[], Any], what: str = 'the condition',
         seconds: float = WAIT_SECONDS) -> Any:
-    """Wait until a condition holds and return what it gave."""
+    """Wait until a condition is true, and return its value."""
     end = time.monotonic() + seconds
     while not (result := condition()):
         if time.monotonic() > end:
@@ -145,7 +145,7 @@ def wait_until(
 
 @pytest.fixture(autouse=True)
 def bags_are_whole_for_rosbags(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Hold every bag that a test leaves whole against rosbags, which drops topics silently."""
+    """Compare every complete bag of a test with rosbags, which drops topics silently."""
     folder = request.getfixturevalue('tmp_path') if 'tmp_path' in request.fixturenames else None
     yield
     if folder is not None:
@@ -161,11 +161,11 @@ def wait_until_fixture() -> Callable[..., Any]:
 
 @contextmanager
 def own_domain() -> Iterator[int]:
-    """Hold a domain id that no other test on this machine uses at the same time."""
+    """Reserve a domain id that no other test on this machine uses at the same time."""
     folder = Path(tempfile.gettempdir()) / f'hmsa_ros_domains_{os.getuid()}'
     folder.mkdir(exist_ok=True)
-    # One after the other, so that late packets of an ended test meet nobody; beginning anywhere,
-    # so that sessions side by side seldom ask for the same.
+    # In sequence, so that late packets of an ended test have no receiver; starting at a random
+    # id, so that simultaneous sessions rarely try the same ones.
     first = next(_turns)
     for i in range(len(DOMAINS)):
         domain = DOMAINS[(first + i) % len(DOMAINS)]
@@ -181,7 +181,7 @@ def own_domain() -> Iterator[int]:
 
 @pytest.fixture(name='own_domain', scope='session')
 def own_domain_fixture() -> Callable[[], AbstractContextManager[int]]:
-    """Return `own_domain`, for tests that need several at once."""
+    """Return `own_domain`, for tests that need several domains at once."""
     return own_domain
 
 
@@ -189,11 +189,11 @@ def own_domain_fixture() -> Callable[[], AbstractContextManager[int]]:
 def ros_domain_id() -> Iterator[int]:
     """Return a domain id that no other test on this machine uses at the same time."""
     with own_domain() as domain:
-        # What is there by now stays; only what the test makes is looked through at its end.
+        # Existing objects stay; only those of the test are searched for garbage at its end.
         gc.freeze()
         yield domain
-        # Nodes that were destroyed stay in the domain until Python has collected them, and who has
-        # it next would meet them.
+        # Destroyed nodes stay in the domain until Python has collected them, and would be
+        # discovered by the next test in it.
         gc.collect()
 
 
@@ -201,11 +201,11 @@ def ros_domain_id() -> Iterator[int]:
 def ros_env(
         ros_domain_id: int, tmp_path_factory: pytest.TempPathFactory,
         monkeypatch: pytest.MonkeyPatch) -> Mapping[str, str]:
-    """Return the environment of ROS processes; it is also set in this process."""
+    """Return the environment of ROS processes, which is also set in this process."""
     settings = {
         'ROS_DOMAIN_ID': str(ros_domain_id),
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        # What is lost before a match is made comes again at once, from the tests' nodes too.
+        # Messages lost before discovery are sent again at once, also by the test's nodes.
         PROFILES: str(ROOT / 'hmsa_ros' / 'fastdds_localhost.xml'),
         'ROS_LOG_DIR': str(tmp_path_factory.mktemp('ros_log')),
         'PYTHONPATH': os.pathsep.join(
@@ -221,14 +221,14 @@ def ros_env(
 @dataclass
 class Process:
     """
-    A running child process whose output goes to files.
+    A running child process whose output is written to files.
 
     Attributes
     ----------
     popen : subprocess.Popen
         The process.
     stdout_path, stderr_path : pathlib.Path
-        Where its output is written.
+        Files of its output.
 
     """
 
@@ -238,12 +238,12 @@ class Process:
 
     @property
     def stdout(self) -> str:
-        """Return what it has written to standard output so far."""
+        """Return its standard output so far."""
         return self.stdout_path.read_text(errors='replace')
 
     @property
     def stderr(self) -> str:
-        """Return what it has written to standard error so far."""
+        """Return its standard error so far."""
         return self.stderr_path.read_text(errors='replace')
 
     @property
@@ -252,23 +252,23 @@ class Process:
         return self.stdout + self.stderr
 
     def alive(self) -> bool:
-        """Return whether it still runs."""
+        """Return whether it is still running."""
         return self.popen.poll() is None
 
     def wait(self, seconds: float = WAIT_SECONDS) -> int:
-        """Wait for its end at most so many seconds; return the status, negative for a signal."""
+        """Wait for its end, with a time limit; return the status, negative for a signal."""
         try:
             return self.popen.wait(seconds)
         except subprocess.TimeoutExpired:
             pytest.fail(f'{self.popen.args!r} did not end within {seconds:g} s: {self.output}')
 
     def stop(self, number: int = signal.SIGINT, seconds: float = WAIT_SECONDS) -> int:
-        """Send a signal and wait for the end."""
+        """Send a signal, and wait for the end."""
         self.popen.send_signal(number)
         return self.wait(seconds)
 
     def wait_for_output(self, text: str, seconds: float = WAIT_SECONDS) -> str:
-        """Wait until the process has printed a text on either output; return both."""
+        """Wait until the process has printed a text on either output; return both outputs."""
         def found() -> bool:
             if text in self.output:
                 return True
@@ -283,7 +283,7 @@ class Process:
 
 @dataclass
 class Starter:
-    """Starts child processes and ends those still running when the test is over."""
+    """Starts child processes, and ends those still running after the test."""
 
     env: Mapping[str, str]
     folder: Path
@@ -311,7 +311,7 @@ class Starter:
         return self.python('-m', 'hmsa_ros', *arguments, **extra_env)
 
     def stop_all(self) -> None:
-        """End every process that still runs, by force if it does not end by itself."""
+        """End every running process, by force if needed."""
         for process in self.processes:
             if process.alive():
                 process.popen.terminate()
@@ -325,7 +325,7 @@ class Starter:
 
 @pytest.fixture
 def handlers() -> Iterator[None]:
-    """Give back the signal handlers that a node takes over."""
+    """Restore the signal handlers that a node replaces."""
     kept = {x: signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     yield
     for number, handler in kept.items():
@@ -351,7 +351,7 @@ class RosSide:
     node : rclpy.node.Node
         The node.
     executor : rclpy.executors.Executor
-        Serves it, only while one of the methods below waits.
+        Serves the node, only while one of the methods below waits.
 
     """
 
@@ -375,7 +375,7 @@ class RosSide:
     def spin_until(
             self, condition: Callable[[], Any], what: str = 'the condition',
             seconds: float = WAIT_SECONDS) -> Any:
-        """Serve callbacks until a condition holds and return what it gave."""
+        """Serve callbacks until a condition is true, and return its value."""
         end = time.monotonic() + seconds
         while not (result := condition()):
             if time.monotonic() > end:
@@ -384,7 +384,7 @@ class RosSide:
         return result
 
     def ask(self, publisher: Any, status: list[Any], stretch: float, *expected: str) -> None:
-        """Publish a setpoint, again and again, until a status with an expected value comes."""
+        """Publish a setpoint repeatedly until a status with an expected value arrives."""
         from std_msgs.msg import Float64
         begin = len(status)
         again = self.node.create_timer(0.5, lambda: publisher.publish(Float64(data=stretch)))
@@ -395,10 +395,10 @@ class RosSide:
     def collect(
             self, message_type: type[Any] | str, topic: str, qos: Any = 1000) -> list[Any]:
         """
-        Subscribe and return the list that received messages are appended to.
+        Subscribe, and return the list that received messages are appended to.
 
-        A node that `Served` runs knows of the subscription then: what it publishes from here on
-        arrives, were it a single message.
+        Nodes of `Served` have discovered the subscription then, so that every later message
+        arrives.
         """
         message_type, qos = bound(message_type, qos)
         messages: list[Any] = []
@@ -414,9 +414,9 @@ class RosSide:
             self, message_type: type[Any] | str, topic: str, qos: Any = 1000,
             subscribers: int = 1) -> Any:
         """
-        Return a publisher that already has so many subscribers.
+        Return a publisher with a number of matched subscribers.
 
-        A node that `Served` runs has discovered the publisher then: what it sends arrives.
+        Nodes of `Served` have discovered the publisher then, so that its messages arrive.
         """
         message_type, qos = bound(message_type, qos)
         before = {x: x.get_publisher_count() for x in Served.subscriptions()}
@@ -429,7 +429,7 @@ class RosSide:
         return publisher
 
     def call(self, service_type: type[Any] | str, name: str, request: Any = None) -> Any:
-        """Call a service once its nodes know of the client, and return its response."""
+        """Call a service once its nodes have discovered the client; return its response."""
         from hmsa_ros.nodes.service_call import ServiceCall
         service_type, _ = bound(service_type)
         full = self.node.resolve_service_name(name)
@@ -467,7 +467,7 @@ def ros(ros_env: Mapping[str, str], ros_domain_id: int) -> Iterator[RosSide]:
 def make_ros(
         ros_env: Mapping[str, str],
         ros_domain_id: int) -> Iterator[Callable[..., RosSide]]:
-    """Return a maker of more test nodes in the test's domain, with node options."""
+    """Return a factory of further test nodes in the test's domain, with node options."""
     sides: list[RosSide] = []
 
     def make(**node_options: Any) -> RosSide:
@@ -481,16 +481,16 @@ def make_ros(
 
 class Served:
     """
-    Nodes of this package that run in a thread of this process, as their processes would.
+    Nodes of this package that run in a thread of this process, as in their own processes.
 
-    They live in rclpy's default context, apart from the test's own.
+    They use rclpy's default context, apart from the test's own node.
 
     Attributes
     ----------
     nodes : list of rclpy.node.Node
         The nodes.
     running : list of Served
-        All that are not closed yet.
+        All instances that are not closed yet.
 
     """
 
@@ -523,22 +523,22 @@ class Served:
         from hmsa_ros.nodes.runner import spin
         try:
             spin((node,), lambda: self._ending)
-        except BaseException as error:  # whatever it is, it would have ended the process
+        except BaseException as error:  # any error would have ended the process
             self._failures.append(error)
 
     @classmethod
     def publishers(cls) -> list[Any]:
-        """Return the publishers of all nodes that run."""
+        """Return the publishers of all running nodes."""
         return [x for served in cls.running for node in served.nodes for x in node.publishers]
 
     @classmethod
     def subscriptions(cls) -> list[Any]:
-        """Return the subscriptions of all nodes that run."""
+        """Return the subscriptions of all running nodes."""
         return [x for served in cls.running for node in served.nodes for x in node.subscriptions]
 
     @classmethod
     def views(cls) -> list[Any]:
-        """Return a node of each context that runs: what it knows, all know there."""
+        """Return one node of each running context, whose nodes share a graph."""
         return [served.nodes[0] for served in cls.running]
 
     def now(self) -> int:
@@ -546,7 +546,7 @@ class Served:
         return int(self.nodes[0].get_clock().now().nanoseconds)
 
     def close(self) -> None:
-        """End the nodes, and raise what one of them has failed with."""
+        """End the nodes, and raise the failure of any of them."""
         import rclpy
         Served.running.remove(self)
         self._ending = True
@@ -580,7 +580,7 @@ def serve(
 
 class SimulatedClock:
     """
-    The test as authority on simulated time.
+    Simulated time published by the test.
 
     Parameters
     ----------
@@ -601,7 +601,7 @@ class SimulatedClock:
             subscribers=len(served.nodes))
 
     def set(self, time_ns: int) -> None:
-        """Set the time in ns, back too, and return when all nodes have it."""
+        """Set the time in ns, perhaps back, and return when all nodes have received it."""
         from builtin_interfaces.msg import Time
         from rosgraph_msgs.msg import Clock
         seconds, nanoseconds = divmod(time_ns, 10**9)
@@ -611,7 +611,7 @@ class SimulatedClock:
         def there() -> bool:
             if all(x.get_clock().now().nanoseconds == time_ns for x in self._served.nodes):
                 return True
-            # Best effort: said again where it got lost.
+            # Best effort, so a lost message is sent again.
             if time.monotonic() > ends[0]:
                 self._publisher.publish(message)
                 ends[0] = time.monotonic() + 0.1
@@ -622,5 +622,5 @@ class SimulatedClock:
 
 @pytest.fixture
 def make_clock() -> Callable[[RosSide, Served], SimulatedClock]:
-    """Return a maker of `SimulatedClock`."""
+    """Return a factory of `SimulatedClock`."""
     return SimulatedClock

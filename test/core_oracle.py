@@ -1,8 +1,8 @@
 """
-Eq. 11 and the two-step command by other means than the package's: an oracle for its tests.
+Eq. 11 and the two-step command, implemented independently: an oracle for the tests.
 
-The equation is typed as the paper prints it, SciPy integrates it, and the intermediate load is
-found by bracketing. Nothing here calls the package.
+The equation is written as in the paper, SciPy integrates it, and the intermediate load is found by
+bracketing. Nothing here calls the package.
 """
 
 from collections.abc import Callable, Sequence
@@ -51,8 +51,8 @@ def equation(
 def integrate(
         rates: Callable[..., Sequence[float]], times: Sequence[float], state: Sequence[float],
         *arguments: float, **options: float) -> np.ndarray:
-    """Return the states at times, by LSODA, which is compiled and takes a tenth of `solve_ivp`."""
-    # It takes no moments that only rounding tells apart.
+    """Return the states at times, by LSODA, which takes a tenth of the time of `solve_ivp`."""
+    # Times that only differ by rounding are not accepted.
     apart = np.diff(times, prepend=-math.inf) > 1e-11
     states = odeint(
         rates, state, np.asarray(times)[apart], arguments, tfirst=True, mxstep=100_000, **options)
@@ -78,7 +78,7 @@ def follow(
 def samples(
         state: Sequence[float], switches: Sequence[float], loads: Sequence[float],
         times: Sequence[float], zeta: float, j_lim: float, c1: float) -> np.ndarray:
-    """Return stretch and rate (2, n) at times, each piece integrated from one to the next."""
+    """Return stretch and rate (2, n) at times, with each piece integrated separately."""
     edges = sorted({*switches, *times})
     edges = [t for t in edges if t >= switches[0]]
     found = {edges[0]: np.array(state, dtype=float)}
@@ -93,10 +93,10 @@ def turning_point(
         state: Sequence[float], load: float, direction: float, zeta: float, j_lim: float,
         c1: float, longest: float = 200.0) -> tuple[float, float] | None:
     """
-    Return time and stretch of the first turning point from motion in a direction.
+    Return time and stretch of the first turning point of a motion in a direction.
 
-    The event of the dense output is only a guess: the time is improved by integrating to it
-    from the last true step.
+    The event of the dense output is only an estimate, which is refined by integrating to it from
+    the last true step.
     """
     right_hand_side = equation(load, zeta, j_lim, c1)
 
@@ -127,12 +127,12 @@ def two_step(
     """Return beta_p, tau_p and beta_1 of a move from rest, by bracketing beta_p."""
     direction = math.copysign(1.0, target - start)
     held = holding_load(target, j_lim)
-    # Without damping the energy balance is exact; damping asks for more.
+    # Without damping the energy balance is exact; damping needs more.
     least = (stored_energy(target, j_lim) - stored_energy(start, j_lim)) / (target - start)
 
     def miss(load: float) -> float:
         found = turning_point((start, 0.0), load, direction, zeta, j_lim, c1)
-        # Without a turning point the motion creeps into the equilibrium of the load.
+        # Without a turning point, the motion approaches the equilibrium of the load.
         return -abs(target - start) if found is None else direction * (found[1] - target)
 
     share = 1e-3
@@ -140,7 +140,7 @@ def two_step(
         share = 2.0 * share if share < 0.5 else 0.5 * (1.0 + share)
         assert share < 0.9999, 'no load below the holding one overshoots'
     most = least + share * (held - least)
-    # Without damping the least load is the solution itself, give or take its rounding.
+    # Without damping, the smallest load is the solution itself, within rounding.
     least -= 1e-9 * (held - least)
     load = brentq(miss, least, most, xtol=1e-15, rtol=1e-14)
     time, _ = turning_point((start, 0.0), load, direction, zeta, j_lim, c1)
@@ -160,7 +160,7 @@ SEQUENCES = (
     *(('fig_9', 0.2, j_lim, (1.20, 1.40, 0.999 * UPPER_LIMIT[j_lim]))
       for j_lim in (1.0, 3.0, 5.0)),
 )
-#: Every move of every sequence, and moves to 0.999 of the limit at the other dampings.
+#: Every move of every sequence, and moves to 0.999 of the limit with the other dampings.
 MOVES = tuple(sorted({
     *((start, target, zeta, j_lim)
       for _, zeta, j_lim, stretches in SEQUENCES

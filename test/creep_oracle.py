@@ -1,4 +1,4 @@
-"""A creeping Gent block under levels, by SciPy: an oracle for plans. Nothing calls the package."""
+"""A creeping Gent block under levels, by SciPy: an oracle independent of the package."""
 
 import math
 
@@ -16,7 +16,7 @@ def elastic(x):
 
 
 def motion(t, y, load, slope, lag, creep, zeta):
-    """Return the derivative of stretch, rate, field and what the branches hold; t in a piece."""
+    """Return the derivative of stretch, rate, field and branch stresses; t within a piece."""
     ratios = np.array(creep.ratios)
     x, v, field, held = y[0], y[1], y[2], y[3:]
     field = field if lag else load + slope * t
@@ -28,7 +28,7 @@ def motion(t, y, load, slope, lag, creep, zeta):
 
 
 def flowing(held, ratios, creep):
-    """Return how fast branches lose what they hold: J. S. Bergstroem and M. C. Boyce, 1998."""
+    """Return the rate at which branches relax: J. S. Bergstroem and M. C. Boyce, 1998."""
     lost = held / np.array(creep.times)
     if creep.flow == 'power_law':
         exponents, stresses = map(np.array, creep.constants)
@@ -37,7 +37,7 @@ def flowing(held, ratios, creep):
 
 
 def ended(levels, creep, end, delivery):
-    """Return the state at the end; the field is that of the amplifier if it does not lag."""
+    """Return the state at the end; without lag, the field is that of the amplifier."""
     levels = [x for x in levels if x[0] < end]
     state = judged(levels, creep, end, delivery.slew, delivery.lag)[2]
     if delivery.lag == 0.0:
@@ -61,7 +61,7 @@ def judged(levels, creep, end, slew=math.inf, lag=0.0, zeta=ZETA):
             found = solve_ivp(
                 motion, (0.0, stop - start), state, method='DOP853', rtol=1e-11, atol=1e-12,
                 t_eval=np.linspace(0.0, stop - start, 9 + int(6 * (stop - start))),
-                # In longer steps it does not see a field that decays within some lags.
+                # Longer steps would miss a field that decays within a few lags.
                 max_step=max(lag, (stop - start) / 1000.0) if lag else math.inf,
                 args=(first, slope, lag, creep, zeta))
             times.append(start + found.t)

@@ -1,20 +1,20 @@
 """
-Code blocks of the pages: found, run in order, and checked where they cannot run.
+Code blocks of the pages: found, run in order, or checked if they cannot run.
 
-A block says by its info string what becomes of it:
+The info string of a block determines its treatment:
 
 ``bash``, ``console``, ``python``
-    It runs. ``console`` shows commands after ``$`` and what they print; a ``text`` block right
-    after a block that runs shows what that printed. Words must be the same, numbers agree to
-    0.1 % or 1e-6, and ``...`` stands for anything.
+    It runs. ``console`` shows commands after ``$`` and their output; a ``text`` block right after
+    a block that runs shows its output. Words must be equal, numbers agree to 0.1 % or 1e-6, and
+    ``...`` stands for anything.
 ``bash ros2-installation``
-    It needs a full ROS 2 installation (the ros2 command, colcon, a desktop): its syntax and
-    every name of this package in it are checked.
+    It needs a full ROS 2 installation (the ros2 command, colcon, a desktop): its syntax and every
+    name of this package in it are checked.
 ``bash repository``
-    It sets the clone up, runs its gate or measures for minutes: its targets, extras, modules and
+    It sets up the clone, runs its gate or measures for minutes: its targets, extras, modules and
     files are checked.
 ``yaml``, ``json``
-    It must be well formed; parameters in it must exist.
+    It must be well formed, and its parameters must exist.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -40,20 +40,20 @@ import yaml
 
 ROOT = Path(__file__).resolve().parent.parent
 RUN, INSTALLATION, REPOSITORY = '', 'ros2-installation', 'repository'
-# What a page's directory shows of the repository: what commands in the pages name.
+# Parts of the repository that commands in the pages name, copied to a page's directory.
 SHOWN = ('README.md', 'benchmarks', 'config', 'docs', 'launch', 'package.xml', 'scripts')
-# Directives of MyST whose content is Markdown again, and those that hold no code to run.
+# Directives of MyST whose content is Markdown again, and those without code to run.
 NESTED = {'note', 'tip', 'warning', 'important', 'admonition', 'dropdown'}
 NO_CODE = {'toctree', 'math', 'figure', 'image', 'literalinclude', 'contents'}
-# Programs of a full installation whose arguments say nothing about this package.
+# Programs of a full installation whose arguments do not concern this package.
 FOREIGN = {
     'apt', 'cd', 'colcon', 'export', 'foxglove-studio', 'git', 'mkdir', 'plotjuggler', 'rosdep',
     'rqt', 'rqt_graph', 'rqt_plot', 'rviz2', 'source', 'sudo', '.', 'pip', 'rerun', 'kill',
     'wait', 'unset', 'echo', 'cp', 'openssl', 'scp', 'ssh', 'systemctl', 'ulimit', 'chrt'}
 KEYWORDS = {'do', 'done', 'else', 'fi', 'if', 'then', 'until', 'while'}
 PATIENCE_SECONDS = 200.0
-# Where a page does not say how far ahead commands are sent, it is so far that a busy machine sends
-# none late.
+# Default lead time, unless a page sets one: long enough that a busy machine sends no late
+# commands.
 AHEAD = """\
 case "$1" in planner|controller)
   name=$1
@@ -73,15 +73,15 @@ class Block:
     Attributes
     ----------
     page : Path
-        Where it is.
+        Its page.
     line : int
         Its first line, from 1.
     language, marker : str
         First word of the info string, and the rest.
     text : str
-        What is in it.
+        Its content.
     follows : bool
-        Whether it stands right after another block.
+        Whether it directly follows another block.
 
     """
 
@@ -94,12 +94,12 @@ class Block:
 
     @property
     def runs(self) -> bool:
-        """Whether it is run, and not only checked."""
+        """Whether it is run, not only checked."""
         return self.language in ('bash', 'console', 'python') and self.marker == RUN
 
     @property
     def place(self) -> str:
-        """Return where it is, as editors understand it."""
+        """Return its location in the form used by editors."""
         return f'{self.page.relative_to(ROOT)}:{self.line}'
 
 
@@ -157,8 +157,8 @@ def fault(block: Block, previous: Block | None) -> str:
 # -- blocks that run -----------------------------------------------------------------------------
 
 
-class Failure(AssertionError):  # noqa: N818 - what it is, not only that it is an error
-    """A block that did not do what its page says."""
+class Failure(AssertionError):  # noqa: N818 - named for its meaning
+    """A block whose behaviour differs from its page."""
 
 
 PYTHON_LOOP = """
@@ -178,7 +178,7 @@ for line in sys.stdin:
             status = 1
     os.write(int(sys.argv[1]), f'{status}\\n'.encode())
 """
-# Ends what a page left running, and fails if something does not end cleanly.
+# Ends the processes that a page left running, and fails if one does not end cleanly.
 TRAILER = """
 set +e
 jobs=$(jobs -p)
@@ -195,33 +195,33 @@ done
 
 class Session:
     """
-    A shell and a Python interpreter in one directory, in which the blocks of a page run.
+    A shell and a Python interpreter in one directory, which run the blocks of a page.
 
     Parameters
     ----------
     folder : Path
         Empty directory.
     environment : mapping of str to str
-        With a ROS domain of its own.
+        Environment with a separate ROS domain.
 
     """
 
     def __init__(self, folder: Path, environment: Mapping[str, str]) -> None:
-        """Lay the directory out; start nothing yet."""
+        """Prepare the directory, without starting anything."""
         self._folder = folder / 'work'
         self._files = folder / 'blocks'
         tools = folder / 'bin'
         for directory in (self._folder, self._files, tools):
             directory.mkdir()
         for name in SHOWN:
-            # A copy: commands of a page may write where they would write in a clone.
+            # A copy, since commands of a page may write as in a clone.
             if (ROOT / name).is_dir():
                 shutil.copytree(
                     ROOT / name, self._folder / name,
                     ignore=shutil.ignore_patterns('_build', '__pycache__'))
             else:
                 shutil.copy(ROOT / name, self._folder / name)
-        # The package as it lies here, whatever the environment has installed.
+        # The package of this clone, regardless of the installed one.
         for name, words in (('hmsa', '-m hmsa_ros '), ('python', ''), ('python3', '')):
             (tools / name).write_text(
                 f'#!/bin/sh\n{AHEAD if words else ""}exec {sys.executable} {words}"$@"\n')
@@ -236,7 +236,7 @@ class Session:
         self._count = 0
 
     def run(self, language: str, text: str, place: str) -> str:
-        """Run a block and return what it printed; raise `Failure` if it fails."""
+        """Run a block, and return its output; raise `Failure` if it fails."""
         self._count += 1
         file = self._files / f'{self._count}.{"py" if language == "python" else "sh"}'
         out = file.with_suffix('.out')
@@ -246,22 +246,22 @@ class Session:
             if self._python is None:
                 self._python = self._start(
                     [sys.executable, '-u', '-c', PYTHON_LOOP, str(self._write)])
-            self._tell(self._python, f'{file}\t{out}\t{place}', place, out)
+            self._execute(self._python, f'{file}\t{out}\t{place}', place, out)
         else:
             file.write_text('set -eo pipefail\n' + text, encoding='utf-8')
             if self._shell is None:
                 self._shell = self._start(['bash', '--noprofile', '--norc'])
-                # If this process is killed its end of the pipe closes, the shell ends, and what
-                # it started with it.
-                self._tell(self._shell, "trap 'kill $(jobs -p) 2>/dev/null || true' EXIT; "
+                # If this process is killed, its end of the pipe closes, and the shell ends with
+                # its child processes.
+                self._execute(self._shell, "trap 'kill $(jobs -p) 2>/dev/null || true' EXIT; "
                            f'echo 0 >&{self._write}', place, out)
-            self._tell(
+            self._execute(
                 self._shell,
                 f'source {file} </dev/null >{out} 2>&1; echo $? >&{self._write}', place, out)
         return out.read_text(encoding='utf-8', errors='replace')
 
     def close(self) -> None:
-        """End everything; raise `Failure` if something failed or stayed behind."""
+        """End everything; raise `Failure` if something failed or was left running."""
         try:
             if self._shell is not None and self._shell.poll() is None and not self._stuck:
                 self.run('bash', TRAILER, 'end of the page')
@@ -273,7 +273,7 @@ class Session:
                 process.stdin.close()
                 with suppress(subprocess.TimeoutExpired):
                     process.wait(0.0 if self._stuck else PATIENCE_SECONDS)
-                # Whatever is left of what it started.
+                # Any processes left.
                 with suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
@@ -286,8 +286,8 @@ class Session:
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, text=True,
             pass_fds=[self._write], start_new_session=True)
 
-    def _tell(self, process: subprocess.Popen[str], line: str, place: str, out: Path) -> None:
-        """Have a line carried out and wait for its status."""
+    def _execute(self, process: subprocess.Popen[str], line: str, place: str, out: Path) -> None:
+        """Execute a line, and wait for its status."""
         assert process.stdin is not None
         process.stdin.write(line + '\n')
         process.stdin.flush()
@@ -306,14 +306,14 @@ class Session:
                 f'{place}: status {status.strip()}, expected 0; it printed\n{self._printed()}')
 
     def _printed(self) -> str:
-        """Return what all blocks printed so far: a node in the background tells in its own."""
+        """Return the output of all blocks so far, since background nodes print later."""
         return '\n'.join(
             f'[{file.stem}] {file.read_text(errors="replace")[-3000:]}'
             for file in sorted(self._files.glob('*.out'), key=lambda file: int(file.stem)))
 
 
 def run_page(page: Path, folder: Path, environment: Mapping[str, str]) -> list[str]:
-    """Run the blocks of a page, compare what they print, and return a log with their times."""
+    """Run the blocks of a page, compare their output, and return a log with their times."""
     session = Session(folder, environment)
     printed: str | None = None
     log = []
@@ -333,7 +333,7 @@ def run_page(page: Path, folder: Path, environment: Mapping[str, str]) -> list[s
             log.append(f'{block.place}: {block.language} ran in '
                        f'{time.monotonic() - began:.1f} s')
     except BaseException:
-        with suppress(Failure):  # what failed first is told
+        with suppress(Failure):  # the first failure is reported
             session.close()
         raise
     session.close()
@@ -341,7 +341,7 @@ def run_page(page: Path, folder: Path, environment: Mapping[str, str]) -> list[s
 
 
 def console(block: Block) -> list[tuple[str, str]]:
-    """Return the commands of a console block, each with what it shows as its output."""
+    """Return the commands of a console block, each with its expected output."""
     parts = re.split(r'^\$ ', block.text, flags=re.M)
     if parts[0].strip():
         raise Failure(f'{block.place}: begins with output: expected $ and a command')
@@ -354,7 +354,7 @@ def console(block: Block) -> list[tuple[str, str]]:
 
 
 def compare(shown: str, printed: str, place: str) -> None:
-    """Raise `Failure` unless a page shows what was printed."""
+    """Raise `Failure` unless the output agrees with the page."""
     if not alike(shown, printed):
         raise Failure(
             f'{place}: the page shows\n{shown}\nbut this was printed\n{printed}')
@@ -376,7 +376,7 @@ def _alike(shown: list[str], printed: list[str]) -> bool:
 
 
 def same_word(shown: str, printed: str) -> bool:
-    """Whether two words are the same, but for the last digits of their numbers."""
+    """Whether two words are equal, apart from the last digits of numbers."""
     if shown == printed:
         return True
     numbers = [float(x) for x in NUMBER.findall(shown)]
@@ -390,7 +390,7 @@ def same_word(shown: str, printed: str) -> bool:
 
 
 def check(block: Block) -> None:
-    """Raise `Failure` unless a block that does not run is right as far as can be told."""
+    """Raise `Failure` unless a block that does not run passes its checks."""
     try:
         if block.language == 'python':
             compile(block.text, block.place, 'exec')
@@ -454,7 +454,7 @@ def _require(condition: object, sentence: str) -> None:
 
 
 def _check_yaml(document: Any) -> None:
-    """Hold a parameter file against what the nodes declare."""
+    """Compare a parameter file with the parameters declared by the nodes."""
     if not isinstance(document, dict):
         return
     for pattern, entry in document.items():
@@ -482,7 +482,7 @@ def _check_parameter(name: str, nodes: Iterable[str]) -> None:
 
 
 def _topic_names() -> dict[str, str]:
-    """Return each topic as it is named from outside without a namespace, with its type."""
+    """Return each topic by its name from outside, without a namespace, with its type."""
     from hmsa_ros.interfaces import topics
 
     found: dict[str, str] = {}
@@ -495,7 +495,7 @@ def _topic_names() -> dict[str, str]:
 
 
 def _known_name(name: str, known: Iterable[str]) -> str | None:
-    """Return the known name that a name with any namespace or joint in front ends with."""
+    """Return the known name at the end of a name with any namespace or joint."""
     return next((x for x in known if ('/' + name.lstrip('/')).endswith(x)), None)
 
 
@@ -541,7 +541,7 @@ def _check_parameters(node: str, words: list[str]) -> None:
 
 
 def _check_hmsa(words: list[str]) -> None:
-    """Require that the command line can be read, without running it."""
+    """Require that a command line can be parsed, without running it."""
     from hmsa_ros.cli import build_parser, split_ros_args
 
     try:
@@ -567,7 +567,7 @@ def _check_launch(name: str, rest: list[str]) -> None:
 
 
 def _check_message(kind: str, words: list[str]) -> None:
-    """Require that a payload fits the type, and the type the topic or service."""
+    """Require that a payload matches the type, and the type the topic or service."""
     from hmsa_ros.interfaces import topics
 
     name, type_name = words[:2]
@@ -592,7 +592,7 @@ def _check_message(kind: str, words: list[str]) -> None:
 
 
 def _fill(message: Any, values: Any) -> None:
-    """Set the fields of a message; rclpy's messages refuse what does not fit."""
+    """Set the fields of a message; rclpy refuses values of the wrong type."""
     _require(isinstance(values, dict), f'{values!r} does not fit {type(message).__name__}')
     types = message.get_fields_and_field_types()
     for name, value in values.items():

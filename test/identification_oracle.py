@@ -1,4 +1,4 @@
-"""Measurements of an actuator, simulated by SciPy alone, for what identifies it."""
+"""Recordings of an actuator, simulated with SciPy only, for identification."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,7 +16,7 @@ BLOCK = paper_actuator()
 
 @dataclass(frozen=True)
 class Extras:
-    """What the actuator has besides the block, SI."""
+    """Properties of the actuator besides the block, in SI."""
 
     coil: float = 0.0
     ratio: float = 0.0
@@ -24,13 +24,13 @@ class Extras:
     force: float = 0.0
     bias: float = 0.0
     gain: float = 1.0
-    power: tuple = (1.0, 1.0)  # with which branches flow: exponent, and stress over G
-    more: tuple = ()  # pairs of ratio and time of more branches
-    law: tuple = ()  # name and constants in Pa of a law in place of Gent's
+    power: tuple = (1.0, 1.0)  # flow of the branches: exponent, and stress over G
+    more: tuple = ()  # pairs of ratio and time of further branches
+    law: tuple = ()  # name and constants in Pa of a law other than Gent's
 
 
 def _held(block: ActuatorParameters, law: tuple):
-    """Return the stress dW/dl in Pa over the stretch, as the energy of a law has it or Gent's."""
+    """Return the stress dW/dl in Pa as a function of the stretch, for a law or Gent's."""
     name, *c = law or ('gent',)
     if name == 'gent':
         modulus, limit = block.shear_modulus, block.chain_limit
@@ -40,7 +40,7 @@ def _held(block: ActuatorParameters, law: tuple):
     if name == 'ogden':
         return lambda x: sum(mu * (x ** (alpha - 1.0) - x ** (-0.5 * alpha - 1.0))
                              for mu, alpha in zip(c[::2], c[1::2], strict=True))
-    if name == 'arruda_boyce':  # by I1; Yeoh's by I1 - 3
+    if name == 'arruda_boyce':  # in I1; Yeoh's in I1 - 3
         shares = enumerate((1.0 / 2.0, 1.0 / 20.0, 11.0 / 1050.0, 19.0 / 7000.0, 519.0 / 673750.0))
         c = [c[0] * share / c[1] ** (2 * i) for i, share in shares]
     slopes = [(i + 1) * y for i, y in enumerate(c)][::-1]
@@ -66,7 +66,7 @@ def level_of(stretch, block: ActuatorParameters = BLOCK) -> float:
 
 
 def steps(targets, span, repeats=1, begin=0.02):
-    """Return times and levels of unshaped steps, after a while without field."""
+    """Return times and levels of unshaped steps, after an interval without field."""
     levels = [level_of(x) for _ in range(repeats) for x in targets]
     return (np.append(begin - 0.02, begin + span * np.arange(len(levels))),
             np.append(0.0, levels))
@@ -74,7 +74,7 @@ def steps(targets, span, repeats=1, begin=0.02):
 
 def simulate(times, level_times, levels, block: ActuatorParameters = BLOCK,
              extras: Extras | None = None):
-    """Return the measured stretch to 2e-9, without noise."""
+    """Return the measured stretch with an error of 2e-9, without noise."""
     arrays = (np.asarray(a, dtype=float).tobytes() for a in (times, level_times, levels))
     return _simulated(*arrays, block, extras or Extras()).copy()
 
@@ -82,7 +82,7 @@ def simulate(times, level_times, levels, block: ActuatorParameters = BLOCK,
 @lru_cache(maxsize=16)
 def _simulated(times: bytes, level_times: bytes, levels: bytes, block: ActuatorParameters,
                x: Extras):
-    """Do what `simulate` does once for all tests that ask for the same, since it takes long."""
+    """Run `simulate` once for all tests with the same arguments, since it takes long."""
     times, level_times, levels = (np.frombuffer(a) for a in (times, level_times, levels))
     inertia = block.density * block.half_length ** 2
     c1 = 2.0 * (block.half_thickness / block.half_length) ** 2
@@ -95,7 +95,7 @@ def _simulated(times: bytes, level_times: bytes, levels: bytes, block: ActuatorP
     held = _held(block, x.law)
 
     def slope(_, state, level):
-        # This is where the time goes: nothing is computed that this actuator does not have.
+        # This dominates the time, so effects that the actuator lacks are skipped.
         stretch, rate, *rest = state.tolist()
         field, elastic, cube, rates = level, held(stretch), stretch * stretch * stretch, []
         total = load - elastic - damping * rate + 0.25 * inertia * rate * rate / (cube * stretch)
@@ -131,7 +131,7 @@ def _upper(limit):
 
 
 def relative(found, block: ActuatorParameters = BLOCK):
-    """Return how far identified parameters of the block are off, in standard deviations."""
+    """Return the errors of identified block parameters in standard deviations."""
     return {
         name: (found.parameters[name].value - getattr(block, name)) / found.parameters[name].std
         for name in found.names if hasattr(block, name)

@@ -1,4 +1,4 @@
-"""MCAP records as bytes, by the mcap package: what tests change, and what they make to do harm."""
+"""MCAP records as bytes, built with the mcap package, for modified and malicious files."""
 
 import struct
 
@@ -32,7 +32,7 @@ def pieces(data):
 
 
 def chunk(packed, size, compression='zstd', start=1, end=1):
-    """Return a chunk that says what it is told to."""
+    """Return a chunk with arbitrary header values."""
     name = compression.encode()
     return record(Opcode.CHUNK, struct.pack('<QQQII', start, end, size, 0, len(name)) + name
                   + struct.pack('<Q', len(packed)) + packed)

@@ -1,9 +1,9 @@
 """
-Writes what plant or driver publish to a file when it is told to end.
+Records messages of plant or driver, and writes them to a file when asked to end.
 
     onlooker.py FILE.npy
 
-A row has the stamp and the time of arrival in s, stretch and flux density in T.
+A row contains the timestamp and the time of arrival in s, stretch and flux density in T.
 """
 
 import signal
@@ -34,7 +34,7 @@ def main():
             raise KeyboardInterrupt
 
     def end(*_):
-        # Once all is read that was measured by now.
+        # Once all samples taken so far are read.
         ends.append(time.time())
 
     node.create_subscription(JointState, 'joint_states', take, 5000)

@@ -1,11 +1,11 @@
 """
-Publishes numbered std_msgs/Float64 messages from a process of its own.
+Publishes numbered std_msgs/Float64 messages from a separate process.
 
     talker.py TOPIC COUNT [--rate HZ] [--best-effort] [--latched] [--depth N] [--first VALUE]
               [--wait SUBSCRIBERS]
 
-It waits for its subscribers, sends, prints "done" and stays until it is told to end. It keeps the
-last N messages for readers that missed some, or all.
+It waits for its subscribers, publishes, prints "done" and stays until it is asked to end. It keeps
+the last N messages for late subscribers.
 """
 
 import argparse
@@ -26,12 +26,12 @@ def main():
     parser.add_argument('--rate', type=float, default=1000.0)
     parser.add_argument('--best-effort', action='store_true')
     parser.add_argument('--latched', action='store_true')
-    # A reliable publisher says nothing again that it no longer keeps.
+    # A reliable publisher cannot repeat messages that it no longer stores.
     parser.add_argument('--depth', type=int)
     parser.add_argument('--first', type=float, default=0.0)
     parser.add_argument('--wait', type=int, default=1)
     options = parser.parse_args()
-    # Told to end, it dies at once: two participants that end at a time may wait for each other.
+    # It ends at once: two participants that end simultaneously may wait for each other.
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = Node('talker', enable_rosout=False, start_parameter_services=False)
     publisher = node.create_publisher(Float64, options.topic, QoSProfile(

@@ -1,4 +1,4 @@
-"""Which verdict answers which request, from what a recorder received and when."""
+"""Assignment of verdicts to requests, from the messages of a recorder and their times."""
 
 from dataclasses import dataclass
 

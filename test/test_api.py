@@ -1,4 +1,4 @@
-"""The public face: what ``import hmsa_ros`` offers, without ROS, in seconds and tesla."""
+"""The public API: the contents of ``import hmsa_ros``, without ROS, in seconds and tesla."""
 
 import contextlib
 import doctest
@@ -26,7 +26,7 @@ MU_0 = 1.25663706127e-6
 
 
 class Frame:
-    """As much of a DataFrame as is needed to take columns from it."""
+    """The part of a DataFrame that is needed to read columns."""
 
     def __init__(self, columns):
         self.columns = columns
@@ -48,7 +48,7 @@ def block():
 
 
 def followed(block, levels, end):
-    """Return stretch and rate at an end in s as SciPy integrates Eq. 11, from SI parameters."""
+    """Return stretch and rate at an end in s, from SciPy's integration of Eq. 11 in SI."""
     time = 5e-3 * (1900.0 / block.shear_modulus) ** 0.5
     load = MU_0 * block.shear_modulus / 0.08
     spans = np.diff([*(x for x, _ in levels), end]) / time

@@ -1,4 +1,4 @@
-"""Work in a process beside the planner: same results, whatever becomes of either process."""
+"""Work in a process beside the planner: same results, even if either process ends."""
 
 from dataclasses import replace
 import os
@@ -19,14 +19,14 @@ MS = 1_000_000
 
 
 def whose(value, gate=None):
-    """Return a value, once somebody writes to a pipe, and which process has returned it."""
+    """Return a value, once a pipe has data, and the process that returned it."""
     if gate is not None:
         gate.read_text()
     return value, os.getpid()
 
 
 def ends(parent):
-    """End whatever process it is in, but not the parent."""
+    """End the present process unless it is the parent."""
     if os.getpid() != parent:
         os.kill(os.getpid(), signal.SIGKILL)
     return 'here'

@@ -1,4 +1,4 @@
-"""Hardware out of a source, a coil and a sensor: what is written and read in whose units."""
+"""Hardware assembled from a source, a coil and a sensor: values and units of all calls."""
 
 import math
 
@@ -30,7 +30,7 @@ class Supply:
 
 
 class Laser:
-    """A sensor that sees the free end of a block of 20 mm come nearer, 2 ms late."""
+    """A sensor of the free end of a block of 20 mm, which approaches it, 2 ms late."""
 
     length = 20.0
 

@@ -1,4 +1,4 @@
-"""Damaged, foreign and old bags: a clear sentence, no traceback, and what can be read is read."""
+"""Damaged, foreign and old bags: clear messages, no traceback, and all readable data."""
 
 import contextlib
 import json
@@ -59,7 +59,7 @@ def write_with_mcap(path, count=400, **options):
 
 
 def stamps(path):
-    """Read a file and return reader and log times; the only errors are the package's own."""
+    """Read a file, and return reader and log times; only the package's errors may occur."""
     reader = BagReader(path)
     return reader, [message.log_time for message in reader.messages()]
 
@@ -149,7 +149,7 @@ def test_no_bytes_after_the_magic_make_the_reader_fail(tmp_path, content):
 
 
 def changed_value(draw, value):
-    """Return a value with something else in its place here and there."""
+    """Return a value with some parts replaced."""
     if draw(strategies.integers(0, 15)) == 0:
         return draw(ODD_VALUES)
     if isinstance(value, dict):

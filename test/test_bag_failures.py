@@ -1,4 +1,4 @@
-"""What becomes of a recording when the disk or the folder fails it."""
+"""Recordings when the disk or the folder fails."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -32,7 +32,7 @@ def message(i, size=0):
 
 @contextmanager
 def file_limit() -> Iterator[None]:
-    """Let no file of this process grow beyond 300 kB, as a quota would."""
+    """Limit the files of this process to 300 kB, as a quota would."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, before[1]))

@@ -1,4 +1,4 @@
-"""The bag's format, held against readers that know nothing of this package."""
+"""The bag's format, compared with independent readers."""
 
 from pathlib import Path
 import random

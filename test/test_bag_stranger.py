@@ -1,4 +1,4 @@
-"""Bags made to do harm: nothing is run, nothing outside is read or written, memory stays flat."""
+"""Malicious bags: nothing is executed, no access outside the bag, bounded memory."""
 
 import json
 import os
@@ -69,7 +69,7 @@ for path, chunk in zip(rest[::2], rest[1::2]):
 
 
 def read_apart(*files, memory=300):
-    """Read bags, each with its largest chunk in MiB, in processes of few MiB; return outputs."""
+    """Read bags, each with its largest chunk in MiB, in processes with little memory."""
     result = subprocess.run(
         [sys.executable, '-c', READER, str(memory), *(str(x) for file in files for x in file)],
         check=False, capture_output=True, text=True, env={**os.environ, 'PYTHONPATH': str(ROOT)})
@@ -92,7 +92,7 @@ def many_small_messages(size):
 
 
 def hostile_files():
-    """Return name, content and an expected sentence of each."""
+    """Return name, content and an expected message of each file."""
     zeros = zstd_of_zeros(512 * MEGA)
     small = many_small_messages(4 * MEGA)
     overlapping = chunk(zstandard.ZstdCompressor().compress(small), len(small), end=10**9)

@@ -1,4 +1,4 @@
-"""A recorded run: integrated again from the bag, and played to a second plant."""
+"""A recorded run, simulated from the bag, and played to a second plant."""
 
 from dataclasses import replace
 import json
@@ -28,7 +28,7 @@ BEGIN = 1_000_000_000
 
 
 def samples(bag):
-    """Return the recorded stretch by stamp."""
+    """Return the recorded stretch by timestamp."""
     return {item.message.header.stamp.sec * 10**9 + item.message.header.stamp.nanosec:
             item.message.position[0]
             for item in read_messages(bag, ['/joint_states'])}
@@ -121,9 +121,9 @@ def test_a_second_plant_moves_the_same_when_the_bag_is_played(
 
 def write_joints(folder, densities, *, told=None, space='', lost=None, strange=()):
     """
-    Write a run of several joints of one plant that differ in density.
+    Write a run of several joints of one plant with different densities.
 
-    ``strange`` are more messages: nanoseconds from the begin, topic, payload.
+    ``strange`` contains further messages: nanoseconds from the begin, topic, payload.
     """
     actuators = {joint: replace(paper_actuator(), density=density)
                  for joint, density in densities.items()}
@@ -166,7 +166,7 @@ def write_joints(folder, densities, *, told=None, space='', lost=None, strange=(
 
 
 def sample(stretch=1.0, *, seconds=0, joint='one', effort=0.0):
-    """Return a sample of a joint as a payload, stamped seconds from the begin."""
+    """Return a sample of a joint as a payload, with a timestamp in s from the begin."""
     message = JointState(name=[joint], position=[stretch], velocity=[0.0], effort=[effort])
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(
         BEGIN + int(seconds * 10**9), 10**9)

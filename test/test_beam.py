@@ -1,4 +1,4 @@
-"""Law beam: its mode, statics and plans against equations written down anew."""
+"""Law beam: its mode, statics and plans against independent equations."""
 
 from dataclasses import replace
 import json

@@ -47,12 +47,12 @@ TIMES = np.arange(0.0, LEVEL_TIMES[-1] + 4.0 * PERIOD, 0.01)
 
 @cache
 def motion():
-    """Return what a sensor without noise sees."""
+    """Return the noise-free output of a sensor."""
     return sampled(TIMES, LEVEL_TIMES, LEVELS)
 
 
 def seen(noise=1e-3, seed=0):
-    """Return what a camera sees."""
+    """Return the output of a camera."""
     return motion() + noise * np.random.default_rng(seed).standard_normal(len(TIMES))
 
 

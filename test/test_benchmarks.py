@@ -1,4 +1,4 @@
-"""The benchmarks run and what they compare is right; how fast it is is not tested."""
+"""The benchmarks run, and their comparisons are correct; their speed is not tested."""
 
 from dataclasses import replace
 from decimal import Decimal

@@ -1,4 +1,4 @@
-"""Calibration of a coil: blind to the truth, for every kind of coil, and off at the end."""
+"""Blind calibration of all kinds of coils, which are off at the end."""
 
 import json
 import math
@@ -19,7 +19,7 @@ LOOP = np.array(loop(8.0, 8))
 
 
 def readings(slope, saturation=math.inf, hysteresis=0.0, noise=2e-4, seed=0):
-    """Return what a probe with an offset reads of a coil with a loop that is an ellipse."""
+    """Return probe readings with offset of a coil whose hysteresis loop is an ellipse."""
     flux = slope * LOOP if saturation == math.inf else saturation * np.tanh(
         slope * LOOP / saturation)
     rising = np.sign(np.diff(LOOP, prepend=-1.0))
@@ -88,7 +88,7 @@ class Supply:
 
 
 def coil(joint):
-    """Return it with its coil."""
+    """Return the supply with its coil."""
     return Assembly(Supply(), CoilModel(0.05))
 
 

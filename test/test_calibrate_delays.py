@@ -1,4 +1,4 @@
-"""Calibration of delays and statics: blind to the truth of benches that SciPy integrates."""
+"""Blind calibration of delays and statics, on benches integrated with SciPy."""
 
 from dataclasses import replace
 from functools import cache
@@ -23,7 +23,7 @@ NOISE = 1e-3
 
 @cache
 def recorded(seed):
-    """Return truth, samples, readings of a probe, and levels of a bench drawn at random."""
+    """Return truth, samples, probe readings and levels of a random bench."""
     random = np.random.default_rng((42, seed))
     truth = {
         'transport': random.uniform(0.0, 3e-3), 'lag': math.exp(random.uniform(

@@ -1,4 +1,4 @@
-"""Which classes of hardware pass ``hmsa check-driver``, and what is said of the others."""
+"""Classes of hardware that pass ``hmsa check-driver``, and messages about the others."""
 
 import json
 
@@ -59,7 +59,7 @@ BROKEN = {
 
 @pytest.fixture
 def lab(tmp_path, monkeypatch):
-    """Write a module with a class of hardware, and try it; return what was found."""
+    """Write a module with a hardware class, and test it; return the results."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv('PYTHONPATH', str(tmp_path))
 

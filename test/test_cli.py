@@ -1,4 +1,4 @@
-"""The command line: plan, send, and how bad input is answered."""
+"""The command line: plan, send, and reactions to bad input."""
 
 import argparse
 import fcntl
@@ -258,7 +258,7 @@ def scripts(tmp_path_factory):
 
 
 def complete(script, folder, *words):
-    """Return what bash offers for the last word."""
+    """Return bash's completions of the last word."""
     assert shutil.which('bash')
     done = subprocess.run(
         ['bash', '-c', 'source "$0"; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _hmsa; '
@@ -338,7 +338,7 @@ COLOUR = re.compile(rb'\x1b\[(?:\d+;)*(?:3[0-7]|4[0-7]|9[0-7]|38|48)[;m]')
 
 
 def on_terminal(code, **env):
-    """Run code of Python on a terminal and return what it showed there."""
+    """Run Python code on a terminal, and return its output there."""
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack('HHHH', 24, 80, 0, 0))
     shown = b''

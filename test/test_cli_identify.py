@@ -21,7 +21,7 @@ STRETCH = simulate(TIMES, *LEVELS) + 1e-3 * np.random.default_rng(0).standard_no
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """Return a folder with a recording, made the current one."""
+    """Return a folder with a recording, which is the working directory."""
     monkeypatch.chdir(tmp_path)
     write('camera.csv', 'time,stretch', zip(TIMES, STRETCH, strict=True))
     write('levels.csv', 'time,flux_density', zip(*LEVELS, strict=True))
@@ -98,7 +98,7 @@ def test_what_is_not_identified_is_not_written_and_ends_with_1(folder, capsys):
 
 
 def lagging(name, hysteresis):
-    """Write a recording of a coil with play by a late camera; return arguments, and how late."""
+    """Write a recording with hysteresis and a late camera; return arguments and delay."""
     given = plants(1, 3, hysteresis=(hysteresis, 1.0001 * hysteresis), latency=(0.045, 0.0450001))
     switches, levels, end = sequence(given)
     seen = motion(given, switches, levels, end)

@@ -1,4 +1,4 @@
-"""``hmsa robustness`` and ``hmsa sweep``: what users type, see and get."""
+"""``hmsa robustness`` and ``hmsa sweep``: input, output and files."""
 
 import builtins
 from concurrent.futures import ThreadPoolExecutor
@@ -47,7 +47,7 @@ def run(capsys, tmp_path, monkeypatch):
 
 @pytest.fixture
 def refused(run):
-    """Return a runner that expects bad input and returns the one line about it."""
+    """Return a runner that expects bad input, and returns its one-line message."""
     def run_words(*words):
         status, out, err = run(*words)
         assert (status, out, err.count('\n')) == (2, '', 1)

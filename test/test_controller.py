@@ -49,7 +49,7 @@ def test_cycles_that_begin_late_are_counted_and_the_work_is_measured():
 
 
 def messages(bag, topic):
-    """Return (log time, message) as the mcap package reads them."""
+    """Return (log time, message), read with the mcap package."""
     file, = bag.glob('*.mcap')
     with file.open('rb') as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])

@@ -1,4 +1,4 @@
-"""Messages become records and records messages, and nothing is lost on the way."""
+"""Conversion of messages to records and back, without loss."""
 
 from contextlib import suppress
 import math
@@ -31,7 +31,7 @@ POINTS = st.lists(st.tuples(FINITE, STAMPS), max_size=5)
 
 
 def sent(message):
-    """Return a message as it arrives."""
+    """Return a message as received."""
     return deserialize_message(serialize_message(message), type(message))
 
 
@@ -82,7 +82,7 @@ def test_command_is_read_only_if_finite_along_z_and_after_the_epoch(x, y, z, sta
 
 
 def read(message):
-    """Return what is read of a trajectory as it arrives, and its points."""
+    """Return a received trajectory as read, and its points."""
     request = read_trajectory(serialize_message(message))
     found = list(request.points)
     # Anew, as where they are planned again.

@@ -1,4 +1,4 @@
-"""Actuators advanced together: as each alone, and the coil and the force."""
+"""Actuators advanced together, compared with each alone, and the coil and the force."""
 
 from dataclasses import replace
 import math
@@ -18,7 +18,7 @@ ACCURACY = 1e-10
 
 
 def scipy_motion(load, seconds, stretch=1.0):
-    """Return stretch and rate in 1/s after a flux density over time, by SciPy."""
+    """Return stretch and rate in 1/s under a flux density over time, by SciPy."""
     material, unit = ACTUATOR.nondimensional, ACTUATOR.time_unit
 
     def motion(time, state):

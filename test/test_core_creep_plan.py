@@ -30,7 +30,7 @@ SAMPLED = Delivery(0.27)
 
 
 def left(segments, creep, longest=40.0, delivery=IDEAL):
-    """Return how far from its target each move leaves the stretch, and what it is said to."""
+    """Return the deviation from the target after each move, and its predicted value."""
     end = segments[-1].begin + longest
     levels = [(x.begin + y.time, y.load) for x in segments for y in x.move.levels]
     times, stretch, _ = judged(

@@ -1,4 +1,4 @@
-"""Several planners under one request, and plans that reality has overtaken."""
+"""Several planners under one request, and plans invalidated by events."""
 
 from dataclasses import replace
 import math
@@ -31,7 +31,7 @@ SOME = [(1.1, 44 * MS), (1.2, 88 * MS), (1.4, 132 * MS)]
 
 
 class Joint:
-    """A planner and an actuator that obeys it, whose commands may be on the way for long."""
+    """A planner and an actuator that obeys it, with transport delay of commands."""
 
     def __init__(self, actuator=None, stretch=1.0, once=False, **options):
         self.actuator = actuator or paper_actuator()
@@ -73,7 +73,7 @@ class Joint:
             self.advance(self.now, resume)
 
     def advance(self, time, resume=False):
-        """Let the actuator move on and tell of each change of level that takes effect."""
+        """Advance the actuator, and report each change of level that takes effect."""
         plant = self.plant
         while (stamp := plant.schedule.next_stamp) is not None and stamp <= time:
             before = plant.schedule.current

@@ -30,7 +30,7 @@ HARDWARE = [{}, {'period': 0.11}, {'period': 0.4}, {'slew': 1.5}, {'slew': 0.4},
 
 
 def rates(_, state, load, slope, lag):
-    """Equation 11 and the coil, written out once more; the time is that of a piece."""
+    """Equation 11 and the coil, implemented independently; times are within a piece."""
     stretch, rate, field = map(float, state)
     j, c1 = PAPER.j_lim, PAPER.c1
     chain = 1.0 - (2.0 / stretch + stretch ** 2 - 3.0) / j
@@ -41,7 +41,7 @@ def rates(_, state, load, slope, lag):
 
 
 def end_of(move, request):
-    """Integrate a command with SciPy to where it is said to be at rest."""
+    """Integrate a command with SciPy to its predicted rest."""
     delivery = request.delivery
     pieces, _ = ramps(move.levels, request.load, move.duration, delivery.slew)
     state = [request.state.stretch, request.state.rate, request.field]

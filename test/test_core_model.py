@@ -28,7 +28,7 @@ RANDOM_STATES = 200
 
 
 def inside(j_lim: float, share: np.ndarray) -> np.ndarray:
-    """Return stretches at shares of the admissible interval."""
+    """Return stretches at fractions of the admissible interval."""
     lower, upper = equations.stretch_limits(j_lim)
     return lower + (upper - lower) * share
 
@@ -85,7 +85,7 @@ def derivation():
 
 @pytest.fixture
 def states():
-    """Return stretches, rates and loads all over the admissible region."""
+    """Return stretches, rates and loads throughout the admissible region."""
     random = np.random.default_rng(11)
     return (inside(BLOCK.chain_limit, random.uniform(0.01, 0.99, RANDOM_STATES)),
             random.normal(0.0, 2.0, RANDOM_STATES), random.normal(0.0, 5.0, RANDOM_STATES))

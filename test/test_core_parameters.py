@@ -1,4 +1,4 @@
-"""Parameter records refuse what they cannot mean and survive what they can."""
+"""Parameter records: invalid values are refused, extreme ones are accepted."""
 
 from dataclasses import fields, FrozenInstanceError, replace
 import math

@@ -1,4 +1,4 @@
-"""The planner over time, its command stream obeyed by a simulated actuator."""
+"""The planner over time, with its command stream applied to a simulated actuator."""
 
 from dataclasses import replace
 import math
@@ -31,7 +31,7 @@ RESIDUAL = 1e-6
 
 
 class Rig:
-    """A planner and an actuator that obeys its commands, polled as the node polls it."""
+    """A planner and an actuator that obeys its commands, polled as by the node."""
 
     def __init__(self, *, zeta=0.2, stretch=1.0, tick=2 * MS, **options):
         self.actuator = paper_actuator(NondimensionalParameters(zeta=zeta))
@@ -68,7 +68,7 @@ class Rig:
         return plan
 
     def wait(self, milliseconds, *, check=True):
-        """Let time go by and compare the actuator with the prediction at every tick."""
+        """Advance time, and compare the actuator with the prediction at every tick."""
         end = self.now + round(milliseconds * MS)
         while self.now < end:
             self.now = min(self.now + self.tick, end)
@@ -91,7 +91,7 @@ class Rig:
 
 
 def refused(code, reason, attempt):
-    """Check a refusal and that it changes nothing."""
+    """Check a refusal, and that it changes nothing."""
     with pytest.raises(RefusedError, match=reason) as caught:
         attempt()
     assert caught.value.code is code

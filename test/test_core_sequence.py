@@ -1,4 +1,4 @@
-"""Sequences of setpoints: the paper's, and what is refused or done otherwise, with reasons."""
+"""Sequences of setpoints: the paper's, and refusals and fallbacks with reasons."""
 
 import contextlib
 from itertools import pairwise
@@ -46,7 +46,7 @@ def command(segments):
 
 
 def state_at(time, segments, material, start=(1.0, 0.0)):
-    """Return the state under the command by an integration of our own."""
+    """Return the state under the command by an independent integration."""
     levels = [x for x in command(segments) if x[0] < time]
     ends = [x[0] for x in levels[1:]] + [time]
     return follow(

@@ -1,4 +1,4 @@
-"""Shapers against an integration of their own: at rest at the target, or a reason."""
+"""Shapers against an independent integration: at rest at the target, or a reason."""
 
 from collections import Counter
 from dataclasses import replace
@@ -60,7 +60,7 @@ def end_state(move: Move, request: Request) -> tuple[float, float]:
 
 
 def distance_from_rest(move: Move, request: Request) -> float:
-    """Return how far from rest at the target a move ends, as a share of one that can be judged."""
+    """Return the deviation from rest at the target after a move, as a fraction of the move."""
     stretch, rate = end_state(move, request)
     frequency = float(natural_frequency(request.target, request.material))
     size = abs(request.target - request.state.stretch) + abs(request.state.rate) / frequency
@@ -175,7 +175,7 @@ def test_minimum_time_arrives_above_critical_damping_where_two_step_does_not(zet
 
 
 def plan_or_reason(name: str, request: Request) -> tuple[Move, RefusedError | None]:
-    """Return a shaper's move, or an empty one and the refusal."""
+    """Return a shaper's move, or an empty one with the refusal."""
     try:
         return get_shaper(name)(request), None
     except RefusedError as error:
@@ -230,7 +230,7 @@ def test_too_little_room_for_the_grid_or_the_ramps_is_refused_with_what_is_neede
 
 
 def drawn(random: np.random.Generator) -> Request:
-    """Return a move drawn at random, with limits of which some are tight."""
+    """Return a random move, with limits of which some are tight."""
     start, target = random.uniform(0.7, 1.8, 2)
     material = NondimensionalParameters(zeta=float(random.choice([0.05, 0.2, 1.0, 2.5])))
     loads = sorted(float(elastic_force(x, material)) for x in (start, target))

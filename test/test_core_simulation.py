@@ -1,4 +1,4 @@
-"""The simulated actuator and the command stream it obeys, against SciPy and naive models."""
+"""The simulated actuator and its command stream, against SciPy and naive models."""
 
 import math
 
@@ -212,7 +212,7 @@ def test_undamped_motion_is_not_followed_for_ever():
 
 
 class NaiveSchedule:
-    """Keeps everything and looks it up."""
+    """Stores all commands and searches them."""
 
     def __init__(self, current):
         self.commands = [(-math.inf, current)]

@@ -1,4 +1,4 @@
-"""A brake ends at rest at a whole nanosecond, however small the motion is."""
+"""A braking move ends at rest at a whole nanosecond, even for the smallest motion."""
 
 import numpy as np
 import pytest

@@ -50,13 +50,13 @@ def group(zeta, j_lim=5.0, c1=2.0):
 
 
 def distance(end, target, material):
-    """Return how far a state is from rest at a target, in units of stretch."""
+    """Return the deviation of a state from rest at a target, in units of stretch."""
     return max(
         abs(end[0] - target), abs(end[1]) / float(natural_frequency(target, material)))
 
 
 def after_plan(start, rate, plan, material, tolerance=1e-13):
-    """Return the state at tau_p by an integration of our own."""
+    """Return the state at tau_p by an independent integration."""
     return follow(
         (start, rate), [(plan.tau_p, plan.beta_p)], material.zeta, material.j_lim,
         material.c1, tolerance=tolerance)
@@ -367,7 +367,7 @@ def test_a_plan_exists_exactly_where_the_step_response_crosses(start, target, sh
 
 @st.composite
 def moving_moves(draw):
-    """Draw a material, a state with a rate and a target, all over the admissible region."""
+    """Draw a material, a moving state and a target throughout the admissible region."""
     material = group(
         draw(st.sampled_from([0.0, 0.02, 0.2, 0.4, 1.1, 1.8]) | st.floats(0.0, 3.0)),
         draw(st.sampled_from([1.0, 3.0, 5.0]) | st.floats(0.5, 20.0)),
@@ -582,7 +582,7 @@ def test_bad_rows_carry_their_code_and_spoil_no_other():
 
 
 def blocks_from_rest(count):
-    """Return moves of Gent blocks of all kinds, many of them out of the ordinary."""
+    """Return moves of all kinds of Gent blocks, many of them extreme."""
     random = np.random.default_rng(3)
     j_lim = np.exp(random.uniform(-3.0, 5.0, count))
     j_lim[::20] = math.inf
@@ -599,7 +599,7 @@ def blocks_from_rest(count):
 
 
 def planned(rows, *, wide=True):
-    """Return the results of a batch, with the widest instructions or without."""
+    """Return the results of a batch, with or without the widest instructions."""
     start, target, zeta, j_lim, c1 = rows
     status, found = np.empty(len(start), np.int64), np.empty((3, len(start)))
     materials = pack(zeta, j_lim, c1)

@@ -1,4 +1,4 @@
-"""Corrections from samples, carried out by a block that SciPy simulates."""
+"""Corrections from samples, applied to a block simulated with SciPy."""
 
 from dataclasses import replace
 import math
@@ -62,7 +62,7 @@ class Block:
 
 
 class Bench:
-    """A block as a device that is measured at 1 kHz, 2 ms late, by a sensor with a bias."""
+    """A block as a device, sampled at 1 kHz, 2 ms late, by a sensor with a bias."""
 
     def __init__(self, block, noise, seed):
         self.block, self.time, self.next_sample = block, MS, MS
@@ -95,7 +95,7 @@ class Bench:
 
 
 def closed_loop(factor, noise=1e-3, seed=0, **settings):
-    """Move to the target by the controller in simulated time; return the block."""
+    """Move to the target with the controller in simulated time; return the block."""
     block = Block(replace(oracle.BLOCK, shear_modulus=factor * oracle.BLOCK.shear_modulus))
     loop = Loop(
         PlannerGroup({'a': Planner(oracle.BLOCK, PlannerOptions(
@@ -110,7 +110,7 @@ def closed_loop(factor, noise=1e-3, seed=0, **settings):
 
 
 def left(block):
-    """Return peak to peak and offset over the next 15 ms, as shares of the step."""
+    """Return peak-to-peak and mean error over the next 15 ms, as fractions of the step."""
     seen = np.array([block.at((90 + 0.2 * i) * MS) for i in range(75)])
     level = block.levels[-1][1] * block.block.remanence / oracle.mu_0 / block.block.shear_modulus
     rest = brentq(lambda x: oracle.force_of(x, 5.0) - level, 1.01, 2.0)

@@ -1,4 +1,4 @@
-"""What devices obey after their coil was cut off, and commands of another clock."""
+"""Commands that devices obey after a cut-off of the coil, and commands of another clock."""
 
 import pytest
 
@@ -16,7 +16,7 @@ ZERO = Fallback(0.1, 'zero')
 
 
 class Coil:
-    """An amplifier that does at once what it is told."""
+    """An amplifier that applies commands immediately."""
 
     def write(self, level, now):
         return now
@@ -40,7 +40,7 @@ BOTH = pytest.mark.parametrize('make', [plant, driver])
 
 
 def cut_off(make, fallback=ZERO):
-    """Return a device whose coil was cut off, since nobody had commanded it for too long."""
+    """Return a device whose coil was cut off after a silence."""
     device = make(fallback)
     device.receive(0, START + MS, 0.05)
     for step in range(1, 200):
@@ -52,7 +52,7 @@ def cut_off(make, fallback=ZERO):
 
 
 def refused(device, stamp, level):
-    """Return why a command is refused; empty where it has been obeyed."""
+    """Return why a command is refused; empty if it is obeyed."""
     device.receive(0, stamp, level)
     for _ in range(30):
         device.advance(device.time + MS)

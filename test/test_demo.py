@@ -1,4 +1,4 @@
-"""The demo, whole: real processes over DDS, one core loaded, evaluated from its bag."""
+"""The complete demo: real processes over DDS, with one core loaded, evaluated from its bag."""
 
 import json
 from pathlib import Path
@@ -50,7 +50,7 @@ def test_every_setpoint_is_reached_and_held_while_another_process_loads_a_core(s
 
 
 def _check_bag(bag: Path) -> None:
-    """Open the bag with two readers that are not ours."""
+    """Read the bag with two independent readers."""
     with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         counts = {x.topic: x.msgcount for x in reader.connections}
         # Two a setpoint, and signs of life with the last one.

@@ -1,4 +1,4 @@
-"""The simulated plant without ROS: what it decides and what it says."""
+"""The simulated plant without ROS: its decisions and reports."""
 
 from collections import deque
 from dataclasses import replace
@@ -25,7 +25,7 @@ START = 1000 * MS
 
 
 def plant(*, fallback=None, errors=None, joints=1, **settings):
-    """Return a simulated device with samples each millisecond, and what it says at first."""
+    """Return a simulated device with samples each millisecond, and its first reports."""
     joint = SimulatedJoint(
         Setup(ACTUATOR), fallback or Fallback(), errors or SensorErrors())
     device = SimulatedDevice([joint] * joints, **{'period': MS, 'time': START, **settings})
@@ -40,7 +40,7 @@ def told(device):
 
 
 def check(samples, commands, *, begin=START):
-    """Hold samples against the core's simulation of commands."""
+    """Compare samples with the core's simulation of commands."""
     simulation = ActuatorSimulation(ACTUATOR, time=begin)
     for stamp, level in commands:
         simulation.command(stamp, level)

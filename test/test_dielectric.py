@@ -26,7 +26,7 @@ EPSILON = PERMITTIVITY * epsilon_0
 
 
 def stack(limit: float = math.inf, **more: float) -> Actuator:
-    """Return the stack with a limit of its chains."""
+    """Return the stack, with a limiting extensibility."""
     return Actuator.dielectric(**{
         'half_length': LENGTH, 'half_thickness': HEIGHT, 'layer_thickness': LAYER,
         'permittivity': PERMITTIVITY, 'shear_modulus': MODULUS, 'density': DENSITY,
@@ -37,8 +37,8 @@ def follow(ratio, rate, levels, limit=math.inf, dense=None):
     """
     Follow pairs of duration and voltage from a capacitance ratio and its rate.
 
-    By Lagrange's equation of the stretch s in the plane, per volume: the thickness is s^-2, the
-    electrodes of a layer hold the energy eps (V/h)^2 s^4/2.
+    Integrates Lagrange's equation of the in-plane stretch s, per volume: the thickness is s^-2,
+    and the electrodes of a layer store the energy eps (V/h)^2 s^4/2.
     """
     def change(_, y, volts):
         s, v = y

@@ -1,4 +1,4 @@
-"""The pages: built with warnings as errors, and every block in them run or checked."""
+"""The pages: built with warnings as errors, with every block run or checked."""
 
 from importlib import import_module
 from pathlib import Path
@@ -28,12 +28,12 @@ RUNNING = [page for page in PAGES if any(block.runs for block in blocks(page))]
 
 
 def name_of(page: Path) -> str:
-    """Return a page as it reads from the root of the repository."""
+    """Return the path of a page from the root of the repository."""
     return str(page.relative_to(ROOT))
 
 
 def a_block(language: str, text: str, marker: str = '') -> Block:
-    """Return a block of some page."""
+    """Return a block of an arbitrary page."""
     return Block(ROOT / 'README.md', 1, language, marker, text)
 
 

@@ -1,4 +1,4 @@
-"""The driver node: hardware in the place of the plant, alone and in one process with a planner."""
+"""The driver node: hardware in place of the plant, alone and with a planner in one process."""
 
 from pathlib import Path
 import sys
@@ -37,7 +37,7 @@ def nothing(joint):
 
 
 def field(ros):
-    """Return a list that fills with the levels that took effect."""
+    """Return a list that receives the levels that took effect."""
     topic = topics.FLUX_DENSITY_APPLIED
     return ros.collect(topic.type, topic.name, topic.qos)
 

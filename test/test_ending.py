@@ -1,4 +1,4 @@
-"""How processes end when they are told to: at the start, at work, and twice."""
+"""End of processes on signals: at the start, at work, and twice."""
 
 from contextlib import suppress
 from random import Random

@@ -1,4 +1,4 @@
-"""The estimator, held against motions that SciPy simulates."""
+"""The estimator, compared with motions simulated with SciPy."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def ns(seconds):
 
 
 def run(samples, free=None, options=None, prior=None, times=SAMPLED, levels=LEVELS):
-    """Feed samples one by one, each 2 ms late; return the estimator and its last estimate."""
+    """Pass samples one by one, each 2 ms late; return the estimator and its last estimate."""
     prior = prior or Prior.nominal(oracle.BLOCK, free or ('shear_modulus', 'damping_coefficient',
                                                           'stretch_bias'))
     estimator = Estimator(prior, options)
@@ -312,7 +312,7 @@ def test_a_gain_that_explains_samples_as_well_as_a_force_is_as_likely_but_not_so
 
 
 def _unsure(*, expected=True):
-    """Return an estimate of a block as given whose G and ratio of creep lean on each other."""
+    """Return an estimate of a block whose G and creep ratio are correlated."""
     prior = Prior.nominal(oracle.BLOCK, suspects=True)
     estimator = Estimator(prior)
     estimator.set_levels([(0, 0.0)])

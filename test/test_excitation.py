@@ -1,4 +1,4 @@
-"""What to record: inside the limits, at rest at the end, worth more than unshaped steps."""
+"""Excitations: within the limits, at rest at the end, better than unshaped steps."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""A selection of the faults that `python -m benchmarks faults` injects, and the soak in short."""
+"""A selection of the faults that `python -m benchmarks faults` injects, and a short soak."""
 
 import json
 import math
@@ -95,7 +95,7 @@ def test_residual_counts_from_the_last_change_of_the_field():
 
 
 def lives(slope, *, noise=0.0, count=400, lives=3):
-    """Return samples of some lives of an hour each that grow by so many bytes an hour."""
+    """Return samples of several lives of an hour each, growing by a rate in bytes per hour."""
     dice = random.Random(1)
     samples = []
     for life in range(lives):

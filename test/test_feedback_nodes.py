@@ -1,4 +1,4 @@
-"""Planner and plant as processes, the plant with a G that is a fifth higher."""
+"""Planner and plant as processes, with G of the plant 20 % higher."""
 
 from dataclasses import replace
 import math
@@ -19,7 +19,7 @@ PLANT = ('--ros-args', '-p', 'mismatch.shear_modulus:=1.2', '-p', 'stretch_noise
 
 
 def begin(start, ros, mode, *more):
-    """Start both and wait for them; return a function of the newest sentence and its values."""
+    """Start both and wait for them; return a function of the newest message and its values."""
     statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
     samples = ros.collect(topics.JOINT_STATES.type, 'joint_states', topics.JOINT_STATES.qos)
     # In slow motion, with commands far enough ahead for a busy machine.

@@ -1,4 +1,4 @@
-"""Feedback that does no harm: what samples cannot show is not learnt, and can be unlearnt."""
+"""Harmless feedback: effects that samples cannot show are not learned, and can be reverted."""
 
 from dataclasses import replace
 import math
@@ -33,7 +33,7 @@ FAULTS = {
 
 
 def bench(slow=True, noise=1e-4, plant=None, factors=None, **more):
-    """Return a bench; a slow block has a unit of time of 44 ms, the other one of 4.4 ms."""
+    """Return a bench; a slow block has a time scale of 44 ms, the other one of 4.4 ms."""
     nominal, true = paper(slow, **(factors or {}))
     found = Bench(
         Plant(true, **(plant or {})), nominal, noise, lead=(2 if slow else 50) * MS, **more)
@@ -42,7 +42,7 @@ def bench(slow=True, noise=1e-4, plant=None, factors=None, **more):
 
 
 def moves(it, targets=MOVES):
-    """Return vibration and offset of moves in % of the step."""
+    """Return vibration and steady-state error of moves in % of the step."""
     slow = it.planner.model.units.time > 0.01
     return np.array([it.move(x, (1200 if slow else 400) * MS) for x in targets])
 
@@ -235,7 +235,7 @@ def test_an_update_costs_no_more_whatever_timestamps_come(seed, monkeypatch):
 # -- the field -----------------------------------------------------------------------------------
 
 def field_of(it, time):
-    """Return the level that is really in force."""
+    """Return the actual level."""
     return [x[1] for x in it.plant.levels if x[0] <= time][-1]
 
 

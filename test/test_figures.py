@@ -1,4 +1,4 @@
-"""The paper's figures: their data against independent values, their pictures, the command."""
+"""The paper's figures: data against independent values, figures, and the command."""
 
 from contextlib import redirect_stderr, redirect_stdout
 import csv
@@ -36,7 +36,7 @@ AT_REST = 1e-9
 
 
 def elastic_force(stretch: float, j_lim: float) -> float:
-    """The load in balance with a stretch, from the bracket of Eq. 11."""
+    """Return the load in balance with a stretch, from the bracket of Eq. 11."""
     return (stretch ** 4 - stretch) / stretch ** 3 / (
         1.0 - (2.0 / stretch + stretch ** 2 - 3.0) / j_lim)
 
@@ -57,7 +57,7 @@ def motion(_: float, state: Any, load: float, zeta: float, j_lim: float, c1: flo
 
 
 def follow(switches: Any, loads: Any, time: Any, zeta: float, j_lim: float) -> Any:
-    """The stretch at the given times, integrated piece by piece by another solver."""
+    """Return the stretch at times, integrated piece by piece with another solver."""
     state = [1.0, 0.0]
     stretch = np.empty(time.size)
     for begin, end, load in zip(switches, [*switches[1:], time[-1]], loads, strict=True):
@@ -87,7 +87,7 @@ def check_picture(path: Path) -> None:
 
 @pytest.fixture(scope='module')
 def printed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
-    """What the command wrote in which folder, drawn coarsely, and what it printed."""
+    """Return the command's output folder, drawn coarsely, and its output."""
     out, err = StringIO(), StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
         patch.chdir(tmp_path_factory.mktemp('work'))

@@ -1,4 +1,4 @@
-"""Branches of creep that flow by a power law, judged by SciPy and by closed forms."""
+"""Viscoelastic branches with power-law flow, compared with SciPy and closed forms."""
 
 from dataclasses import replace
 import math

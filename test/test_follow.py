@@ -1,4 +1,4 @@
-"""The action FollowJointTrajectory on the wire, with its messages and without them."""
+"""The action FollowJointTrajectory over ROS, with and without its messages."""
 
 import importlib.util
 

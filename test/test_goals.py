@@ -1,4 +1,4 @@
-"""Goals of FollowJointTrajectory without ROS: taken, carried out, judged by samples, ended."""
+"""Goals of FollowJointTrajectory without ROS: accepted, executed, judged by samples, ended."""
 
 from dataclasses import replace
 import math
@@ -80,7 +80,7 @@ class Bench:
 
 
 def dense(goal=1.3, duration=100, count=21):
-    """Return a smooth path as MoveIt sends it."""
+    """Return a smooth path as sent by MoveIt."""
     s = np.linspace(0.0, 1.0, count)
     x = 1.0 + (goal - 1.0) * s * s * (3.0 - 2.0 * s)
     v = (goal - 1.0) / (duration * 1e-3) * 6.0 * s * (1.0 - s)

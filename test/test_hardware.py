@@ -1,4 +1,4 @@
-"""Drivers of hardware without ROS: what is written when, what fails, and what is said of it."""
+"""Drivers of hardware without ROS: times of writes, failures, and messages."""
 
 import math
 from threading import Event
@@ -23,7 +23,7 @@ TODAY = 1_800_000_000_000 * MS
 
 
 class Bench:
-    """An amplifier that takes 2 us, and a sensor; notes what it is asked."""
+    """An amplifier that takes 2 us, and a sensor; records its calls."""
 
     def __init__(self):
         self.writes = []
@@ -50,7 +50,7 @@ def driver(period=0, bench=None, **settings):
 
 
 def serve(*benches, period=0, reconnect=False, **calls):
-    """Return a worker that has started."""
+    """Return a started worker."""
     worker = HardwareWorker(lambda: HardwareDevice(
         [HardwareJoint(x, 0.5, name=f'joint_{i}') for i, x in enumerate(benches)],
         time=monotonic_ns(), period=period, calls=Calls(**{'limit': 60.0, **calls})),
@@ -171,7 +171,7 @@ def test_a_sign_of_life_is_passed_on_unless_the_next_level_is_near():
 
 
 class Amplifier(Bench):
-    """Gives at most 0.2 T, in steps, and answers as it is told to."""
+    """Outputs at most 0.2 T, in steps, with configurable answers."""
 
     resolution = 1e-3
     limit = 0.4
@@ -318,7 +318,7 @@ def test_hardware_that_has_lost_its_state_begins_without_a_field():
 
 
 class Board:
-    """A board that keeps levels and has a clock of its own: it began later and runs fast."""
+    """A board that stores levels, with its own clock, which started later and runs fast."""
 
     capacity = None
     rate = 1.0 + 80e-6
@@ -332,7 +332,7 @@ class Board:
         self.level, self.asked = 0.0, 0
 
     def time_ns(self):
-        """Answer on the host: each look takes 20 us."""
+        """Return the host time, which advances by 20 us with each call."""
         self.host += 20_000
         return self.host
 
@@ -633,14 +633,14 @@ def test_a_worker_writes_each_level_at_its_stamp_and_switches_off_in_the_end():
 
 
 class WordlessError(Exception):
-    """Cannot even be shown."""
+    """An exception without a printable text."""
 
     def __str__(self):
         raise SystemExit
 
 
 class Odd(BaseException):
-    """What nobody expects."""
+    """An unexpected exception."""
 
 
 @pytest.mark.parametrize('error', [
@@ -746,7 +746,7 @@ def test_a_temperature_that_is_none_and_a_limit_without_one_are_refused():
 
 
 class Cable(Bench):
-    """Can be pulled out; a new connection works once it is in again."""
+    """A line that can be disconnected; a new connection works once it is connected again."""
 
     def __init__(self):
         super().__init__()
@@ -852,7 +852,7 @@ def test_a_worker_that_is_ended_meanwhile_says_that_the_coil_was_not_switched_of
 
 
 class Gate(Bench):
-    """Blocks where it is asked to, until it is let go or a call comes from another thread."""
+    """Blocks on request, until it is released or a call comes from another thread."""
 
     def __init__(self):
         super().__init__()

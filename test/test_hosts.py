@@ -1,4 +1,4 @@
-"""Planner, plant and recorder on hosts that lose each other, and whose clocks differ."""
+"""Planner, plant and recorder on hosts with connection losses and different clocks."""
 
 from pathlib import Path
 import signal
@@ -55,7 +55,7 @@ class Laboratory:
         self._onlooker.wait_for_output('sees')
 
     def seen(self):
-        """Return stamps and times of arrival in s, stretches and flux densities in T."""
+        """Return timestamps and times of arrival in s, stretches and flux densities in T."""
         assert self._onlooker.stop(signal.SIGTERM) == 0, self._onlooker.output
         return np.load(self._file).T
 

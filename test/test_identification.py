@@ -1,4 +1,4 @@
-"""Identification: derivatives, bounds, accuracy, verdicts, against simulations by SciPy."""
+"""Identification: derivatives, bounds, accuracy, verdicts, against simulations with SciPy."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Identification of the constants of a law, and of two branches of creep, blind."""
+"""Identification of the constants of laws, and of two viscoelastic branches, blind."""
 
 from dataclasses import replace
 import json
@@ -34,7 +34,7 @@ def block_of(law: str, constants: dict):
 
 def recorded(extras: Extras, *, noise=NOISE, seed=0, levels=(0.05, -0.03, 0.07, 0.02, 0.0),
              repeats=4, span=0.06, rate=1e3) -> Recording:
-    """Return a recording of unshaped steps, large enough to tell laws apart."""
+    """Return a recording of unshaped steps, large enough to distinguish laws."""
     fields = np.append(0.0, np.tile(levels, repeats))
     begins = np.append(0.0, 0.02 + span * np.arange(len(fields) - 1))
     times = np.arange(0.0, begins[-1] + span, 1.0 / rate)
@@ -45,7 +45,7 @@ def recorded(extras: Extras, *, noise=NOISE, seed=0, levels=(0.05, -0.03, 0.07, 
 
 
 def covered(found, true: dict) -> list[bool]:
-    """Return which of the intervals hold the truth."""
+    """Return which of the intervals contain the truth."""
     return [found.parameters[x].low <= y <= found.parameters[x].high for x, y in true.items()]
 
 

@@ -1,4 +1,4 @@
-"""The parameter file of one's own actuator: asking, what follows, what is implausible."""
+"""Parameter file of a new actuator: questions, derived values, implausible values."""
 
 from dataclasses import replace
 import json
@@ -287,7 +287,7 @@ def test_numbers_are_taken_in_the_range_that_the_nodes_take():
 # Asking --------------------------------------------------------------------------------------
 
 def ask(folder, answers, *words):
-    """Run it on a terminal of its own and return status, what it showed and its output."""
+    """Run it on a separate terminal; return status, terminal output and standard output."""
     ours, theirs = pty.openpty()
     with subprocess.Popen(
             [sys.executable, '-m', 'hmsa_ros', 'init', *words], stdin=theirs,

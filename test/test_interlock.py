@@ -1,4 +1,4 @@
-"""The interlock: what opens it, what it does to coil and planner, and what comes after it."""
+"""The interlock: opening, effect on coil and planner, and recovery."""
 
 from dataclasses import replace
 from functools import partial
@@ -24,7 +24,7 @@ A, B, C = b'a', b'b', b'c'
 
 
 def opened(lock, now, *said, here=(A, B, C)):
-    """Return whether an interlock is open after what publishers say at a time in ms."""
+    """Return whether an interlock is open after messages of publishers at a time in ms."""
     for publisher, closed in said:
         lock.receive(publisher, now * MS, closed=closed, present=lambda: here)
     return bool(lock.look(now * MS))
@@ -75,7 +75,7 @@ def test_a_required_interlock_is_open_without_anybody_and_after_a_silence():
 
 
 class Coil:
-    """An amplifier that is armed, keeps levels or not, and notes what it is told."""
+    """An amplifier that can be armed, with or without stored levels; records its calls."""
 
     def __init__(self, lose=''):
         self.told, self.lose = [], lose
@@ -97,7 +97,7 @@ class Coil:
 
 
 class Keeping(Coil):
-    """One that keeps levels itself."""
+    """An amplifier that stores levels."""
 
     def schedule(self, levels):
         self.told += [x for _, x in levels]

@@ -1,4 +1,4 @@
-"""The hysteresis of an iron core: found in a staircase, and undone."""
+"""The hysteresis of an iron core: fitted to a staircase, and compensated."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ MS = 1_000_000
 
 
 class Source:
-    """A source that keeps levels ahead, before a coil whose core nobody has told it."""
+    """A source that stores levels, with a coil whose core is unknown to it."""
 
     resolution = 1e-6
 
@@ -33,7 +33,7 @@ class Source:
             self.ahead = [x for x in self.ahead if x[0] < levels[0][0]] + list(levels)
 
     def go_on(self, now):
-        """Put out what is due; return the field then."""
+        """Output the levels that are due; return the field."""
         while self.ahead and self.ahead[0][0] <= now:
             stamp, self.amperes = self.ahead.pop(0)
             self.told.append((stamp - 400, self.amperes))  # it counts in us
@@ -47,7 +47,7 @@ class Source:
 
 
 def plays(level, widths, weights):
-    """Return the field of plays over levels, one after the other, from a demagnetised core."""
+    """Return the field of plays for successive levels, from a demagnetised core."""
     states, found = [0.0] * len(widths), []
     for x in level:
         states = [min(max(y, x - r), x + r) for y, r in zip(states, widths, strict=True)]
@@ -57,7 +57,7 @@ def plays(level, widths, weights):
 
 @pytest.fixture(scope='module')
 def settings(tmp_path_factory):
-    """Return what hmsa calibrate coil writes of a coil with 2 % of hysteresis."""
+    """Return the output of hmsa calibrate coil for a coil with 2 % of hysteresis."""
     folder, core = tmp_path_factory.mktemp('core'), Iron(0.02 * LARGEST, 0.3 * LARGEST)
     rows, noise = ['current,flux_density'], np.random.default_rng(1)
     for level in loop(LARGEST, 8):
@@ -70,7 +70,7 @@ def settings(tmp_path_factory):
 
 
 def fields(coil, levels):
-    """Return fields where levels are handed over two ahead, and the second is replaced."""
+    """Return fields if levels are scheduled two ahead, and the second is replaced."""
     source = Source(Iron(0.02 * LARGEST, 0.3 * LARGEST))
     assembly, found = Assembly(source, coil), []
     for i, level in enumerate(levels):

@@ -1,4 +1,4 @@
-"""Joints of one node: names, parameters for all and for each, topics."""
+"""Joints of one node: names, common and separate parameters, topics."""
 
 import re
 

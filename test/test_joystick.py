@@ -1,4 +1,4 @@
-"""The example of a joystick, with the planner and the plant that it moves."""
+"""The joystick example, with its planner and plant."""
 
 from pathlib import Path
 import runpy

@@ -1,4 +1,4 @@
-"""What the judge says of motions of which the truth is known, in closed form."""
+"""The judge's findings for motions with a known truth, in closed form."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ STEP = 0.2
 
 
 def held(offset=0.0, vibration=0.0, decay=DECAY, noise=0.0, rate=1000, seconds=0.5, seed=0):
-    """Return samples from the arrival at time 0 on; offset, vibration and noise in % of STEP."""
+    """Return samples from an arrival at time 0; error, vibration and noise in % of STEP."""
     time = np.arange(0.0, seconds, 1.0 / rate)
     size = vibration / (1.0 + np.exp(-np.pi * decay / OMEGA))
     motion = offset + size * np.exp(-decay * time) * np.cos(OMEGA * time)

@@ -1,4 +1,4 @@
-"""What late, rounded and saturated levels cost, and what the planner does about it."""
+"""Effects of late, rounded and saturated levels, and the planner's reactions."""
 
 from dataclasses import replace
 import math
@@ -25,7 +25,7 @@ TARGETS, SPAN = (1.2, 1.4, 1.1, 1.3), 8.0
 
 
 class Bench:
-    """A runtime before a coil that writes late; SciPy says what the actuator does."""
+    """A runtime with a coil that writes late; SciPy simulates the actuator."""
 
     def __init__(
             self, unit, lead, settings=QUIET, write=lambda number, level: (0, level),
@@ -141,7 +141,7 @@ KINDS = ('single', 'burst', 'lost', 'onset', 'persistent', 'jitter')
 
 
 def _delays(kind, largest, seed):
-    """Return how late the hardware writes, by at most so many ns."""
+    """Return the lateness of the hardware, at most a number of ns."""
     chance = random.Random(seed)
     first, late = chance.randrange(7), round(chance.uniform(0.05, 1.0) * largest)
     numbers = {
@@ -160,7 +160,7 @@ def _delays(kind, largest, seed):
 
 
 def _case(kind, seed):
-    """Return unit of time in s, lead time in ms, shaper, and how late the hardware writes."""
+    """Return time scale in s, lead time in ms, shaper, and lateness of the hardware."""
     chance = random.Random(f'{kind} {seed}')
     unit = chance.choice((0.0044, 0.02, 0.044, 0.2))
     return unit, chance.choice((5, 20, 50, 100)), chance.choice((
@@ -169,7 +169,7 @@ def _case(kind, seed):
 
 
 def _policies(kind, seed, monkeypatch, case=None):
-    """Return what is left of a case by doing nothing, deciding, and always replanning."""
+    """Return the errors of a case with no replanning, the decision, and with replanning always."""
     unit, lead, shaper, largest = case or _case(kind, seed)
     left = {}
     for policy in ('nothing', 'decide', 'always'):

@@ -1,8 +1,8 @@
 """
-The launch files: what they start, and these very processes run.
+The launch files: the processes that they start, and a run of these processes.
 
-ROS 2's launch is not on the package index. What the files decide is a module of ours; where
-launch is installed, it runs the files for real, too.
+ROS 2's launch is not on the package index. The decisions of the files are in a module of the
+package; if launch is installed, it also runs the files.
 """
 
 from importlib import import_module
@@ -32,7 +32,7 @@ REAL = getattr(find_spec('launch'), 'origin', None) is not None
 
 @pytest.fixture(params=FILES)
 def started(request):
-    """Return for each launch file what it starts with some arguments."""
+    """Return the processes of each launch file for some arguments."""
     file, needed = FILES[request.param]
     return lambda **given: file.evaluate({**needed, **given}, ROOT)
 
@@ -131,7 +131,7 @@ def test_a_process_that_fails_ends_everything_and_one_that_is_ended_does_not_fai
 
 
 class ByHand:
-    """Starts the processes of a launch file and, at the end, ends them."""
+    """Starts the processes of a launch file, and ends them."""
 
     def __init__(self, start):
         self._start = start
@@ -152,7 +152,7 @@ class ByHand:
 
 
 class ByLaunch:
-    """Runs the files by ROS 2's launch."""
+    """Runs the files with ROS 2's launch."""
 
     def __init__(self, start):
         self._start = start

@@ -1,4 +1,4 @@
-"""The law of a table: against the Gent block it is sampled from, SciPy, and what files hold."""
+"""The law of a table, compared with the sampled Gent block and SciPy, and its files."""
 
 import json
 import math

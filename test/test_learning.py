@@ -1,4 +1,4 @@
-"""Learning from repeats, on benches with hysteresis and a second mode that no model has."""
+"""Learning from repeats, on benches with unmodelled hysteresis and second mode."""
 
 from dataclasses import replace
 import json
@@ -31,7 +31,7 @@ def planned():
 
 
 class Bench:
-    """An actuator behind a coil with 2 % of hysteresis, and a second mode that it rings with."""
+    """An actuator behind a coil with 2 % of hysteresis, with a second vibration mode."""
 
     def __init__(self, seed, largest):
         self.random = random = np.random.default_rng((7, seed))
@@ -64,7 +64,7 @@ class Bench:
 
 
 def judged(true, levels):
-    """Return vibration and offset in % of the step, from half a move after each move on."""
+    """Return vibration and steady-state error in % of the step, half a move after each move."""
     found, before = [], 1.0
     for i, (target, span) in enumerate(SETPOINTS):
         own = [t for t, _ in levels if span * i - 1e-3 <= t < span * (i + 1) - 1e-3]

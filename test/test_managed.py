@@ -1,4 +1,4 @@
-"""Managed nodes: their states, from inside and over the services of ROS 2."""
+"""Managed nodes: their states, from inside and through the services of ROS 2."""
 
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.ros
 
 
 class Example(ManagedNode):
-    """Notes what it is asked to do; refuses as long as it is told to."""
+    """Records its calls; refuses while it is configured to."""
 
     def __init__(self, refuse=()):
         super().__init__('example')
@@ -78,7 +78,7 @@ def test_a_node_starts_by_itself_and_goes_through_all_states(ros, serve):
 
 
 class Asked(Example):
-    """Is called in every way while it is cleaned up."""
+    """Is called in every way during clean-up."""
 
     def configure(self):
         super().configure()

@@ -28,14 +28,14 @@ def scene(*joints: str, **options: object) -> Scene:
 
 
 def of(markers: MarkerArray, number: int, joint: str = 'actuator') -> Marker:
-    """Return the one marker of a joint that has an identifier."""
+    """Return a joint's only marker with an identifier."""
     found = [x for x in markers.markers if (x.ns, x.id) == (joint, number)]
     assert len(found) == 1
     return found[0]
 
 
 def length(marker: Marker) -> float:
-    """Return the signed length of an arrow along z, held to be vertical."""
+    """Return the signed length of an arrow, which must be parallel to z."""
     start, end = marker.points
     assert (start.x, start.y) == (end.x, end.y)
     return float(end.z - start.z)

@@ -1,4 +1,4 @@
-"""What our processes ask of the middleware."""
+"""Middleware settings of the package's processes."""
 
 import os
 from pathlib import Path

@@ -37,7 +37,7 @@ TURN = np.exp(2j * np.pi * np.arange(96) / 96)
 
 
 def vibration(move, start, target, errors, delivery=IDEAL):
-    """Return the peak to peak that SciPy finds after arrival on another actuator, as a share."""
+    """Return SciPy's peak-to-peak vibration on another actuator, as a fraction of the step."""
     actual = errors.actual(PAPER)
     stiffer = (1.0 + errors.shear_modulus) / (1.0 + errors.remanence)
     faster = math.sqrt(1.0 + errors.shear_modulus)

@@ -1,4 +1,4 @@
-"""Planner and plant as processes: how they end, how they refuse to start, and their loop."""
+"""Planner and plant as processes: end, refused start, and joint operation."""
 
 import re
 import signal

@@ -1,4 +1,4 @@
-"""The planner at work and whoever reads its record say the same of the same motion."""
+"""The planner and the evaluation of its record reach the same findings for the same motion."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -41,7 +41,7 @@ STALLED = (2, 46, 124, 299)
 
 
 class Drawn:
-    """A randomly drawn experiment: a planner and a simulated device in one loop of 1 ms."""
+    """A random experiment: a planner and a simulated device in one loop of 1 ms."""
 
     def __init__(self, seed: int) -> None:
         draw = random.Random(seed)
@@ -84,7 +84,7 @@ class Drawn:
             plant=block, planner=block, parameters_known=True)
 
     def carry_out(self) -> Run:
-        """Carry it out and return what a recorder would have seen of it."""
+        """Carry it out, and return the run as a recorder would store it."""
         self.runtime.request(Trajectory(('a',), self.points, len(self.points), name='x'))
         plans, commands, verdicts, samples, sensors = [], [], [], [], []
         under_way: list[tuple[int, Send]] = []
@@ -140,7 +140,7 @@ class Drawn:
             verdicts=tuple(verdicts), sensors=tuple(sensors))
 
     def shown(self) -> list[tuple[int, float]]:
-        """Return the samples that come now."""
+        """Return the samples that arrive now."""
         self.waiting += [(x.time, x.stretch[0]) for x in self.device.samples()]
         if self.way == 'unordered' and len(self.waiting) < 7:
             return []
@@ -156,13 +156,13 @@ class Drawn:
 
 @lru_cache(maxsize=8)
 def carried_out(seed: int) -> tuple[Drawn, Run]:
-    """Return an experiment, and what a recorder would have seen of it."""
+    """Return an experiment, and the run as a recorder would store it."""
     drawn = Drawn(seed)
     return drawn, drawn.carry_out()
 
 
 def said(seeds: Iterable[int]) -> set[str]:
-    """Hold what is said online against what is said of the record; return all verdicts."""
+    """Compare online findings with those from the record; return all verdicts."""
     seen = set()
     for seed in seeds:
         drawn, run = carried_out(seed)

@@ -1,4 +1,4 @@
-"""Publishing while other threads run."""
+"""Publishing while other threads are running."""
 
 from itertools import count
 from threading import Event, Thread

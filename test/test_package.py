@@ -1,4 +1,4 @@
-"""What describes the package: setup.py, package.xml, constraints and files must agree."""
+"""Consistency of the package's descriptions: setup.py, package.xml, constraints and files."""
 
 import ast
 from importlib import import_module
@@ -55,7 +55,7 @@ print(json.dumps({
 
 @pytest.fixture(scope='module')
 def setup() -> dict[str, Any]:
-    """Return what setup.py says."""
+    """Return the arguments of setup.py."""
     output = subprocess.run(
         [sys.executable, '-c', READ_SETUP], cwd=ROOT, check=True, capture_output=True,
         text=True).stdout
@@ -86,7 +86,7 @@ def keys(requirements: list[str]) -> set[str]:
 
 
 def imported() -> set[str]:
-    """Return the top-level modules that the package imports, the standard library's not."""
+    """Return the top-level modules that the package imports, without the standard library."""
     modules = set()
     for path in SOURCES:
         for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):

@@ -1,4 +1,4 @@
-"""What may be imported from where: the physics and the bags know no ROS, help is quick."""
+"""Permitted imports: physics and bags do not depend on ROS, and help is quick."""
 
 import ast
 from pathlib import Path
@@ -60,7 +60,7 @@ for name in {names!r}:
 
 
 def imported(package: str) -> set[str]:
-    """Return which other packages of ours the modules of a package import anywhere."""
+    """Return the other packages of this project that a package's modules import."""
     found = set()
     for path in (ROOT / 'hmsa_ros' / package).rglob('*.py'):
         for node in ast.walk(ast.parse(path.read_text())):

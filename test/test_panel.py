@@ -1,4 +1,4 @@
-"""The panel: what it gives to whom, and what it does with real nodes, by its socket."""
+"""The panel: access to its page, and its effects on real nodes through its socket."""
 
 import asyncio
 from http.client import HTTPConnection
@@ -37,7 +37,7 @@ def server(tmp_path_factory):
 
 
 def ask(server, path, method='GET', host='', **headers):
-    """Return status, headers and body of a request with its headers as given."""
+    """Return status, headers and body of the response to a request with given headers."""
     connection = HTTPConnection(server.host, timeout=WAIT_SECONDS)
     connection.putrequest(method, path, skip_host=True)
     for value in (host or server.host).split('|'):
@@ -196,7 +196,7 @@ sys.exit(main(['panel']))
 
 @pytest.fixture
 def panel(start, tmp_path):
-    """Return a starter of a panel with planner and plant, which gives process and address."""
+    """Return a starter of a panel with planner and plant; it returns process and address."""
     def begin(*options):
         start.hmsa('plant')
         # Far ahead, so that a busy machine does not delay commands.
@@ -213,7 +213,7 @@ class Page:
         self._connection = connection
 
     async def until(self, condition):
-        """Return the first frame for which a condition holds."""
+        """Return the first frame for which a condition is true."""
         while (message := await self._connection.read_message()) is not None:
             frame = json.loads(message, parse_constant=pytest.fail)
             if condition(frame):
@@ -233,14 +233,14 @@ class Page:
 
 
 async def opened(address):
-    """Return a page that sees the planner, whose stop it knows."""
+    """Return a page that has discovered the planner and its stop service."""
     page = Page(await connect(address))
     await page.until(lambda x: x['request'] and x['joints'] and x['feedback'] == 'off')
     return page
 
 
 def play(scenario):
-    """Play a scenario to its end."""
+    """Run a scenario to its end."""
     asyncio.run(asyncio.wait_for(scenario, 2.0 * WAIT_SECONDS))
 
 

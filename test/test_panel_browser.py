@@ -1,4 +1,4 @@
-"""The panel in a real browser, with real nodes: what it shows, does and keeps from others."""
+"""The panel in a real browser, with real nodes: display, controls and protection."""
 
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -69,7 +69,7 @@ def test_a_page_of_another_origin_reaches_nothing_even_with_the_address(browser,
 
 
 def press(page, selector):
-    """Click in the middle of an element, as a person does."""
+    """Click in the middle of an element, as a user does."""
     page.wait_for(f'!document.querySelector("{selector}").disabled')
     x, y = page.evaluate(
         f'(() => {{ const one = document.querySelector("{selector}");'

@@ -1,4 +1,4 @@
-"""Parameters: declared once, described, and the files under config/ held against them."""
+"""Parameters: declared once, described, and consistent with the files under config/."""
 
 from dataclasses import replace
 from importlib import import_module

@@ -36,7 +36,7 @@ def force(x):
 
 
 def moved(levels, times, start=1.0, slew=math.inf, lag=0.0, creep=()):
-    """Return stretches at times (s) under levels (s, T), by ramps and lag, each piece by SciPy."""
+    """Return stretches at times (s) under levels (s, T), with ramps and lag, by SciPy."""
     ratios, speeds = [x for x, _ in creep], [TIME / x for _, x in creep]
 
     def motion(t, y, load, slope, begin):
@@ -72,7 +72,7 @@ def moved(levels, times, start=1.0, slew=math.inf, lag=0.0, creep=()):
 
 
 def dense(duration=0.1, count=41, goal=1.4, *, accelerations=False):
-    """Return times in s and points of a smooth path as MoveIt sends one, and its knots."""
+    """Return times in s and points of a smooth path as sent by MoveIt, and its knots."""
     s = np.linspace(0.0, 1.0, count)
     rows = np.array([
         1.0 + (goal - 1.0) * (10.0 * s ** 3 - 15.0 * s ** 4 + 6.0 * s ** 5),
@@ -97,13 +97,13 @@ def sent(draft):
 
 
 def hermite(points):
-    """Return the cubic through points, as a joint_trajectory_controller has it."""
+    """Return the cubic through points, as in a joint_trajectory_controller."""
     return CubicHermiteSpline(
         [t / SECOND for _, t in points], [x[0] for x, _ in points], [x[1] for x, _ in points])
 
 
 def off(draft, path, end, goal, **coil):
-    """Return how far SciPy's motion is off a path, and off its goal afterwards, at most."""
+    """Return the largest deviations of SciPy's motion from a path, and from its goal later."""
     times = np.linspace(0.0, end + 0.05, 4001)
     away = np.abs(moved(sent(draft), times, **coil) - np.where(
         times < end, path(np.minimum(times, end)), goal))

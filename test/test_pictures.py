@@ -1,4 +1,4 @@
-"""Pictures: their size on paper, their formats, colours and data, and the curves of a run."""
+"""Figures: their size on paper, formats, colours and data, and the curves of a run."""
 
 import csv
 import importlib.util
@@ -47,7 +47,7 @@ IMAGES = ROOT / 'docs' / 'images'
 
 
 def cielab(colour: str, vision: np.ndarray) -> np.ndarray:
-    """Return a colour as it is seen."""
+    """Return a colour as perceived with a type of vision."""
     rgb = np.array([int(colour[i:i + 2], 16) / 255 for i in (1, 3, 5)])
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     xyz = np.array([
@@ -119,7 +119,7 @@ def test_curves_of_a_sweep_are_named_by_symbols_and_axes_have_units_or_none() ->
 
 
 def oscillation(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the free motion of a nonlinear oscillator of period `PERIOD`, about."""
+    """Return the approximate free motion of a nonlinear oscillator of period `PERIOD`."""
     rate = 2.0 * np.pi / PERIOD
     found = solve_ivp(
         lambda _, y: (y[1], -rate**2 * (y[0] - 1.1) * (1.0 + 0.5 * (y[0] - 1.1)) - 60.0 * y[1]),
@@ -196,7 +196,7 @@ def test_time_begins_at_the_first_level_of_the_run_and_its_step_is_drawn(tmp_pat
 
 
 def script() -> ModuleType:
-    """Return the script that draws the pictures of the documentation."""
+    """Return the script that draws the figures of the documentation."""
     path = ROOT / 'scripts' / 'draw_docs.py'
     spec = importlib.util.spec_from_file_location('draw_docs', path)
     assert spec is not None
@@ -215,7 +215,7 @@ NEWEST = re.findall(
 
 
 def from_afar(path: Path) -> Image.Image:
-    """Return a picture in shades of grey, eight dots as one."""
+    """Return a figure in shades of grey, with eight dots combined into one."""
     image = Image.open(path).convert('L')
     return image.resize((image.width // 8, image.height // 8), Image.Resampling.BOX)
 

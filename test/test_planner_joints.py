@@ -1,4 +1,4 @@
-"""The planner node with several joints, with late commands, and with one before and after it."""
+"""The planner node with several joints, late commands, and a predecessor and successor."""
 
 from dataclasses import replace
 import math
@@ -50,7 +50,7 @@ QUIET = ('-p', 'use_sim_time:=true', '-p', 'heartbeat_period:=0.0')
 
 
 class Driver:
-    """An actuator and its coil in the hand of the test, which tells what takes effect."""
+    """An actuator and its coil controlled by the test, which reports levels that take effect."""
 
     def __init__(self, ros: Any, joint: str = '', joints: tuple[str, ...] = ('',)) -> None:
         self.actuator = paper_actuator()
@@ -67,7 +67,7 @@ class Driver:
             ros.node, topics.of_joint(topics.FLUX_DENSITY_APPLIED, joint, joints))
 
     def on_command(self, message: Any) -> None:
-        """Take a command, or keep it on its way."""
+        """Accept a command, or keep it in transit."""
         self.received += 1
         if self.hold_back:
             self.held.append(message)
@@ -77,7 +77,7 @@ class Driver:
         self.plant.command(*command)
 
     def release(self) -> None:
-        """Let what was on its way arrive."""
+        """Deliver the commands in transit."""
         self.hold_back = False
         for message in self.held:
             self.received -= 1
@@ -85,7 +85,7 @@ class Driver:
         self.held.clear()
 
     def advance(self, time: int) -> None:
-        """Let the actuator move on, and tell what takes effect."""
+        """Advance the actuator, and report levels that take effect."""
         plant = self.plant
         while (stamp := plant.schedule.next_stamp) is not None and stamp <= time:
             before = plant.schedule.current
@@ -96,21 +96,21 @@ class Driver:
         plant.advance(time)
 
     def sample(self, name: str = 'actuator') -> JointState:
-        """Return the state in force."""
+        """Return the actual state."""
         return JointState(
             header=to_command(self.plant.time, 0.0, '').header, name=[name],
             position=[self.plant.stretch], velocity=[self.plant.rate],
             effort=[self.plant.flux_density])
 
     def residual(self, stretch: float) -> float:
-        """Return how far it is from resting at a stretch."""
+        """Return the deviation from rest at a stretch."""
         frequency = float(natural_frequency(stretch, self.actuator.nondimensional))
         return math.hypot(
             self.plant.stretch - stretch, self.plant.rate * self.actuator.time_unit / frequency)
 
 
 class Rig:
-    """A planner in a thread, simulated time in hand, and drivers of its joints."""
+    """A planner in a thread, simulated time set by the test, and drivers of its joints."""
 
     def __init__(
             self, ros: Any, make_clock: Any, served: Any, joints: tuple[str, ...] = ('',)
@@ -136,7 +136,7 @@ class Rig:
 
     @property
     def runtime(self) -> PlannerRuntime:
-        """What the node connects to the wire."""
+        """The runtime of the node."""
         runtime: PlannerRuntime = self.planner._runtime
         return runtime
 
@@ -147,7 +147,7 @@ class Rig:
         return driver
 
     def at(self, now: int) -> None:
-        """Let time be, and have the planner look."""
+        """Set the time, and have the planner serve."""
         self.clock.set(now)
         self.now = now
 
@@ -173,7 +173,7 @@ class Rig:
         return self.verdict(code=code, request=message.header.frame_id)
 
     def run(self, end: int, step: int = 4 * MS) -> None:
-        """Let time run; each command that is due arrives before it goes on."""
+        """Advance time; each command arrives when it is due."""
         while self.now < end:
             self.at(min(self.now + step, end))
             self.spin(
@@ -192,7 +192,7 @@ class Rig:
 
 @pytest.fixture
 def rig(ros: Any, serve: Any, make_clock: Any) -> Any:
-    """Return a maker of a rig with node arguments."""
+    """Return a factory of a rig with node arguments."""
     def make(*arguments: str, joints: tuple[str, ...] = ('',)) -> Rig:
         named = ('-p', f'joints:=[{", ".join(joints)}]') if len(joints) > 1 else ()
         return Rig(ros, make_clock, serve(PlannerNode, *QUIET, *named, *arguments), joints)
@@ -208,7 +208,7 @@ OTHERS = (
 
 
 def trajectory(names: tuple[str, ...], *points: tuple[float, int]) -> JointTrajectory:
-    """Return a request that differs from joint to joint by a hundredth."""
+    """Return a request with stretches that differ between joints by 0.01."""
     return to_trajectory(
         [([x + 0.01 * JOINTS.index(name) for name in names], t) for x, t in points], names)
 

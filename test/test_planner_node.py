@@ -1,4 +1,4 @@
-"""The planner node on the wire: requests in, command stream, plan and verdicts out."""
+"""The planner node over ROS: requests in; command stream, plan and verdicts out."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -49,7 +49,7 @@ def trajectory(
 
 
 class Bench:
-    """A planner node, simulated time in hand, and the core planner to hold it against."""
+    """A planner node, simulated time set by the test, and the core planner for comparison."""
 
     def __init__(
             self, ros: Any, clock: Any, prefix: str, remapped: dict[str, str]) -> None:
@@ -80,7 +80,7 @@ class Bench:
         return name if name.startswith('/') else f'{namespace}/{name}'
 
     def collect(self, topic: Any) -> list[Any]:
-        """Return the messages of a topic, once its publisher is there."""
+        """Return the list of messages of a topic, once its publisher is discovered."""
         messages: list[Any] = self.ros.collect(topic.type, self.name(topic), topic.qos)
         self.ros.spin_until(
             lambda: self.ros.node.count_publishers(self.name(topic)), self.name(topic))
@@ -91,20 +91,20 @@ class Bench:
         return self.ros.publisher(topic.type, self.name(topic), topic.qos)
 
     def at(self, now: int) -> None:
-        """Let time be, and take the commands that the core planner hands out then."""
+        """Set the time, and take the commands of the core planner."""
         self.clock.set(now)
         self.now = now
         self.take()
 
     def take(self) -> None:
-        """Wait for what the core planner hands out now."""
+        """Wait for the commands that the core planner gives now."""
         self.expected += self.core.due(self.now)
         self.ros.spin_until(
             lambda: len(self.commands) >= len(self.expected),
             f'{len(self.expected)} commands')
 
     def run(self, end: int, step: int = 10 * MS) -> None:
-        """Let time run to an end."""
+        """Advance time to an end."""
         while self.now < end:
             self.at(min(self.now + step, end))
 
@@ -144,10 +144,10 @@ class Bench:
 
     def check(self) -> None:
         """
-        Hold the command stream against the core planner's.
+        Compare the command stream with the core planner's.
 
-        A last setpoint follows on the same topic, so that a message too many would lie before
-        its commands.
+        A last setpoint follows on the same topic, so that an excess message would precede its
+        commands.
         """
         self.at(self.now + 1000 * MS)
         self.setpoint(1.01)
@@ -158,7 +158,7 @@ class Bench:
 
 @pytest.fixture
 def bench(ros: Any, serve: Any, make_clock: Any) -> Callable[..., Bench]:
-    """Return a maker of a bench with node arguments."""
+    """Return a factory of a bench with node arguments."""
     def make(
             *arguments: str, prefix: str = '/planner', now: int = START,
             **remapped: str) -> Bench:

@@ -1,4 +1,4 @@
-"""The plant when things go wrong: silence, strangers, clocks, delays, noise and disturbances."""
+"""The plant under faults: silence, unknown publishers, clocks, delays, noise, disturbances."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -30,7 +30,7 @@ EVERY = QoSProfile(depth=200_000)
 
 
 class Stand:
-    """A plant that leads simulated time and advances by steps, and what it says."""
+    """A plant that publishes time and advances by steps, and its reports."""
 
     def __init__(self, ros: Any, *, node: str = 'plant', subscribers: int = 1) -> None:
         self.ros = ros
@@ -45,7 +45,7 @@ class Stand:
         ros.spin_until(lambda: self.applied, 'the level at the start')
 
     def send(self, *commands: tuple[int, float], publisher: Any = None) -> None:
-        """Send commands and return when the plant has them."""
+        """Send commands, and return when the plant has received them."""
         from rclpy.duration import Duration
         publisher = publisher or self.publisher
         for stamp, flux_density in commands:
@@ -95,7 +95,7 @@ class Stand:
 
 @pytest.fixture
 def stand(ros: Any, serve: Any) -> Callable[..., Stand]:
-    """Return a maker of a stand with node arguments."""
+    """Return a factory of a stand with node arguments."""
     def make(*arguments: str) -> Stand:
         serve(PlantNode, *LEADING, *arguments)
         return Stand(ros)

@@ -1,4 +1,4 @@
-"""The plant node on the wire: stamped commands in, samples of the simulated actuator out."""
+"""The plant node over ROS: timestamped commands in, samples of the simulated actuator out."""
 
 from collections.abc import Callable, Sequence
 import math
@@ -43,7 +43,7 @@ END = START + 100 * MS
 def response(
         commands: Sequence[tuple[int, float]], stamps: Sequence[int], *, start: int = START,
         stretch: float = 1.0, flux_density: float = 0.0) -> tuple[Any, Any]:
-    """Return stretch and rate in 1/s as the core simulates commands from rest."""
+    """Return stretch and rate in 1/s from the core's simulation of commands from rest."""
     unit = ACTUATOR.time_unit
     switches = [0.0, *((x - start) / 1e9 / unit for x, _ in commands)]
     loads = [x / ACTUATOR.flux_density_unit for x in (flux_density, *(y for _, y in commands))]
@@ -54,12 +54,12 @@ def response(
 
 
 def levels(commands: Sequence[tuple[int, float]], stamps: Sequence[int]) -> list[float]:
-    """Return the flux density in force at each stamp."""
+    """Return the flux density in force at each timestamp."""
     return [next((y for x, y in reversed(commands) if x <= t), 0.0) for t in stamps]
 
 
 class Bench:
-    """A plant node, its samples and a line to send commands."""
+    """A plant node, its samples, and a publisher of commands."""
 
     def __init__(self, ros: Any, served: Any) -> None:
         self.ros = ros
@@ -69,23 +69,23 @@ class Bench:
         self.publisher = ros.publisher(command.type, command.name, command.qos)
 
     def collect(self, topic: topics.Topic, qos: QoSProfile | None = None) -> list[Any]:
-        """Return the messages of a topic, once its publisher is there."""
+        """Return the list of messages of a topic, once its publisher is discovered."""
         messages: list[Any] = self.ros.collect(topic.type, topic.name, qos or topic.qos)
         self.ros.spin_until(lambda: self.ros.node.count_publishers(topic.name), topic.name)
         return messages
 
     def send(self, *commands: tuple[int, float]) -> None:
-        """Send commands and return when the plant has them."""
+        """Send commands, and return when the plant has received them."""
         for stamp, flux_density in commands:
             self.publisher.publish(to_command(stamp, flux_density, 'coil'))
         self.delivered()
 
     def delivered(self) -> None:
-        """Return when the plant has all messages."""
+        """Return when the plant has received all messages."""
         assert self.publisher.wait_for_all_acked(Duration(seconds=60))
 
     def pause(self, paused: bool = True) -> None:
-        """Pause the plant or let it go on."""
+        """Pause or resume the plant."""
         answer = self.ros.call(
             SetBool, topics.from_outside(topics.SET_PAUSED.name, 'plant'),
             SetBool.Request(data=paused))
@@ -96,7 +96,7 @@ class Bench:
         return self.ros.call(Trigger, topics.from_outside(service.name, 'plant'))
 
     def step(self) -> int:
-        """Make one step and return the time in ns that it led to."""
+        """Make one step, and return the resulting time in ns."""
         known = len(self.samples)
         answer = self.trigger(topics.STEP)
         assert answer.success
@@ -106,23 +106,23 @@ class Bench:
         return self.stamps()[-1]
 
     def stamps(self) -> list[int]:
-        """Return the samples' stamps in ns."""
+        """Return the samples' timestamps in ns."""
         return [from_time(x.header.stamp) for x in self.samples]
 
     def wait(self, stamp: int) -> None:
-        """Wait for a sample with a stamp, or a later one."""
+        """Wait for a sample with a timestamp, or a later one."""
         self.ros.spin_until(
             lambda: self.samples and from_time(self.samples[-1].header.stamp) >= stamp,
             f'the sample at {stamp} ns')
 
     def run(self, end: int) -> None:
-        """Let the plant run at least until an end, and pause it."""
+        """Run the plant at least until an end, and pause it."""
         self.pause(False)
         self.wait(end)
         self.pause()
 
     def check(self, commands: Sequence[tuple[int, float]], **start: Any) -> None:
-        """Hold the samples against the core's simulation of commands."""
+        """Compare the samples with the core's simulation of commands."""
         stamps = self.stamps()
         stretches, rates = response(commands, stamps, **start)
         np.testing.assert_allclose(
@@ -148,7 +148,7 @@ class Bench:
 
 @pytest.fixture
 def bench(ros: Any, serve: Any) -> Callable[..., Bench]:
-    """Return a maker of a bench with node arguments."""
+    """Return a factory of a bench with node arguments."""
     def make(*arguments: str) -> Bench:
         return Bench(ros, serve(PlantNode, *arguments))
     return make
@@ -156,7 +156,7 @@ def bench(ros: Any, serve: Any) -> Callable[..., Bench]:
 
 @pytest.fixture
 def leading(bench: Callable[..., Bench]) -> Bench:
-    """Return a plant that leads simulated time, paused at its start."""
+    """Return a plant that publishes simulated time, paused at its start."""
     return bench(*LEADING)
 
 
@@ -201,7 +201,7 @@ BAD = {
 
 
 def bad_command(name: str) -> Any:
-    """Return a bad command, which would supersede all others."""
+    """Return a bad command, which would replace all others."""
     x, y, z, sign = BAD[name]
     message = to_command(sign * START, z, 'coil')
     message.magnetic_field.x, message.magnetic_field.y = x, y

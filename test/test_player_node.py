@@ -36,7 +36,7 @@ RELIABLE = (Qos(),)
 
 
 def write_bag(folder, entries, profiles=RELIABLE):
-    """Write (topic, milliseconds, value) entries; topics with 'command' carry fields."""
+    """Write (topic, milliseconds, value) entries; topics with 'command' contain fields."""
     with BagWriter(folder) as writer:
         numbers = {}
         for i, (name, milliseconds, value) in enumerate(entries):

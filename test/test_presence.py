@@ -1,4 +1,4 @@
-"""Two planners, plants or drivers of one joint are noticed, refused and named."""
+"""Two planners, plants or drivers of one joint are detected, refused and named."""
 
 import json
 
@@ -22,7 +22,7 @@ TWO_PLANNERS = '2 planners (/planner and /planner): stop one'
 
 
 class Asking:
-    """Asks a planner for a stretch again and again, and reads verdicts and diagnostics."""
+    """Requests a stretch from a planner repeatedly, and reads verdicts and diagnostics."""
 
     def __init__(self, ros):
         self.verdicts, self.reports = [], {}
@@ -38,7 +38,7 @@ class Asking:
         self.reports |= {x.name.partition(': commands')[0]: x for x in message.status}
 
     def until(self, *, refused: bool) -> Verdict:
-        """Ask until it is refused, as there are several, or until it is not."""
+        """Repeat the request until it is refused for several planners, or accepted."""
         del self.verdicts[:]
         setpoint = endpoints.interface_class(topics.SETPOINT.type)(data=1.1)
         again = self._ros.node.create_timer(0.05, lambda: self._setpoint.publish(setpoint))

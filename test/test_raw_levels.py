@@ -1,4 +1,4 @@
-"""Levels sent as they are: checked against limits, carried out to the letter, ended at rest."""
+"""Levels sent unchanged: checked against limits, executed exactly, ended at rest."""
 
 import csv
 import json
@@ -30,7 +30,7 @@ def planned(levels, **options):
 
 
 def followed(plan, end=0.3):
-    """Return the stretch from the first level on, as SciPy has it."""
+    """Return SciPy's stretch from the first level on."""
     levels = [x for x in plan.levels if x.stamp > 0]
     times = (np.array([x.stamp for x in levels]) - levels[0].stamp) / SECOND
     fields = np.array([x.flux_density for x in levels])

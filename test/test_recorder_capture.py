@@ -1,4 +1,4 @@
-"""Taking raw messages off subscriptions, and the simulated time they are stamped with."""
+"""Raw messages taken from subscriptions, and their simulated timestamps."""
 
 from pathlib import Path
 

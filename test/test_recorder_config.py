@@ -1,4 +1,4 @@
-"""The parameter files of recorder and player against what the nodes declare."""
+"""Consistency of the parameter files of recorder and player with the nodes."""
 
 from pathlib import Path
 

@@ -35,7 +35,7 @@ TALKER = Path(__file__).parent / 'talker.py'
 
 
 class Recorder:
-    """A recorder process and what it says of itself."""
+    """A recorder process with its diagnostics."""
 
     def __init__(self, start, ros, folder, *parameters, topics='/a'):
         self.folder = folder
@@ -207,7 +207,7 @@ def test_a_bag_is_recovered_after_kill_9(record, ros, tmp_path):
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """Return a file system of three megabytes, most of it taken by the file "filler"."""
+    """Return a file system of three megabytes, mostly filled by the file "filler"."""
     folder = tmp_path / 'disk'
     folder.mkdir()
     command = ['mount', '-t', 'tmpfs', '-o', 'size=3m', 'tmpfs', str(folder)]

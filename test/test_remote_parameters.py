@@ -1,4 +1,4 @@
-"""Parameters of other nodes: asked for until they have come."""
+"""Parameters of other nodes, requested until they arrive."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Repeats of runs, compared by mean and spread."""
+"""Repeated runs, compared by mean and standard deviation."""
 
 import csv
 from dataclasses import replace
@@ -17,7 +17,7 @@ MODULI = {'before': (1.02, 1.04, 1.06), 'after': (0.999, 1.0, 1.001)}
 
 @pytest.fixture(scope='module')
 def folders(tmp_path_factory):
-    """Return two folders as hmsa run --repeat writes them, of plants of differing stiffness."""
+    """Return two folders as from hmsa run --repeat, of plants with different stiffness."""
     folder = tmp_path_factory.mktemp('repeats')
     for name, factors in MODULI.items():
         for i, factor in enumerate(factors, 1):

@@ -1,4 +1,4 @@
-"""The report: what it says against what is in the bag, and that the page needs nothing else."""
+"""The report: results against the contents of the bag, in a self-contained page."""
 
 import csv
 from dataclasses import asdict, replace
@@ -115,7 +115,7 @@ def status(level, code, message, stretch='', **more):
 
 
 def parameters(**nodes):
-    """Return what the recorder stores of the nodes' actuators."""
+    """Return the recorded parameters of the nodes' actuators."""
     return {
         f'{node}.{name}': json.dumps(value) for node, actuator in nodes.items()
         for name, value in {
@@ -125,7 +125,7 @@ def parameters(**nodes):
 
 @cache
 def of_the_paper():
-    """Return the messages of the paper's sequence, which nobody may change."""
+    """Return the messages of the paper's sequence, which must not be modified."""
     return tuple(fresh())
 
 
@@ -177,7 +177,7 @@ def fresh(
 
 
 def payload(message, kind):
-    """Return a message as it is stored; bytes are stored as they are."""
+    """Return a message in its stored form; bytes are stored unchanged."""
     return message if isinstance(message, bytes) else bytes(STORE.serialize_cdr(message, kind))
 
 
@@ -185,9 +185,9 @@ def write(
         folder, messages, *, chunk_size=2**20, definitions=(), published=MappingProxyType({}),
         **custom_data):
     """
-    Write a bag as this package's recorder does, but for some types' definitions.
+    Write a bag as this package's recorder does, except for definitions of some types.
 
-    Messages were published when they were recorded, or at other times, by those.
+    Messages are published when they are recorded, or at other given times.
     """
     with BagWriter(folder, custom_data=custom_data, chunk_size=chunk_size) as writer:
         numbers = {}
@@ -224,7 +224,7 @@ def parts_of(*bags, **options):
 
 
 def one(folder, messages, **custom_data):
-    """Write a bag and return its run, evaluated."""
+    """Write a bag, and return its evaluated run."""
     part, = parts_of(write(folder, messages, **custom_data))
     return part
 
@@ -244,7 +244,7 @@ def test_a_path_is_one_setpoint_which_is_judged_from_its_end_on(tmp_path):
 
 
 class Page(HTMLParser):
-    """What a page consists of."""
+    """The elements of a page."""
 
     def __init__(self, text):
         super().__init__()
@@ -546,7 +546,7 @@ def test_a_recorder_on_another_clock_leaves_lead_and_delay_open(tmp_path):
 
 
 def applied(messages, late=0, space=''):
-    """Return what a plant tells of the commands: the level at the start and each change."""
+    """Return a plant's reports on commands: the initial level and each change."""
     topic, kind = f'{space}/{APPLIED}', TYPES[APPLIED]
     return [(START, topic, kind, command(START, 0.0))] + [
         (time + LEAD, topic, kind, command(time + LEAD + late, x.magnetic_field.z))
@@ -658,7 +658,7 @@ def test_the_field_of_a_driver_that_measures_none_is_what_it_applied(tmp_path):
 
 
 def of_several_joints(names, plants):
-    """Return a run of several joints, one topic a joint and one message of all their states."""
+    """Return a run of several joints, with a topic for each and one for all states."""
     runs = [simulated(plant=x) for x in plants]
     messages = []
     for name, run in zip(names, runs, strict=True):
@@ -702,7 +702,7 @@ def test_each_joint_of_a_planner_of_several_is_a_run(tmp_path, bag):
 # Bags of all kinds ---------------------------------------------------------------------------
 
 def write_with_rosbags(folder, messages):
-    """Write a bag as a stranger does, without the parameters of any node."""
+    """Write a bag as another program does, without node parameters."""
     with RosbagsWriter(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connections = {}
         for time, topic, kind, message in sorted(messages, key=lambda x: x[0]):
@@ -845,7 +845,7 @@ def test_a_slew_limit_that_is_none_is_not_taken_for_one(tmp_path, text, reached)
 
 
 def of_another_definition(folder, role):
-    """Write a run, one type of which is something else in it."""
+    """Write a run in which one type has another definition."""
     setpoint = STORE.types[TYPES[SETPOINT]](data=1.1)
     return write(
         folder, [*simulated(), (START, '/planner/setpoint', TYPES[SETPOINT], setpoint)],
@@ -1142,7 +1142,7 @@ def test_the_command_writes_page_and_pictures_and_names_them(bag, tmp_path, caps
 
 
 def rounded(messages):
-    """Return messages with the commands of hardware that sets steps of 1e-4 of 20 mT."""
+    """Return messages with the commands of hardware with steps of 1e-4 of 20 mT."""
     for _, topic, _, x in messages:
         if topic.endswith('command'):
             x.magnetic_field.z = 2e-6 * round(x.magnetic_field.z / 2e-6)
@@ -1412,7 +1412,7 @@ def test_a_parameter_file_says_what_the_block_really_is(tmp_path):
 
 
 def _bad(tmp_path, case):
-    """Return arguments that cannot be used and what is said of them."""
+    """Return arguments that are refused, and the message."""
     good = tmp_path / 'good'
     write(good, simulated(((1.1, 10.0),)))
     if case == 'nothing there':

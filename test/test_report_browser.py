@@ -1,4 +1,4 @@
-"""The report's page in a real browser: plots, clicks, phones and the dark."""
+"""The report's page in a real browser: plots, clicks, phones and dark mode."""
 
 from dataclasses import replace
 
@@ -54,7 +54,7 @@ def files(bags, tmp_path_factory):
 
 
 def drawn(opened):
-    """Draw all figures and return the keys of those that have curves on the screen."""
+    """Draw all figures, and return the keys of those with visible curves."""
     opened.evaluate(DRAW_ALL)
     opened.wait_for(
         '[...document.querySelectorAll(".plot")].every(x => x.querySelector(".main-svg"))')

@@ -1,4 +1,4 @@
-"""The example for ros2_control over topics: its files, its bridge, and what the way costs."""
+"""The example for ros2_control over topics: its files, its bridge, and its accuracy."""
 
 import importlib.util
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A whole experiment with one command: what it measures, what it refuses, and how it ends."""
+"""A complete experiment with one command: measurements, refusals, and end."""
 
 import json
 import re

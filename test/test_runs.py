@@ -1,4 +1,4 @@
-"""A run as a record: parameters from files, verification, tables, and files that stay whole."""
+"""A run as a record: parameters from files, verification, tables, and intact files."""
 
 import csv
 from dataclasses import replace
@@ -33,7 +33,7 @@ STEP = 1_000_000
 
 
 def moved(*, applied=True, commands=((10, 0.01),), creep=None, told=None):
-    """Return a run of 100 samples in which commands, (sample, T), were obeyed or not."""
+    """Return a run of 100 samples whose commands, (sample, T), were obeyed or not."""
     simulation = ActuatorSimulation(paper_actuator(), time=BEGIN, creep=creep)
     levels = [Level(BEGIN + at * STEP, flux, BEGIN) for at, flux in commands]
     rows = []

@@ -1,4 +1,4 @@
-"""A planner that learns from samples: a simulated device, without ROS."""
+"""A planner with feedback: a simulated device, without ROS."""
 
 from dataclasses import replace
 from functools import partial
@@ -41,7 +41,7 @@ def commands(loop):
 
 
 def left(truth, begin, end, target, step):
-    """Return vibration and offset between two times in ms after the start, as shares of a step."""
+    """Return vibration and steady-state error between times in ms, as fractions of a step."""
     seen = truth[(truth[:, 0] >= START + begin * MS) & (truth[:, 0] < START + end * MS), 1]
     return np.ptp(seen) / step, (np.mean(seen) - target) / step
 
@@ -101,7 +101,7 @@ def test_adapting_knows_the_creep_of_the_block(factor):
 
 
 def moved(loop, target):
-    """Go to a target; return the setpoint as planned first, and the true stretch."""
+    """Move to a target; return the setpoint as planned first, and the true stretch."""
     loop.runtime.request(Target('a', target))
     return loop.runtime.group.planners['a'].plan.segments[-1], loop.run((target, 500 * MS))
 

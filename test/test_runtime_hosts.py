@@ -12,18 +12,18 @@ BEATING = replace(QUIET, heartbeat_period=200 * MS)
 
 
 class Bench(Rig):
-    """A rig whose device gives receipts, has a clock of its own, and may be cut off."""
+    """A rig whose device sends receipts, has its own clock, and may be cut off."""
 
     def __init__(self, *, settings=BEATING, **options):
         super().__init__(settings=settings, **options)
         self.runtime.surroundings.glance = self.glance
-        self.ahead = 0  # of the device's clock
+        self.ahead = 0  # lead of the device's clock
         self.linked = True
         self.cut = False
         self.refused = []
-        self.lost = False  # whether the samples show the actuator at rest without a field
+        self.lost = False  # whether samples show rest without a field
         self.samples = True
-        self.hears = True  # whether commands arrive where the link works
+        self.hears = True  # whether commands arrive while the link works
         self._newest = 0
         self._next = START
 
@@ -51,13 +51,13 @@ class Bench(Rig):
             self.runtime.received('a', self.now + self.ahead, self._newest, cut_off=self.cut)
 
     def cut_off(self):
-        """Lose the device, whose watchdog switches the coil off."""
+        """Disconnect the device, whose watchdog switches the coil off."""
         self.linked, self.cut = False, True
         self.plant.command(self.now, 0.0)
         self.plant.advance(self.now)
 
     def come_back(self):
-        """Have the link again, and what the device has told about its coil."""
+        """Reconnect, and deliver the device's reports on its coil."""
         self.linked, self.wire = True, []
         self.runtime.applied('a', self.plant.time - 1, 0.0)
 

@@ -1,4 +1,4 @@
-"""A planner at work without ROS: late commands, take-over, signs of life, long trajectories."""
+"""A planner at work without ROS: late commands, take-over, heartbeats, long trajectories."""
 
 from dataclasses import replace
 import math
@@ -44,7 +44,7 @@ def trajectory(*points, joints=('a',), stamp=None, name=''):
 
 
 class Rig:
-    """A runtime and actuators that obey it, whose commands may be held back on their way."""
+    """A runtime and actuators that obey it, with transport delay of commands."""
 
     def __init__(self, *, settings=QUIET, joints=('a',), blocks=None, **options):
         self.options = Options(flux_density_min=-0.5, flux_density_max=0.5, **options)
@@ -111,7 +111,7 @@ class Rig:
         return new
 
     def deliver(self):
-        """Let arrive what is no longer on its way."""
+        """Deliver the commands that are no longer in transit."""
         if self.hold_back:
             return
         arrived = [x for x in self.wire if x[0] <= self.now]
@@ -123,7 +123,7 @@ class Rig:
             plant.command(stamp + delay, x.flux_density)
 
     def advance(self):
-        """Let the actuators move on, and tell what takes effect."""
+        """Advance the actuators, and report levels that take effect."""
         for name, plant in self.plants.items():
             now = self.now - self.set_by
             while (stamp := plant.schedule.next_stamp) is not None and stamp <= now:
@@ -255,7 +255,7 @@ def test_what_is_done_with_a_plan_before_it_is_taken_makes_no_command_late(monke
 
 
 def zigzag(count, name='long', hold=HOLD, **more):
-    """Return a long request that makes its points one by one."""
+    """Return a long request that generates its points one by one."""
     return Trajectory(
         ('a',), (((1.1 + 0.1 * (k % 2),), (k + 1) * hold) for k in range(count)), count,
         name=name, **more)

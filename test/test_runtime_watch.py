@@ -1,4 +1,4 @@
-"""What a planner says of arrivals that are measured: by a simulated device, without ROS."""
+"""The planner's findings on measured arrivals, with a simulated device, without ROS."""
 
 from dataclasses import replace
 import math

@@ -1,4 +1,4 @@
-"""A bench supply with SCPI commands: in memory, and over TCP with what lines do."""
+"""A bench supply with SCPI commands: in memory, and over TCP with line faults."""
 
 import socket
 from threading import Thread
@@ -28,7 +28,7 @@ def serve(supply, server, spoil):
 
 @pytest.fixture
 def tcp():
-    """Return a supply, its port, and a list whose entries each spoil one answer."""
+    """Return a supply, its port, and a list whose entries each modify one answer."""
     supply, faults = SimulatedSupply(), []
     server = socket.create_server(('127.0.0.1', 0))
     thread = Thread(daemon=True, target=serve, args=(

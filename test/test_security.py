@@ -1,8 +1,8 @@
 """
-Who may do what: the policies of config/security against their schema and the nodes' real graph.
+Permissions: the policies of config/security against their schema and the nodes' real graph.
 
-The schema is that of SROS 2's policies, version 0.2.0. The graph is read from running nodes: what
-they publish, subscribe, serve and call must be granted, and nothing else.
+The schema is that of SROS 2's policies, version 0.2.0. The graph is read from running nodes: their
+publishers, subscriptions, services and clients must be permitted, and nothing else.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -40,7 +40,7 @@ PARAMETERS = ('set_parameters', 'set_parameters_atomically', 'change_state')
 
 
 def children(element: ElementTree.Element, tag: str) -> list[ElementTree.Element]:
-    """Return the children, all of which must have a tag, and of which there must be one."""
+    """Return the children, of which there must be at least one, all with a tag."""
     found = list(element)
     assert found, f'{element.tag} is empty'
     assert {x.tag for x in found} == {tag}
@@ -56,7 +56,7 @@ def full_name(name: str, namespace: str, node: str) -> str:
 
 
 def grants(policy: ElementTree.Element) -> dict[str, set[Grant]]:
-    """Return what each enclave may do, held against the schema on the way."""
+    """Return the permissions of each enclave, and check the schema."""
     assert policy.tag == 'policy'
     assert policy.attrib == {'version': VERSION}
     (enclaves,) = children(policy, 'enclaves')
@@ -92,7 +92,7 @@ GRANTS = grants(POLICY)
 
 
 def used(side: RosSide, node: str) -> set[Grant]:
-    """Return what a running node does."""
+    """Return the entities used by a running node."""
     found: set[Grant] = set()
     for permission, look in (
             ('publish', side.node.get_publisher_names_and_types_by_node),
@@ -106,7 +106,7 @@ def used(side: RosSide, node: str) -> set[Grant]:
 def watch(
         side: RosSide, nodes: Iterable[str], seen: dict[str, set[Grant]],
         complete: Callable[[], Any], what: str) -> None:
-    """Gather what nodes do until a condition holds."""
+    """Collect the entities used by nodes until a condition is true."""
     def gathered() -> bool:
         running = {name for name, namespace in side.node.get_node_names_and_namespaces()}
         for node in nodes:
@@ -125,7 +125,7 @@ def watch(
 
 
 def enclave_of(node: str) -> set[Grant]:
-    """Return what a node of this package may do."""
+    """Return the permissions of a node of this package."""
     return GRANTS[f'/hmsa/{node}'] - FOLLOW
 
 

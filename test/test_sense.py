@@ -1,4 +1,4 @@
-"""Stretch out of the messages of sensors of other packages."""
+"""Stretch from the messages of sensors in other packages."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def test_a_reference_may_be_as_long_as_it_likes():
 
 
 def filled(kind):
-    """Return a message whose fields of a reading are 1, 2, 3."""
+    """Return a message whose reading has the fields 1, 2, 3."""
     message = interface_class(kind)()
     if kind == STATES:
         message.name, message.position = ['a', 'b'], [1.0, 2.0]

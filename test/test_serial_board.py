@@ -1,4 +1,4 @@
-"""The serial board: firmware, line and driver, with what boards and cables do to them."""
+"""The serial board: firmware, line and driver, with faults of boards and cables."""
 
 import errno
 from functools import partial
@@ -214,7 +214,7 @@ def driver(line, **settings):
 
 
 def go_on(device, done, what):
-    """Have a device go on until something is done."""
+    """Advance a device until a condition is true."""
     wait_until(lambda: device.advance(time_ns()) or done(), what)
 
 

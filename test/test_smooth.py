@@ -88,7 +88,7 @@ def judged(levels, state, end, force=gent, slew=math.inf, lag=0.0, creep=None):
 
 
 def left(move, request, force=gent):
-    """Return how far from rest a move leaves the block, and its path."""
+    """Return the deviation from rest after a move, and its path."""
     end = max(move.duration, move.levels[-1].time)
     path = judged(
         [(x.time, x.load) for x in move.levels], request.state, end + 1e-6, force,

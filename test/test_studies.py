@@ -1,4 +1,4 @@
-"""The studies: residuals under errors of the model, sampled hardware, heavy damping, sweeps."""
+"""Studies: residuals for parameter errors, sampled hardware, heavy damping, sweeps."""
 
 import csv
 from dataclasses import replace
@@ -195,7 +195,7 @@ def test_steady_offset_is_no_residual(small):
 
 
 def left(result, case, errors):
-    """Return the residual of a result's move for some errors."""
+    """Return the residual of a result's move for parameter errors."""
     return Actual.off(MATERIAL, errors).residual(
         result.move, case.start, case.target, result.arrival)
 
@@ -246,7 +246,7 @@ def test_shapers_that_fall_back_or_refuse_say_so():
 
 @pytest.fixture
 def lost(monkeypatch):
-    """Return a study in which the motion is lost wherever zeta is too large."""
+    """Return a study in which the simulation fails if zeta is too large."""
     case = Case(1.0, 1.1)
     whole = Actual.residual
 

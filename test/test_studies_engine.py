@@ -1,4 +1,4 @@
-"""Studies in chunks: the same table whatever computes them, and nothing lost on the way."""
+"""Studies in chunks: the same table however it is computed, without losses."""
 
 from concurrent.futures import ThreadPoolExecutor
 import os

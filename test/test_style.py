@@ -1,4 +1,4 @@
-"""Rules of this project that ruff does not know."""
+"""Rules of this project that ruff does not cover."""
 
 import ast
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 def name_of(path: Path) -> str:
-    """Return a path as it reads from the root of the repository."""
+    """Return a path relative to the root of the repository."""
     return str(path.relative_to(ROOT))
 
 
@@ -35,7 +35,7 @@ def nodes(path: Path) -> tuple[ast.AST, ...]:
 
 
 def public_functions(path: Path) -> Iterator[Function]:
-    """Walk the functions and methods that a user of a module can call."""
+    """Yield the functions and methods that are public in a module."""
     pending: list[ast.stmt] = tree(path).body
     while pending:
         node, *pending = pending
@@ -46,7 +46,7 @@ def public_functions(path: Path) -> Iterator[Function]:
 
 
 def own_nodes(function: Function) -> Iterator[ast.AST]:
-    """Walk a function's body without what it defines and what it may catch itself."""
+    """Yield a function's nodes, without nested definitions and bodies with handlers."""
     pending: list[ast.AST] = list(function.body)
     while pending:
         node = pending.pop()

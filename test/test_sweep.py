@@ -1,4 +1,4 @@
-"""Sweeps over laws, shapers, samples and SI parameters, each against plans made one by one."""
+"""Sweeps over laws, shapers, samples and SI parameters, compared with individual plans."""
 
 import csv
 import json
@@ -67,7 +67,7 @@ def run(capsys, tmp_path, monkeypatch):
 
 
 def planned(run, path, target, shaper):
-    """Return what hmsa plan says of a move, None where it refuses."""
+    """Return the move planned by hmsa plan, None if refused."""
     status, out, _ = run('plan', f'{target}:100', '--params-file', path, '--shaper', shaper,
                          '--json')
     return None if status else json.loads(out)['segments'][0]

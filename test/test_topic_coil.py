@@ -1,4 +1,4 @@
-"""Coils behind topics of other packages: arrays, numbers and vectors, and how they are left."""
+"""Coils behind topics of other packages: arrays, numbers and vectors, and their closing."""
 
 import signal
 

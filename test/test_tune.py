@@ -1,4 +1,4 @@
-"""Tuning: what is chosen, what is refused, and moves that no longer vibrate."""
+"""Tuning: choices, refusals, and moves without vibration."""
 
 from dataclasses import replace
 import json
@@ -43,7 +43,7 @@ WORSE = """\
 
 
 def known(std: float) -> Known:
-    """Return that the example block is known to a relative standard deviation."""
+    """Return knowledge of the example block with a relative standard deviation."""
     block = paper_actuator()
     values = (block.shear_modulus, block.damping_coefficient)
     return Known(('shear_modulus', 'damping_coefficient'), values,

@@ -1,4 +1,4 @@
-"""The package's types, by mypy: here, so that it runs beside the other tests."""
+"""Types of the package, checked with mypy as a test, in parallel with the others."""
 
 from pathlib import Path
 import subprocess

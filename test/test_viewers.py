@@ -1,8 +1,8 @@
 """
-What viewers are given: the files of config/ against the topics of the package, and Rerun.
+Files for viewers in config/, compared with the package's topics, and Rerun.
 
-The viewers themselves are no Python packages, so that their files are held against what their
-readers ask for; Rerun's is shown a bag if rerun-sdk is installed.
+The viewers are not Python packages, so their files are compared with the requirements of their
+readers. Rerun shows a bag if rerun-sdk is installed.
 """
 
 from collections.abc import Iterator, Mapping
@@ -52,7 +52,7 @@ PLOT_STYLES = {'Lines', 'Dots', 'LinesAndDots', 'Sticks', 'Steps', 'StepsInv'}
 
 
 def by_name() -> Mapping[str, topics.Topic]:
-    """Return the topics by full name, of one joint and no namespace."""
+    """Return the topics by full name, for one joint without namespace."""
     found = {}
     for topic in vars(topics).values():
         if isinstance(topic, topics.Topic):
@@ -70,7 +70,7 @@ def services() -> Mapping[str, topics.Service]:
 
 
 def field(type_name: str, path: str) -> None:
-    """Follow a path of fields, as ``points[:].positions[0]``, through a message type."""
+    """Follow a path of fields, such as ``points[:].positions[0]``, through a message type."""
     kind = interface_class(type_name)
     message: Any = kind()
     for part in path.split('.'):
@@ -86,7 +86,7 @@ def field(type_name: str, path: str) -> None:
 
 
 def classes(value: Any) -> Iterator[str]:
-    """Return every class that an RViz file names."""
+    """Yield every class named in an RViz file."""
     if isinstance(value, dict):
         if value.get('Class'):
             yield value['Class']
@@ -263,7 +263,7 @@ def test_without_rerun_it_is_asked_for_in_one_line(tmp_path, capfd, monkeypatch)
 
 @pytest.fixture
 def rerun_program() -> list[str]:
-    """Return Rerun's program, which comes with rerun-sdk."""
+    """Return the executable of Rerun in rerun-sdk."""
     pytest.importorskip('rerun', reason='rerun-sdk is not installed')
     return [sys.executable, '-m', 'rerun']
 

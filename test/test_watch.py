@@ -1,4 +1,4 @@
-"""The live view: what it shows of which scene, and the whole of it on a terminal."""
+"""The live view: its display of scenes, and all of it on a terminal."""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -200,7 +200,7 @@ def test_json_has_null_for_what_is_not_known():
 # The command ---------------------------------------------------------------------------------
 
 class Terminal:
-    """``hmsa watch`` on a terminal of its own."""
+    """``hmsa watch`` on a separate terminal."""
 
     def __init__(self, env, *words, columns=80, rows=24, **more):
         self.file, theirs = pty.openpty()

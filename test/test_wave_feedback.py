@@ -1,4 +1,4 @@
-"""Waves that feedback keeps at their amplitude and mean, on a plant that SciPy integrates."""
+"""Waves whose amplitude and mean are maintained by feedback, on a plant integrated by SciPy."""
 
 import math
 
@@ -23,7 +23,7 @@ EXACT = {'g': 1.0, 'damping': 1.0, 'remanence': 1.0, 'creep': 0.0}
 
 
 class Plant:
-    """The paper's block with other parameters, which may change at any time."""
+    """The paper's block with other parameters, which may change over time."""
 
     def __init__(self, **parameters):
         self.parameters = EXACT | parameters
@@ -53,7 +53,7 @@ class Plant:
 
 
 class Run:
-    """A wave of the stretch that is sent as a path, and what comes of it."""
+    """A wave sent as a path, and its result."""
 
     def __init__(self, plant, share, *, shape='sine', cycles=10, noise=1e-4, feedback='adapt'):
         self.plant, self.noise, self.begin, self.now = plant, noise, 0, SECOND
@@ -77,7 +77,7 @@ class Run:
         self.begin = self.planner.plan.segments[0].since
 
     def go(self, seconds):
-        """Go on for a time in s from the begin of the wave."""
+        """Advance to a time in s from the begin of the wave."""
         while self.now < self.begin + seconds * SECOND:
             for x in self.runtime.tick(self.now):
                 if isinstance(x, Send):
@@ -99,13 +99,13 @@ class Run:
 
     @property
     def off(self):
-        """Return times in s and how far off the wave the actuator is, as shares of it."""
+        """Return times in s and deviations from the wave, as fractions of the amplitude."""
         times, stretch = np.array(self.truth).T
         times = (times - self.begin) / SECOND
         return times, (stretch - np.interp(times, self.times, self.wanted)) / AMPLITUDE
 
     def kept(self, first, last):
-        """Return amplitude and mean from one cycle to another, as errors in shares of it."""
+        """Return relative errors of amplitude and mean between two cycles."""
         times, stretch = np.array(self.truth).T
         turns = (times - self.begin) / SECOND * self.frequency
         inside = (turns >= first) & (turns < last)

@@ -21,7 +21,7 @@ _OF_EACH, _CYCLES = 64, 6
 
 
 def spectrum(plan, frequency, fade, mean=1.0, **coil):
-    """Return the amplitudes at multiples of a frequency and between, and what is left after."""
+    """Return the amplitudes at multiples of a frequency and between, and the error after it."""
     times = fade / frequency + np.arange(_CYCLES * _OF_EACH) / (_OF_EACH * frequency)
     end = plan.move_times[-1]
     stretch = moved(plan.levels.tolist(), np.append(
