@@ -1,4 +1,4 @@
-"""Harmless feedback: effects that samples cannot show are not learned, and can be reverted."""
+"""Harmless feedback: effects that samples cannot show are not learnt, and can be reverted."""
 
 from dataclasses import replace
 import math

@@ -1,1 +1,1 @@
-"""What a planner does at work, without ROS: requests and news in, commands and verdicts out."""
+"""A planner at work, without ROS: from requests, receipts and samples to commands and verdicts."""

@@ -55,7 +55,7 @@ class Devices:
     # -- silence -------------------------------------------------------------------------------
 
     @property
-    def deaf(self) -> bool:
+    def all_silent(self) -> bool:
         """Whether all devices have fallen silent."""
         return bool(self.receipts.silent) and self.receipts.silent >= self._planners.keys()
 
@@ -214,7 +214,7 @@ class Devices:
             Severity.ERROR, code,
             f'{words}, and the next request starts from where the actuator is then')
 
-    def holds(self, settings: Settings) -> bool:
+    def must_wait(self, settings: Settings) -> bool:
         """
         Return whether planning must wait until a cut-off device obeys and commands arrive.
 

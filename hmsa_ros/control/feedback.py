@@ -1,4 +1,4 @@
-"""Feedback: estimates from samples, and models learned from them."""
+"""Feedback: estimates from samples, and models learnt from them."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -216,7 +216,7 @@ class Feedback:
              'used_by_plans': joint.adapts and joint.acting is not None,
              'corrections': self.corrections}))
 
-    # -- what comes of them --------------------------------------------------------------------
+    # -- results -------------------------------------------------------------------------------
 
     def audit(self, name: str, hold: Hold) -> None:
         """Audit a setpoint of a joint, once all samples that have arrived are processed."""

@@ -221,7 +221,7 @@ class Following:
         return f'{self.lateness.words()}; ' + (
             self.clocks or self.lateness.advice(self._lead_time))
 
-    # -- plans made anew -----------------------------------------------------------------------
+    # -- replanning ----------------------------------------------------------------------------
 
     def to_resume(self) -> list[str]:
         """Return the joints whose plan may have to be replanned."""

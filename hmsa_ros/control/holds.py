@@ -102,7 +102,7 @@ class Hold:
 
     # -- samples -------------------------------------------------------------------------------
 
-    def lacks(self, stamp: int, steady: int) -> bool:
+    def needs(self, stamp: int, steady: int) -> bool:
         """Return whether a sample is needed; old timestamps announce newer samples."""
         if self.over:
             return False

@@ -81,7 +81,7 @@ class Lateness:
         self.largest = max(self.largest, late)
         self._missed = True
 
-    # -- what is expected ----------------------------------------------------------------------
+    # -- prediction ----------------------------------------------------------------------------
 
     def _likely(self) -> tuple[list[int], list[int]]:
         """Return the usual lateness in ns, sorted, and the newest one if it is an exception."""

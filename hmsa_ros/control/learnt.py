@@ -1,4 +1,4 @@
-"""Learned parameters of an actuator: as a model to plan with, as its sensor, and as a file."""
+"""Learnt parameters of an actuator: as a model to plan with, as its sensor, and as a file."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -55,10 +55,10 @@ def learnt_model(
 
 def as_of_path(model: Model, before: Model, estimate: Estimate) -> Model:
     """
-    Return a model learned from a path, with the force of the previous model unless it is known.
+    Return a model learnt from a path, with the force of the previous model unless it is known.
 
-    Around a single equilibrium, as in a wave, a force cannot be told from a bias and would shift
-    the mean.
+    Around a single equilibrium, as in a wave, a force is indistinguishable from a bias and would
+    shift the mean.
     """
     force = before.options.constant_force
     if abs(model.options.constant_force - force) >= _FORCED * estimate.deviations.get(
@@ -145,7 +145,7 @@ def known_of(estimate: Estimate) -> Known:
 
 
 def file_text(estimates: Mapping[str, Estimate], now: datetime) -> str:
-    """Return a parameter file with the learned values by joint; '' names all joints."""
+    """Return a parameter file with the learnt values by joint; '' names all joints."""
     lines = [
         f'# What feedback learnt of an actuator until {now.isoformat(" ", "seconds")}.',
         '# Planner and plant take it after their own parameter file.',
@@ -165,9 +165,9 @@ def file_text(estimates: Mapping[str, Estimate], now: datetime) -> str:
 
 def save(file: str, estimates: Mapping[str, Estimate | None], *, by_joint: bool) -> str:
     """
-    Write the learned parameters by joint, and return a confirmation.
+    Write the learnt parameters by joint, and return a confirmation.
 
-    Raises `BadInputError` if nothing was learned yet, or if the file cannot be written.
+    Raises `BadInputError` if nothing was learnt yet, or if the file cannot be written.
     """
     if not file:
         raise BadInputError('parameter feedback_file is empty: expected the file to write to')

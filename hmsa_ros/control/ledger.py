@@ -22,7 +22,7 @@ _STEP = 0.02
 class Moves:
     """How the moves of a request were planned; times are timestamps in ns."""
 
-    learnt: bool = False  # planned with learned parameters
+    learnt: bool = False  # planned with learnt parameters
     expected: float = 0.0  # predicted amplitude of the newest move
     corrected: list[int] = field(default_factory=list)  # times from which plans were corrected
 
@@ -31,7 +31,7 @@ class Ledger:
     """
     Compare the errors that moves leave, as judged from samples.
 
-    A move planned with the given parameters shows the open-loop vibration. If a learned level
+    A move planned with the given parameters shows the open-loop vibration. If a learnt level
     holds the actuator, the open-loop steady-state error is known too, because the given parameters
     predict the shift between the two levels accurately enough.
     """

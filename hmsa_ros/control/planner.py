@@ -144,7 +144,7 @@ class PlannerRuntime:
     def _look_at_samples(self) -> None:
         for joint, seen in self.surroundings.glance():
             self._takeover.observe(joint, seen)
-            self._silence.heard(joint, seen.stamp)
+            self._silence.record(joint, seen.stamp)
 
     def _unseen(self) -> str:
         self._look_at_samples()
@@ -329,7 +329,7 @@ class PlannerRuntime:
             return None
         now = self._clock()
         times = [
-            None if self.devices.deaf else self.group.next_command(),
+            None if self.devices.all_silent else self.group.next_command(),
             self._bulletin.next_change, self._bulletin.preview_again, self._watch.wake(now),
             self.feedback.wake]
         if self.settings.heartbeat_period:
@@ -424,7 +424,7 @@ class PlannerRuntime:
         if requests and all(isinstance(x, Stop) for x in requests):
             return True
         try:
-            if self.devices.holds(self.settings):
+            if self.devices.must_wait(self.settings):
                 return False
             self._look_at_samples()
             return self._takeover.look(self.settings, keep=not requests)

@@ -39,7 +39,7 @@ class Offset(NamedTuple):
 class _Joint:
     """State of the device of a joint; times in ns by the steady clock, unless noted."""
 
-    heard: int  # arrival of the newest receipt
+    arrived: int  # arrival of the newest receipt
     time: int = 0  # its time by the clock of the device
     command: int = 0  # timestamp that it acknowledged; 0 for none
     unanswered: int | None = None  # time since which no command is acknowledged
@@ -93,14 +93,14 @@ class Receipts:
         if known is None:
             known = self._joints[joint] = _Joint(steady)
         if known.silent and comparable and (
-                time - known.time < steady - known.heard - _STALE):
+                time - known.time < steady - known.arrived - _STALE):
             return False
         anew, known.command = known.command != 0 and command == 0, command
         if anew:
             # Commands that were sent to the previous device are lost.
             known.sent.clear()
             known.unanswered = None
-        known.heard, known.time, known.missing = steady, time, 0
+        known.arrived, known.time, known.missing = steady, time, 0
         known.lags.append(now - time)
         sent = known.sent.pop(command, None)
         if sent is None:
@@ -143,9 +143,9 @@ class Receipts:
         changed: list[str] = []
         for name, known in self._joints.items():
             if absent > _PAUSE:
-                known.heard += absent
+                known.arrived += absent
                 known.unanswered = None
-            silent = steady - known.heard > _PATIENCE
+            silent = steady - known.arrived > _PATIENCE
             if silent is not known.silent:
                 changed.append(name)
                 known.silent = silent

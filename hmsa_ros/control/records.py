@@ -42,7 +42,7 @@ class Settings:
     feedback_tolerance: float = TOLERANCE  # fraction of the step from which it is large
     feedback_trim: float = 0.0  # limit in T for trimming against a force; 0: off
     feedback_frozen: bool = False  # estimate only the state, keep the parameters
-    feedback_file: str = ''  # file for learned parameters; empty: none
+    feedback_file: str = ''  # file for learnt parameters; empty: none
     # By joint, prior uncertainty of the parameters.
     known: Mapping[str, Known] = field(default_factory=dict)
 

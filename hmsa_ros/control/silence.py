@@ -35,7 +35,7 @@ class Silence:
         """Discard all samples."""
         self._joints.clear()
 
-    def heard(self, joint: str, stamp: int) -> None:
+    def record(self, joint: str, stamp: int) -> None:
         """Record the timestamp of the newest sample of a joint."""
         before = self._joints.get(joint)
         self._joints[joint] = _Joint(

@@ -273,7 +273,7 @@ class Joint:
             self.amplitude = max(self.amplitude, math.hypot(
                 found.stretch - at[0], found.rate / at[1]))
 
-    # -- what plans begin from -----------------------------------------------------------------
+    # -- initial states of plans ---------------------------------------------------------------
 
     def predicted(self, time: int) -> Estimate | None:
         """Return the estimate for a time under the plan in force."""
@@ -295,7 +295,7 @@ class Joint:
         return self.predicted(time)
 
     def adapted(self, model: Model | None = None) -> bool:
-        """Return whether a model, by default that of the plans, uses learned parameters."""
+        """Return whether a model, by default that of the plans, uses learnt parameters."""
         return (model or self.planner.model) != self.given
 
     def believed(self, time: int) -> Believed | None:
@@ -326,7 +326,7 @@ class Joint:
             self._sensor = found, sensor_of(found, self.estimator.prior)
         return self._sensor[1]
 
-    # -- what plans are made with --------------------------------------------------------------
+    # -- models of plans -----------------------------------------------------------------------
 
     def learnt(self, model: Model) -> Model:
         """Return a model updated by the estimate, or by the last confirmed parameters."""
@@ -352,7 +352,7 @@ class Joint:
         return place >= 0 and time >= (plan.segments[place].arrival or 0) + look
 
     def choose(self, latest: Estimate, doing: Doing) -> Awaited[None]:
-        """Adopt learned parameters once clearly better, or while a move waits for them."""
+        """Adopt learnt parameters once clearly better, or while a move waits for them."""
         used, segments = self.used or self.planner.model, self.planner.plan.segments
         model, waits = used, latest.time < self.waits
         if differs(used, latest):

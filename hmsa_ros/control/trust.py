@@ -29,7 +29,7 @@ class Trust:
         self.beginnings = 0  # number of restarts
         self.acts = at_once
         self.why = ''  # why samples are not trusted; empty if they are
-        self.ended = False  # whether learned parameters made moves worse
+        self.ended = False  # whether learnt parameters made moves worse
         self._begin, self._doubts, self._rejected = begin, 0, 0
         # Number of estimates that fitted a move and failed later; number of moves still to fit.
         self._failures, self._moves = 0, 1
@@ -78,7 +78,7 @@ class Trust:
             self.confirmed = model
 
     def end(self, why: str) -> None:
-        """End feedback, since learned parameters make moves worse."""
+        """End feedback, since learnt parameters make moves worse."""
         if not self.why:
             # The samples fit, so the parameters that they confirmed are no better.
             self.confirmed = None

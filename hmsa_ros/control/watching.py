@@ -197,7 +197,7 @@ class Watch:
         self.restart()
 
     def restart(self) -> None:
-        """Discard all findings; what is planned so far is not judged."""
+        """Discard all findings; present plans are not judged."""
         self._opens = None
         for name, planner in self._group.planners.items():
             plan = planner.plan
@@ -294,7 +294,7 @@ class Watch:
             self._open_until(min(stamp, self._around.clock() + AHEAD))
         for joint in self._joints.values():
             for hold in joint.holds:
-                wanted |= hold.lacks(stamp, steady)
+                wanted |= hold.needs(stamp, steady)
         return wanted
 
     def add(self, name: str, stamp: int, stretch: float) -> None:

@@ -280,7 +280,7 @@ class Assembly:
         return when, self._level(now, really)
 
     def _current(self, stamp: int, level: float, *, off: bool = False) -> float:
-        """Return the current in A for a level in T from a stamp in ns on."""
+        """Return the current in A for a level in T from a timestamp in ns on."""
         return self.coil.current(
             level if self._core is None else self._core.ask(stamp, level, off=off))
 

@@ -1,1 +1,1 @@
-"""ROS 2 edge: the planner, plant, recorder and player nodes, and what they share."""
+"""The ROS 2 nodes, and their common parts."""

@@ -193,7 +193,7 @@ class ManagedNode(LifecycleNode):
     # -- transitions ---------------------------------------------------------------------------
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Configure; destroy what a refused attempt has created."""
+        """Configure; destroy the entities of a refused attempt."""
         self._kept = self._entities()
         result = self._attempt('configure', self.configure)
         if result != TransitionCallbackReturn.SUCCESS:

@@ -347,7 +347,7 @@ class Recorder(ManagedNode):
         self.close()
 
     def close(self) -> None:
-        """Record what has arrived, close the bag and print the counts."""
+        """Record the messages that have arrived, close the bag and print the counts."""
         if self._closed:
             return
         self._closed = True

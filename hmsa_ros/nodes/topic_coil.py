@@ -45,7 +45,7 @@ class _Topic:
         try:
             self.name = self._node.resolve_topic_name(name)
             until = monotonic() + _PATIENCE
-            while not self.heard and monotonic() < until:
+            while not self.matched and monotonic() < until:
                 sleep(_LOOK)
                 if not type_name:
                     found = self._node.get_subscriptions_info_by_topic(self.name)
@@ -61,12 +61,12 @@ class _Topic:
             raise
 
     @property
-    def heard(self) -> bool:
+    def matched(self) -> bool:
         """Whether there is a subscriber."""
         return self._publisher is not None and bool(self._publisher.get_subscription_count())
 
     def _require_subscriber(self) -> None:
-        if not self.heard:
+        if not self.matched:
             raise TopicError(
                 f'no node subscribes to {self.name}{f" ({self.type})" if self.type else ""}: '
                 'start the node that serves the coil, or compare hardware.topic and hardware.type '
@@ -84,7 +84,7 @@ class _Topic:
 
     def close(self) -> None:
         """Close after the last message is acknowledged."""
-        if self.heard:
+        if self.matched:
             self._publisher.wait_for_all_acked(Duration(seconds=_LAST))
         leave(self._node)
 
