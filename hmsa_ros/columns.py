@@ -177,6 +177,6 @@ def _places(
                    if name == 'stretch' else ', '.join(known)))
         factor = known[unit]
         if factor != 1.0:
-            notes.append(f'{name} was converted from {unit} as the header says')
+            notes.append(f'{name} was converted from {unit} according to the header')
         places[name] = place, factor
     return places, notes

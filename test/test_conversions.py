@@ -242,8 +242,8 @@ ARRIVED = Finding(Code.ARRIVED, 'rests', SETPOINT, 100, 1e-3, 1e-5, 2e-3, 1e-5, 
     ('unobserved', 0, unobserved(SETPOINT), False, ''),
     ('too_damped', 1, unobserved(SETPOINT), False, ''),
     ('unobserved', 1, unobserved(SETPOINT), True, 'setpoint 2 of 3: 1.4 is predicted'),
-    ('replanned', 1, unobserved(SETPOINT), False, 'a sentence; what comes of it is not measured'),
-    ('late', 1, None, False, 'a sentence; what comes of it is not measured'),
+    ('replanned', 1, unobserved(SETPOINT), False, 'a sentence; the result is not measured'),
+    ('late', 1, None, False, 'a sentence; the result is not measured'),
     ('stopped', 2, ARRIVED, True, 'a sentence'),
     ('missed', 1, missed(SETPOINT, 'left out'), True, 'setpoint 2 of 3: 1.4 was missed: left')])
 def test_only_what_arrived_or_nobody_measures_is_no_failure(

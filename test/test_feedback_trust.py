@@ -263,5 +263,5 @@ def test_nothing_is_learnt_while_the_field_is_not_reported_any_more():
     it.plant.command(it.now, 0.0)
     it.plant.limit = 0.0
     it.move(1.1, 400 * MS)
-    assert 'the field is not reported any more' in it.message
+    assert 'the field is no longer reported' in it.message
     assert it.planner.model.actuator.shear_modulus == pytest.approx(1e4, rel=2e-3)

@@ -488,7 +488,7 @@ def test_a_board_whose_clock_begins_anew_has_lost_its_state():
 
 
 @pytest.mark.parametrize(('changes', 'expected'), [
-    ({'applied': lambda self: []}, 'does not say that 0.2 T took effect'),
+    ({'applied': lambda self: []}, 'does not report that 0.2 T took effect'),
     ({'applied': lambda self: [1]}, 'expected a list of'),
     ({'applied': lambda self: [(10**30, 0.2)]}, 'expected a list of'),
     ({'schedule': lambda self, levels: 1 / 0}, 'schedule of joint actuator raised ZeroDivision'),

@@ -245,7 +245,7 @@ def test_a_device_that_dds_has_lost_and_found_is_not_a_new_one():
     rig.linked, rig.wire, rig.found = True, [], True
     rig.run(rig.now + 1000 * MS)
     assert rig.status.verdict.code == 'cut_off'
-    assert not any('came after the commands were sent' in x for x in rig.notes())
+    assert not any('started after the commands were sent' in x for x in rig.notes())
     assert (rig.cut, rig.refused, rig.status.unheard) == (False, [], '')
     assert {x.flux_density for t, x in rig.sent if t > rig.now - 800 * MS} == {0.0}
     rig.runtime.request(Target('a', 1.3))

@@ -666,7 +666,7 @@ def test_a_device_that_takes_over_from_another_is_sent_no_level_of_before(receip
     reporters.remove(b'old')
     rig.run(rig.now + 20 * MS)
     assert len(rig.sent) == sent
-    assert sum('plant or driver of joint a came after the commands were sent' in x
+    assert sum('plant or driver of joint a started after the commands were sent' in x
                for x in rig.notes()) == 1
 
 

@@ -49,7 +49,7 @@ def check_joints(request: Request, joints: Sequence[str], settings: Settings) ->
         raise RefusedError(
             Code.TOO_LONG,
             f'the trajectory has {count} setpoints: expected at most {settings.max_points}, the '
-            'parameter max_points; send it in parts, each stamped with its start')
+            'parameter max_points; send it in parts, each with its start as timestamp')
 
 
 def _unknown(reason: str) -> RefusedError:

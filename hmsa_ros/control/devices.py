@@ -142,8 +142,8 @@ class Devices:
         planned = bool(planner.plan.segments)
         planner.restart()
         dropped = self._dropped(
-            joint, Code.MISSED, f'plant or driver of joint {joint} came after the commands were '
-            'sent: what it has not heard is dropped')
+            joint, Code.MISSED, f'plant or driver of joint {joint} started after the commands '
+            'were sent: the commands that it missed are dropped')
         return dropped if planned else None
 
     def cut_off(
@@ -242,8 +242,8 @@ class Devices:
             raise RefusedError(
                 Code.UNHEARD,
                 f'commands of joint {lost[0]} have not arrived for {passed / NANOSECONDS:.0f} s, '
-                'though the plant or driver is heard: look at the network in the direction from '
-                'the planner to it, and send the request again')
+                'though its receipts arrive: check the network in the direction from the planner '
+                'to the plant or driver, and send the request again')
         return True
 
     @property

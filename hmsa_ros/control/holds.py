@@ -89,7 +89,7 @@ class Hold:
         self.setpoint = replace(
             self.setpoint, end=end, moved=None if arrival == self.setpoint.arrival else arrival)
         if not held and end is not None and arrival >= end:
-            self.miss('a plan that was made anew reaches it only after its time')
+            self.miss('after replanning, it is reached only after its time')
             return
         self.found, self.over, self.unreported = None, False, False
         self._begin_at(arrival)
@@ -241,8 +241,8 @@ class Hold:
         if not samples:
             return unobserved(
                 setpoint, self._ahead and (
-                    f'samples are stamped up to {self._ahead / NANOSECONDS:.3g} s ahead of the '
-                    'clock') or '')
+                    f'timestamps of samples are up to {self._ahead / NANOSECONDS:.3g} s ahead '
+                    'of the clock') or '')
         stamps = np.fromiter(samples, dtype=np.int64, count=len(samples))
         values = np.fromiter(samples.values(), dtype=np.float64, count=len(stamps))
         finding: Finding = yield from self._doing(

@@ -166,11 +166,11 @@ class Receipts:
                 return (
                     f'no receipt of joint {name} from the plant or driver for more than '
                     f'{_PATIENCE / NANOSECONDS:g} s: it has ended, or its host cannot be '
-                    'reached; no command is sent until it is heard again')
+                    'reached; no command is sent until receipts arrive')
             if self.lost(name):
                 return (
-                    f'commands of joint {name} do not arrive: the plant or driver is heard, and '
-                    f'has received none for more than {_PATIENCE / NANOSECONDS:g} s')
+                    f'commands of joint {name} do not arrive: the plant or driver sends receipts, '
+                    f'but has received no command for more than {_PATIENCE / NANOSECONDS:g} s')
         return ''
 
     def lag(self, joint: str) -> int | None:

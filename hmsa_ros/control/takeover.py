@@ -159,9 +159,9 @@ class Takeover:
             return
         raise RefusedError(
             Code.CLOCKS_DIFFER,
-            f'samples of joint {name} are stamped {-seen.lag / NANOSECONDS:.3f} s ahead of the '
-            'clock of the planner, more than lead_time, and every command would come too late: '
-            'set the clocks of planner, plant and sensor by one source')
+            f'timestamps of samples of joint {name} are {-seen.lag / NANOSECONDS:.3f} s ahead '
+            'of the clock of the planner, more than lead_time, and every command would come too '
+            'late: set the clocks of planner, plant and sensor by one source')
 
     # -- before later requests -----------------------------------------------------------------
 

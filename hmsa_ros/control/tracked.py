@@ -195,7 +195,7 @@ class Joint:
         """Return why the field may differ from the commanded one; empty if it does not."""
         if math.isnan(field):
             return (
-                'the field is not reported any more, and may not be the one commanded'
+                'the field is no longer reported, and may differ from the command'
                 if self._measured else '')
         self._measured = True
         plan = self.planner.plan
@@ -378,11 +378,11 @@ class Joint:
         why = trust.why or self.estimator.screening.trouble
         if trust.ended:
             return (f'{why}: feedback has ended, open loop with {trust.parameters}; '
-                    '~/reset_estimate begins it anew')
+                    '~/reset_estimate restarts it')
         if why:
             more = f', with {trust.parameters}' if self.adapts else ''
-            anew = ('; the estimate has begun anew and counts after a move that samples fit; '
-                    '~/reset_estimate forgets all') if trust.beginnings else ''
+            anew = ('; the estimate has restarted and is used after a move that samples fit; '
+                    '~/reset_estimate discards it') if trust.beginnings else ''
             return f'{why}: open loop until samples fit again{more}{anew}'
         if self.latest is None:
             return 'no estimate yet'

@@ -106,8 +106,8 @@ def calibrate_coil(current: Array, flux_density: Array) -> CoilCalibration:
     span = float(np.ptp(flux_density))
     if span == 0.0:
         raise BadInputError(
-            f'all readings are {flux_density[0]:g} T: they do not follow the current; look after '
-            'the probe and its direction')
+            f'all readings are {flux_density[0]:g} T: they do not follow the current; check the '
+            'probe and its direction')
     straight = _fit(current, flux_density, saturating=False)
     bent = _fit(current, flux_density, saturating=True)
     at, mean, hysteresis = branch_means(current, flux_density)
@@ -120,7 +120,7 @@ def calibrate_coil(current: Array, flux_density: Array) -> CoilCalibration:
     if slope == 0.0 or not deviation < 0.2 * abs(slope):
         raise BadInputError(
             f'the readings do not follow the current ({slope:.3g} T/A, standard deviation '
-            f'{deviation:.3g}): expected a field that rises or falls with it; look after the '
+            f'{deviation:.3g}): expected a field that rises or falls with it; check the '
             'probe and its direction')
     misses = float(np.max(np.abs(mean - _model(at, *values)))) / span
     half = float(stdtrit(len(current) - len(values), 0.975)) * deviation

@@ -279,7 +279,7 @@ class Coil(GuardedJoint):
         if self._awaited and now - self._awaited[0][0] > self._patience:
             stamp, level = self._awaited[0]
             raise HardwareError(
-                f'{self.instrument.name}.applied does not say that {level:g} T took effect, '
+                f'{self.instrument.name}.applied does not report that {level:g} T took effect, '
                 f'{(now - stamp) / NANOSECONDS:.3f} s after its time: expected that within '
                 'hardware.timeout')
 
@@ -418,7 +418,7 @@ class Coil(GuardedJoint):
             with suppress(HardwareError):
                 self.disarm()
             return str(error)
-        return f'{self.instrument.name}.write says that {self.level:g} T are left'
+        return f'{self.instrument.name}.write reports that {self.level:g} T are left'
 
     # -- the device's clock and temperature ----------------------------------------------------
 

@@ -240,7 +240,7 @@ class HardwareWorker:
                 self.trouble = (
                     f'{why or left}: the coil could NOT be switched off and may be on'
                     f'{f" ({left})" if why and left != why else ""}; cut the power of the '
-                    'amplifier; the driver goes on trying')
+                    'amplifier; the driver keeps trying')
             if self._ended:
                 last = last or monotonic() + _LAST_ATTEMPTS
                 if monotonic() > last:

@@ -85,7 +85,7 @@ class Verdict:
             return self.finding
         # Without samples, a prediction counts as long as the plan is followed.
         if self.level == _WARN and self.code not in _HARMLESS:
-            return f'{self.message}; what comes of it is not measured'
+            return f'{self.message}; the result is not measured'
         return ''
 
     @property

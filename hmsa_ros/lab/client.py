@@ -320,7 +320,7 @@ class PlannerClient(Visitor):
         late = self.verdict.late - verdict.late
         if late > 0 and not self.verdict.failure and self.verdict.measured != Code.ARRIVED:
             raise HmsaError(
-                f'{late} commands came late, and what comes of it is not measured: expected '
+                f'{late} commands came late, and the result is not measured: expected '
                 'commands in time (lead_time), or samples (joint_states)')
         return self.verdict
 

@@ -178,8 +178,8 @@ def conduct(experiment: Experiment, progress: Progress) -> Conducted:
                 if resting:
                     raise
                 raise HmsaError(
-                    f'{str(error) or "interrupted"}; the planner does not say that the actuator '
-                    'rests: look after the coil') from error
+                    f'{str(error) or "interrupted"}; the planner does not report that the '
+                    'actuator rests: check the coil') from error
             progress('closing the bag', 1.0)
             exits = session.stop()
             for name, status in exits.items():

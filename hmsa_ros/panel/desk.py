@@ -166,7 +166,7 @@ class Desk:
             self._sure = self._received
         elif now - self._stopping > _GONE_SECONDS:
             self._stopping = -math.inf
-            self._notify('the planner does not answer the stop: look after the coil', 2)
+            self._notify('the planner does not answer the stop: check the coil', 2)
 
     # -- commands ------------------------------------------------------------------------------
 
