@@ -11,7 +11,7 @@ from hmsa_ros.control.feedback import Feedback
 from hmsa_ros.control.learnt import alike, as_of_path, believed, learnt_model
 from hmsa_ros.control.ledger import Moves
 from hmsa_ros.control.records import Severity, Verdict
-from hmsa_ros.control.slices import anew, Clock, Work
+from hmsa_ros.control.slices import Clock, replanning, Work
 from hmsa_ros.control.tracked import Joint
 from hmsa_ros.control.weighing import LEAST_STEP, step_of
 from hmsa_ros.estimation import Estimate
@@ -128,7 +128,7 @@ class Corrections:
                 yield self._work(joint, _correct)
 
     def _work(self, joint: Joint, make: Callable[[Joint, int], Steps[Draft | None]]) -> Work:
-        return anew(
+        return replanning(
             joint.name, joint.planner, partial(make, joint), self._clock, corrects=True)
 
     def _rejoin(self, joint: Joint, now: int) -> Steps[Draft | None]:

@@ -128,9 +128,9 @@ class Devices:
 
     def received(self, joint: str, time: int, command: int) -> Verdict | None:
         """Process a receipt as `Receipts.received` does; return the verdict on a plan."""
-        anew = self.receipts.received(
+        restarted = self.receipts.received(
             joint, time, command, self._around.clock(), comparable=not self._around.one_clock())
-        if not anew:
+        if not restarted:
             return None
         self._following.newest.pop(joint, None)
         return self._appeared(joint)

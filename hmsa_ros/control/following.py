@@ -11,7 +11,7 @@ from hmsa_ros.control.lateness import Lateness
 from hmsa_ros.control.receipts import Receipts
 from hmsa_ros.control.records import Settings, Severity, Verdict
 from hmsa_ros.control.seldom import Seldom
-from hmsa_ros.control.slices import anew, Clock, Work
+from hmsa_ros.control.slices import Clock, replanning, Work
 from hmsa_ros.control.weighing import (
     aims,
     compared,
@@ -233,7 +233,7 @@ class Following:
 
     def resumption(self, name: str, clock: Clock) -> Work:
         """Return the work of replanning the rest for a joint if that reduces the error."""
-        return anew(
+        return replanning(
             name, self._group.planners[name], partial(self._resumed, name), clock)
 
     def _resumed(self, name: str, now: int) -> Steps[Draft | None]:

@@ -115,7 +115,7 @@ class PlannerRuntime:
         if (isinstance(request, Trajectory) and self.settings.trajectory_mode == 'rest'
                 and not request.follows):
             request = replace(request, path=None)
-        self._begin_anew()
+        self._process_clock()
         self._check(request)
         if not isinstance(request, Stop):
             self.following.asked(request.joints)
@@ -193,7 +193,7 @@ class PlannerRuntime:
         now = self._clock()
         if self._stepped:
             # The timestamp is of the clock after it was set.
-            self._begin_anew()
+            self._process_clock()
             now = self._clock()
         if joint in self.feedback.joints:
             self.feedback.joints[joint].applied(stamp, flux_density)
@@ -234,7 +234,7 @@ class PlannerRuntime:
         self.clock_jumps += 1
         self._set_back = max(self._set_back, back)
 
-    def _begin_anew(self) -> None:
+    def _process_clock(self) -> None:
         """Process a clock that was set, and report it."""
         back, self._set_back = self._set_back, 0
         by, self._stepped = self._stepped, 0
@@ -273,7 +273,7 @@ class PlannerRuntime:
 
     def deactivate(self) -> None:
         """Come to rest, sending all commands for that now, and accept no more requests."""
-        self._begin_anew()
+        self._process_clock()
         self.active = False
         # Samples from before the joints come to rest do not show their later position.
         self._takeover.drop()
@@ -342,13 +342,13 @@ class PlannerRuntime:
 
     def send(self, now: int) -> list[Output]:
         """Return the commands due at a time in ns: the urgent part of `tick`."""
-        self._begin_anew()
+        self._process_clock()
         self._send(now)
         return self._taken()
 
     def tick(self, now: int) -> list[Output]:
         """Do the work due at a time in ns, for a few ms at most; return the outputs."""
-        self._begin_anew()
+        self._process_clock()
         self._engage()
         estimated = self._send(now) and self.feedback.update(now)
         if not estimated:
@@ -362,7 +362,7 @@ class PlannerRuntime:
             self._bulletin.look_for_listeners()
             if not estimated:
                 self._judge(now)
-        self._begin_anew()
+        self._process_clock()
         return self._taken()
 
     def _send(self, now: int) -> bool:

@@ -95,8 +95,8 @@ class Receipts:
         if known.silent and comparable and (
                 time - known.time < steady - known.arrived - _STALE):
             return False
-        anew, known.command = known.command != 0 and command == 0, command
-        if anew:
+        restarted, known.command = known.command != 0 and command == 0, command
+        if restarted:
             # Commands that were sent to the previous device are lost.
             known.sent.clear()
             known.unanswered = None
@@ -104,11 +104,11 @@ class Receipts:
         known.lags.append(now - time)
         sent = known.sent.pop(command, None)
         if sent is None:
-            return anew
+            return restarted
         known.unanswered = None
         if comparable and now >= sent:
             known.exchanges.append(Offset(time - (sent + now) // 2, (now - sent) // 2 + 1))
-        return anew
+        return restarted
 
     def since(self, joint: str, time: int) -> bool:
         """Return whether a joint's newest receipt is no older than a time of its device."""

@@ -65,7 +65,7 @@ def work_on(request: Request, group: PlannerGroup, clock: Clock, then: Then) -> 
     return Work(frozenset(names), steps, request)
 
 
-def anew(
+def replanning(
         name: str, planner: Planner, make: Callable[[int], Steps[Draft | None]], clock: Clock, *,
         corrects: bool = False) -> Work:
     """Return the work of replanning a joint; without a draft its plan is kept."""

@@ -381,9 +381,9 @@ class Joint:
                     '~/reset_estimate restarts it')
         if why:
             more = f', with {trust.parameters}' if self.adapts else ''
-            anew = ('; the estimate has restarted and is used after a move that samples fit; '
+            restart = ('; the estimate has restarted and is used after a move that samples fit; '
                     '~/reset_estimate discards it') if trust.beginnings else ''
-            return f'{why}: open loop until samples fit again{more}{anew}'
+            return f'{why}: open loop until samples fit again{more}{restart}'
         if self.latest is None:
             return 'no estimate yet'
         plan = self.planner.plan

@@ -140,7 +140,7 @@ class _Joint:
         self.holds = [x for x in self.holds if not x.over or x.unreported]
         self.holds.append(self._hold(number))
 
-    def begin_anew(self) -> None:
+    def restart_holds(self) -> None:
         """Restart gathering samples of unfinished setpoints, since all times have changed."""
         self.holds = [
             x if x.over else self._hold(x.setpoint.number - 1) for x in self.holds]
@@ -214,7 +214,7 @@ class Watch:
         for name, joint in self._joints.items():
             joint.asked = joint.asked.shifted(by)
             joint.plan = self._group.planners[name].plan
-            joint.begin_anew()
+            joint.restart_holds()
         if self._opens is not None:
             self._opens += by
 

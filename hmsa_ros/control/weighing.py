@@ -137,12 +137,12 @@ def compared(
         arrival = own.arrival if own is not None else (
             aim.end if draft.resumed is not None and place >= draft.resumed else None)
         wanted.append(replace(aim, arrival=max(aim.arrival, arrival or aim.arrival)))
-    anew = [*(x for x in levels if x.stamp < draft.begin), *draft.levels]
+    replanned = [*(x for x in levels if x.stamp < draft.begin), *draft.levels]
     # Each setpoint that the draft leaves out, beyond those considered, is missed by a step.
     out = max(len(plan.segments) - first - len(wanted), 0) if draft.resumed is None else 0
     return (
         expected(start, levels, wanted, lateness),
-        expected(start, anew, wanted, lateness) + 2.0 * out)
+        expected(start, replanned, wanted, lateness) + 2.0 * out)
 
 
 def worthwhile(

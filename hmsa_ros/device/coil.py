@@ -423,7 +423,7 @@ class Coil(GuardedJoint):
     # -- the device's clock and temperature ----------------------------------------------------
 
     def _synchronise(self) -> None:
-        """Compare clocks anew, if the device has one, and read the temperature."""
+        """Compare clocks again, if the device has one, and read the temperature."""
         self.instrument.synchronise(self._clock)
         self._check_temperature()
         if self.instrument.clock_map is not None or self.instrument.has('temperature'):

@@ -394,7 +394,7 @@ class Instrument:
                 f'{what}: expected a list of (timestamp in ns, level in T)'))
 
     def synchronise(self, clock: Callable[[], int]) -> None:
-        """Compare clocks anew, if the hardware has one; ``clock`` returns the host time in ns."""
+        """Compare clocks again, if the hardware has one; ``clock`` returns the host time in ns."""
         self._handed.clear()
         if self.clock_map is not None:
             self.clock_map = ClockMap()

@@ -30,9 +30,9 @@ class Interlock:
             self, publisher: bytes, now: int, *, closed: bool,
             present: Callable[[], Collection[bytes]]) -> None:
         """Process a message of a publisher; ``present`` returns those that have not left."""
-        anew = closed and not self._messages.get(publisher, (False, 0))[0]
+        newly = closed and not self._messages.get(publisher, (False, 0))[0]
         self._messages[publisher] = closed, now
-        if anew and not all(x for x, _ in self._messages.values()):
+        if newly and not all(x for x, _ in self._messages.values()):
             here = present()
             self._messages = {x: y for x, y in self._messages.items() if y[0] or x in here}
         if not closed:
