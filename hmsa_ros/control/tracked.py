@@ -382,7 +382,7 @@ class Joint:
         if why:
             more = f', with {trust.parameters}' if self.adapts else ''
             restart = ('; the estimate has restarted and is used after a move that samples fit; '
-                    '~/reset_estimate discards it') if trust.beginnings else ''
+                       '~/reset_estimate discards it') if trust.beginnings else ''
             return f'{why}: open loop until samples fit again{more}{restart}'
         if self.latest is None:
             return 'no estimate yet'
