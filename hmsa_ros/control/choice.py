@@ -29,7 +29,7 @@ from hmsa_ros.planning.timeline import Model
 
 # Other parameters must reduce the predicted error by at least this fraction of the step.
 _LEAST = 3e-4
-# Fraction of the step up to which an increase counts as small; 0 for the given parameters.
+# Fraction of the step up to which a change is small; 0 while the given parameters are in use.
 _LITTLE = 0.015
 # Shorter steps are replaced by this one.
 _STEP = 0.15
