@@ -103,7 +103,7 @@ class Hold:
     # -- samples -------------------------------------------------------------------------------
 
     def needs(self, stamp: int, steady: int) -> bool:
-        """Return whether a sample is needed; old timestamps announce newer samples."""
+        """Return whether a sample is needed; old ones show that newer ones may follow."""
         if self.over:
             return False
         if self._seen < stamp <= self._closes:
