@@ -49,22 +49,22 @@ OWN = (
 
 HARDWARE = ParameterSpec(
     'hardware.name', '',
-    'What writes and reads: serial_board (a board on a serial port), scpi_supply (a bench '
-    'supply), topic (a topic of another node), or MODULE:NAME. Called with the name of a joint, '
-    'NAME returns an object with the methods write and read. MODULE is found as an import finds '
-    'it, or in the working directory. `hardware` alone is short for it. Other parameters '
-    'hardware.* are given to it as keyword arguments, those of a joint (left.hardware.*) before '
-    'those for all.')
+    'Hardware class: serial_board (a board on a serial port), scpi_supply (a bench supply), topic '
+    '(a topic of another node), or MODULE:NAME. NAME is called with the name of a joint, and '
+    'returns an object with the methods write and read. MODULE is searched for like an import, '
+    'and in the working directory. `hardware` is short for this parameter. Other parameters '
+    'hardware.* are passed as keyword arguments; those of a joint (left.hardware.*) take '
+    'precedence.')
 
 TIMEOUT = ParameterSpec(
     'hardware.timeout', 1.0,
-    'Longest time that a call of the hardware may take; past it the driver tries to switch off '
-    'from another thread, and ends.', 's', 0.01, 1e3)
+    'Time limit of a call of the hardware; if it is exceeded, the driver tries to switch off from '
+    'another thread, and ends.', 's', 0.01, 1e3)
 
 RECONNECT = ParameterSpec(
     'hardware.reconnect', False,
-    'Whether to go on once hardware that has failed, as by a pulled cable, obeys again: with the '
-    'coil off, after a new request, as after an open interlock. Otherwise the driver ends.')
+    'Whether to continue when failed hardware, as after a disconnected cable, obeys again; as '
+    'after an open interlock, the coil is off until a new request. Otherwise the driver ends.')
 
 INTERLOCK = (
     ParameterSpec(
