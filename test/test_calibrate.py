@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -95,7 +96,8 @@ def coil(joint):
 @pytest.mark.parametrize('typed', [False, True])
 def test_a_guided_run_measures_the_coil_and_leaves_it_off(typed, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, 'bench_under_test', sys.modules[__name__])
-    monkeypatch.setattr('builtins.input', lambda _: f'{1e3 * 0.052 * Supply.amperes} mT')
+    monkeypatch.setattr('sys.stdin', SimpleNamespace(
+        readline=lambda: f'{1e3 * 0.052 * Supply.amperes} mT\n'))
     Supply.written.clear()
     probe = [] if typed else ['--probe', 'bench_under_test:Supply']
     assert main([

@@ -7,10 +7,11 @@ example: hmsa calibrate coil readings.csv --out coil.yaml
 """
 
 import argparse
-from contextlib import nullcontext
+from contextlib import nullcontext, redirect_stdout
 from dataclasses import asdict
 import math
 from pathlib import Path
+import sys
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.check_driver import settings_of
@@ -202,14 +203,17 @@ def _readings(arguments: argparse.Namespace) -> 'tuple[Array, Array]':
 
 def _typed(current: float) -> float:
     """Ask until a reading is valid; raise `HmsaError` at the end of the input."""
-    while True:
-        try:
-            return number_of(
-                input(f'flux density at {current:.4g} A [T, or with a unit]: '), 'T', 'reading')
-        except BadInputError as error:
-            print(error)
-        except EOFError:
-            raise HmsaError('the readings end early: expected one for each level') from None
+    with redirect_stdout(sys.stderr):  # what is asked is no result
+        while True:
+            try:
+                return number_of(
+                    input(f'flux density at {current:.4g} A [T, or with a unit]: '), 'T',
+                    'reading')
+            except BadInputError as error:
+                print(error)
+            except EOFError:
+                raise HmsaError(
+                    'the readings end early: expected one for each level') from None
 
 
 def _probe(name: str) -> 'Callable[[float], float]':
