@@ -384,6 +384,13 @@ def test_a_notebook_which_asks_for_colours_gets_no_progress():
     assert (shown.stdout, shown.stderr) == ('done\n', '')
 
 
+def test_a_table_is_printed_where_the_locale_lacks_its_characters():
+    shown = subprocess.run(
+        [sys.executable, '-c', TABLE], cwd=ROOT, env={**os.environ, 'PYTHONIOENCODING': 'ascii'},
+        capture_output=True, text=True, check=True)
+    assert 'two_step' in shown.stdout
+
+
 @pytest.mark.parametrize('code', [PROGRESS, TABLE])
 @pytest.mark.parametrize('env', [{'NO_COLOR': '1'}, {'TERM': 'dumb'}])
 def test_no_colour_where_none_is_wanted(code, env):
