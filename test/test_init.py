@@ -120,9 +120,9 @@ def test_coils_that_cannot_be_are_refused(values):
 # The file ------------------------------------------------------------------------------------
 
 def test_the_file_has_what_was_given_in_si_units(run, tmp_path):
-    status, out, err = run(*OWN, '--out', 'own.yaml')
+    status, out, err = run(*OWN, '--out', 'my own.yaml')
     assert (status, err) == (0, '')
-    found = parameters(tmp_path / 'own.yaml')
+    found = parameters(tmp_path / 'my own.yaml')
     damping = found.pop('actuator.damping_coefficient')
     assert found == {
         'actuator.half_length': 0.005, 'actuator.half_thickness': 0.004,
@@ -130,9 +130,15 @@ def test_the_file_has_what_was_given_in_si_units(run, tmp_path):
         'actuator.chain_limit': 20.0, 'flux_density_min': -0.2, 'flux_density_max': 0.2,
         'slew_limit': 0.0, 'joint': 'actuator', 'publish_rate': 4000.0}
     assert damping == pytest.approx(8 * 0.1 * 0.005 * 0.004 * math.sqrt(1900 * 30e3))
-    assert 'hmsa planner --ros-args --params-file own.yaml' in out
-    for line in out.splitlines()[:10]:
-        assert f'#   {line}' in (tmp_path / 'own.yaml').read_text()
+    assert "hmsa planner --ros-args --params-file 'my own.yaml'" in out
+    for line in [*out.splitlines()[:10], *out.splitlines()[-2:]]:
+        assert f'#   {line.strip()}' in (tmp_path / 'my own.yaml').read_text()
+
+
+def test_a_law_without_limiting_stretches_shows_none(run):
+    assert 'limiting stretches' in run('--yes', '--out', 'gent.yaml')[1]
+    for law in ('neo_hookean', 'yeoh:c10=5kPa'):
+        assert 'limiting' not in run('--yes', '--force', '--law', law)[1]
 
 
 def test_a_small_actuator_is_sampled_often_enough(run, tmp_path):

@@ -2,6 +2,7 @@
 
 import math
 
+from hmsa_ros.model.laws.record import ENDLESS
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.planning.scales import Scales
 
@@ -16,7 +17,8 @@ def facts(found: Scales, block: ActuatorParameters) -> list[tuple[str, str]]:
         ('damping', f'{found.damping:.4g} N s/m, zeta {found.zeta:.4g}'),
         ('critical damping at rest',
          f'{found.critical_damping:.4g} N s/m, zeta {found.critical_zeta:.4g}'),
-        (f'limiting {words}', '{:.4f} and {:.4f}'.format(*found.stretch_limits)),
+        *([] if found.stretch_limits in (ENDLESS, (0.0, math.inf))
+          else [(f'limiting {words}', '{:.4f} and {:.4f}'.format(*found.stretch_limits))]),
         *([] if beam else [('shape c1', f'{found.c1:.4g}')]),
         *((f'{drive.name} for {stretch:.6g}', drive.text(level, '.4g'))
           for stretch, level in found.flux_densities),

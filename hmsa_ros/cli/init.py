@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 import math
 from pathlib import Path
+from shlex import quote
 import sys
 from typing import Any, cast, TYPE_CHECKING
 
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from hmsa_ros.model.parameters import ActuatorParameters
 
 _JOINT = 'actuator'
+_NODES = ('plant', 'planner')  # that read the file
 # Quantities of the coil, and those with another name in `Actuator`.
 _COIL = ('flux_max', 'flux_min', 'slew_limit')
 # Forms with their own sizes and constants.
@@ -137,8 +139,7 @@ def run(arguments: argparse.Namespace) -> int:
     table = [f'{name:<26} {value}' for name, value in facts(found, made.block)]
     write_text(path, '\n'.join([
         '# Parameters of an actuator for planner and plant, written by hmsa init:',
-        f'#   hmsa plant --ros-args --params-file {path.name}',
-        f'#   hmsa planner --ros-args --params-file {path.name}',
+        *(f'#   hmsa {x} --ros-args --params-file {quote(path.name)}' for x in _NODES),
         '#', '# What follows from them (computed by hmsa init when it wrote this file):',
         *(f'#   {line}' for line in table), '/**:', '  ros__parameters:',
         *_lines(form, parameters), *_joints(joints, made.block), *_sampling(made.block)]) + '\n')
@@ -149,7 +150,7 @@ def run(arguments: argparse.Namespace) -> int:
             'file': path, 'joints': joints, 'parameters': parameters,
             'scales': asdict(found), 'warnings': doubts},
         *table, f'\n{path} written; to use it:',
-        *(f'  hmsa {x} --ros-args --params-file {path}' for x in ('plant', 'planner')))
+        *(f'  hmsa {x} --ros-args --params-file {quote(str(path))}' for x in _NODES))
 
 
 def _asked(arguments: argparse.Namespace) -> tuple[str, tuple[Quantity, ...]]:
