@@ -103,7 +103,7 @@ def field_delays(
         raise BadInputError(
             f'the readings of the probe miss a lagged field by {noise:.3g} T, and it steps by '
             f'{np.max(np.abs(weight)):.3g} T at most: expected a field that follows the levels; '
-            'look after the probe, or raise --limit')
+            'check the probe, or raise --limit')
     half = float(stdtrit(freedom, 0.975)) * noise * np.sqrt(
         np.abs(np.diag(np.linalg.pinv(found.jac.T @ found.jac))))
     transport, lag = (
