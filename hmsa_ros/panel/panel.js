@@ -144,7 +144,7 @@ function draw(canvas, lines, scale, least, label) {
   if (low > high) [low, high] = [0, 1];
   const room = Math.max(0.08 * (high - low), 0.5 * (least - (high - low)));
   [low, high] = [low - room, high + room];
-  const below = 18, place = y => 4 + (high - y) / (high - low) * (height - below - 8);
+  const below = 18, place = y => 8 + (high - y) / (high - low) * (height - below - 12);
   pen.font = `11px ${style.fontFamily}`;
   pen.fillStyle = colour('--soft');
   pen.strokeStyle = colour('--grid');
