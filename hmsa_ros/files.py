@@ -49,13 +49,16 @@ def write_text(path: Path, text: str) -> None:
 
 
 def check_targets(*targets: Path | None, sources: Iterable[Path | None] = ()) -> None:
-    """Raise `BadInputError` for a target that cannot be written, or is also a source."""
+    """Raise `BadInputError` for a target that cannot be written, or is a source or named twice."""
     read = [x.resolve() for x in sources if x is not None]
-    for target in filter(None, targets):
+    named = [x for x in targets if x is not None]
+    for i, target in enumerate(named):
         why = ('it is a folder; expected a file' if target.is_dir() else
                f'{target.parent} is no folder; expected one that exists'
                if not target.resolve().parent.is_dir() else
-               'it is read; expected another file' if target.resolve() in read else '')
+               'the command reads it; expected another name' if target.resolve() in read else
+               'two outputs name the same file; expected different files'
+               if target.resolve() in [x.resolve() for x in named[:i]] else '')
         if why:
             raise BadInputError(f'cannot write {target}: {why}')
 

@@ -96,6 +96,30 @@ def test_bad_input_is_answered_in_one_line_with_status_2(words, said, capsys):
     assert said in captured.err
 
 
+@pytest.mark.parametrize(('command', 'file'), [
+    ('simulate in.csv --until 0.3 --out in.csv', 'in.csv'),
+    ('simulate in.csv --until 0.3 --picture in.png --data', 'in.csv'),
+    ('simulate a_levels.csv --until 0.3 --out a.csv', 'a_levels.csv'),
+    ('simulate in.csv --until 0.3 --out out.csv --picture out.png --data', 'out.csv'),
+    ('plan --path in.csv --params-file in.yaml --out in.csv', 'in.csv'),
+    ('wave in.csv --frequency 3 --amplitude 0.05 --out in.csv', 'in.csv'),
+    ('wave sine --frequency 3 --amplitude 0.05 --out out.csv --path out.csv', 'out.csv'),
+    ('excite --params-file in.yaml --duration 0.2 --out in.yaml', 'in.yaml'),
+    ('calibrate coil in.csv --out in.yaml', 'in.csv'),
+    ('calibrate coil in.csv --out out.yaml --picture out.png --data', 'out.csv'),
+    ('calibrate latency --simulate --params-file in.yaml --out in.yaml', 'in.yaml'),
+    ('sweep --cases in.csv --out in.csv', 'in.csv'),
+])
+def test_no_command_writes_over_what_it_reads_or_wrote(
+        command, file, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in ('in.csv', 'a_levels.csv', 'in.yaml'):
+        Path(name).write_text('zeta\n0.1\n')
+    assert main(command.split()) == 2
+    assert f'cannot write {file}: ' in capsys.readouterr().err
+    assert {x.read_text() for x in tmp_path.iterdir()} == {'zeta\n0.1\n'}
+
+
 @pytest.mark.slow
 @pytest.mark.ros
 def test_send_reports_until_the_sequence_has_been_carried_out(start, ros):

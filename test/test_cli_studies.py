@@ -304,7 +304,7 @@ def test_sweep_says_how_to_get_parquet_where_it_is_missing(refused, tmp_path, mo
     (['--cases', 'none.csv'], 'cannot read none.csv: No such file'),
     (['--cases', '.'], 'cannot read .: Is a directory'),
     (['--out', 'o.txt'], '.csv or .parquet'),
-    (['--out', 'none/o.csv'], 'cannot write none/o.csv: No such file'),
+    (['--out', 'none/o.csv'], 'cannot write none/o.csv: none is no folder'),
     (['--out', 'none/o.parquet'], 'none/o.parquet'),
     (['--rate', '1'], '--rate'),
 ])

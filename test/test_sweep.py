@@ -341,7 +341,7 @@ def test_a_view_puts_each_row_of_a_sweep_where_its_axes_say():
 
 @pytest.mark.parametrize(('words', 'message'), [
     (('--zeta', '0:1:9', '--picture', 'x.gif'), 'ends in .png, .pdf, .svg or .pgf'),
-    (('--zeta', '0:1:9', '--picture', 'x.png', '--data', '--out', 'x.csv'), 'the table of --out'),
+    (('--zeta', '0:1:9', '--picture', 'x.png', '--data', '--out', 'x.csv'), 'name the same file'),
     (('--zeta', '0:1:9', '--picture', 'x.png', '--width', '0'), 'expected 40 to 400 mm'),
     (('--zeta', '0:1:9', '--picture', 'x.png', '--show', 'zeta'), 'expected some of beta_p'),
     (('--zeta', '0:1:9', '--j-lim', '1:9:9', '--c1', '1:2:9', '--picture', 'x.png'),

@@ -20,7 +20,7 @@ from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.quantities import number_of
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.files import check_targets, write_text, yaml_text
+from hmsa_ros.files import write_text, yaml_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -108,12 +108,12 @@ def _coil(arguments: argparse.Namespace) -> int:
     from hmsa_ros.device.calibration import calibrate_coil
     from hmsa_ros.device.iron_core import fit_core
 
-    check_targets(arguments.out)
+    paper = paper_of(
+        arguments, *_files(arguments.out), sources=[Path(arguments.source)])
     if not (arguments.limit > 0.0 and arguments.settle >= 0.0 and arguments.steps >= 2):
         raise BadInputError(
             f'--limit {arguments.limit:g}, --settle {arguments.settle:g} or --steps '
             f'{arguments.steps}: expected a limit above 0 T, at least 0 s and at least 2 steps')
-    paper = paper_of(arguments)
     current, flux = _readings(arguments)
     found = calibrate_coil(current, flux)
     core, left = None, math.nan
@@ -246,11 +246,16 @@ def _made(name: str, option: str) -> Any:
     return found
 
 
+def _files(out: Path | None) -> tuple[Path, ...]:
+    """Return a parameter file and the table beside it."""
+    return () if out is None else (out, out.with_suffix('.csv'))
+
+
 def _write_table(out: Path, columns: 'dict[str, Array]') -> Path:
     """Write columns to a table next to a parameter file; return its path."""
     from hmsa_ros.recordings.tables import write_table
 
-    table = out.with_suffix('.csv')
+    _, table = _files(out)
     write_table(table, columns)
     return table
 
@@ -267,7 +272,6 @@ def _write_parameters(out: Path, words: str, nodes: 'dict[str, dict[str, Any]]')
 
 def _checked(arguments: argparse.Namespace, least: int) -> str:
     """Check the options, with a minimum number of steps; return the name of the hardware."""
-    check_targets(arguments.out)
     if arguments.simulate is (arguments.source is not None):
         raise BadInputError('expected either MODULE:NAME of hardware or --simulate')
     if arguments.steps < least:
@@ -304,7 +308,8 @@ def _latency(arguments: argparse.Namespace) -> int:
 
     example: hmsa calibrate latency my_lab:Bench --probe my_lab:Hall --limit 0.05 --out delays.yaml
     """
-    paper, name = paper_of(arguments), _checked(arguments, 2)
+    name = _checked(arguments, 2)
+    paper = paper_of(arguments, arguments.out, sources=[arguments.params_file])
     if arguments.lag is not None:
         if not 0.0 <= arguments.lag < 1.0:
             raise BadInputError(f'--lag is {arguments.lag:g} s: expected 0 to 1 s')
@@ -354,14 +359,14 @@ def _static(arguments: argparse.Namespace) -> int:
     Stretch at rest over flux density, and the scale of the sensor.
 
     Hold a slow staircase of levels, from 0 to --limit, to its negative and back. Writes the table
-    of the hyperelastic model ``table`` for the planner, and the scale of the sensor by which the
+    of the hyperelastic model "table" for the planner, and the scale of the sensor by which the
     stretch without a field is 1. With --gauge also its gain and offset. The coil is off at the
     end, and after Ctrl-C.
 
     example: hmsa calibrate static my_lab:Bench --limit 0.05 --settle 5 --out static.yaml
     """
     # A table needs six levels.
-    paper, name = paper_of(arguments), _checked(arguments, 3)
+    paper, name = paper_of(arguments, *_files(arguments.out)), _checked(arguments, 3)
     if not 0.1 <= arguments.settle < math.inf:
         raise BadInputError(f'--settle is {arguments.settle:g} s: expected at least 0.1 s')
     from hmsa_ros.device.statics import scale_at_rest, scale_by_gauge, statics

@@ -15,7 +15,7 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_command, JSON, show
 from hmsa_ros.cli.progress import progress
-from hmsa_ros.files import write_text
+from hmsa_ros.files import check_targets, write_text
 from hmsa_ros.table import Column, Table
 
 if TYPE_CHECKING:
@@ -52,6 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.identification.files import read_belief
     from hmsa_ros.identification.quantities import free_of
 
+    check_targets(arguments.out, sources=[arguments.params_file])
     belief = read_belief(arguments.params_file)
     with progress('designing the sequence'):
         found = excite(

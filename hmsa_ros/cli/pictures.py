@@ -1,9 +1,11 @@
 """Options common to all commands that draw figures."""
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
 
 from hmsa_ros.cli.options import Row
+from hmsa_ros.files import check_targets
 from hmsa_ros.report.paper import kind_of, KINDS, kinds_in, Paper
 
 _ENDS = f'{", ".join(f".{x}" for x in KINDS[:-1])} or .{KINDS[-1]}'
@@ -45,12 +47,23 @@ def picture_options(
     return *files, ('pictures', rows)
 
 
-def paper_of(arguments: argparse.Namespace) -> Paper:
-    """Return the paper format of the options; raise `BadInputError` if invalid."""
-    for picture in getattr(arguments, 'picture', ()):
+def paper_of(
+        arguments: argparse.Namespace, *targets: Path | None,
+        sources: Iterable[Path | None] = ()) -> Paper:
+    """
+    Return the paper format of the options; raise `BadInputError` if invalid.
+
+    Figures and their data must not replace other targets or the sources of the command.
+    """
+    pictures: list[Path] = getattr(arguments, 'picture', [])
+    for picture in pictures:
         kind_of(picture)
-    return Paper(arguments.width, arguments.font_size, arguments.dpi,
-                 getattr(arguments, 'data', False))
+    paper = Paper(arguments.width, arguments.font_size, arguments.dpi,
+                  getattr(arguments, 'data', False))
+    check_targets(
+        *targets, *pictures, *(dict.fromkeys(x.with_suffix('.csv') for x in pictures)
+                               if paper.data else ()), sources=sources)
+    return paper
 
 
 def formats_of(arguments: argparse.Namespace) -> tuple[str, ...]:

@@ -25,6 +25,7 @@ from hmsa_ros.cli.options import (
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import setpoint
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import check_targets
 from hmsa_ros.table import Column
 
 if TYPE_CHECKING:
@@ -103,6 +104,7 @@ def _in_units(arguments: argparse.Namespace) -> int:
     """Plan in seconds and tesla, or volts."""
     from hmsa_ros.api.plan import table_of
 
+    check_targets(arguments.out, sources=(arguments.path, arguments.params_file))
     actuator = _actuator(arguments)
     shaper = arguments.shaper or 'two_step'
     plan = _along(actuator, arguments) if arguments.path else actuator.plan(

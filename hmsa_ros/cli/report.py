@@ -16,7 +16,7 @@ from hmsa_ros.cli.options import add_command, bags, show
 from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import check_targets, write_text
+from hmsa_ros.files import write_text
 
 if TYPE_CHECKING:
     from hmsa_ros.recordings.record import Run
@@ -43,16 +43,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Read, evaluate and write; raise `BadInputError` if a file cannot be written."""
     out = arguments.out or Path(f'{arguments.bags[0].resolve().stem}_report.html')
     pictures: list[Path] = arguments.picture
-    paper = paper_of(arguments)
+    paper = paper_of(arguments, out, sources=arguments.bags)
     targets = [out, *pictures, *(
         dict.fromkeys(x.with_suffix('.csv') for x in pictures) if paper.data else ())]
-    if len({x.resolve() for x in targets}) < len(targets):
-        raise BadInputError(
-            'two of --out and --picture name the same file: expected different files')
     if part := next((x for x in targets if x.suffix in ('.mcap', '.yaml')), None):
         raise BadInputError(
             f'cannot write {part}: it may be part of a bag; expected a name such as report.html')
-    check_targets(*targets, sources=arguments.bags)
 
     from hmsa_ros.recordings.bags import read_runs
     from hmsa_ros.recordings.parameters import read_parameter_file

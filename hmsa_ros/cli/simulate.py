@@ -38,7 +38,12 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Simulate, write and print."""
-    paper = paper_of(arguments)
+    from hmsa_ros.recordings.tables import levels_beside
+
+    out: Path | None = arguments.out
+    paper = paper_of(
+        arguments, *(() if out is None else (out, levels_beside(out))),
+        sources=(arguments.levels, arguments.params_file))
     from hmsa_ros.api.actuator import Actuator
 
     actuator = Actuator() if arguments.params_file is None else Actuator.from_yaml(
@@ -46,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     with progress('simulating'):
         motion = actuator.simulate(arguments.levels, **{
             x: getattr(arguments, x) for x in ('until', 'start', 'rate', 'noise', 'seed')})
-        written = [] if arguments.out is None else motion.save(arguments.out)
+        written = [] if out is None else motion.save(out)
         if arguments.picture:
             motion.plot(arguments.picture, **asdict(paper))
     report, files = motion.report(), [*written, *arguments.picture]

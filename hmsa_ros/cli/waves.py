@@ -15,6 +15,7 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_command, EXAMPLE, JSON, show
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import check_targets
 
 if TYPE_CHECKING:
     from hmsa_ros.api.actuator import Actuator
@@ -50,6 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise BadInputError(
             f'the shape is {arguments.shape} and --to is {arguments.to}: expected --to HZ with '
             'sweep, and with no other shape')
+    check_targets(
+        arguments.out, arguments.path, sources=(Path(arguments.shape), arguments.params_file))
     actuator = Actuator() if arguments.params_file is None else Actuator.from_yaml(
         arguments.params_file)
     shape: Any = arguments.shape

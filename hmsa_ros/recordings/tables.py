@@ -62,9 +62,13 @@ def write_run(path: Path, run: Run) -> list[Path]:
     write_table(path, samples)
     if not run.levels:
         return [path]
-    beside = path.with_name(f'{path.stem}_levels{path.suffix}')
-    write_table(beside, levels)
-    return [path, beside]
+    write_table(levels_beside(path), levels)
+    return [path, levels_beside(path)]
+
+
+def levels_beside(path: Path) -> Path:
+    """Return where the levels go whose samples go to a file."""
+    return path.with_name(f'{path.stem}_levels{path.suffix}')
 
 
 def write_table(path: Path, columns: Mapping[str, Array]) -> None:

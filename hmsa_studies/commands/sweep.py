@@ -21,7 +21,7 @@ from typing import Any, TYPE_CHECKING
 from hmsa_ros.cli.options import add_command, MATERIAL
 from hmsa_ros.cli.pictures import formats_of, paper_of, picture_options
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.report.paper import kind_of, named, Paper
+from hmsa_ros.report.paper import named, Paper
 from hmsa_studies.commands import chunked
 
 if TYPE_CHECKING:
@@ -114,20 +114,16 @@ class _Picture:
         if wrong:
             raise BadInputError(
                 f'--show has {wrong[0]!r}: expected some of {", ".join(sweep.results)}')
-        self._paper = paper_of(arguments)
-        for path in self._paths:
-            kind_of(path)
         out: Path | None = arguments.out
+        self._paper = paper_of(
+            arguments, None if out is None or _is_folder(out) else out,
+            sources=(arguments.cases, arguments.params_file))
         asked = bool(self._paths)
         self._default = arguments.show is None and self._paper == Paper()
         if out is not None and _is_folder(out) and not asked:
             self._paths = named(out, 'table', formats_of(arguments))
         self._tables = list(dict.fromkeys(
             x.with_suffix('.csv') for x in self._paths if self._paper.data))
-        if out is not None and out in self._tables:
-            raise BadInputError(
-                f'--data would write {out}, which is the table of --out: expected another name '
-                'for one of them')
         if not self._paths:
             return
         try:
@@ -300,10 +296,6 @@ def _places(out: Path) -> tuple[Path, Path]:
         raise BadInputError(
             f'the format of {out} is unknown: expected a name that ends in .csv or .parquet, or a '
             'folder')
-    if out.is_dir():
-        raise BadInputError(f'{out} is a folder: expected the name of a file')
-    if not out.parent.is_dir():
-        raise BadInputError(f'cannot write {out}: No such file or directory; expected a folder')
     return out, out.with_name(f'{out.name}.chunks')
 
 
