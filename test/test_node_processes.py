@@ -89,13 +89,16 @@ def test_bad_arguments_refuse_the_start_in_one_line_with_status_2(
 
 
 @pytest.mark.parametrize('words', [['planner'], ['send', '1.1:1']])
-def test_a_log_that_cannot_be_written_refuses_the_start(start, words):
+@pytest.mark.parametrize(('name', 'value', 'said'), [
+    ('ROS_LOG_DIR', '/dev/null/log',
+     r'ROS cannot write its log \(.*/dev/null/log.*\): set ROS_LOG_DIR .*'),
+    ('ROS_DOMAIN_ID', 'abc', "ROS_DOMAIN_ID is 'abc': expected a whole number of 0 to 232"),
+    ('ROS_DOMAIN_ID', '233', "ROS_DOMAIN_ID is '233': expected a whole number of 0 to 232")])
+def test_an_environment_in_which_ros_cannot_start_is_named(start, words, name, value, said):
     # A process writes to one log.
-    process = start.hmsa(*words, ROS_LOG_DIR='/dev/null/log')
+    process = start.hmsa(*words, **{name: value})
     assert process.wait() == 2
-    assert re.fullmatch(
-        r'hmsa: error: ROS cannot write its log \(.*/dev/null/log.*\): set ROS_LOG_DIR .*\n',
-        process.stderr)
+    assert re.fullmatch(f'hmsa: error: {said}\n', process.stderr)
 
 
 @pytest.mark.parametrize('node', NODES)

@@ -1,6 +1,7 @@
 """Start of ROS in a process, and temporary nodes of commands that inspect a running system."""
 
 from collections.abc import Callable, Sequence
+import os
 import re
 from time import monotonic
 from typing import Any, TypeVar
@@ -21,6 +22,7 @@ from hmsa_ros.nodes.service_call import ServiceCall
 T = TypeVar('T')
 #: Maximum time in s of one wait for callbacks.
 SLICE_SECONDS = 0.05
+_LAST_DOMAIN = 232
 
 
 def start_ros(
@@ -31,9 +33,14 @@ def start_ros(
     Raises
     ------
     BadInputError
-        If the log cannot be written.
+        If the log cannot be written, or there is no such domain.
 
     """
+    domain = os.environ.get('ROS_DOMAIN_ID', '').strip()
+    # DDS has no ports for others, and ends the process.
+    if domain and not (domain.isdecimal() and int(domain) <= _LAST_DOMAIN):
+        raise BadInputError(
+            f'ROS_DOMAIN_ID is {domain!r}: expected a whole number of 0 to {_LAST_DOMAIN}')
     prepare_middleware()
     try:
         rclpy.init(
