@@ -415,6 +415,13 @@ def test_a_table_is_printed_where_the_locale_lacks_its_characters():
     assert 'two_step' in shown.stdout
 
 
+def test_nothing_is_wrong_where_standard_output_is_closed():
+    shown = subprocess.run(
+        ['sh', '-c', f'{shlex.quote(sys.executable)} -m hmsa_ros plan 1.1:10 >&-'], cwd=ROOT,
+        capture_output=True, text=True, check=True)
+    assert shown.stderr == ''
+
+
 @pytest.mark.parametrize('code', [PROGRESS, TABLE])
 @pytest.mark.parametrize('env', [{'NO_COLOR': '1'}, {'TERM': 'dumb'}])
 def test_no_colour_where_none_is_wanted(code, env):

@@ -94,7 +94,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     ENDING.interrupt()
     try:
         status: int = arguments.run(arguments)
-        sys.stdout.flush()
+        print(end='', flush=True)  # also where standard output is closed
         return status
     except HmsaError as error:
         return complain(error)
