@@ -1,5 +1,5 @@
 """
-Recordings: MCAP bags as rosbag2 (Jazzy) lays them out.
+MCAP bags in the layout of rosbag2 (Jazzy).
 
-Reading and writing need no running ROS graph and do not import rclpy.
+Reading and writing do not need ROS and do not import rclpy.
 """

@@ -1,8 +1,8 @@
 """
-Message definitions: of installed interface packages, with their hashes, and those of bags.
+Message definitions of installed interface packages, with their hashes, and of bags.
 
-A bag holds the text of each message type with all it depends on, so that a reader needs no
-ROS. The text is taken from the ``share`` folders of the environment, without rclpy.
+A bag contains the definition of each message type with its dependencies, so that readers do not
+need ROS. Definitions are read from the ``share`` folders of the environment, without rclpy.
 """
 
 from collections.abc import Callable
@@ -19,10 +19,10 @@ from typing import Any, TYPE_CHECKING
 from hmsa_ros.bag import limits
 from hmsa_ros.errors import BagError
 
-if TYPE_CHECKING:  # slow to load, and no use to a node that records nothing
+if TYPE_CHECKING:  # slow to import
     from hmsa_ros.bag.metadata import Topic
 
-# Types that are part of the language of .msg files and have no file of their own.
+# Built-in types of .msg files.
 _BUILTIN = frozenset((
     'bool', 'byte', 'char', 'float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32',
     'uint32', 'int64', 'uint64', 'string', 'wstring'))
@@ -31,14 +31,14 @@ _SEPARATOR = '\n' + '=' * 80 + '\nMSG: '
 
 
 def share_folders() -> list[Path]:
-    """Return AMENT_PREFIX_PATH's share folders in order, then that of this Python environment."""
+    """Return the share folders of AMENT_PREFIX_PATH in order, then of this Python environment."""
     prefixes = [prefix for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
                 if prefix]
     return [Path(prefix) / 'share' for prefix in [*prefixes, sys.prefix]]
 
 
 def is_interface_package(name: str) -> bool:
-    """Return whether a package is installed as a ROS package, not only as a Python module."""
+    """Return whether a package is installed as a ROS package, not just as a Python module."""
     return re.fullmatch(r'[A-Za-z]\w*', name) is not None and any(
         (folder / name / 'package.xml').is_file() for folder in share_folders())
 
@@ -53,7 +53,7 @@ def _split(type_name: str) -> tuple[str, str]:
 
 
 def _find(type_name: str, suffix: str) -> Path | None:
-    """Return the file of a type, or None if no package of the environment has it."""
+    """Return the file of a type; None if it is not installed."""
     package, name = _split(type_name)
     for folder in share_folders():
         path = folder / package / 'msg' / f'{name}{suffix}'
@@ -76,7 +76,7 @@ def _dependencies(type_name: str, text: str) -> list[str]:
 
 @cache
 def message_definition(type_name: str) -> tuple[str, str]:
-    """Return ``'ros2msg'`` and the text of a type and all it needs, or raise `BagError`."""
+    """Return ``'ros2msg'`` and the definition of a type with dependencies; raise `BagError`."""
     sections: list[str] = []
     names = ['/'.join(_split(type_name))]
     for name in names:
@@ -94,7 +94,7 @@ def message_definition(type_name: str) -> tuple[str, str]:
 
 @cache
 def type_hash(type_name: str) -> str:
-    """Return the RIHS01 hash of a type, or an empty text if the environment does not have it."""
+    """Return the RIHS01 hash of a type; empty if it is not installed."""
     path = _find(type_name, '.json')
     if path is None:
         return ''
@@ -111,10 +111,10 @@ _NESTED = re.compile(r'^\s*(?:[A-Z]\w*|\w+/[\w/]+)\s*\[', re.MULTILINE)
 
 
 def make_decoder(info: 'Topic') -> Callable[[bytes], Any]:
-    """Return what decodes a topic's payloads; both raise `BagError` where it cannot be done."""
+    """Return the decoder of a topic's payloads; both raise `BagError` if they cannot decode."""
     from mcap.records import Schema
     from mcap_ros2.decoder import DecoderFactory
-    # A decoder of its own: the library keeps decoders by schema number, which differs between
+    # A new factory for each topic: the library caches decoders by schema id, which differs between
     # the files of a bag.
     try:
         # Its parser prints before it raises.
@@ -132,7 +132,7 @@ def make_decoder(info: 'Topic') -> Callable[[bytes], Any]:
             f'expected CDR with a ros2msg definition, got {info.encoding!r} with '
             f'{info.definition_encoding or "no definition"!r}')
 
-    # Arrays of primitive values take what they say of their length; those of messages may take
+    # Decoded arrays of primitive values take about their encoded size; arrays of messages may take
     # a hundred times as much.
     most = limits.DECODED_SIZE if _NESTED.search(info.definition) else limits.CHUNK_SIZE
 

@@ -1,5 +1,5 @@
 """
-What a bag contains of the experiment: the parameters of its nodes.
+Metadata of the experiment in a bag: the parameters of its nodes.
 
 The recorder stores them as custom data under the node's full name, a dot and the parameter's
 name (``/left/plant.actuator.density``), the value as JSON. Bags of version 0.1 have the last
@@ -13,7 +13,7 @@ from typing import Any
 
 #: Setpoints kept for the custom data of a bag.
 MAX_SETPOINTS = 1000
-# And of what length altogether.
+# Their maximum total length.
 _SETPOINTS_LENGTH = 2**18
 
 
@@ -45,14 +45,14 @@ def parameters_of(custom_data: Mapping[str, str], node: str, space: str) -> dict
 
 
 class SetpointLog:
-    """The latest setpoints that were sent, as they go into the custom data of a bag."""
+    """The latest setpoints, as stored in the custom data of a bag."""
 
     def __init__(self) -> None:
         self._entries: deque[str] = deque(maxlen=MAX_SETPOINTS)
         self._changed = False
 
     def add(self, topic: str, received_ns: int, message: Any) -> None:
-        """Take in a message with a setpoint (``data``) or a sequence of them (``points``)."""
+        """Add a message with a setpoint (``data``) or a sequence of them (``points``)."""
         entry: dict[str, Any] = {'topic': topic, 'received': received_ns}
         if hasattr(message, 'points'):
             stamp = message.header.stamp
@@ -67,7 +67,7 @@ class SetpointLog:
         self._changed = True
 
     def news(self) -> dict[str, str]:
-        """Return the custom data if they have changed, as many as are of a reasonable length."""
+        """Return the custom data if changed, limited to a reasonable length."""
         if not self._changed:
             return {}
         self._changed = False

@@ -1,4 +1,4 @@
-"""The files of a bag: those that its metadata name, and no others."""
+"""Find the files of a bag: those that its metadata list, and no others."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,10 +11,10 @@ _Problem = Callable[[str], None]
 
 def find(path: Path, problem: _Problem) -> tuple[list[Path], metadata.BagMetadata | None]:
     """
-    Return the files of a bag, a folder or one file, in order, and what its metadata say.
+    Return the files of a bag (a folder or one file) in order, and its metadata.
 
-    ``problem`` gets what cannot be read or does not agree. Raises `BadInputError` if there is
-    none, or it is of another kind.
+    ``problem`` is called with a message about each inconsistency. Raises `BadInputError` if there
+    is no bag, or its format is not supported.
     """
     try:
         if path.is_file():
@@ -61,7 +61,7 @@ def find(path: Path, problem: _Problem) -> tuple[list[Path], metadata.BagMetadat
 
 
 def _is_own(path: Path, problem: _Problem) -> bool:
-    """Return whether a path is a file that lies in its folder."""
+    """Return whether a path is a file in its folder, not a link to another folder."""
     if not path.is_file():
         return False
     if path.resolve().parent != path.parent.resolve():
@@ -72,7 +72,7 @@ def _is_own(path: Path, problem: _Problem) -> bool:
 
 
 def _metadata(folder: Path, problem: _Problem) -> metadata.BagMetadata | None:
-    """Return what the metadata say, None if they are missing or cannot be used."""
+    """Return the metadata; None if they are missing or unusable."""
     path = folder / metadata.FILE_NAME
     if not path.exists():
         problem(f'{path} is missing: the files themselves are read')
@@ -97,10 +97,10 @@ def _metadata(folder: Path, problem: _Problem) -> metadata.BagMetadata | None:
 
 def _listed(
         folder: Path, stored: metadata.BagMetadata, problem: _Problem) -> list[Path]:
-    """Return the files that the metadata name and that are there, each once."""
+    """Return the existing files that the metadata list, each once."""
     found: dict[Path, None] = {}
     for file in stored.files:
-        # Up to version 3 paths begin with the folder; none leads out of it.
+        # Up to version 3, paths begin with the folder. A path never leads out of it.
         path = folder / Path(file.path.replace('\0', '')).name
         try:
             if _is_own(path, problem):

@@ -1,4 +1,4 @@
-"""What is in a bag, in figures and in words."""
+"""Summarize a bag."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -11,31 +11,31 @@ from hmsa_ros.bag.experiment import node_parameters, parameter_key
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.errors import BagError, printable
 
-# What is printed as JSON, in this order.
+# Keys of the JSON output, in this order.
 _SHOWN = (
     'path', 'files', 'start_ns', 'end_ns', 'duration', 'message_count', 'lost', 'sent_before',
     'topics', 'parameters', 'custom_data', 'complete', 'problems')
-# What custom data count by topic.
+# Keys of custom data with counts by topic.
 _COUNTED = 'lost', 'sent_before'
 
 
 @dataclass(frozen=True)
 class TopicSummary:
-    """One topic in figures."""
+    """The summary of one topic."""
 
     name: str
     type: str
     count: int
-    rate: float | None  #: a second over the length of the bag; None where that is not defined
+    rate: float | None  #: messages per second over the length of the bag; None if undefined
     lost: int | None  #: None if the recorder did not count
-    sent_before: int | None  #: sent before the recorder was matched; None as for lost
-    reliability: str  #: of the publishers, several separated by a slash; empty if unknown
+    sent_before: int | None  #: sent before the recorder was matched; None if not counted
+    reliability: str  #: of the publishers, separated by slashes; empty if unknown
     durability: str
 
 
 @dataclass(frozen=True)
 class BagSummary:
-    """A bag in figures."""
+    """The summary of a bag."""
 
     path: str  #: as given
     files: tuple[tuple[str, int], ...]  #: name and size in bytes
@@ -43,9 +43,9 @@ class BagSummary:
     end_ns: int | None
     topics: tuple[TopicSummary, ...]  #: in order of name
     parameters: Mapping[str, str]  #: of the recorded nodes, values as JSON
-    custom_data: Mapping[str, str]  #: everything else that was stored with the bag
+    custom_data: Mapping[str, str]  #: all other custom data
     complete: bool  #: whether every file was closed by its writer
-    problems: tuple[str, ...]  #: what could not be read, one sentence each
+    problems: tuple[str, ...]  #: parts that could not be read, one sentence each
 
     @property
     def duration(self) -> float:
@@ -66,7 +66,7 @@ class BagSummary:
 
     @property
     def sent_before(self) -> int | None:
-        """Return how many messages were sent before the recorder was matched, None as above."""
+        """Return how many messages were sent before the recorder was matched; None if unknown."""
         return self._sum('sent_before')
 
     def _sum(self, name: str) -> int | None:
@@ -77,9 +77,9 @@ class BagSummary:
 def summarize(
         bag: str | os.PathLike[str] | BagReader, *,
         max_chunk_size: int = limits.CHUNK_SIZE) -> BagSummary:
-    """Return the figures of a bag, or of one that is read; raise `BadInputError` if it is none."""
+    """Return the summary of a bag or of its reader; raise `BadInputError` if it is no bag."""
     reader = bag if isinstance(bag, BagReader) else BagReader(bag, max_chunk_size=max_chunk_size)
-    # First of all: it finds out what is damaged.
+    # This comes first because it detects damage.
     counts = reader.counts()
     start, end = reader.start_time, reader.end_time
     seconds = 0.0 if start is None or end is None else (end - start) * 1e-9
@@ -106,7 +106,7 @@ def summarize(
 
 def missing_messages(custom_data: Mapping[str, str], key: str) -> dict[str, int] | None:
     """
-    Return counts by topic of a bag's custom data; None if it has none.
+    Return the counts by topic in a bag's custom data; None if missing.
 
     The key is ``lost``, or ``sent_before`` for messages sent before the recorder was matched.
     """
@@ -120,7 +120,7 @@ def missing_messages(custom_data: Mapping[str, str], key: str) -> dict[str, int]
 
 
 def to_json(summary: BagSummary, notes: Sequence[str] = ()) -> str:
-    """Return a summary, and what is notable besides, as one JSON object."""
+    """Return a summary and notes as one JSON object."""
     shown = asdict(summary) | {
         'files': [{'name': name, 'size': size} for name, size in summary.files]}
     return json.dumps(
@@ -130,7 +130,7 @@ def to_json(summary: BagSummary, notes: Sequence[str] = ()) -> str:
 
 def to_text(
         summary: BagSummary, notes: Sequence[str] = (), *, parameters: bool = False) -> str:
-    """Return a summary and what is notable besides in words; with the parameters if asked."""
+    """Return a summary and notes as text, optionally with the parameters."""
     return '\n'.join(map(printable, _lines(summary, notes, parameters)))
 
 
@@ -183,7 +183,7 @@ def _lines(
 
 
 def _time(nanoseconds: int) -> str:
-    """Return a time as a date, or as seconds where it is simulated."""
+    """Return a time as a date, or in seconds if simulated."""
     seconds = nanoseconds * 1e-9
     if seconds < 1e8:
         return f'{seconds:.9f} s'

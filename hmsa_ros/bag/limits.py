@@ -1,8 +1,8 @@
 """
-What a bag may cost whoever reads it.
+Limits on the resources that reading a bag may take.
 
-A bag may come from anybody. Its lengths and counts are held against these limits before memory
-is taken for them, and its YAML is counted before it is built.
+Bags can come from untrusted sources. Their sizes and counts are checked against these limits
+before memory is allocated, and YAML is checked before it is loaded.
 """
 
 import json
@@ -13,7 +13,7 @@ from typing import Any
 from hmsa_ros.errors import BagError
 
 MEBIBYTE = 2**20
-#: Largest content of a chunk, and largest message; what a reader may be told otherwise.
+#: Largest content of a chunk, and largest message; readers can be given another limit.
 CHUNK_SIZE = 128 * MEBIBYTE
 #: Content of chunks that overlap in time, as a multiple of the largest chunk.
 CHUNKS_AT_ONCE = 4
@@ -25,7 +25,7 @@ CHANNELS = 8192
 TOPICS = 4096
 #: Summary of a file, that of half a terabyte in usual chunks.
 SUMMARY_SIZE = 128 * MEBIBYTE
-#: Data held against their CRC as a whole when a bag is summarized: seconds.
+#: Largest data section whose CRC is checked when a bag is summarized, which takes seconds.
 CHECKED_SIZE = 1024 * MEBIBYTE
 #: Record of a schema, a channel, statistics or metadata.
 RECORD_SIZE = 16 * MEBIBYTE
@@ -35,8 +35,8 @@ KEPT_SIZE = 64 * MEBIBYTE
 DEFINITION_SIZE = 2 * MEBIBYTE
 #: Entries of a map in a record.
 MAP_ENTRIES = 100_000
-#: Message to be decoded whose type has arrays of messages: each may take a hundred times its
-#: bytes in Python.
+#: Largest message of a type with arrays of messages that is decoded: in Python it may take a
+#: hundred times its size.
 DECODED_SIZE = 8 * MEBIBYTE
 #: File ``metadata.yaml``.
 YAML_SIZE = 16 * MEBIBYTE
@@ -49,7 +49,7 @@ PROBLEMS = 200
 
 
 def load_json(text: str) -> Any:
-    """Return what a JSON text holds; raise `BagError` unless all its numbers are finite."""
+    """Return the content of a JSON text; raise `BagError` unless all its numbers are finite."""
     def number(digits: str) -> float:
         value = float(digits)
         if not math.isfinite(value):
@@ -64,8 +64,8 @@ def load_json(text: str) -> Any:
 
 
 def load_yaml(text: str) -> Any:
-    """Return what a YAML text holds; raise `BagError` if it is none, too large, or has anchors."""
-    import yaml  # whoever plans without files need not wait for it
+    """Return the content of a YAML text; raise `BagError` if invalid, too large, or aliased."""
+    import yaml  # slow to import
 
     # The C parser is some ten times faster; not every installation of PyYAML has it.
     loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
@@ -75,7 +75,7 @@ def load_yaml(text: str) -> Any:
     try:
         for event in yaml.parse(text, Loader=loader):
             if isinstance(event, yaml.AliasEvent):
-                # With these a few lines unfold to more than fits into any memory.
+                # With aliases, a few lines can expand to more than any memory.
                 raise BagError('it uses YAML anchors, expected plain YAML')
             if isinstance(event, yaml.NodeEvent):
                 nodes += 1

@@ -1,4 +1,4 @@
-"""Messages of several chunks in order of time."""
+"""Merge the messages of several chunks in order of log time."""
 
 from array import array
 from collections.abc import Callable, Iterator
@@ -11,7 +11,7 @@ from hmsa_ros.errors import BagError
 
 
 class Message(NamedTuple):
-    """A message as stored: topic, stamps in nanoseconds, sequence and payload."""
+    """A stored message: topic, times in ns, sequence number and payload."""
 
     topic: str
     log_time: int
@@ -22,10 +22,10 @@ class Message(NamedTuple):
 
 class Cursor:
     """
-    A place among the messages of a chunk or run, at first in the order stored.
+    A position in the messages of a chunk or run, initially in stored order.
 
-    It keeps places, not messages: a chunk of many small messages would take ten times its size.
-    Of equal stamps the smaller ``key`` comes first; ``problem`` says what is damaged.
+    Only offsets are kept: the messages of a chunk could take ten times its size. Among equal log
+    times, the smaller ``key`` comes first; ``problem`` describes damage.
     """
 
     def __init__(
@@ -52,9 +52,9 @@ class Cursor:
             self.problem = str(error)
 
     def sort(self) -> None:
-        """Put the messages in order of time; equal ones stay as they are."""
+        """Sort the messages by log time; the sort is stable."""
         times = self._times
-        # Nearly always they are in order already.
+        # Usually they are sorted already.
         if any(later < earlier for earlier, later in zip(times, islice(times, 1, None),
                                                          strict=False)):
             order = sorted(range(len(times)), key=times.__getitem__)
@@ -72,7 +72,7 @@ class Cursor:
         return self._times[self._next]
 
     def take(self, limit: int) -> Iterator[Message]:
-        """Return the next messages, up to a log time; that is for messages in order."""
+        """Yield the next messages before a log time; the messages must be sorted."""
         unpack, head_size = records.MESSAGE_HEAD.unpack_from, records.MESSAGE_HEAD.size
         prefix_size = records.PREFIX.size
         content, names = self.content, self._names
@@ -86,13 +86,13 @@ class Cursor:
 
 
 def merge(cursors: list[Cursor], limit: int) -> Iterator[Message]:
-    """Yield the messages of sorted chunks before a log time, of equal stamps the oldest first."""
+    """Yield the messages of sorted chunks before a log time; equal times in written order."""
     heap = [(cursor.time, cursor.key, cursor) for cursor in cursors
             if cursor.left and cursor.time < limit]
     heapq.heapify(heap)
     while heap:
         _, key, cursor = heapq.heappop(heap)
-        # Up to the next message of another chunk; where they are equal, key decides.
+        # Up to the next message of another chunk; the key decides between equal times.
         until = limit if not heap else min(limit, heap[0][0] + (key < heap[0][1]))
         yield from cursor.take(until)
         if cursor.left and cursor.time < limit:

@@ -1,4 +1,4 @@
-"""The file ``metadata.yaml`` of a bag: version 9 as Jazzy writes it, and reading its elders."""
+"""The file ``metadata.yaml`` of a bag: writes version 9 (Jazzy), reads versions 1 to 9."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,28 +13,28 @@ from hmsa_ros.errors import BadInputError, BagError
 
 FILE_NAME = 'metadata.yaml'
 VERSION = 9
-# What rosbag2 writes as the start of a bag without a message.
+# The start time that rosbag2 writes for a bag without messages.
 NO_TIME = 9223372036854775807
-#: Key of custom data while a bag is written: who finds it reads what a killed writer left.
+#: Key of custom data while a bag is being written, which a killed writer leaves behind.
 NOT_ENDED = 'hmsa_ros.not_ended'
 _Dumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag, read or to be written; the metadata say no definition of it."""
+    """A topic of a bag; ``metadata.yaml`` does not contain its definition."""
 
     name: str  #: for example ``'/joint_states'``
-    type: str  #: for example ``'sensor_msgs/msg/JointState'``; empty if a bag does not have it
-    definition: str = ''  #: with its dependencies; empty if not known
+    type: str  #: for example ``'sensor_msgs/msg/JointState'``; empty if unknown
+    definition: str = ''  #: with its dependencies; empty if unknown
     definition_encoding: str = 'ros2msg'  #: or ``'ros2idl'``, empty
     profiles: tuple[qos.Qos, ...] = ()  #: what the publishers offer
-    type_hash: str = ''  #: RIHS01 hash, empty if not known
+    type_hash: str = ''  #: RIHS01 hash; empty if unknown
     encoding: str = 'cdr'  #: of the messages
     message_count: int = 0  #: as the metadata say
 
     def check(self) -> None:
-        """Raise `BadInputError` for a topic that nobody could name or decode."""
+        """Raise `BadInputError` if name or type is empty."""
         if not self.name:
             raise BadInputError('a topic has an empty name: expected a name such as /stretch')
         if not self.type:
@@ -53,14 +53,14 @@ class FileMetadata:
 
 @dataclass(frozen=True)
 class BagMetadata:
-    """What ``metadata.yaml`` says of a bag."""
+    """The content of ``metadata.yaml``."""
 
     start_ns: int = NO_TIME  #: first log time; `NO_TIME` without a message
     duration_ns: int = 0
     message_count: int = 0
     topics: tuple[Topic, ...] = ()
     files: tuple[FileMetadata, ...] = ()  #: in order of writing
-    #: What the user and the recorder noted.
+    #: Notes of the user and the recorder.
     custom_data: Mapping[str, str] = field(default_factory=dict)
     ros_distro: str = 'jazzy'  #: that wrote it
     version: int = VERSION  #: of the file's layout
@@ -69,7 +69,7 @@ class BagMetadata:
 
 
 def to_map(metadata: BagMetadata) -> dict[str, Any]:
-    """Return metadata as plain maps in rosbag2's order of keys, without the outer key."""
+    """Return metadata as dictionaries in rosbag2's order of keys, without the outer key."""
     return {
         'version': VERSION,
         'storage_identifier': metadata.storage,
@@ -112,7 +112,7 @@ def to_yaml(metadata: BagMetadata, *, outer_key: bool = True) -> str:
 def write(folder: Path, metadata: BagMetadata) -> None:
     """Replace a bag's metadata file in one step; on an OSError the old file is unchanged."""
     path = folder / FILE_NAME
-    # Written beside it and renamed: a reader never sees half of it, nor does a crash leave it.
+    # Renaming is atomic: neither a reader nor a crash gets a partial file.
     temporary = folder / f'.{FILE_NAME}.new'
     try:
         with temporary.open('w', encoding='utf-8') as file:
@@ -128,7 +128,7 @@ def write(folder: Path, metadata: BagMetadata) -> None:
 def read(path: Path) -> BagMetadata:
     """Read a file of version 1 to 9, with defaults for what it lacks, or raise `BagError`."""
     try:
-        # A stranger's bag may have anything under this name: a pipe, a device, a link to one.
+        # In a foreign bag it may be a pipe, a device, or a link to one.
         if not path.is_file():
             raise BagError(f'{path} is no file: expected the metadata of a bag')
         with path.open('rb') as file:

@@ -1,8 +1,8 @@
 """
-One MCAP file being written.
+Write one MCAP file.
 
-A chunk is in the file whole or not at all, and room for the chunk and for the summary is taken
-on the disk before, so that a full disk leaves a file that can still be closed.
+A chunk is written completely or not at all. Space for the chunk and the summary is reserved on the
+disk beforehand, so that the file can be closed even if the disk is full.
 """
 
 from collections import Counter
@@ -41,14 +41,13 @@ from hmsa_ros.bag.records import MAGIC, MESSAGE, MESSAGE_FIXED, MESSAGE_HEAD
 LIBRARY = f'hmsa_ros {__version__}'
 #: Name of the metadata record with the experiment.
 EXPERIMENT = 'hmsa_ros'
-#: Room is taken in steps of so many bytes.
+#: Space is reserved in steps of this many bytes.
 RESERVE_STEP = 256 * 1024
 _INDEX_HEAD = struct.Struct('<BQHI')
 _COMPRESS: Mapping[str, Any] = {
     '': lambda data: data, 'lz4': lz4.frame.compress, 'zstd': zstandard.compress}
-#: Compression of each preset, and whether it has checksums. Names as rosbag2 has them, and lz4.
-#: With fastwrite rosbag2 leaves out chunks too; here they stay, since the recovery of a cut file
-#: goes by them.
+#: Compression of each preset, and whether it has checksums. The names are those of rosbag2, and
+#: lz4. rosbag2's fastwrite also omits chunks; here they stay, since `hmsa bag recover` needs them.
 PRESETS: Mapping[str, tuple[str, bool]] = {
     'none': ('', True), 'fastwrite': ('', False), 'lz4': ('lz4', True),
     'zstd_fast': ('zstd', True), 'zstd_small': ('zstd', True)}
@@ -59,12 +58,12 @@ Entry = tuple[int, int, int, int, bytes]
 
 class OutputFile:
     """
-    One file of a bag; what writes raises `OSError` if the disk does not take all of it.
+    One file of a bag; methods that write raise `OSError` if the disk does not accept all of it.
 
-    ``topics`` is the list of the bag's topics, which may grow. ``counts`` has the messages stored
-    by topic, ``start`` and ``end`` are the lowest and highest log time stored, ``size`` is what
-    is stored in bytes, ``message_size`` the part of it that is messages, and ``notes_size`` that
-    which says something of the experiment.
+    ``topics`` is the list of the bag's topics, which may grow. ``counts`` contains the number of
+    messages by topic, ``start`` and ``end`` the first and last log time, ``size`` the size of the
+    file in bytes, ``message_size`` that of the messages, and ``notes_size`` that of the metadata
+    records of the experiment.
     """
 
     def __init__(self, path: Path, preset: str, topics: Sequence[Topic]) -> None:
@@ -78,17 +77,17 @@ class OutputFile:
         self._topics = topics
         self._schemas: dict[str, Schema] = {}  # by message type
         self._channels: list[Channel] = []
-        self._declared: list[McapRecord] = []  # what the next chunk begins with
+        self._declared: list[McapRecord] = []  # schemas and channels for the next chunk
         self._chunks: list[ChunkIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._noted: dict[str, str] = {}
         self._crc = 0
-        # Bytes of the file that are taken on the disk, and what of them is for its end.
+        # Bytes reserved on the disk, and those needed for the end of the file.
         self._room = self._end_size = self._notes_room = 0
         self._ending = False
 
     def write(self, entries: Sequence[Entry]) -> None:
-        """Store messages as one chunk, after what of their topics is not yet in the file."""
+        """Store messages as one chunk, preceded by the declarations of new topics."""
         self._declare()
         declared = _packed(self._declared)
         content, places = _messages(entries, len(declared))
@@ -122,17 +121,17 @@ class OutputFile:
         self.end = max(self.end, chunk.message_end_time)
 
     def describe(self, serialized_metadata: str, notes: Mapping[str, str]) -> None:
-        """Store the record that rosbag2 has at both ends of a file, and the experiment."""
+        """Store the metadata that rosbag2 has at both ends of a file, and the experiment."""
         if not self.size:
             self._add(MAGIC + _packed([Header('ros2', LIBRARY)]))
         self._add_metadata('rosbag2', {'serialized_metadata': serialized_metadata})
         self.note(notes)
 
     def note(self, values: Mapping[str, str]) -> None:
-        """Store what of the experiment the file does not say yet: viewers show each record."""
+        """Store new or changed values of the experiment only: viewers show each record."""
         new = {key: value for key, value in values.items() if self._noted.get(key) != value}
         if new:
-            # All of it comes once more at the end, and twice in the metadata file.
+            # All values are written again at the end, and twice to the metadata file.
             self._notes_room = 4 * sum(len(key) + len(value) for key, value in values.items())
             before = self.size
             self._add_metadata(EXPERIMENT, new)
@@ -141,7 +140,7 @@ class OutputFile:
 
     def finish(
             self, serialized_metadata: str, notes: Mapping[str, str], *, fsync: bool) -> None:
-        """Store the metadata and the summary in the room taken, and close the file."""
+        """Store the metadata and the summary in the reserved space, and close the file."""
         self._declare()
         self._ending = True
         self.describe(serialized_metadata, notes)
@@ -167,7 +166,7 @@ class OutputFile:
             summary_start=begin, summary_offset_start=begin + len(summary) - len(offsets),
             summary_crc=0)
         if self._has_crc:
-            # Of the summary and the footer's fields before it.
+            # The CRC covers the summary and the preceding fields of the footer.
             footer.summary_crc = zlib.crc32(summary + _packed([footer])[:-4])
         self._add(data_end + summary + _packed([footer]) + MAGIC)
         os.ftruncate(self._descriptor, self.size)
@@ -176,7 +175,7 @@ class OutputFile:
         self.close()
 
     def sync(self) -> None:
-        """Wait until what is stored is on the disk."""
+        """Wait until all data are on the disk."""
         os.fsync(self._descriptor)
 
     def close(self) -> None:
@@ -184,7 +183,7 @@ class OutputFile:
         os.close(self._descriptor)
 
     def check_still_there(self) -> None:
-        """Raise `FileNotFoundError` if the file was removed: what is written is lost."""
+        """Raise `FileNotFoundError` if the file was removed or replaced."""
         try:
             there = os.stat(self.path)
         except OSError as error:
@@ -194,14 +193,14 @@ class OutputFile:
             raise FileNotFoundError(2, f'{self.path} has been replaced', str(self.path))
 
     def summary(self) -> metadata.FileMetadata:
-        """Return what the bag's metadata say of the file."""
+        """Return the entry of the file in the bag's metadata."""
         if not self.counts:
             return metadata.FileMetadata(self.path.name)
         return metadata.FileMetadata(
             self.path.name, self.start, self.end - self.start, self.counts.total())
 
     def _declare(self) -> None:
-        """Announce topics that are new; they are stored with the next chunk and in the summary."""
+        """Declare new topics; they are stored with the next chunk and in the summary."""
         for topic in self._topics[len(self._channels):]:
             if topic.type not in self._schemas:
                 self._schemas[topic.type] = Schema(
@@ -214,7 +213,7 @@ class OutputFile:
                     'offered_qos_profiles': qos.to_yaml(topic.profiles),
                     'topic_type_hash': topic.type_hash}))
             self._declared.append(self._channels[-1])
-        # In the summary, and in the metadata.
+        # They are repeated in the summary and the metadata.
         self._end_size += 3 * len(_packed(self._declared))
 
     def _add_metadata(self, name: str, values: Mapping[str, str]) -> None:
@@ -225,7 +224,7 @@ class OutputFile:
         self._metadata.append(index)
 
     def _add(self, data: bytes, end_size: int = 0) -> None:
-        """Store data whole, with room for so many bytes more at the end, or undo all of it."""
+        """Store data completely or not at all, reserving ``end_size`` more bytes for the end."""
         self._end_size += end_size
         needed = self.size + len(data) + self._end_size + self._notes_room + RESERVE_STEP // 2
         if needed > self._room and not self._ending:
@@ -254,7 +253,7 @@ def _packed(records: Iterable[McapRecord]) -> bytes:
 
 
 def _messages(entries: Sequence[Entry], place: int) -> tuple[bytes, dict[int, list[int]]]:
-    """Return messages as bytes that begin at a place, and by topic their times and places."""
+    """Return messages as bytes that start at a place, and their times and places by topic."""
     pack, head = MESSAGE_HEAD.pack, MESSAGE_HEAD.size
     parts: list[bytes] = []
     places: dict[int, list[int]] = {}

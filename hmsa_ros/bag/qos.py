@@ -1,7 +1,7 @@
 """
 Quality of service as rosbag2 stores it: a YAML list of profiles.
 
-Jazzy (metadata version 9) writes names (``reliable``); older bags hold the numbers of rmw.
+Jazzy (metadata version 9) writes names (``reliable``); older bags contain the numbers of rmw.
 """
 
 from collections.abc import Iterable
@@ -23,7 +23,7 @@ _POLICIES = {
     'history': HISTORIES, 'reliability': RELIABILITIES, 'durability': DURABILITIES,
     'liveliness': LIVELINESSES}
 INFINITE_NS = 9223372036854775807
-#: Key of custom data, before a topic's name: profiles of publishers that came later.
+#: Prefix of keys of custom data, before a topic's name: profiles of later publishers.
 LATER = 'offered_qos_profiles.'
 
 
@@ -32,7 +32,7 @@ class Qos:
     """One offered profile; durations in ns, `INFINITE_NS` for none."""
 
     history: str = 'unknown'  #: one of `HISTORIES`
-    depth: int = 0  #: 0 where it was not discovered
+    depth: int = 0  #: 0 if not discovered
     reliability: str = 'reliable'  #: one of `RELIABILITIES`
     durability: str = 'volatile'  #: one of `DURABILITIES`
     deadline_ns: int = INFINITE_NS
@@ -64,7 +64,7 @@ def _stored(name: str, value: Any) -> Any:
 
 
 def _read(name: str, value: Any) -> Any:
-    """Read a field's value; a policy is a name or the number of rmw, unknown ones say so."""
+    """Read a field's value; a policy is a name or a number of rmw, 'unknown' if neither."""
     known = _POLICIES.get(name)
     if known is not None:
         if isinstance(value, str):
@@ -77,7 +77,7 @@ def _read(name: str, value: Any) -> Any:
 
 
 def to_maps(profiles: Iterable[Qos]) -> list[dict[str, Any]]:
-    """Return profiles as plain maps, in the order of keys that rosbag2 writes."""
+    """Return profiles as dictionaries in rosbag2's order of keys."""
     return [{
         key: _stored(name, getattr(profile, name)) for name, key in _KEYS.items()}
         for profile in profiles]

@@ -1,20 +1,20 @@
 """
-Reading a bag: a folder or a single ``.mcap`` file, written here or by rosbag2.
+Read a bag, a folder or a single ``.mcap`` file, of this package or of rosbag2.
 
-For analysis without ROS there is one function::
+For analysis without ROS, use one function::
 
     read_messages(path, topics=None, *, start=None, end=None)
         -> iterator of DecodedMessage(topic, log_time_ns, publish_time_ns, message)
 
-in order of log time over all files of the bag, messages of equal stamp in the order they were
-written. ``message`` has the fields of the message type as attributes
-(``message.header.stamp.sec``). For raw payloads use `BagReader`.
+in order of log time over all files of the bag, messages with equal times in the order written.
+``message`` has the fields of the message type as attributes (``message.header.stamp.sec``). For
+raw payloads use `BagReader`.
 
-What cannot be read is skipped and reported in `BagReader.problems`, one sentence each: a file
-that was cut off gives everything up to the cut, a damaged chunk costs that chunk.
+Unreadable parts are skipped and reported in `BagReader.problems`, one sentence each: a truncated
+file is read up to its end, a damaged chunk is skipped.
 
-A bag may come from anybody: what it says of sizes is held against `hmsa_ros.bag.limits` before
-memory is taken, only files in its own folder are read, and nothing in it is ever run.
+Bags can come from untrusted sources: sizes are checked against `hmsa_ros.bag.limits` before memory
+is allocated, only files in the bag's folder are read, and no content is executed.
 """
 
 from collections.abc import Callable, Collection, Iterator
@@ -39,7 +39,7 @@ _NEVER = 2**64
 
 
 class DecodedMessage(NamedTuple):
-    """A decoded message: topic, stamps in nanoseconds and the message itself."""
+    """A decoded message: topic, times in ns, and the message."""
 
     topic: str
     log_time_ns: int
@@ -56,8 +56,8 @@ class BagReader:
     path : path
         Folder of a bag, or one ``.mcap`` file.
     max_chunk_size : int
-        Largest content of a chunk, and largest message, in bytes; what is larger is passed
-        over. Reading takes a few times as much memory at most.
+        Largest content of a chunk, and largest message, in bytes; larger ones are skipped. Reading
+        takes at most a few times as much memory.
 
     Attributes
     ----------
@@ -68,19 +68,19 @@ class BagReader:
     topics : mapping of str to Topic
         By name, in order of appearance.
     metadata : hmsa_ros.bag.metadata.BagMetadata or None
-        What ``metadata.yaml`` says, if it is there and can be read.
+        Content of ``metadata.yaml``; None if it is missing or unreadable.
     custom_data : mapping of str to str
         From ``metadata.yaml``, or else from the files.
     records : mapping of str to mapping
-        Metadata records by name, those of one name together; of several values the last
-        counts.
+        Metadata records by name. Records of the same name are combined, later values replacing
+        earlier ones.
     problems : list of str
-        What could not be read so far, one sentence each; grows while messages are read.
+        Unreadable parts found so far, one sentence each; grows while messages are read.
 
     Raises
     ------
     BadInputError
-        If there is nothing that could be read.
+        If no file can be read.
 
     """
 
@@ -141,7 +141,7 @@ class BagReader:
         """Return the blocks with messages."""
         for file in self._files:
             for block in file.blocks:
-                # The times of a chunk with channels only are 0, as stamps may be that never saw
+                # A chunk without messages has the times 0, and so may messages recorded without
                 # a clock.
                 if block.size and (block.end or self._has_messages(block)):
                     yield block
@@ -165,12 +165,12 @@ class BagReader:
         start, end : int, optional
             Only log times of at least ``start`` and less than ``end``, in nanoseconds.
         cancelled : callable
-            Asked before each chunk; the messages end when it says yes.
+            Called before each chunk; the iteration ends when it returns True.
 
         Yields
         ------
         Message
-            Messages of equal stamp in the order they were written.
+            Messages with equal times in the order written.
 
         """
         blocks = sorted(
@@ -184,7 +184,7 @@ class BagReader:
             if cancelled():
                 return
             if sum(len(cursor.content) for cursor in active) + block.size > most:
-                # Every chunk so far reaches beyond the start of this one.
+                # All active chunks overlap with this one.
                 self._files[block.file].problem(
                     f': more than {most} bytes of chunks overlap in time, at byte '
                     f'{block.offset}: skipped')
@@ -198,7 +198,7 @@ class BagReader:
             active = [cursor for cursor in active if cursor.left]
 
     def stored_messages(self) -> Iterator[Message]:
-        """Yield all messages in the order they lie in the files."""
+        """Yield all messages in the order stored."""
         for file in self._files:
             for block in file.blocks:
                 cursor = self._cursor(block)
@@ -206,7 +206,7 @@ class BagReader:
                     yield from cursor.take(_NEVER)
 
     def counts(self) -> dict[str, int]:
-        """Return the messages by topic; counted where statistics and CRC cannot be trusted."""
+        """Return the number of messages by topic, counting them if the statistics may be wrong."""
         result = dict.fromkeys(self.topics, 0)
         for file in self._files:
             for number, count in file.counts().items():

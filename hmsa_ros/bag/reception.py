@@ -1,4 +1,4 @@
-"""What a recorder makes of messages received and of its own state, without ROS."""
+"""Process received messages and the state of a recorder, without ROS."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -10,14 +10,14 @@ from hmsa_ros.bag.qos import Qos
 from hmsa_ros.bag.recording import Status
 
 OK, WARN, ERROR = range(3)
-# Between two flushes messages wait: only more than that is reported.
+# Messages always wait for a flush: longer delays, in flush periods and in s, are reported.
 _BEHIND_PERIODS = 4.0
 _BEHIND_SECONDS = 1.0
 
 
 @dataclass
 class RecordedTopic:
-    """A topic being recorded: its subscription and what is known of its publishers."""
+    """A recorded topic: its subscription and its publishers."""
 
     name: str
     type: str
@@ -32,30 +32,30 @@ class RecordedTopic:
 
     @property
     def latched(self) -> bool:
-        """Return whether a publisher may keep its last messages for who is late."""
+        """Return whether a publisher may send its last messages to late subscribers."""
         return any(x.durability == 'transient_local' for x in self.offered)
 
     def take(
             self, messages: Iterable[tuple[int, int, int, bytes, bytes]],
             at: Callable[[int], int] | None, *, paused: bool) -> tuple[list[Entry], int]:
         """Count gaps; return the messages to write, and the length of their payloads in bytes."""
-        # Source and reception stamp in ns, sequence number, publisher, payload of each; at() gives
-        # the log time at a moment of system time. What passes while paused is not missed.
+        # A message has source and reception timestamp in ns, sequence number, publisher, payload.
+        # at() converts system time to log time. Messages during a pause do not count as missed.
         batch: list[Entry] = []
         size = 0
         for source, received, sequence, publisher, data in messages:
             before = self.last.get(publisher)
             if before is not None and sequence <= before:
-                continue  # seen already, through the subscription this one replaces
+                continue  # already received by the previous subscription
             if before is not None and not paused:
                 self.missed += sequence - before - 1
             elif not paused and not self.latched:
-                # Volatile publishers count from 1, and send nothing again to who is late.
+                # Volatile publishers count from 1, and send nothing to late subscribers.
                 self.before += sequence - 1
             self.last[publisher] = sequence
             if paused:
                 continue
-            # Not every middleware stamps on reception.
+            # Not every middleware provides reception timestamps.
             stamp = received or time.time_ns()
             batch.append((self.number, stamp if at is None else at(stamp), source, sequence, data))
             size += len(data)

@@ -27,22 +27,22 @@ RETRY_SECONDS = 1.0
 END_SECONDS = 10.0
 # On top of it, for a disk that does not answer.
 _GRACE_SECONDS = 5.0
-#: New files that may follow each other at once, and then one in so many seconds: each costs
-#: declarations, an index, and waiting for the disk.
+#: Number of new files that may be opened immediately, and the interval in s after that: each file
+#: needs declarations and an index, and waits for the disk.
 FILE_BURST = 10
 FILE_SECONDS = 1.0
 
 
 @dataclass(frozen=True)
 class Limits:
-    """When to flush, when to split and how much to keep in memory."""
+    """Limits on flushing, splitting, and memory."""
 
-    flush_period: float = 0.5  #: s after which the operating system has a message at the latest
+    flush_period: float = 0.5  #: s until a message has been passed to the operating system
     max_size: int = 0  #: bytes at which a file is split; 0 for never, else at least 1024
     max_duration_ns: int = 0  #: time span at which a file is split; 0 for never
     #: bytes of queued messages at which new ones are counted as lost
     cache_size: int = 100 * 2**20
-    snapshot_ns: int = 0  #: above 0, messages are kept for so long, written for a snapshot
+    snapshot_ns: int = 0  #: above 0: messages are kept this long, and written by a snapshot only
 
     def __post_init__(self) -> None:
         if not self.flush_period > 0.0:
@@ -76,7 +76,7 @@ class Status(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """Something the thread is asked to do, and where its answer goes."""
+    """An action for the thread, and the future of its result."""
 
     action: Callable[[], object]
     answer: Future[object]
@@ -84,7 +84,7 @@ class _Task(NamedTuple):
 
 @dataclass
 class _Batch:
-    """Messages, what they take in memory, and since when they wait."""
+    """Queued messages, their size in memory, and when they were queued."""
 
     messages: list[Entry]
     size: int
@@ -93,10 +93,10 @@ class _Batch:
 
 class Recording:
     """
-    Writes to a bag in a thread of its own.
+    Write to a bag in a separate thread.
 
-    The thread calls ``report`` with a sentence, and whether it is a failure, when writing fails or
-    succeeds again.
+    When writing fails or succeeds again, the thread calls ``report`` with a message and whether it
+    is a failure.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class Recording:
         self._error = ''
         self._next_retry = 0.0
         self._deadline = float('inf')
-        # New files that may be begun now, as of a time, and those that were due nevertheless.
+        # New files that may be opened now, the time of that count, and splits that were skipped.
         self._files_left, self._files_since = float(FILE_BURST), time.monotonic()
         self._crowded = 0
         self._thread = threading.Thread(target=self._run, name='writer', daemon=True)
@@ -124,7 +124,7 @@ class Recording:
     # From any thread -------------------------------------------------------------------------
 
     def add_topic(self, topic: Topic) -> int:
-        """Announce a topic, or new offers of a known one; return its number for the messages."""
+        """Add a topic, or new profiles of a known one; return its number for the messages."""
         topic.check()
         with self._condition:
             number = number_of(topic, self._topics)
@@ -134,7 +134,7 @@ class Recording:
         return number
 
     def put(self, messages: list[Entry], payload_bytes: int) -> None:
-        """Record messages, whose payloads have so many bytes in all; returns at once."""
+        """Queue messages with a total payload in bytes; return immediately."""
         size = payload_bytes + MESSAGE_OVERHEAD * len(messages)
         batch = _Batch(messages, size, time.monotonic())
         with self._condition:
@@ -153,14 +153,14 @@ class Recording:
         self._ask(partial(self._writer.note, dict(values)))
 
     def split(self) -> str:
-        """Go on in a new file, after all that has been put so far."""
+        """Continue in a new file after all messages queued so far; return its name."""
         return self._answer_to(self._writer.split)
 
     def begin_anew(self) -> None:
         """
-        Go on in a new file, if this one has messages; returns at once.
+        Continue in a new file if the current one has messages; return immediately.
 
-        For when time has jumped back: a snapshot does not reach back beyond it either.
+        Used after a backward jump of time; messages kept for a snapshot are discarded.
         """
         with self._condition:
             while self._kept:
@@ -168,7 +168,7 @@ class Recording:
             self._ask(self._begin_anew)
 
     def snapshot(self) -> str:
-        """Write what is kept in memory; raise `BagError` where every message is recorded."""
+        """Write the messages kept in memory; raise `BagError` if not in snapshot mode."""
         if not self._limits.snapshot_ns:
             raise BagError('there is no snapshot to take: every message is recorded; expected '
                            'snapshot mode')
@@ -195,14 +195,14 @@ class Recording:
                 0.0 if since is None else time.monotonic() - since, self._crowded)
 
     def close(self, last_words: Callable[[Status], Mapping[str, str]] | None = None) -> Status:
-        """Write what has been put, add the custom data of ``last_words``, and close the bag."""
+        """Write the queued messages, add the custom data of ``last_words``, and close the bag."""
         with self._condition:
             self._closing = True
             self._deadline = time.monotonic() + END_SECONDS
             self._condition.notify()
         self._thread.join(END_SECONDS + _GRACE_SECONDS)
         if self._thread.is_alive():
-            # It waits for the disk and cannot be waited for: the bag stays as a kill leaves it.
+            # The thread is blocked by the disk: the bag stays as after a kill.
             self._error = (f'the disk of {self._writer.folder} has not answered for '
                            f'{_GRACE_SECONDS:g} s: the bag is not closed')
             self._give_up()
@@ -221,7 +221,7 @@ class Recording:
         return self.status()
 
     def _ask(self, action: Callable[[], object]) -> Future[object]:
-        """Have the thread do something; return its answer to come."""
+        """Have the thread perform an action; return the future of its result."""
         task = _Task(action, Future())
         with self._condition:
             self._items.append(task)
@@ -229,7 +229,7 @@ class Recording:
         return task.answer
 
     def _answer_to(self, action: Callable[[], object]) -> str:
-        """Have the thread do something and return its answer."""
+        """Have the thread perform an action, and return its result."""
         with self._condition:
             if self._closing:
                 raise BagError('the recording has ended')
@@ -240,7 +240,7 @@ class Recording:
             raise BagError(str(error)) from error
 
     def _keep(self, batch: _Batch) -> None:
-        """Keep messages in memory for a snapshot, the oldest giving way, or count them as lost."""
+        """Keep messages in memory for a snapshot, discarding the oldest; count those too large."""
         self._queued += batch.size
         self._kept.append(batch)
         oldest = batch.messages[-1][1] - self._limits.snapshot_ns
@@ -252,14 +252,14 @@ class Recording:
                 self._lose(batch.messages)
 
     def _lose(self, messages: Iterable[Entry]) -> None:
-        """Count messages that will not be written."""
+        """Count messages that will not be written as lost."""
         self._overflowed.update(message[0] for message in messages)
 
     # In the thread ---------------------------------------------------------------------------
 
     def _run(self) -> None:
         """Write until the end."""
-        # More often than promised: receiving and writing take time too.
+        # Shorter than the flush period because receiving and writing take time too.
         period = 0.6 * self._limits.flush_period
         next_flush = time.monotonic() + period
         while True:
@@ -280,14 +280,14 @@ class Recording:
             if time.monotonic() >= next_flush:
                 next_flush = time.monotonic() + period
             if closing and self._error:
-                # One last try; it may be the file alone that cannot grow any more.
+                # One last attempt: a new file may succeed.
                 self._retry()
             if closing and (self._error or self._is_late() or not self._items):
                 self._give_up()
                 return
 
     def _take_items(self) -> None:
-        """Do and write everything that is queued; on failure the rest waits for the next try."""
+        """Process the queue; after a failure, the rest waits for the next attempt."""
         while self._items and not self._is_late():
             item = self._items[0]
             if isinstance(item, _Task):
@@ -312,7 +312,7 @@ class Recording:
                 self._queued -= item.size
 
     def _write_splitting(self, messages: Iterable[Entry]) -> None:
-        """Write one message after the other, with a new file where a limit is reached."""
+        """Write message by message, and continue in a new file when a limit is reached."""
         writer, limits = self._writer, self._limits
         for message in messages:
             full = (limits.max_size and writer.file_size >= limits.max_size) or (
@@ -321,7 +321,7 @@ class Recording:
                 if full and self._may_split():
                     writer.split()
             finally:
-                # Where that fails, too: it waits then.
+                # Also if splitting fails: the message then stays pending in the writer.
                 writer.write((message,))
 
     def _begin_anew(self) -> None:
@@ -329,7 +329,7 @@ class Recording:
             self._writer.split()
 
     def _may_split(self) -> bool:
-        """Return whether a new file may be begun so soon, and take note."""
+        """Return whether a new file may be opened now, and update the counts."""
         now = time.monotonic()
         self._files_left = min(
             float(FILE_BURST), self._files_left + (now - self._files_since) / FILE_SECONDS)
@@ -345,7 +345,7 @@ class Recording:
         return time.monotonic() > self._deadline
 
     def _fail(self, error: OSError) -> None:
-        """Take note that writing is not possible; it is tried again later."""
+        """Record that writing has failed; it is tried again later."""
         known = self._error
         self._error = f'cannot write to {self._writer.folder}: {_reason(error)}'
         if not known:
@@ -356,7 +356,7 @@ class Recording:
         self._next_retry = time.monotonic() + RETRY_SECONDS
 
     def _retry(self) -> None:
-        """Try to go on in a new file."""
+        """Try to continue in a new file."""
         try:
             name = self._writer.reopen()
         except OSError as error:
@@ -366,7 +366,7 @@ class Recording:
             self._report(f'recording continues in {name}', False)
 
     def _give_up(self) -> None:
-        """Count what is left in the queue as lost, and answer who waits."""
+        """Count the rest of the queue as lost, and fail its pending actions."""
         with self._condition:
             for item in self._items:
                 if isinstance(item, _Batch):
@@ -377,7 +377,7 @@ class Recording:
 
 
 def _not_closed(error: OSError) -> str:
-    """Return the sentence for a bag that could not be closed."""
+    """Return the message for a bag that could not be closed."""
     return f'the bag could not be closed properly: {_reason(error)}'
 
 
@@ -387,7 +387,7 @@ def _reason(error: OSError) -> str:
 
 
 def lost_by_topic(*counts: Mapping[str, int]) -> dict[str, int]:
-    """Return the sums of losses of several kinds by topic."""
+    """Return the total losses by topic."""
     total = Counter[str]()
     for count in counts:
         total.update(count)

@@ -1,4 +1,4 @@
-"""What a file of a bag holds: by its summary, or else record by record."""
+"""Scan a file of a bag: by its summary, or else record by record."""
 
 from array import array
 from collections import Counter, defaultdict
@@ -27,15 +27,15 @@ from hmsa_ros.bag import limits, records
 from hmsa_ros.bag.records import Block, MAGIC, PREFIX
 from hmsa_ros.errors import BadInputError, BagError, printable
 
-# Messages outside chunks are grouped, so that they are handled like chunks.
+# Messages outside chunks are grouped and handled like chunks.
 _RUN_BYTES = 512 * 1024
 _CRC_BYTES = 2**20
-# What an entry of a map takes besides its texts.
+# Size of an entry of a map in addition to its texts.
 _ENTRY_BYTES = 100
 _FOOTER_SIZE = PREFIX.size + 20
 _TAIL_SIZE = _FOOTER_SIZE + len(MAGIC)
 _DATA_END_SIZE = PREFIX.size + 4
-# Read by nobody here, but no sign of damage.
+# Valid records that are not used here.
 _PASSED_OVER = frozenset(
     (Opcode.ATTACHMENT, Opcode.ATTACHMENT_INDEX, Opcode.SUMMARY_OFFSET))
 _Declared = TypeVar('_Declared', Schema, Channel)
@@ -43,9 +43,10 @@ _Declared = TypeVar('_Declared', Schema, Channel)
 
 class Intake:
     """
-    What is taken in of all files of a bag: within limits, and with the problems that are found.
+    Limits and problems of all files of a bag.
 
-    ``problems`` has sentences about what cannot be read, each once and not without end.
+    ``problems`` contains a sentence for each unreadable part, without repetition and limited in
+    number.
     """
 
     def __init__(self, max_chunk_size: int) -> None:
@@ -55,7 +56,7 @@ class Intake:
         self.problems: list[str] = []
 
     def problem(self, sentence: str) -> None:
-        """Note what cannot be read."""
+        """Record a problem."""
         if sentence in self._known or len(self._known) > limits.PROBLEMS:
             return
         self._known.add(sentence)
@@ -64,13 +65,13 @@ class Intake:
             else 'further problems are not listed')
 
     def check_size(self, size: int, what: str) -> None:
-        """Raise `BagError` for what is larger, in bytes, than the memory it may take."""
+        """Raise `BagError` if a size in bytes exceeds the limit."""
         if size > self._max_chunk_size:
             raise BagError(f'a {what} of {size} bytes is larger than the {self._max_chunk_size} '
                            'bytes allowed')
 
     def keep(self, size: int) -> None:
-        """Count what is kept of the small records; raise `BagError` for too much of it."""
+        """Count the size of records kept in memory; raise `BagError` above the limit."""
         if self._kept + size > limits.KEPT_SIZE:
             raise BagError(f'schemas, channels and metadata are larger than '
                            f'{limits.KEPT_SIZE} bytes')
@@ -79,10 +80,10 @@ class Intake:
 
 class ScannedFile:
     """
-    What a file holds; records by their id, metadata records by name.
+    The content of a file: records by id, metadata records by name.
 
-    ``blocks`` are its parts with messages, in their order; ``complete`` says whether it was closed
-    by its writer. Raises `BadInputError` if it is no MCAP file.
+    ``blocks`` are its parts with messages, in order; ``complete`` is whether its writer closed it.
+    Raises `BadInputError` if it is not an MCAP file.
     """
 
     def __init__(self, intake: Intake, path: Path, number: int) -> None:
@@ -111,12 +112,12 @@ class ScannedFile:
                 f'{path} cannot be read ({error.strerror}): expected an MCAP file') from error
 
     def problem(self, sentence: str) -> None:
-        """Note that something is damaged."""
+        """Record a problem, and that the file is damaged."""
         self._damaged = True
         self._intake.problem(f'{self.path.name}{sentence}')
 
     def counts(self) -> dict[int, int]:
-        """Return the messages by channel; counted where statistics and CRC cannot be trusted."""
+        """Return the messages by channel, counting them if the statistics may be wrong."""
         try:
             with self.path.open('rb') as stream:
                 self._descriptor = stream.fileno()
@@ -128,7 +129,7 @@ class ScannedFile:
         return self._counts
 
     def _clear(self) -> None:
-        """Forget what has been taken in."""
+        """Reset the content."""
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.blocks: list[Block] = []
@@ -136,7 +137,7 @@ class ScannedFile:
         self._counts = Counter[int]()
 
     def _take(self, record: McapRecord) -> None:
-        """Take in a schema, channel or metadata, or raise `BagError` if it is too large."""
+        """Add a schema, channel or metadata record; raise `BagError` if it is too large."""
         if isinstance(record, Schema):
             if self._is_new(self.schemas, record):
                 self._intake.keep(len(record.data))
@@ -157,7 +158,7 @@ class ScannedFile:
             values.update(record.metadata)
 
     def _is_new(self, known: Mapping[int, _Declared], record: _Declared) -> bool:
-        """Return whether a declaration is to be taken in."""
+        """Return whether a declaration is new and within limits."""
         what = type(record).__name__.lower()
         if record.id in known:
             if known[record.id] != record:
@@ -169,7 +170,7 @@ class ScannedFile:
         return True
 
     def _add_block(self, block: Block, offset: int) -> None:
-        """Take in a chunk that is not too large."""
+        """Add a chunk unless it is too large."""
         try:
             self._intake.check_size(max(block.size, block.length), 'chunk')
         except BagError as error:
@@ -180,7 +181,7 @@ class ScannedFile:
     # -- record by record -----------------------------------------------------------------------
 
     def _walk(self) -> None:
-        """Take in the file record by record, and count its messages."""
+        """Read the file record by record, and count its messages."""
         offset, chunked, said = len(MAGIC), False, None
         self.complete = False
         run: int | None = None  # where messages outside chunks begin
@@ -222,12 +223,12 @@ class ScannedFile:
         self._count(said)
 
     def _end_run(self, begin: int | None, end: int) -> None:
-        """Take in messages outside chunks like a chunk that does not say its times."""
+        """Add messages outside chunks as a chunk of unknown times."""
         if begin is not None:
             self.blocks.append(Block(self._number, begin, end - begin, end - begin, -1, -1))
 
     def _read_record(self, offset: int, head: bytes) -> McapRecord | None:
-        """Take in one record that is no message."""
+        """Read one record that is not a message."""
         opcode, length = PREFIX.unpack_from(head)
         content = head[PREFIX.size:]
         if opcode == Opcode.CHUNK:
@@ -248,7 +249,7 @@ class ScannedFile:
         return None
 
     def _count(self, said: int | None) -> None:
-        """Go through all blocks: for what is declared in them, and for what is true of them."""
+        """Read all blocks for their declarations, counts and times."""
         blocks, self.blocks, self._counts, self._counted = self.blocks, [], Counter(), True
         unpack = records.MESSAGE_HEAD.unpack_from
         for block in blocks:
@@ -285,7 +286,7 @@ class ScannedFile:
     # -- by the summary -------------------------------------------------------------------------
 
     def _read_summary(self) -> bool:
-        """Take in the file by its summary; False if that is missing or not to be trusted."""
+        """Read the summary; return False if it is missing or unreliable."""
         tail = os.pread(self._descriptor, _TAIL_SIZE, max(0, self._size - _TAIL_SIZE))
         if not (tail.endswith(MAGIC) and tail.startswith(PREFIX.pack(Opcode.FOOTER, 20))):
             return False
@@ -307,7 +308,7 @@ class ScannedFile:
             return False
 
     def _take_summary(self, summary: bytes, data_end: int) -> bool:
-        """Take in the records of a summary; False if they are not complete."""
+        """Add the records of a summary; return False if it is incomplete."""
         found: defaultdict[type[McapRecord] | None, list[Any]] = defaultdict(list)
         for opcode, begin, end in records.split(summary):
             record = records.parse_any(opcode, summary[begin:end])

@@ -1,9 +1,9 @@
 """
-Writing a bag: a folder of MCAP files and ``metadata.yaml``, as rosbag2 (Jazzy) lays it out.
+Write a bag: a folder of MCAP files and ``metadata.yaml``, in the layout of rosbag2 (Jazzy).
 
-`BagWriter` keeps what has been written readable at every moment: each flush ends a chunk and
-hands it to the operating system, ``metadata.yaml`` exists from the start, and a write that fails
-half way is undone. Message payloads are stored as given.
+The bag is readable at any time: each flush ends a chunk and passes it to the operating system,
+``metadata.yaml`` exists from the start, and a write that fails is rolled back. Message payloads
+are stored as given.
 """
 
 from collections import Counter
@@ -25,10 +25,10 @@ from hmsa_ros.bag.topics import number_of
 from hmsa_ros.errors import BadInputError, BagError
 
 __all__ = ['BagWriter', 'MIN_FILE_SIZE', 'parse_custom_data', 'PRESETS', 'Topic']
-# Metadata records that a file may have in any case.
+# Size up to which metadata records are always written to a file.
 _NOTES_SIZE = 2**20
 MIN_FILE_SIZE = 1024
-#: What MCAP can number.
+#: Limit of the MCAP format.
 MAX_CHANNELS = 2**16 - 1
 _TOPIC_OF = operator.itemgetter(0)
 
@@ -57,8 +57,8 @@ class BagWriter:
     folder, custom_data
         As given; see `note`.
     dropped : dict of str to int
-        By topic, messages given to `write` that are not in the bag: not written by the end, or
-        in a file that was removed under the writer.
+        By topic, messages given to `write` that are not in the bag: not written at the end, or
+        in a file that was removed during writing.
 
     Raises
     ------
@@ -68,8 +68,8 @@ class BagWriter:
 
     Notes
     -----
-    The writer does not split by itself: `file_size` and `file_duration_ns` let its user decide.
-    Until `close`, ``metadata.yaml`` says that the recording has not ended.
+    The writer does not split by itself: the caller decides, by `file_size` and
+    `file_duration_ns`. Until `close`, ``metadata.yaml`` marks the recording as not ended.
 
     """
 
@@ -83,7 +83,7 @@ class BagWriter:
         if chunk_size < 1:
             raise BadInputError(f'chunk size is {chunk_size}: expected at least 1 byte')
         self.folder = Path(folder)
-        # In metadata and messages, which are UTF-8, whatever the folder's name is.
+        # Metadata and messages are UTF-8; the name of a folder can be any bytes.
         self._stem = re.sub('[\ud800-\udfff]', '_', self.folder.name)
         self._ros_distro = ros_distro
         self._topics: list[Topic] = []
@@ -150,11 +150,11 @@ class BagWriter:
         return {topic.name: self._counts[number] for number, topic in enumerate(self._topics)}
 
     def add_topic(self, topic: Topic) -> int:
-        """Announce a topic and return its number, or raise `BagError` beyond `MAX_CHANNELS`."""
+        """Add a topic and return its number; raise `BagError` beyond `MAX_CHANNELS`."""
         topic.check()
         number = number_of(topic, self._topics)
         if number < len(self._topics):
-            # Its first profiles hold for every file.
+            # All files contain the first profiles.
             if set(topic.profiles) - set(self._topics[number].profiles):
                 self.note({qos.LATER + topic.name: qos.to_yaml(topic.profiles)})
             return number
@@ -182,13 +182,13 @@ class BagWriter:
         """Add to the custom data: in ``metadata.yaml``, and in the file at once or at its end."""
         self._add(values)
         if self._file is not None:
-            # What changes all the time would be more than the messages are.
+            # Frequent changes would take more space than the messages.
             if self._file.notes_size <= max(_NOTES_SIZE, self._file.size // 16):
                 self._file.note(self._notes())
             self._write_metadata()
 
     def flush(self) -> None:
-        """Hand everything to the operating system: the end of this process loses nothing."""
+        """Pass everything to the operating system, so that it survives the end of the process."""
         self._write_chunk()
         if self._file is not None:
             self._file.check_still_there()
@@ -196,13 +196,13 @@ class BagWriter:
                 self._file.sync()
 
     def split(self) -> str:
-        """Close the file and go on in a new one."""
+        """Close the file and continue in a new one."""
         self._write_chunk()
         self._finish_file()
         return self._open()
 
     def reopen(self) -> str:
-        """Give up the file after an `OSError`, as `abandon` does; write what waits to the next."""
+        """Abandon the file after an `OSError`, and write the pending messages to a new one."""
         self.abandon()
         self.folder.mkdir(parents=True, exist_ok=True)
         name = self._open()
@@ -210,12 +210,12 @@ class BagWriter:
         return name
 
     def drop_pending(self) -> None:
-        """Forget the messages that wait for the next flush, counting them in `dropped`."""
+        """Discard the pending messages, and count them in `dropped`."""
         self.dropped.update(self._topics[entry[0]].name for entry in self._waiting)
         self._forget_waiting()
 
     def abandon(self) -> None:
-        """Give up the file after an `OSError`, closing it as well as can be done."""
+        """Abandon the file after an `OSError`, closing it as well as possible."""
         file = self._file
         if file is None:
             return
@@ -226,11 +226,10 @@ class BagWriter:
             self._finish_file()
         except OSError as error:
             if self._file is None:
-                return  # it is closed, and only the metadata could not be written
+                return  # closed; only the metadata could not be written
             file.close()
             if not isinstance(error, FileNotFoundError):
-                # There is no summary then: the messages are there, a reader that needs the
-                # summary gets it from `hmsa bag recover`.
+                # The file has its messages but no summary; `hmsa bag recover` adds one.
                 self._closed_files.append(file.summary())
             else:
                 self._counts.subtract(file.counts)
@@ -239,13 +238,13 @@ class BagWriter:
             self._file = None
 
     def abort(self) -> None:
-        """End as a killed process would: what is in the file stays, nothing says it is all."""
+        """End as if the process was killed: the file stays as it is, marked as not ended."""
         if not self._closed and self._file is not None:
             self._file.close()
         self._closed, self._file = True, None
 
     def close(self) -> None:
-        """Write what is left and close the bag; closing again does nothing."""
+        """Write the pending messages and close the bag; closing again does nothing."""
         if self._closed:
             return
         self._closed = True
@@ -259,7 +258,7 @@ class BagWriter:
                 self._write_metadata()
 
     def _open(self) -> str:
-        """Open the next file and write what every file begins with."""
+        """Open the next file and write its header and metadata."""
         while True:
             path = self.folder / f'{self._stem}_{self._next_number}.mcap'
             self._next_number += 1
@@ -283,7 +282,7 @@ class BagWriter:
             file.path.unlink()
 
     def _write_chunk(self) -> None:
-        """Write the messages that wait as one chunk."""
+        """Write the pending messages as one chunk."""
         if not self._waiting:
             return
         if self._file is None:
@@ -298,7 +297,7 @@ class BagWriter:
         self._start, self._end = 2**64, 0
 
     def _finish_file(self) -> None:
-        """Write metadata and summary, close the file and bring ``metadata.yaml`` up to date."""
+        """Write metadata and summary, close the file and update ``metadata.yaml``."""
         file = self._file
         if file is None:
             return
@@ -309,22 +308,22 @@ class BagWriter:
         self._write_metadata()
 
     def _write_metadata(self) -> None:
-        """Bring ``metadata.yaml`` up to date."""
+        """Update ``metadata.yaml``."""
         files = [*self._closed_files, *([self._file.summary()] if self._file else [])]
         ended = {} if self._closed else {metadata.NOT_ENDED: 'true'}
         metadata.write(self.folder, self._metadata(
             files, self._counts, {**self.custom_data, **ended}))
 
     def _add(self, values: Mapping[str, str]) -> None:
-        """Add to the custom data; what UTF-8 cannot hold is written as its codes."""
+        """Add to the custom data, escaping characters that UTF-8 cannot encode."""
         self.custom_data.update({_storable(x): _storable(y) for x, y in values.items()})
 
     def _notes(self) -> dict[str, str]:
-        """Return what a file says of the experiment."""
+        """Return the metadata record of the experiment."""
         return {'version': __version__, **self.custom_data}
 
     def _serialized(self, file: OutputFile) -> str:
-        """Return the metadata as rosbag2 has them in a file, about that file alone."""
+        """Return the metadata of one file, as rosbag2 stores them in it."""
         return metadata.to_yaml(
             self._metadata([file.summary()], file.counts, self.custom_data), outer_key=False)
 
@@ -342,12 +341,12 @@ class BagWriter:
 
 
 def _storable(text: str) -> str:
-    """Return a text with what UTF-8 cannot hold written as its codes."""
+    """Return a text with the characters escaped that UTF-8 cannot encode."""
     return text.encode('utf-8', 'backslashreplace').decode()
 
 
 def parse_custom_data(pairs: Iterable[str]) -> dict[str, str]:
-    """Read pairs like ``'actuator=A3'``; raise `BadInputError` for one that is none, or twice."""
+    """Read pairs like ``'actuator=A3'``; raise `BadInputError` if malformed or repeated."""
     values: dict[str, str] = {}
     for pair in itertools.filterfalse(lambda text: not text, pairs):
         key, equals, value = pair.partition('=')
