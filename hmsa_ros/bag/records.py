@@ -1,9 +1,9 @@
 """
-MCAP records as bytes: what the mcap package does not check or cannot bound.
+Parse MCAP records from untrusted files.
 
-https://mcap.dev/spec. Little endian; a record is its opcode (1 byte), the length of its content
-(8 bytes) and the content. The package's own classes read the records; here they are given no
-more than the record has, and chunks are unfolded into no more memory than they say.
+See https://mcap.dev/spec. Little endian; a record consists of its opcode (1 byte), the length of
+its content (8 bytes) and the content. The classes of the mcap package parse the content; this
+module checks lengths, and limits the memory of decompressed chunks.
 """
 
 from collections.abc import Iterator
@@ -34,15 +34,15 @@ from mcap.writer import MCAP0_MAGIC
 from hmsa_ros.bag import limits
 from hmsa_ros.errors import BagError
 
-#: How a file begins and ends.
+#: Begin and end of a file.
 MAGIC = MCAP0_MAGIC
 PREFIX = struct.Struct('<BQ')
 # Opcode, length, channel, sequence, log time, publish time; the payload follows.
 MESSAGE_HEAD = struct.Struct('<BQHIQQ')
-#: A plain number: this is asked of every message.
+#: A plain int, since comparing an enum for every message is slow.
 MESSAGE = int(Opcode.MESSAGE)
 MESSAGE_FIXED = MESSAGE_HEAD.size - PREFIX.size
-#: Of the content of a chunk before its data, at most: compression has a short name.
+#: Maximum size of a chunk's fields before its data: the name of the compression is short.
 CHUNK_HEAD_SIZE = 64
 _CHUNK_HEAD = struct.Struct('<QQQII')
 _Record = TypeVar('_Record', bound=McapRecord)
@@ -55,7 +55,7 @@ _CLASSES: dict[int, type[Any]] = {
 
 @dataclass(frozen=True)
 class Block:
-    """A chunk, or a run of messages outside chunks, and where its stored bytes lie."""
+    """A chunk, or a run of messages outside chunks, and its position in the file."""
 
     file: int  #: number of the file
     offset: int
@@ -68,7 +68,7 @@ class Block:
 
     @classmethod
     def of_chunk(cls, file: int, offset: int, head: bytes, length: int) -> 'Block':
-        """Read what a chunk record of a length says before its data, or raise `BagError`."""
+        """Read the fields before the data of a chunk record of a length, or raise `BagError`."""
         try:
             start, end, size, crc, name = _CHUNK_HEAD.unpack_from(head)
             begin = _CHUNK_HEAD.size + name + 8
@@ -91,7 +91,7 @@ class Block:
 
 
 class _Content(ReadDataStream):
-    """The content of a record: ends where the record does, and has a limit of fields."""
+    """The content of a record: reads to its end only, and limits the number of fields."""
 
     def __init__(self, data: bytes, what: str) -> None:
         super().__init__(io.BytesIO(data))
@@ -114,7 +114,7 @@ class _Content(ReadDataStream):
 
 
 def parse(kind: type[_Record], content: bytes) -> _Record:
-    """Read a record by the mcap package's class, or raise `BagError`; not UTF-8 becomes codes."""
+    """Parse a record by the mcap package, escaping invalid UTF-8; raise `BagError` if damaged."""
     what = kind.__name__.lower()
     stream = _Content(content, what)
     try:
@@ -127,7 +127,7 @@ def parse(kind: type[_Record], content: bytes) -> _Record:
 
 
 def parse_any(opcode: int, content: bytes) -> McapRecord | None:
-    """Return the record of a known kind, None of another; see `parse`."""
+    """Return the record, None if of unknown kind; see `parse`."""
     kind = _CLASSES.get(opcode)
     return None if kind is None else parse(kind, content)
 
@@ -139,8 +139,8 @@ def decompress(data: bytes, compression: str, size: int) -> bytes:
     elif compression == 'zstd':
         import zstandard
         try:
-            # A frame may say its own size: believed only if it is what the chunk says. No more
-            # memory than that is taken, whatever the data would unfold to.
+            # A frame may contain its size, which must be that of the chunk: decompression never
+            # allocates more.
             if zstandard.frame_content_size(data) not in (size, -1):
                 raise BagError('a chunk does not decompress to the size it says')
             content = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
@@ -160,7 +160,7 @@ def decompress(data: bytes, compression: str, size: int) -> bytes:
 
 
 def split(content: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, start and end of each content; raise `BagError` where a record is cut."""
+    """Yield opcode, start and end of each record's content; raise `BagError` if truncated."""
     offset, size = 0, len(content)
     prefix_size, unpack = PREFIX.size, PREFIX.unpack_from
     while offset < size:
@@ -175,7 +175,7 @@ def split(content: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def read_exactly(descriptor: int, length: int, offset: int) -> bytes:
-    """Return so many bytes from an offset on; raise `BagError` if the file has not as many."""
+    """Return ``length`` bytes from an offset; raise `BagError` if the file has fewer."""
     data = os.pread(descriptor, length, offset)
     while len(data) < length:
         more = os.pread(descriptor, length - len(data), offset + len(data))

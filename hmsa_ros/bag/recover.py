@@ -1,4 +1,4 @@
-"""Making a readable bag out of what a crash, a full disk or a damaged file left."""
+"""Recover a readable bag after a crash, a full disk or damage."""
 
 from dataclasses import dataclass, replace
 import os
@@ -11,7 +11,7 @@ from hmsa_ros.errors import BagError
 
 @dataclass(frozen=True)
 class Recovered:
-    """The new bag's folder, its number of messages, and what of the old could not be read."""
+    """Folder and number of messages of the new bag, and the unreadable parts of the old one."""
 
     folder: str
     message_count: int
@@ -40,6 +40,6 @@ def recover(
     if check.problems or found != expected:
         raise BagError(f'{out} does not read back as written: '
                        + ('; '.join(check.problems) or f'{found}, expected {expected}'))
-    # Counted last, when all damage is known.
+    # The count comes last because it may find more damage.
     reader.counts()
     return Recovered(str(out), sum(found.values()), tuple(reader.problems))

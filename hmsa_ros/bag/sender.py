@@ -1,4 +1,4 @@
-"""Sending the messages of a bag, each at its own place on an absolute schedule."""
+"""Send the messages of a bag on an absolute schedule."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -12,20 +12,20 @@ from hmsa_ros.bag.reader import BagReader, Message
 from hmsa_ros.bag.transport import PlayingInterruptedError, Transport
 
 _POLL_SECONDS = 0.02
-# Read ahead at a time, each an equal share of the messages and of the memory.
+# Number of batches that share the messages and the memory read ahead.
 _BATCHES = 8
-#: Read ahead at most, whatever the number of messages: they may be large.
+#: Limit on the memory of messages read ahead.
 READ_AHEAD_BYTES = 64 * 2**20
 
 
 class ReadAhead:
-    """Reads so many messages ahead in a thread; ``read`` is asked for them with ``cancelled``."""
+    """Read messages ahead in a thread; ``read`` takes the argument ``cancelled``."""
 
     def __init__(self, read: Callable[..., Iterator[Message]], size: int) -> None:
         self._ended = False
         self._messages = read(cancelled=lambda: self._ended)
         self._most = -(-size // _BATCHES)
-        # One thread: the batches come in order.
+        # A single thread keeps the batches in order.
         self._thread = ThreadPoolExecutor(1, 'read ahead')
         self._ahead = deque(self._thread.submit(self._batch) for _ in range(_BATCHES))
 
@@ -45,19 +45,19 @@ class ReadAhead:
             yield from batch
 
     def wait(self, transport: Transport) -> None:
-        """Wait for the first messages, or the end if there are none or nobody waits."""
+        """Wait for the first messages, the end, or an interruption."""
         while not (self._ahead[0].done() or transport.interrupted):
             wait([self._ahead[0]], _POLL_SECONDS)
 
     def stop(self) -> None:
-        """Read no further."""
+        """Stop reading."""
         self._ended = True
         self._thread.shutdown(cancel_futures=True)
 
 
-#: How often the clock is repeated while time stands still, in s.
+#: Interval in s at which the clock is repeated during a pause.
 CLOCK_WHILE_WAITING_SECONDS = 0.1
-# A loop over a bag of a single moment would send without pause.
+# Without a minimum, a loop over a bag of zero length would send without pause.
 _SHORTEST_ROUND_SECONDS = 0.1
 
 
@@ -74,7 +74,7 @@ class Excerpt:
 
 @dataclass(frozen=True)
 class ClockOut:
-    """The clock sent at so many Hz of real time (0 for not), or before each message."""
+    """The clock: sent at a frequency in Hz of real time (0 for none), or before each message."""
 
     send: Callable[[int], None]
     frequency: float = 0.0
@@ -83,10 +83,10 @@ class ClockOut:
 
 class Sender:
     """
-    Sends a bag once, or in a loop, by what a transport says is due.
+    Send a bag once or in a loop, on the schedule of a transport.
 
-    ``latched`` says how many messages a late subscriber of a topic gets; ``count`` is the number
-    of messages sent so far.
+    ``latched`` contains the number of messages that a late subscriber of a topic receives;
+    ``count`` is the number of messages sent so far.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class Sender:
         self.count = 0
 
     def run(self) -> None:
-        """Send until the end of the excerpt, or of the last round, or until it is stopped."""
+        """Send until the end of the excerpt or of the last round, or until stopped."""
         while True:
             begin, count = time.monotonic(), self.count
             if not self._play(self._excerpt.start) or self.count == count:
@@ -119,7 +119,7 @@ class Sender:
                 self._excerpt.read_ahead)
             try:
                 self._send_latched(start)
-                # Time runs from when there is something to send.
+                # Time starts when the first message is ready.
                 source.wait(self._transport)
                 self._transport.begin(start)
                 self._send_all(source, start)
@@ -135,7 +135,7 @@ class Sender:
         """Send messages, each at its time."""
         tick, clock = start, self._clock
         if clock.frequency > 0.0:
-            # Before the first message: in a loop, time jumps back with this.
+            # Before the first message: in a loop, this is the backward jump of time.
             clock.send(start)
         for message in messages:
             tick = self._tick_until(message.log_time, tick, last=False)
@@ -164,11 +164,11 @@ class Sender:
         """Wait until a time of the bag."""
         while (standing_at := self._transport.wait(
                 when, message=message, timeout=CLOCK_WHILE_WAITING_SECONDS)) is not None:
-            # Time stands still, but who comes now is to know it.
+            # Repeat the time for new subscribers.
             self._clock.send(standing_at)
 
     def _send_latched(self, start: int) -> None:
-        """Send what a subscriber of the latched topics would have got at a time."""
+        """Send the messages that a new subscriber of the latched topics would have received."""
         if not self._latched or start <= self._excerpt.first:
             return
         kept = {name: deque[Message]() for name in self._latched}

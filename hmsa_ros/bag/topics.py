@@ -1,4 +1,4 @@
-"""The topics of a bag, from the channels of its files and from what its metadata say."""
+"""The topics of a bag, from the channels of its files and from its metadata."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -21,7 +21,7 @@ def number_of(topic: Topic, known: Sequence[Topic]) -> int:
 def topics_of(
         files: Iterable[ScannedFile], described: Mapping[str, Topic],
         custom_data: Mapping[str, str], problem: Callable[[str], None]) -> dict[str, Topic]:
-    """Return the topics of files, and of what the metadata say of them, in order of appearance."""
+    """Return the topics of files, with the profiles of their metadata, in order of appearance."""
     topics: dict[str, Topic] = {}
     for file in files:
         for channel in file.channels.values():
@@ -51,7 +51,7 @@ def topics_of(
                     profiles, channel.metadata.get('topic_type_hash', ''),
                     channel.message_encoding)
             elif len(profiles) > len(known.profiles):
-                # A later split may know more publishers.
+                # A later file may contain more publishers.
                 topics[name] = replace(known, profiles=profiles)
     return topics
 

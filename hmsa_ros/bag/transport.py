@@ -1,22 +1,22 @@
-"""Position and speed of playing, which other threads change: pause, seek, step and stop."""
+"""Position and speed of playback, controlled by other threads: pause, seek, step and stop."""
 
 from collections import deque
 import threading
 import time
 
-# A wait that can be woken ends this much early; the rest is slept, which is more exact.
+# An interruptible wait ends this much early; sleeping the rest is more accurate.
 _FINE_SECONDS = 0.01
 
 
 class PlayingInterruptedError(Exception):
-    """Playing was stopped, or is to go on from another time of the bag."""
+    """Playback was stopped, or is to continue from another time of the bag."""
 
 
 class Transport:
     """
-    The schedule of one run, paused at first: which time of the bag (ns) is due when.
+    The schedule of one playback, initially paused: when each time of the bag (ns) is due.
 
-    ``rate`` multiplies the recorded speed, ``position`` is the time of the bag reached and
+    ``rate`` multiplies the recorded speed, ``position`` is the current time of the bag and
     ``late`` the largest delay of a message so far in s. Every change notifies ``change``.
     """
 
@@ -35,7 +35,7 @@ class Transport:
     # Called by other threads -------------------------------------------------------------------
 
     def set_paused(self, paused: bool) -> None:
-        """Pause or go on, without a jump in the schedule."""
+        """Pause or resume, without a jump in the schedule."""
         with self.change:
             if paused != self.paused:
                 self._rebase()
@@ -50,7 +50,7 @@ class Transport:
             self.change.notify_all()
 
     def seek(self, when: int) -> None:
-        """Go on from a time of the bag in ns."""
+        """Continue from a time of the bag in ns."""
         with self.change:
             self._seek = when
             self.change.notify_all()
@@ -66,7 +66,7 @@ class Transport:
         return answer.is_set() and not self.stopped
 
     def stop(self) -> None:
-        """End playing, and what waits for it."""
+        """Stop playback, and end all waits for it."""
         with self.change:
             self.stopped = True
             for answer in self._answers:
@@ -74,7 +74,7 @@ class Transport:
             self.change.notify_all()
 
     def _rebase(self) -> None:
-        """Count from now on."""
+        """Restart the schedule at the current time and position."""
         since, began = self._anchor
         now = time.monotonic()
         if not self.paused:
@@ -84,29 +84,29 @@ class Transport:
     # Called by the thread that sends -----------------------------------------------------------
 
     def begin(self, start: int) -> None:
-        """Have a time of the bag be due now."""
+        """Start the schedule: a time of the bag is due now."""
         with self.change:
             self.position = start
             self._anchor = (start, time.monotonic())
 
     @property
     def interrupted(self) -> bool:
-        """Return whether what is going on has been given up."""
+        """Return whether playback is to stop or to seek."""
         return self.stopped or self._seek is not None
 
     def take_seek(self, otherwise: int) -> int:
-        """Return the time of the bag to go on from."""
+        """Return the time of the bag to continue from."""
         with self.change:
             start, self._seek = self._seek, None
             return otherwise if start is None else start
 
     @property
     def stepping(self) -> bool:
-        """Whether the next message is wanted at once."""
+        """Whether the next message is to be sent immediately."""
         return self._steps > 0
 
     def sent(self, when: int) -> None:
-        """Note that a message has left, and answer who requested it."""
+        """Record that a message was sent, and complete the step that requested it."""
         self.position = when
         if self._answers:
             with self.change:
@@ -119,9 +119,9 @@ class Transport:
 
     def wait(self, when: int, *, message: bool, timeout: float) -> int | None:
         """
-        Wait until a time of the bag (ns) is due; a message may be what a step asks for.
+        Wait until a time of the bag (ns) is due; a message can be requested by a step.
 
-        Returns None then, or where time stands still after ``timeout`` s of a pause. Raises
+        Returns None then, or the current time of the bag after ``timeout`` s of a pause. Raises
         `PlayingInterruptedError`.
         """
         while True:
