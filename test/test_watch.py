@@ -88,7 +88,7 @@ def test_words_that_do_not_fit_are_left_out_whole():
         lines = [x.plain for x in Screen(10.0).lines(scene(), width, 24)]
         place = next(i for i, x in enumerate(lines) if x.startswith('actuator'))
         assert re.fullmatch(
-            r'actuator  stretch 1\.10000(  target 1\.20000(  off -1\.0e-01'
+            r'actuator  stretch 1\.10000(  target 1\.20000(  error -1\.0e-01'
             r'(  rate \+0\.500 1/s)?)?)?', lines[place])
         assert re.fullmatch(
             r'flux density \+34\.500 mT(  commanded \+65\.000 mT)?', lines[place + 1])
@@ -146,7 +146,7 @@ def test_a_frame_of_80_by_24_says_everything():
     text = '\n'.join(lines)
     for words in (
             'domain 42', '12.500 s (simulated)', '1000 samples/s', 'q ends', 'stretch 1.10000',
-            'target 1.20000', 'off -1.0e-01', 'rate +0.500 1/s', 'flux density +34.500 mT',
+            'target 1.20000', 'error -1.0e-01', 'rate +0.500 1/s', 'flux density +34.500 mT',
             'commanded +65.000 mT', '└-10 s───', '-5 s──', '──now',
             'setpoint 1 of 3  moving', '25 %',
             'verdict  OK    accepted', 'planner  WARN  2 commands sent late, late 2, sent 6',

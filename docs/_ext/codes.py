@@ -93,7 +93,7 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'the planner predicts.',
         'Repair the sensor, or stop its publisher; without samples moves start as predicted.'),
     Code.UNHEARD: (
-        'The plant or driver is heard, but commands do not arrive there, as when a link works in '
+        'The plant or driver sends receipts, but commands do not arrive, as when a link works in '
         'one direction only.',
         'Repair the network from the host of the planner to that of the plant or driver; then '
         'send the request again.'),

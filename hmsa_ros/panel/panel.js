@@ -106,7 +106,7 @@ function joint(card, seen) {
   put(card.querySelector('h2'), seen.name);
   const texts = {
     name, label: name, stretch: number(seen.stretch, 5), target: number(seen.target, 5),
-    off: seen.stretch === null || seen.target === null ? '?'
+    error: seen.stretch === null || seen.target === null ? '?'
       : (seen.stretch - seen.target).toExponential(1).replaceAll('-', '\u2212'),
     drive: drive.name, level: `${drive.name} in ${drive.shown}`,
     flux: seen.flux_density === null ? '?'

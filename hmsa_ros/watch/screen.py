@@ -120,7 +120,7 @@ def _level(value: float, joint: Joint) -> str:
     return joint.drive.text(value, '+.3f') if math.isfinite(value) else '?'
 
 
-def _off(joint: Joint) -> str:
+def _error(joint: Joint) -> str:
     return number(joint.stretch - joint.target, '+.1e')
 
 
@@ -205,7 +205,7 @@ class Screen:
     def _joint(self, joint: Joint, now: float, width: int, rows: int) -> list[Text]:
         first = _fitted(width, [
             (joint.name, 'bold'), (f'{joint.coordinate} {number(joint.stretch)}', _VALUE),
-            (f'target {number(joint.target)}', _TARGET), (f'off {_off(joint)}', ''),
+            (f'target {number(joint.target)}', _TARGET), (f'error {_error(joint)}', ''),
             (f'rate {number(joint.rate, "+.3f")} 1/s', '')])
         second = _fitted(width, [
             (f'{joint.drive.name} {_level(joint.flux_density, joint)}', ''),
@@ -252,7 +252,7 @@ class Screen:
         name = shared_name(x.coordinate for x in scene.joints)
         level = drive_of(name).name
         lines = [Text(
-            f'{"joint":<{wide}} {name:>{_WIDE}} {"target":>8} {"off":>8} {level:>13}',
+            f'{"joint":<{wide}} {name:>{_WIDE}} {"target":>8} {"error":>8} {level:>13}',
             style=_SOFT)]
         if room <= _ENDS:
             # No room for a header.
@@ -264,7 +264,7 @@ class Screen:
             line = Text(f'{joint.name[:wide]:<{wide}} ')
             line.append(f'{number(joint.stretch):>{_WIDE}}', style=_VALUE)
             line.append(f' {number(joint.target):>8}', style=_TARGET)
-            line.append(f' {_off(joint):>8} {_level(joint.flux_density, joint):>13} ')
+            line.append(f' {_error(joint):>8} {_level(joint.flux_density, joint):>13} ')
             across = width - cell_len(line.plain)
             if across > 0:
                 line.append(self._chart(joint, scene.now, across, 1)[0][0])
