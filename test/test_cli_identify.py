@@ -193,7 +193,8 @@ def test_bad_samples_end_with_2_and_a_sentence(folder, capsys, text, message):
     (100.0, -100.0, 0.0, 'if it is strain in percent, divide it by 100 and add 1'),
     (10.0, 0.0, 0.0, 'if it is ten times the stretch, divide it by 10'),
     (10.0, 0.0, 0.05, 'if it is ten times the stretch, divide it by 10'),
-    (3.0, 0.0, 0.0, 'if it is a length, in mm perhaps, divide it by the length at rest')])
+    (3.0, 0.0, 0.0, 'if it is a length, in mm or m perhaps, divide it by the length at rest'),
+    (0.02, 0.0, 0.0, 'if it is a length, in mm or m perhaps, divide it by the length at rest')])
 def test_what_is_no_stretch_is_refused_with_what_it_looks_like(
         folder, capsys, factor, offset, first, message):
     rows = [(t, factor * y + offset) for t, y in zip(TIMES, STRETCH, strict=True) if t >= first]

@@ -157,14 +157,16 @@ class Recording:
         least, most = what.at_rest if seen else what.possible
         if least <= rest <= most and what.possible[0] <= low and high <= what.possible[1]:
             return
-        strain = abs(rest) < 0.4 if seen else low < what.possible[0]
+        # A length in m is small too, but never near to 0 beside its own rest.
+        strain = abs(rest) < 0.4 and not 0.0 < rest < 3.0 * low if seen else (
+            low < what.possible[0])
         looks = what.looks or (
             'strain in percent, divide it by 100 and add 1' if strain and high > what.possible[1]
             else 'strain, add 1; if it is the deflection of a beam, give its parameter file'
             if strain
             else 'ten times the stretch, divide it by 10' if 6.0 < rest < 16.0
             else 'percent, divide it by 100' if 60.0 < rest < 160.0
-            else 'a length, in mm perhaps, divide it by the length at rest')
+            else 'a length, in mm or m perhaps, divide it by the length at rest')
         raise BadInputError(
             f'{self.label} has {what.plural} from {low:.4g} to {high:.4g}'
             + (f', {rest:.4g} without field' if seen else '')
