@@ -317,6 +317,7 @@ def test_foreign_motion_is_rejected_without_a_number():
     found = identify(replace(recording, stretch=recording.stretch[::-1].copy()))
     assert found.verdict == 'model_rejected'
     assert all(np.isnan(found.parameters[x].value) for x in found.names)
+    assert not found.warnings
 
 
 def test_ratios_alone_are_not_identifiable_and_said_to_be():

@@ -183,7 +183,8 @@ def _conclude(
     reason = reason.replace('shear_modulus', quantities.modulus_of(best.values.get('law'))[0])
     parameters, matrix = estimates_of(best, known, lost)
     outliers = int(np.count_nonzero(best.weights == 0.0))
-    warnings = (*best.recording.notes, *_warnings(best, known, outliers, given))
+    warnings = best.recording.notes if distant else (
+        *best.recording.notes, *_warnings(best, known, outliers, given))
     return Identification(
         verdict, reason, warnings, parameters, best.free, matrix, known.deviation,
         float(np.sqrt(np.mean(best.residual ** 2))), len(best.recording.time), outliers,
