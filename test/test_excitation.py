@@ -61,6 +61,7 @@ def test_command_prints_and_writes_the_levels(tmp_path, monkeypatch, capsys):
     (['--duration', 'nan'], 'duration is nan s'),
     (['--stretch-max', '0.9'], 'expected a range with 1 inside'),
     (['--rate', '0'], 'rate is 0 Hz'),
+    (['--duration', '0.6', '--rate', '10'], '0.6 s at 10 Hz are 6 samples: expected 12 or more'),
     (['--duration', '5000'], 'more than a million samples')])
 def test_bad_arguments_end_with_2_and_a_sentence(capsys, arguments, message):
     assert main(['excite', *arguments]) == 2

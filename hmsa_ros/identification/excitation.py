@@ -16,7 +16,7 @@ import numpy as np
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import quantities
-from hmsa_ros.identification.recording import Course
+from hmsa_ros.identification.recording import Course, FEWEST
 from hmsa_ros.identification.response import respond, Response
 from hmsa_ros.model import equations
 from hmsa_ros.model.delivery import Delivery
@@ -163,10 +163,12 @@ class Designer:
             raise BadInputError(
                 f'duration is {duration:g} s: expected at least '
                 f'{(_SHORTEST + _LAST) * self.period:.3g} s, {_SHORTEST + _LAST:g} periods')
-        if duration * rate > 1e6:
+        if not FEWEST <= duration * rate <= 1e6:
             raise BadInputError(
-                f'{duration:g} s at {rate:g} Hz are more than a million samples: expected a '
-                'shorter sequence')
+                f'{duration:g} s at {rate:g} Hz are ' + (
+                    'more than a million samples: expected a shorter sequence'
+                    if duration * rate > 1e6 else f'{int(duration * rate)} samples: expected '
+                    f'{FEWEST} or more'))
         self.duration, self._rate = duration, rate
         self._reference = dict.fromkeys(self._free, 1.0)
         self.point: Array = np.zeros(2 * _PATTERN)
@@ -208,8 +210,9 @@ class Designer:
             return None
         matrix = response.jacobian.T @ response.jacobian / self._noise ** 2
         sign, size = np.linalg.slogdet(matrix)
-        deviations = np.full(len(matrix), math.inf) if sign <= 0.0 else np.sqrt(
-            np.maximum(np.diag(np.linalg.inv(matrix)), 0.0))
+        variances = np.diag(np.linalg.inv(matrix)) if sign > 0.0 else np.zeros(len(matrix))
+        # Those of a matrix that is singular but for rounding may be below 0.
+        deviations = np.sqrt(np.where(variances > 0.0, variances, math.inf))
         std = {}
         for name, deviation in zip(self._free, deviations.tolist(), strict=True):
             value = self._values[name]
@@ -302,7 +305,7 @@ class Designer:
 
         Raises `BadInputError` if none keeps within the limits.
         """
-        if self.duration > _WINDOW * self.period:
+        if self.duration > _WINDOW * self.period >= FEWEST / self._rate:
             # What is best in the long run is so already over some tens of periods.
             part = Designer(
                 self._actuator, self._bounds, _WINDOW * self.period, rate=self._rate,
