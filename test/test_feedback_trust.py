@@ -10,6 +10,7 @@ import pytest
 from hmsa_ros.control import tracked
 from hmsa_ros.estimation import estimator, window
 from hmsa_ros.estimation.motion import follow
+from hmsa_ros.planning.drafting import finish
 
 MOVES = (1.4, 1.1, 1.4, 1.1, 1.4)
 
@@ -142,6 +143,20 @@ def test_moves_that_get_worse_end_feedback_and_what_it_did_is_taken_back(monkeyp
     it.runtime.feedback.reset()
     it.pass_time(300 * MS)
     assert it.estimates[-1].values['ended'] is False
+
+
+def test_a_move_from_a_learnt_level_leaves_no_more_than_open_loop_once_it_is_forgotten():
+    left = {}
+    for mode in ('off', 'adapt'):
+        it = bench(False, factors={'shear_modulus': 0.85}, feedback=mode)
+        moves(it, MOVES[:1])
+        if mode == 'adapt':
+            it.runtime.feedback.reset()
+        # A first point that repeats the setpoint is accepted as before.
+        assert finish(it.planner.draft_request(
+            [(MOVES[0], 0), (MOVES[1], 400 * MS)], None, it.now)) is not None
+        left[mode] = moves(it, MOVES[1:2])[0]
+    assert left['adapt'][0] < left['off'][0] + 0.5
 
 
 @pytest.mark.parametrize('factors', [

@@ -9,7 +9,7 @@ from hmsa_ros.control.holds import Hold
 from hmsa_ros.control.learnt import alike, save
 from hmsa_ros.control.records import EstimateChanged, Output, Settings, Severity
 from hmsa_ros.control.slices import Clock
-from hmsa_ros.control.tracked import Joint, RESTING
+from hmsa_ros.control.tracked import as_held, Joint, RESTING
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation.words import differences
 from hmsa_ros.judge.records import Sensor
@@ -64,7 +64,8 @@ class Feedback:
 
     def _believed(self, name: str, time: int) -> Believed | None:
         joint = self.joints.get(name)
-        return None if joint is None else joint.believed(time)
+        return as_held(self._group.planners[name], time) if joint is None else (
+            joint.believed(time))
 
     def restart(self) -> None:
         """Discard the estimates: plan with the given parameters, from the predicted state."""

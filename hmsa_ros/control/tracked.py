@@ -18,7 +18,7 @@ from hmsa_ros.estimation.motion import held, rest
 from hmsa_ros.estimation.words import sentence
 from hmsa_ros.identification.known import Known
 from hmsa_ros.judge.records import Sensor
-from hmsa_ros.model.equations import equilibrium_stretch
+from hmsa_ros.model.equations import equilibrium_stretch, stretch_limits
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.planner import Believed, Planner
 from hmsa_ros.planning.timeline import Model, Plan
@@ -305,7 +305,7 @@ class Joint:
         except HmsaError:
             return None
         if found is None:
-            return None
+            return as_held(self.planner, time)
         # Effects missing in the model shift its equilibrium: a plan uses the stretches of its
         # model.
         level, model = self.planner.plan.levels[-1].flux_density, self.planner.model
@@ -414,6 +414,26 @@ class Joint:
             'too_late': screening.late, 'ahead_of_clock': screening.ahead,
             'new_beginnings': self.trust.beginnings, 'ended': self.trust.ended,
             **self.sensor.to_dict()}
+
+
+def as_held(planner: Planner, time: int) -> Believed | None:
+    """
+    Return the predicted state at a time in ns, in the stretches of the planner's model.
+
+    The last level may be planned with other parameters. With those of the model it holds another
+    stretch, and a move from the planned one would leave vibration. None if it needs no change.
+    """
+    last, model = planner.plan.levels[-1], planner.model
+    if last.model.actuator == model.actuator and last.model.others == model.others:
+        return None
+    state = planner.state(time)
+    stretch = state.stretch + float(
+        equilibrium_stretch(model.load(last.flux_density), model.material)
+        - equilibrium_stretch(last.load, last.model.material))
+    low, high = stretch_limits(model.material)
+    return None if not low < stretch < high else (
+        stretch, state.rate / model.units.time, tuple(
+            x + model.holding(stretch) - model.holding(state.stretch) for x in state.followed))
 
 
 def _updated(estimator: Estimator, now: int) -> tuple[Estimator, Estimate | None]:

@@ -114,8 +114,8 @@ def draft_sequence(
     """
     begin = outset.begin
     if points[0][1] == 0 and len(points) > 1 and base == begin:
-        # A first point at time 0 that repeats the present position is ignored.
-        here = outset.state.stretch
+        # A first point at time 0 that repeats the planned position is ignored.
+        here = outset.plan.level(begin).at(begin).stretch
         if abs(points[0][0] - here) > 1e-6:
             raise RefusedError(
                 Code.SPELL_TOO_SHORT,
