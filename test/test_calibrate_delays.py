@@ -48,6 +48,27 @@ def recorded(seed):
     return truth, nominal, (time + truth['latency'], stretch), (time, field), (begins, levels)
 
 
+@pytest.mark.parametrize('lag', [1e-9, 2e-5, 1e-4])
+def test_a_field_that_rises_between_two_readings_has_honest_intervals(lag):
+    right = 0
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        transport = random.uniform(0.0, 3e-3)
+        begins = 1.0 + np.cumsum(random.uniform(0.12, 0.2, 24))
+        levels = np.resize([0.02, -0.01, 0.03, 0.005], 24)
+        time = np.arange(1.0, begins[-1] + 0.2, 1e-3)
+        place = np.searchsorted(begins + transport, time, 'right')
+        target = np.append(0.0, levels)
+        since = time - np.append(0.0, begins + transport)[place]
+        left = np.where(place > 0, target[place - 1] - target[place], 0.0) * np.exp(-since / lag)
+        field = target[place] + left + 2e-5 * random.standard_normal(len(time))
+        found = field_delays(time, field, begins, levels)
+        right += (found.transport.low <= transport <= found.transport.high
+                  and found.lag.low <= lag <= found.lag.high)
+        assert found.transport.value == pytest.approx(transport, abs=2e-4)
+    assert right >= 17
+
+
 @pytest.mark.parametrize('seed', [
     pytest.param(x, marks=pytest.mark.slow if x > 2 else ()) for x in range(8)])
 def test_transport_lag_and_latency_are_told_apart_on_random_benches(seed):

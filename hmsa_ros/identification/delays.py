@@ -23,6 +23,8 @@ _LONGEST = 0.05
 _TRANSPORTS = np.linspace(-2e-3, 2e-2, 45)
 _LAGS = np.geomspace(5e-5, 2e-2, 9)
 _LEAST_LAG = 1e-6
+# Readings within the first three lags of a step from which its shape is known.
+_RISE = 3
 # A field must change by so many deviations of its readings for its time to be known.
 _SEEN = 10.0
 
@@ -93,8 +95,15 @@ def field_delays(
     def off(values: Array) -> Array:
         return weight * (response(since, 1e-3 * values[0], 1e-3 * values[1]) - share)
 
-    best = min((float(np.sum(off(np.array((x, y)))**2)), x, y)
-               for x in 1e3 * _TRANSPORTS for y in 1e3 * _LAGS)[1:]
+    def search(transports: Array, lags: Array) -> tuple[float, float]:
+        return min((float(np.sum(off(np.array((x, y)))**2)), x, y)
+                   for x in 1e3 * transports for y in 1e3 * lags)[1:]
+
+    coarse = 1e-3 * search(_TRANSPORTS, _LAGS)[0]
+    # The cost of a short lag is constant between two readings.
+    spacing = float(np.ptp(since)) / len(since)
+    best = search(
+        coarse + np.arange(-5e-4, 5e-4, max(spacing, 1e-5)), np.append(0.25 * spacing, _LAGS))
     found = least_squares(
         off, best, x_scale='jac', xtol=1e-12, ftol=1e-12, bounds=([-np.inf, 0.0], np.inf))
     freedom = len(since) - 2
@@ -106,9 +115,17 @@ def field_delays(
             'check the probe, or raise --limit')
     half = float(stdtrit(freedom, 0.975)) * noise * np.sqrt(
         np.abs(np.diag(np.linalg.pinv(found.jac.T @ found.jac))))
+    values, since_ms = found.x, 1e3 * since
+    begin, end = values[0], values[0] + 3.0 * values[1]
+    if np.count_nonzero((since_ms > begin) & (since_ms < end)) < _RISE:
+        # All that is known is the readings between which the field rises, for three lags.
+        before = float(np.max(since_ms, where=since_ms <= begin, initial=0.0))
+        after = float(np.min(since_ms, where=since_ms >= end, initial=1e3 * _LONGEST))
+        half = (after - before) / np.array([2.0, 6.0])
+        values = np.array([before, 0.0]) + half
     transport, lag = (
         Interval(1e-3 * float(x), 1e-3 * float(x - y), 1e-3 * float(x + y))
-        for x, y in zip(found.x, half, strict=True))
+        for x, y in zip(values, half, strict=True))
     return FieldDelays(transport, lag, noise, since, share)
 
 
