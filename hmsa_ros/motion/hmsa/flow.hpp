@@ -35,6 +35,12 @@ template <class C> struct PowerLaw {
         const S size = x * inverse(s);
         return x * power(S(size * size + nothing), C(0.5 * (m - 1.0)));
     }
+    // What remains of x after a span of constant force; before it, at most twice as much.
+    double relaxed(double x, double speed, double span) const
+    {
+        const double p = value(m) - 1, way = x != 0 ? speed * (*this)(x) / x * span : 0;
+        return x * min(exp(p > 0 ? -log1p(max(p * way, -0.9)) / p : -way), 2.0);
+    }
     // x = x0 (1 + a t)^(-n) is the mean of exponentials whose rates have a Gamma distribution: a
     // sum over their logarithms, accurate to 1e-8. Slow ones count as constant up to a time.
     Fading fading(double x, double speed, double until) const

@@ -186,7 +186,7 @@ inline bool trail(const Trail &of)
     branches.read(of.branches, of.branch_count);
     Step<double, 1> step;
     for (int b = 0; b < of.branch_count; b++) {
-        // In terms of the distance from the force; exact for a linear rule.
+        // In terms of the distance from the force; exact for a linear rule, and for constant force.
         double x = of.forces[0] - of.branches[branch_columns * b + follower_at], end, h = 0;
         for (int i = 0; i < of.count; i++) {
             const double span = i ? of.times[i] - of.times[i - 1] : 0;
@@ -194,9 +194,10 @@ inline bool trail(const Trail &of)
             if (branches.flow[b].kind == maxwell) {
                 const double faded = expm1(-branches.speed[b] * span);
                 x += faded * (x - slope / branches.speed[b]);
-            } else {
-                const double sign = span < 0 ? -1 : 1;
-                double left = abs(span);
+            } else if (slope == 0)
+                x = branches.flow[b].power_law_flow.relaxed(x, branches.speed[b], span);
+            else {
+                double left = span;
                 for (int n = 0; left > 0; n++) {
                     if (n == most_attempts)
                         return false;
@@ -204,7 +205,7 @@ inline bool trail(const Trail &of)
                     const double scale = abs(x) + 1e-9;  // errors are relative to the present value
                     double y = x / scale;
                     const double error = step([&](int, const double *at, double *by) {
-                        *by = sign * (slope - branches.rate(b, *at * scale)) / scale;
+                        *by = (slope - branches.rate(b, *at * scale)) / scale;
                     }, &y, h, rtol, &end);
                     if (error <= 1)
                         x = end * scale, left -= h;
