@@ -103,6 +103,9 @@ def test_it_pulls_in_at_the_voltage_and_the_stretch_of_the_literature():
     assert block.plan([(1.5, 0.1)], 'step').report()['status'] == ['step']
     with pytest.raises(RefusedError, match='overshoots and pulls in'):
         block.plan([(2.2, 0.1)], 'step')
+    # What is held until further notice swings as far.
+    with pytest.raises(RefusedError, match='overshoots and pulls in'):
+        Planner(block.block, Options(flux_density_max=1e4, shaper='step')).setpoint(2.2, 0)
     # Chains that lock early leave no way to pull in.
     assert stack(5.0).plan([(3.0, 0.1)]).report()['status'] == ['two_step']
 

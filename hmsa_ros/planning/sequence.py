@@ -186,22 +186,26 @@ def _follow(request: Request, move: Move, span: float) -> State:
             material, delivery)
     parts, last = ramps(move.levels, request.load, end, delivery.slew)
     ramped = max(parts[-1][0], 0.0)
+    # A move that is held without an end also swings after the last level.
+    _check_known(request, move.levels, (ramped, max(end, span)))
     if not material.creep:
         end = min(end, ramped + longest_motion(last, material) + delivery.settling(0.0))
-    _check_known(request, move.levels, (ramped, end))
     return follow(move.levels, request.start, end, material, delivery)
 
 
 def _check_known(request: Request, levels: Sequence[Level], ends: tuple[float, float]) -> None:
     """
-    Refuse a move that leaves the range of the elastic model, or pulls in.
+    Refuse a move that leaves the range of the elastic model, pulls in, or collapses.
 
     ``ends`` are the times of the last ramp and of the end of the check.
     """
     material, target = request.material, request.target
-    elastic = material.law
-    if elastic is None or elastic.limits == ENDLESS:
+    elastic, limits = material.law, stretch_limits(material)
+    if elastic is None or limits == ENDLESS:
         return
+    # Where the force decreases, unless that is where the range of the model ends.
+    falls = [x if x != y else z for x, y, z in zip(
+        limits, elastic.limits, (-math.inf, math.inf), strict=True)]
     where = f'{material.coordinate.name} {request.state.stretch:.6g}'
     # The first swing about the last level is the widest.
     swing = 2.0 * math.pi / float(natural_frequency(target, material))
@@ -213,20 +217,21 @@ def _check_known(request: Request, levels: Sequence[Level], ends: tuple[float, f
     try:
         stretch = sampled(
             levels, request.start, times, material, request.delivery, _LOOK_RTOL)[STRETCH]
-            # A voltage pulls in where the elastic force decreases below it.
-        over = stretch[stretch > stretch_limits(material)[1]]
-        pulled = elastic.volts and np.any(elastic_force(over, material) < levels[-1].load)
+        # Where the elastic force decreases below the last load, nothing brings it back.
+        after = stretch[times >= ends[0]]
+        pull = levels[-1].load - elastic_force(after, material)
+        lost = bool(np.any(
+            (after > falls[1]) & (pull > 0.0) | (after < falls[0]) & (pull < 0.0)))
     except HmsaError:
-            # Without limiting extensibility, the motion diverges.
-        if not elastic.volts:
-            raise
-        pulled = True
-    if pulled:
+        # Without limiting extensibility, the motion diverges.
+        lost = True
+    if lost:
         raise RefusedError(
             Code.OUT_OF_RANGE,
-            f'the move from {where} to {target:g} '
-            f'overshoots and pulls in: expected a target of less, or a shaper that does not '
-            'overshoot, such as two_step')
+            f'the move from {where} to {target:g} overshoots and '
+            + ('pulls in: expected a target of less' if elastic.volts
+               else 'cannot be followed: expected a smaller move')
+            + ', or a shaper that does not overshoot, such as two_step')
     for widest, beyond in ((np.min(stretch), -1.0), (np.max(stretch), 1.0)):
         limit = elastic.limits[beyond > 0.0]
         if beyond * (widest - limit) > 0.0:
