@@ -18,6 +18,7 @@ from hmsa_ros.identification.recording import Recording
 from hmsa_ros.interfaces.actuator import actuator_from, parameters_of
 from hmsa_ros.interfaces.parameters import BLOCK
 from hmsa_ros.model.actuators import check_stretch, unheld
+from hmsa_ros.model.delivery import Delivery
 from hmsa_ros.model.equations import (
     elastic_energy,
     elastic_force,
@@ -26,9 +27,14 @@ from hmsa_ros.model.equations import (
     stretch_limits,
 )
 from hmsa_ros.model.laws import LAWS
+from hmsa_ros.model.moves import State
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.model.simulation import simulate
-from hmsa_ros.model.status import Code
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.planning.sequence import plan_sequence
+from hmsa_ros.planning.setpoint import Setpoint
+from hmsa_ros.planning.shapers import get_shaper
+from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.two_step import Groups, plan_two_step, plan_two_step_batch
 from hmsa_ros.recordings.parameters import read_parameter_file, recorded
 
@@ -207,6 +213,16 @@ def test_what_cannot_be_held_is_refused_where_the_force_falls(name):
     assert np.any((stretch - edge) * (edge - 1.0) > 0.0)
     assert stretch[-1] == pytest.approx(1.0, abs=0.05)
     assert equilibrium_stretch(10.0 * elastic_force(edge, group), group) == pytest.approx(edge)
+
+
+def test_a_move_that_collapses_where_the_force_falls_is_refused_and_others_are_found():
+    group = block('mooney_rivlin', {'law.c10': 5e3, 'law.c01': -300.0}).nondimensional
+    request = Request(State(1.0, -0.5), 0.3, group, delivery=Delivery(slew=2.0))
+    fast, slow = (get_shaper(x)(request) for x in ('minimum_time', 'two_step'))
+    assert (fast.code, fast.levels) == (Code.TWO_STEP, slow.levels)
+    with pytest.raises(RefusedError, match='overshoots .* such as two_step'):
+        plan_sequence([Setpoint(0.2, math.inf)], group, 'step')
+    assert plan_sequence([Setpoint(0.2, math.inf)], group)[0].move.code is Code.TWO_STEP
 
 
 @pytest.mark.parametrize(('name', 'constants', 'message'), [

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from hmsa_ros import motion
+from hmsa_ros.errors import HmsaError
 from hmsa_ros.model import law
 from hmsa_ros.model.moves import Level, Move, State
 from hmsa_ros.model.simulation import paces, sampled
@@ -75,8 +76,9 @@ def _attempt(request: Request, low: float, high: float) -> Attempt:
     elastic = replace(request, material=request.material.elastic)
     try:
         pushing, braking = _durations(elastic, push, brake)
-    except RefusedError:
-        if request.delivery.lag > 0.0:
+    except HmsaError as error:
+        # Where the elastic force decreases, the motion under a push may diverge.
+        if request.delivery.lag > 0.0 or not isinstance(error, RefusedError):
             return None
         raise
     delivery, holding = request.delivery, request.holding_load()
