@@ -308,6 +308,11 @@ def test_a_board_without_room_and_one_that_is_none_are_said(line, monkeypatch):
     monkeypatch.setattr(serial_board, '_BOOT', 0.1)
     with pytest.raises(BoardError, match='does not answer, 0.1 s after it was asked H'):
         Board(str(line.path))
+    line.loss, sent = 0.0, []
+    monkeypatch.setattr(line.board, 'write', sent.append)
+    monkeypatch.setattr(line.board, 'read', lambda _: sent.pop())
+    with pytest.raises(BoardError, match=r'answers H \[\d+, 500000\], 0.1 s .* without echo'):
+        Board(str(line.path))
 
 
 @pytest.mark.parametrize(('settings', 'expected'), [

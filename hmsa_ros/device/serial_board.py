@@ -141,10 +141,10 @@ class Board(OnLine):
                 continue
             if monotonic() > until:
                 why = 'does not answer' if answer is None else 'is full' if (
-                    answer.verb == 'F') else f'answers {answer}'
+                    answer.verb == 'F') else f'answers {answer.verb} {answer.values}'
                 raise BoardError(
                     f'the board on {self._port} {why}, {patience:g} s after it was asked {verb}: '
-                    'expected the firmware of this package, at the same baud')
+                    'expected the firmware of this package, at the same baud, without echo')
 
     def _attempt(self, verb: str, values: Sequence[int]) -> _Answer | None:
         self._number = (self._number + 1) % 65536
