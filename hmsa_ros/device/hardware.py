@@ -364,8 +364,8 @@ class Instrument:
             'read', self._theirs(now), take=lambda x: [self._stamped(y, now) for y in readings(x)],
             wrong=lambda what: HardwareError(
                 f'{what}: expected stretch, (stretch, rate), (stretch, rate, timestamp in ns, '
-                f'near now, {now}) or a list of the latter, at most {_MOST_PIECES}, with NaN for '
-                'what is not measured'))
+                f'near now, {now}) or a list of the latter, at most {_MOST_PIECES} and [] if '
+                'there is none, with NaN for what is not measured'))
 
     def _stamped(self, found: Reading, now: int) -> Reading:
         if found.stamp is None:
