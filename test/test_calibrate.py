@@ -49,8 +49,17 @@ def test_the_constant_is_right_to_a_fifth_of_a_percent_in_nearly_all_runs(satura
 def test_a_coil_like_no_model_gets_a_table_that_the_driver_takes(tmp_path, capsys):
     source, out = tmp_path / 'readings.csv', tmp_path / 'coil.yaml'
     flux = 0.05 * LOOP + 0.02 * np.maximum(LOOP, 0.0)
-    source.write_text('current [A],flux_density [mT]\n' + ''.join(
-        f'{x},{1e3 * y}\n' for x, y in zip(LOOP, flux, strict=True)))
+    def write(values):
+        source.write_text('current [A],flux_density [mT]\n' + ''.join(
+            f'{x},{1e3 * y}\n' for x, y in zip(LOOP, values, strict=True)))
+
+    # The table would replace the readings, which a number does not.
+    beside = ['calibrate', 'coil', str(source), '--out', str(source.with_suffix('.yaml'))]
+    write(0.05 * LOOP)
+    assert main(beside) == 0
+    write(flux)
+    assert main(beside) == 2
+    assert f'cannot write {source}: the command reads it' in capsys.readouterr().err
     assert main(['calibrate', 'coil', str(source), '--out', str(out)]) == 0
     assert 'table' in capsys.readouterr().out
     settings = {x.removeprefix('hardware.coil.'): y for _, x, y in entries_of(out)}

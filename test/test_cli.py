@@ -105,7 +105,7 @@ def test_bad_input_is_answered_in_one_line_with_status_2(words, said, capsys):
     ('wave in.csv --frequency 3 --amplitude 0.05 --out in.csv', 'in.csv'),
     ('wave sine --frequency 3 --amplitude 0.05 --out out.csv --path out.csv', 'out.csv'),
     ('excite --params-file in.yaml --duration 0.2 --out in.yaml', 'in.yaml'),
-    ('calibrate coil in.csv --out in.yaml', 'in.csv'),
+    ('calibrate coil in.csv --out in.csv', 'in.csv'),
     ('calibrate coil in.csv --out out.yaml --picture out.png --data', 'out.csv'),
     ('calibrate latency --simulate --params-file in.yaml --out in.yaml', 'in.yaml'),
     ('sweep --cases in.csv --out in.csv', 'in.csv'),

@@ -20,7 +20,7 @@ from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.quantities import number_of
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.files import write_text, yaml_text
+from hmsa_ros.files import check_targets, write_text, yaml_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -108,14 +108,19 @@ def _coil(arguments: argparse.Namespace) -> int:
     from hmsa_ros.device.calibration import calibrate_coil
     from hmsa_ros.device.iron_core import fit_core
 
+    source, out = Path(arguments.source), arguments.out
+    # Whether the table beside the file is written depends on the readings.
     paper = paper_of(
-        arguments, *_files(arguments.out), sources=[Path(arguments.source)])
+        arguments, *(x for x in _files(out) if x == out or x.resolve() != source.resolve()),
+        sources=[source])
     if not (arguments.limit > 0.0 and arguments.settle >= 0.0 and arguments.steps >= 2):
         raise BadInputError(
             f'--limit {arguments.limit:g}, --settle {arguments.settle:g} or --steps '
             f'{arguments.steps}: expected a limit above 0 T, at least 0 s and at least 2 steps')
     current, flux = _readings(arguments)
     found = calibrate_coil(current, flux)
+    if found.model == 'table':
+        check_targets(*_files(out), sources=[source])
     core, left = None, math.nan
     try:
         core, left = fit_core(found.curve(current), flux)
