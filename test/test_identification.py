@@ -271,6 +271,7 @@ def test_pixels_of_eight_bits_are_said_and_covered():
 
 @pytest.mark.parametrize(('extras', 'words'), [
     (Extras(coil=5e-4), 'coil_time_constant'),
+    (Extras(force=0.1), 'try --free +constant_force'),
     (Extras(ratio=0.1, time=2.0 * T), 'creep'),
     (Extras(ratio=0.1, time=0.1), 'creep')])
 def test_what_the_model_leaves_out_rejects_it_by_name(extras, words):

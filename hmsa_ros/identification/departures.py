@@ -41,7 +41,7 @@ _DELAYS = {'sensor_latency', 'coil_time_constant'}
 # Words, and what to free, by parameter.
 _PARAMETERS = {
     'coil_time_constant': 'lag of the coil', 'sensor_latency': 'latency of the sensor',
-    GAIN: 'gain of the sensor'}
+    GAIN: 'gain of the sensor', 'constant_force': 'constant force'}
 _FORCES = {
     places.FRICTION: 'friction that does not depend on the rate',
     places.SQUARE: 'damping by the square of the rate'}
