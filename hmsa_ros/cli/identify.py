@@ -133,11 +133,11 @@ def known_of(text: str) -> tuple[dict[str, float], dict[str, float]]:
                 f'--known has {part!r}: expected NAME=VALUE or NAME=VALUE+-STD, with a name of '
                 f'{", ".join(QUANTITIES)}')
         unit = QUANTITIES[name].unit
-        value, _, std = (x.strip() for x in rest.partition('+-'))
+        value, known, std = (x.strip() for x in rest.partition('+-'))
         values[name] = number_of(value, unit, name)
         if std.endswith('%'):
             deviations[name] = 0.01 * abs(values[name]) * number_of(std[:-1], '', name)
-        elif std:
+        elif known:
             deviations[name] = number_of(std, unit, name)
     return values, deviations
 
