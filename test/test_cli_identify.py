@@ -252,6 +252,8 @@ def test_a_few_samples_of_nothing_are_no_other_unit(folder, capsys):
     (['camera.csv', '--commands', 'levels.csv', '--free=-density'], 'takes away a parameter'),
     (['camera.csv', '--commands', 'levels.csv', '--known', 'half_length=5mm+-'],
      "half_length is '': expected a number"),
+    (['camera.csv', '--commands', 'levels.csv', '--known', 'half_length=-1mm'],
+     'half_length is -0.001: expected a finite number greater than 0'),
     (['camera.csv', '--commands', 'levels.csv', '--out', 'camera.csv'], 'cannot write'),
     (['camera.csv', '--commands', 'levels.csv', '--params-file', 'camera.csv'],
      'has no ros__parameters'),

@@ -230,14 +230,14 @@ def values_of(
     name of them is unknown or a value out of range.
     """
     others = {x: float(y) for x, y in (others or {}).items()}
+    actuator = replace(
+        actuator, half_length=others.get('half_length', actuator.half_length),
+        half_thickness=others.get('half_thickness', actuator.half_thickness))
     for name, value in others.items():
         quantity = quantity_of(name)
         if not (quantity.least <= value <= quantity.most and math.isfinite(value)):
             raise BadInputError(
                 f'{name} is {value:g}: expected a finite number of at least {quantity.least:g}')
-    actuator = replace(
-        actuator, half_length=others.get('half_length', actuator.half_length),
-        half_thickness=others.get('half_thickness', actuator.half_thickness))
     return {name: x.default for name, x in QUANTITIES.items()} | actuator.numbers | {
         'time_unit': actuator.time_unit, 'law': actuator.law, 'initial_stretch': actuator.rest,
         **others}
