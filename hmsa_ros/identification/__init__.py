@@ -1,6 +1,6 @@
 """
-The parameters of an actuator out of a recording of its motion.
+Identification of the parameters of an actuator from a recording of its motion.
 
 `identify.identify` takes a `recording.Recording` and returns a frozen `result.Identification`.
-Nothing here needs ROS.
+The package does not depend on ROS.
 """

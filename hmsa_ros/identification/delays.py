@@ -1,4 +1,4 @@
-"""How late a field follows its command, and a sensor the motion."""
+"""Delays of a field after its command, and of a sensor after the motion."""
 
 from dataclasses import dataclass
 import math
@@ -15,23 +15,23 @@ from hmsa_ros.identification.result import Identification
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters
 
-# Readings and levels that a fit needs at the least.
+# Minimum numbers of readings and levels for a fit.
 _READINGS, _LEVELS = 50, 4
-# How long after a level in s the readings count.
+# Time after a level, in s, within which readings are used.
 _LONGEST = 0.05
-# In s: transports and lags from which the search starts, and the smallest lag that is told from 0.
+# In s: initial transports and lags of the search, and the smallest lag that differs from 0.
 _TRANSPORTS = np.linspace(-2e-3, 2e-2, 45)
 _LAGS = np.geomspace(5e-5, 2e-2, 9)
 _LEAST_LAG = 1e-6
-# Readings within the first three lags of a step from which its shape is known.
+# Readings within the first three lags of a step that determine its shape.
 _RISE = 3
-# A field must change by so many deviations of its readings for its time to be known.
+# Minimum change of the field, in standard deviations of its readings, to determine its time.
 _SEEN = 10.0
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A value with the ends of its 95 % interval; NaN where it is not known."""
+    """A value with the ends of its 95 % interval; NaN if unknown."""
 
     value: float
     low: float = math.nan
@@ -46,13 +46,13 @@ class Interval:
 
 @dataclass(frozen=True, eq=False)
 class FieldDelays:
-    """What a probe shows of a field."""
+    """Delays of a field from readings of a probe."""
 
-    transport: Interval  #: from the time of a level until the field begins to follow it, in s
+    transport: Interval  #: from the time of a level to the start of its field, in s
     lag: Interval  #: time constant of a first-order lag, in s
     noise: float  #: standard deviation of a reading in T
     since: Array  #: shape (n,), time in s of readings since the last level was set ...
-    share: Array  #: shape (n,), ... and the share of its step that the field had done
+    share: Array  #: shape (n,), ... and the fraction of its step that the field had completed
 
 
 def field_delays(
@@ -60,20 +60,20 @@ def field_delays(
     """
     Fit transport and lag of a coil to readings of its field.
 
-    Each step counts as a share of its own height, so that neither the gain of the coil nor its
-    hysteresis counts.
+    Each step is normalised to its own height, so that gain and hysteresis of the coil do not
+    matter.
 
     Parameters
     ----------
     time, field : ndarray, shape (n,)
         Time in s and reading in T of a probe; n of at least 50.
     level_times, levels : ndarray, shape (m,)
-        When a level in T was set, in s, increasing; m of at least 4.
+        Times in s at which levels in T were set, increasing; m of at least 4.
 
     Returns
     -------
     FieldDelays
-        With intervals.
+        The delays with intervals.
 
     Raises
     ------
@@ -130,17 +130,17 @@ def field_delays(
 
 
 def response(since: Array, transport: float, lag: float) -> Array:
-    """Return the share of a step that is done some time in s after its level was set."""
+    """Return the completed fraction of a step at times in s after its level was set."""
     late = np.maximum(since - transport, 0.0)
     done: Array = 1.0 - np.exp(-np.minimum(late / max(lag, _LEAST_LAG), 700.0))
     return done
 
 
 def _folded(time: Array, field: Array, begins: Array) -> tuple[Array, Array, Array]:
-    """Return times since the last level, shares of its step that are done, and its height in T."""
+    """Return times since the last level, completed fractions of its step, and its height in T."""
     place = np.searchsorted(begins, time, 'right') - 1
     ends = np.append(begins[1:], time[-1])
-    # Long after a step the field rests.
+    # The field has settled long after a step.
     late = time > 0.5 * (begins + ends)[place]
     rest = np.array([
         np.mean(field[late & (place == i)]) if np.any(late & (place == i)) else math.nan
@@ -159,16 +159,16 @@ def _folded(time: Array, field: Array, begins: Array) -> tuple[Array, Array, Arr
 
 @dataclass(frozen=True, eq=False)
 class Delays:
-    """What of the time between a command and a sample of its effect goes where; in s."""
+    """Components of the time between a command and a sample of its effect; in s."""
 
     transport: Interval  #: from the timestamp of a level to the start of its field
-    jitter: float  #: standard deviation of what the device reports of it
+    jitter: float  #: standard deviation of the reported part
     lag: Interval  #: time constant of the field
-    latency: Interval  #: by which timestamps of samples are later than the motion
-    #: what to take off these timestamps: the latency, and the transport that is not reported
+    latency: Interval  #: delay of the timestamps of samples after the motion
+    #: correction of these timestamps: the latency, and the transport that is not reported
     setting: Interval
     field: FieldDelays | None  #: None without a probe
-    motion: Identification  #: of the samples
+    motion: Identification  #: result from the samples
     notes: tuple[str, ...]  #: a sentence each
 
 
@@ -176,25 +176,26 @@ def delays(
         recording: Recording, asked: Array, field: FieldDelays | None,
         actuator: ActuatorParameters, *, lag: float | None = None) -> Delays:
     """
-    Tell transport, lag and latency apart.
+    Separate transport, lag and latency.
 
     Parameters
     ----------
     recording : Recording
-        Samples of the motion, and the levels when the device says that they were set.
+        Samples of the motion, and the levels at the times that the device reports.
     asked : ndarray, shape (m,)
-        When each of these levels was to be set, in s; NaN for one that was not commanded.
+        Commanded time of each of these levels, in s; NaN for one that was not commanded.
     field : FieldDelays or None
-        What a probe has shown, by these levels.
+        Delays of the field measured by a probe, for these levels.
     actuator : ActuatorParameters
         Sizes, and start values of the other parameters.
     lag : float, optional
-        Known time constant of the field in s, in place of a probe.
+        Known time constant of the field in s, instead of a probe.
 
     Returns
     -------
     Delays
-        Without a probe, the latency includes transport that the device does not report.
+        The delays; without a probe, the latency includes transport that the device does not
+        report.
 
     Raises
     ------
@@ -231,7 +232,7 @@ def delays(
 
 
 def _motion(recording: Recording, actuator: ActuatorParameters, lag: float) -> Identification:
-    """Identify the latency behind a known lag, with what the residuals name."""
+    """Identify the latency for a known lag, with parameters that residuals suggest."""
     free: tuple[str, ...] = (*DEFAULT_FREE, 'sensor_latency')
     known = {'coil_time_constant': lag}
     found = identify(recording, free=free, actuator=actuator, known=known)

@@ -1,12 +1,13 @@
 """
-What the model may leave out, each as a direction of the residuals.
+Possible departures from the model, each as a direction of the residuals.
 
-A direction is what a little of it does to every sample: the derivative of the motion by a lag, a
-friction, a branch of creep. What the free parameters could do of it is taken off. How much of the
-rest is in the residuals says whether it is there, and how far it moves the estimates. Where that
-is not proved but hinted at, intervals hold the estimates with and without it. What leaves nothing
-in the residuals, as a gain that remanence makes up for, is considered: it widens the intervals by
-what it may be (S. F. Schmidt, "Application of state-space methods to navigation problems", 1966).
+A direction is the change of every sample by a small amount of the departure: the derivative of the
+motion by a lag, a friction, a viscoelastic branch. The part that the free parameters can explain
+is removed. The remaining part in the residuals shows whether the departure is present, and how far
+it changes the estimates. If this is likely but not proved, intervals include the estimates with
+and without it. Departures without an effect on the residuals, such as a gain for which the
+remanence compensates, widen the intervals by their possible size (S. F. Schmidt, "Application of
+state-space methods to navigation problems", 1966).
 """
 
 from collections.abc import Iterator, Mapping
@@ -24,21 +25,21 @@ from hmsa_ros.identification.result import Signature
 from hmsa_ros.model.equations import Array
 from hmsa_ros.motion import theta as places
 
-# A departure counts from this many deviations on, if it is this share of the residuals or moves an
-# estimate by a deviation.
+# Minimum size of a departure in standard deviations, together with a minimum fraction of the
+# residuals, or a minimum change of an estimate in standard deviations.
 _DEVIATIONS, _SHARE, _MOVES = 4.5, 0.02, 1.0
-# From this many deviations on intervals hold it.
+# Size in standard deviations above which intervals include it.
 _HINT = 2.0
-# Median of chi-squared with one degree of freedom: by so much the square of a deviation is too
-# large in the median.
+# Median of chi-squared with one degree of freedom, by which the median square of a deviation is
+# biased.
 _MEDIAN = 0.455
 GAIN = 'stretch_gain'
-#: Standard deviation of a gain that nobody gave, and from which deviation on it would not show.
+#: Standard deviation of an unknown gain, and size above which it would not be detected.
 USUAL_GAIN, _HIDDEN_GAIN = 0.02, 0.006
-# Directions need no more than that of the integration.
+# Relative tolerance of the integration, sufficient for directions.
 _RTOL = 1e-6
 _DELAYS = {'sensor_latency', 'coil_time_constant'}
-# Words, and what to free, by parameter.
+# Descriptions, and parameters to free, by parameter.
 _PARAMETERS = {
     'coil_time_constant': 'lag of the coil', 'sensor_latency': 'latency of the sensor',
     GAIN: 'gain of the sensor', 'constant_force': 'constant force'}
@@ -48,22 +49,22 @@ _FORCES = {
 
 
 class Departure(NamedTuple):
-    """What a little of something does."""
+    """The effect of a small departure."""
 
-    name: str  # in words
+    name: str  # description
     column: Array  # change of each sample, shape (n,)
-    remedy: str = ''  # what to add to the free parameters
+    remedy: str = ''  # parameters to free
 
 
 def _columns(fit: Fit) -> Iterator[Departure]:
     recording, time = fit.recording, fit.recording.time
     values = dict(fit.values)
-    # Switches at unknown times look like lag and latency, and stand for both.
+    # Switches at unknown times resemble lag and latency, and represent both.
     names = [x for x in _PARAMETERS if x not in fit.free and not (
         recording.earlier and x in _DELAYS)]
     made = [(_PARAMETERS[x], x) for x in names]
     if 'viscoelastic_ratio' not in fit.free and not values['viscoelastic_ratio']:
-        # Branches that hold nothing, all in one simulation.
+        # Branches of zero stiffness, all in one simulation.
         span = float(time[-1] - time[0])
         for (ratio, tau), seconds in zip(
                 BRANCHES, (2.0 * values['time_unit'], 0.03 * span, 0.3 * span), strict=True):
@@ -90,13 +91,13 @@ def _columns(fit: Fit) -> Iterator[Departure]:
 
 @dataclass(frozen=True, eq=False)
 class Departures:
-    """All of them, against the residuals of a fit."""
+    """All departures, tested on the residuals of a fit."""
 
     signatures: tuple[Signature, ...]  # the largest first
-    hint: Array  # variance of the coordinates by what the residuals hint at, shape (p,)
-    # By name what a standard deviation of what they cannot show moves the coordinates by.
+    hint: Array  # variance of the coordinates due to likely departures, shape (p,)
+    # Change of the coordinates by a standard deviation of undetectable departures, by name.
     considered: dict[str, Array]
-    # Latency of the sensor in s that would not be found, if nobody gave it, and what that moves.
+    # Unknown latency of the sensor in s that would not be detected, and its effect.
     late: tuple[float, Array] | None
 
 
@@ -104,10 +105,10 @@ def departures(
         fit: Fit, found: Whiteness, inverse: Array, deviation: float,
         given: Mapping[str, float | None]) -> Departures:
     """
-    Hold all that may be missing against the residuals.
+    Test all possible departures on the residuals.
 
-    The inverse is that of the information for a noise of 1, the deviation that of a sample. Given
-    are names of what the caller knows, with the standard deviation of it, None for exactly.
+    ``inverse`` is that of the information for unit noise, ``deviation`` that of a sample.
+    ``given`` contains parameters known to the caller, with standard deviations, None if exact.
     """
     root = fit.root
     base = root[:, None] * np.hstack([fit.response.jacobian, fit.response.by_switch])
@@ -152,7 +153,7 @@ def departures(
                 signatures[-1].found):
             seconds = _DEVIATIONS * spread / norm
             late = seconds, seconds * way
-        # An offset of the stamps is the commonest, and hides best, as a gain that nobody gave.
+        # An offset of the timestamps is most common, and least detectable, like an unknown gain.
         late_or_off = 'latency' in one.name and not _DELAYS.intersection(fit.free) or (
             one.remedy == GAIN and GAIN not in given)
         least = 0.0 if late_or_off else _HINT
@@ -167,17 +168,17 @@ def departures(
 
 
 def dead_band(fit: Fit, deviation: float) -> float:
-    """Return the root mean square of what steps of the values may do that noise does not hide."""
+    """Return the RMS effect of quantisation that noise does not average out."""
     quantum = fit.recording.quantum
     if not quantum:
         return 0.0
-    # The first harmonic of the staircase, smoothed by normal noise.
+    # The first harmonic of the quantisation, smoothed by normal noise.
     noise = math.sqrt(max((deviation / quantum) ** 2 - 1.0 / 12.0, 0.0))
     return quantum * min(0.3, math.exp(-2.0 * (math.pi * noise) ** 2) / math.pi)
 
 
 def _change(fit: Fit, name: str) -> Array:
-    """Return what a unit more of a given value does to the samples."""
+    """Return the derivative of the samples by a given value."""
     values, timed = fit.values, quantity_of(name).unit == 's'
     little = 1e-3 * abs(values[name]) or (1e-3 * values['time_unit'] if timed else 1e-4)
     ends = []

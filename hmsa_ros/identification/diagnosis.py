@@ -1,4 +1,4 @@
-"""Whether data hold the parameters, and whether the model holds the data."""
+"""Whether data determine the parameters, and whether the model fits the data."""
 
 from collections.abc import Collection, Mapping, Sequence
 import math
@@ -16,35 +16,35 @@ from hmsa_ros.identification.start import segments
 from hmsa_ros.model import equations
 from hmsa_ros.model.equations import Array
 
-# Deviation, in the coordinates, from which on a number is none: of positive values a quarter.
+# Maximum standard deviation of a determined coordinate: for positive values a quarter.
 _RELATIVE = 0.25
-# Chains that lock beyond such a stretch hardly show, and stresses below this share of the modulus.
+# Limiting stretch above which stiffening hardly shows, and minimum stress relative to the modulus.
 _LOOSE, _SMALL_STRESS = 10.0, 0.02
-# Components of a direction below this share of the largest are left out.
+# Minimum component of a direction, relative to the largest, to report it.
 _NAMED = 0.2
-# Residuals in motion this much above those at rest are of the model, not of the sensor.
+# Ratio of residuals in motion to those at rest above which they are due to the model.
 _IN_MOTION = 2.0
 _FEWEST_PARTS = 8
-_OUT = 0.5  # weight below which a sample does not count
+_OUT = 0.5  # weight below which a sample is an outlier
 _SOON = 10  # samples after a change of level
-_CHANCE = 2e-3  # below it no chance makes residuals repeat
-_FEW_WORDS = 4  # frequencies that are named
-_FIRST_KEPT = ('density', 'chain_limit', 'stretch_gain')  # what is known soonest from elsewhere
-_WORTH_SAYING = 0.3  # deviations by which something moves a parameter
-_NUMERICAL = 1e-6  # residuals below this are those of the integration
-# How to see what a model lacks that has no name.
+_CHANCE = 2e-3  # probability below which repeating residuals are not due to chance
+_FEW_WORDS = 4  # maximum number of frequencies to list
+_FIRST_KEPT = ('density', 'chain_limit', 'stretch_gain')  # easiest to know from other sources
+_WORTH_SAYING = 0.3  # minimum change of a parameter to report, in standard deviations
+_NUMERICAL = 1e-6  # residuals below this are integration errors
+# Advice for a departure of unknown kind.
 _LOOK = '; see the figures of --report page.html'
-# What frequencies follow from.
+# Parameters that determine the frequency.
 _TIMED = {'shear_modulus', 'density', 'time_unit'}
-DISTANT = 0.1  # residual over motion from which on nothing was fitted
-# What soft actuators have, with a wide margin, in SI, and the power of the time in it.
+DISTANT = 0.1  # residual relative to the motion above which nothing was fitted
+# Wide ranges for soft actuators, in SI units, and the power of the time unit in each.
 _USUAL = {'shear_modulus': (100.0, 1e8, -2), 'density': (100.0, 2e4, 2),
           'time_unit': (1e-6, 1.0, 1), 'remanence': (3e-4, 3.0, -2)}
 _FINER = {'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
 
 
 def allowed(fit: Fit) -> Array:
-    """Return the deviation of each free parameter's coordinate that still leaves a number."""
+    """Return the maximum standard deviation of each free coordinate that is determined."""
     values = fit.values
     unit = values['time_unit']
     load = quantities.geometry_of(values).loaded * values['shear_modulus']
@@ -60,7 +60,7 @@ def allowed(fit: Fit) -> Array:
 
 
 def _of_law(fit: Fit, name: str) -> float:
-    """Return what is allowed of a constant of the law, and of all that has a logarithm."""
+    """Return the same for a constant of the hyperelastic model or a logarithmic coordinate."""
     quantity, value = quantities.quantity_of(name), float(fit.values[name])
     if quantity.scale == 'log':
         return _RELATIVE
@@ -72,9 +72,10 @@ def _of_law(fit: Fit, name: str) -> float:
 
 def weakness(fit: Fit, deviation: float, factors: Array) -> tuple[set[str], str]:
     """
-    Return what has no number that the data hold, why, and what to record instead; empty if all do.
+    Return undetermined parameters, the reason and what to record; empty if all are determined.
 
-    The deviation is that of a sample; correlation widens those of the parameters by the factors.
+    ``deviation`` is that of a sample; ``factors`` on those of the parameters are due to
+    correlation.
     """
     limits = allowed(fit)
     scaled = limits / np.maximum(factors, 1.0) / deviation
@@ -118,7 +119,7 @@ def weakness(fit: Fit, deviation: float, factors: Array) -> tuple[set[str], str]
 
 
 def _change(fit: Fit, place: int, change: float, first: float) -> str:
-    """Word a change of one parameter along a direction in which the first one grows."""
+    """Describe the change of a parameter along a direction in which the first one increases."""
     name = fit.free[place]
     change = math.copysign(1.0, first) * change
     kind = quantities.quantity_of(name).scale
@@ -134,8 +135,8 @@ def _change(fit: Fit, place: int, change: float, first: float) -> str:
 
 
 def freeing(fit: Fit, without: Collection[str]) -> str:
-    """Return the option that frees what a fit did, but for some parameters."""
-    # Where the motion begins is freed by itself.
+    """Return the option to free the parameters of a fit, except some."""
+    # The initial state is freed automatically.
     kept = [x for x in fit.free if x not in without and not x.startswith('initial_')]
     return f'--free {",".join(kept or quantities.DEFAULT_FREE[3:])}'
 
@@ -145,7 +146,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def second_mode(fit: Fit) -> list[Signature]:
-    """Look for one sharp frequency in the residuals, of evenly spaced samples."""
+    """Search for a single sharp frequency in the residuals of evenly spaced samples."""
     time = fit.recording.time
     gaps = np.diff(time)
     if np.max(gaps) > 1.5 * np.min(gaps):
@@ -157,7 +158,7 @@ def second_mode(fit: Fit) -> list[Signature]:
     place = int(np.argmax(power))
     near = power[max(place - 2, 0):place + 3]
     share = float(np.sum(near) / np.sum(power))
-    # Fisher's g: the chance of the largest of m exponential shares.
+    # Fisher's g: the probability of the largest of m exponential fractions.
     chance = len(power) * math.exp(-len(power) * float(power[place]) / float(np.sum(power)))
     frequency = (place + 3) / (float(np.mean(np.diff(time))) * len(time))
     own = frequency_of(fit)
@@ -169,14 +170,14 @@ def second_mode(fit: Fit) -> list[Signature]:
 
 
 def frequency_of(fit: Fit) -> float:
-    """Return the frequency in Hz at which it rings about rest."""
+    """Return the natural frequency in Hz about rest."""
     group = quantities.group_of(fit.values)
     return float(equations.natural_frequency(group.rest, group) / (
         2.0 * math.pi * fit.values['time_unit']))
 
 
 def in_motion(fit: Fit) -> float:
-    """Return how much larger residuals are in motion than at rest; 1 where nobody can tell."""
+    """Return the ratio of residuals in motion to those at rest; 1 if undetermined."""
     speed = np.abs(fit.response.rate)
     order = np.argsort(speed)
     part = len(order) // 4
@@ -189,12 +190,12 @@ def in_motion(fit: Fit) -> float:
 
 def mistaken(fit: Fit, chance: float = 0.02) -> bool:
     """
-    Whether what did not count is motion: it lies right after the changes of level.
+    Return whether the outliers are motion, as they lie right after the changes of level.
 
-    A fit to the levels at rest alone may take the few samples in motion for outliers. Outliers
-    of the sensor lie there with the probability given at most.
+    A fit only to the levels at rest may take the few samples in motion for outliers. True outliers
+    lie there with at most the given probability.
     """
-    # Slow to load, and no use to a planner that estimates.
+    # Slow to import, and not needed by a planner that estimates.
     from scipy.special import bdtrc
 
     out, recording = fit.weights < _OUT, fit.recording
@@ -203,7 +204,7 @@ def mistaken(fit: Fit, chance: float = 0.02) -> bool:
         return False
     place = np.searchsorted(recording.time, changes)
     last = np.searchsorted(changes, recording.time, side='right') - 1
-    # Of slow samples only a third of those on a level.
+    # At low sampling rates use at most a third of the samples on a level.
     soon = min(_SOON, max(len(out) // (3 * len(changes)), 1))
     after = (last >= 0) & (np.arange(len(out)) - place[last] < soon)
     usual = float(np.mean(after))
@@ -212,13 +213,13 @@ def mistaken(fit: Fit, chance: float = 0.02) -> bool:
 
 
 def distant(fit: Fit, found: Whiteness) -> bool:
-    """Whether nothing of the motion was fitted."""
+    """Return whether the fit fails to reproduce the motion."""
     return not found.white and fit.scale > DISTANT * float(np.std(fit.recording.stretch)) and abs(
         float(found.autocorrelation[1])) > 0.2
 
 
 def check_plausible(fit: Fit, unknown: Collection[str]) -> None:
-    """Raise `BadInputError` for what can only come from data in other units."""
+    """Raise `BadInputError` for values that indicate data in other units."""
     recording = fit.recording
     modulus, ratio = quantities.modulus_of(fit.values.get('law'))
     for name, (least, most, power) in _USUAL.items():
@@ -242,7 +243,7 @@ def check_plausible(fit: Fit, unknown: Collection[str]) -> None:
 
 def misfit(
         fit: Fit, found: Whiteness, marks: Sequence[Signature], alike: Repeated | None) -> str:
-    """Return why the model is rejected, with the figures; empty if it is not."""
+    """Return why the model is rejected, with numbers; empty if it is not."""
     motion = float(np.std(fit.recording.stretch))
     seen = [x for x in marks if x.found]
     figures = (
@@ -282,7 +283,7 @@ def misfit(
 
 
 def _remedy(seen: Sequence[Signature]) -> str:
-    """Word which parameters to free for what explains nearly as much as the first."""
+    """Return which parameters to free for departures nearly as large as the first."""
     names = dict.fromkeys(
         x.remedy for x in seen if x.remedy and x.share > 0.8 * seen[0].share)
     lines = ' or '.join(f'--free +{x.replace(",", ",+")}' for x in names)
@@ -290,7 +291,7 @@ def _remedy(seen: Sequence[Signature]) -> str:
 
 
 def cost(fit: Fit, marks: Sequence[Signature], alike: Repeated | None) -> float:
-    """Return what the model lacks of the motion, peak to peak of a swing, over a step."""
+    """Return the peak-to-peak error of the model, relative to a step."""
     share = max((x.share for x in marks if x.found), default=0.0)
     ends = [float(fit.response.stretch[end - 1]) for _, end, _, _ in segments(fit.recording, 1)]
     steps = np.abs(np.diff(ends))
@@ -304,14 +305,14 @@ def considered(
         moves: Mapping[str, Array], std: Array, free: Sequence[str], given: Collection[str]
 ) -> list[str]:
     """
-    Return the errors that do not show but that the intervals allow for, a sentence each.
+    Return undetectable errors that the intervals account for, one sentence each.
 
-    Moves are those of the coordinates, by the name of what may be wrong; with them come the
-    deviations of the coordinates, and the names that the caller gave.
+    ``moves`` contains the changes of the coordinates by description of the error; ``std`` are the
+    standard deviations of the coordinates, and ``given`` the names known to the caller.
     """
     found = []
     for name, way in moves.items():
-        # What is not determined has no deviation.
+        # Undetermined coordinates have no standard deviation.
         ratio = np.divide(np.abs(way), std, out=np.zeros(len(std)), where=np.isfinite(std))
         place = int(np.argmax(ratio))
         if ratio[place] > _WORTH_SAYING:
@@ -326,9 +327,10 @@ def considered(
 
 def undetected(late: tuple[float, Array], std: Array, fit: Fit) -> list[str]:
     """
-    Return what a latency that would not be found moves by more than a deviation, if anything.
+    Return the effect of an undetectable latency, if it exceeds a standard deviation.
 
-    Given are that latency in s, what it moves the coordinates by, and their deviations.
+    ``late`` contains the latency in s and the changes of the coordinates; ``std`` are their
+    standard deviations.
     """
     seconds, moves = late
     modulus, ratio = quantities.modulus_of(fit.values.get('law'))
@@ -346,7 +348,7 @@ def undetected(late: tuple[float, Array], std: Array, fit: Fit) -> list[str]:
 
 
 def resting(fit: Fit, names: Collection[str]) -> str:
-    """Return that samples show rest alone, which does not determine the parameters named."""
+    """Return the message that samples only show rest, which does not determine some parameters."""
     return (
         f'{_listed([x for x in fit.free if x in names])} cannot be identified from this '
         f'recording: rest at each level explains the samples, {fit.recording.gap:.3g} s apart, as '
@@ -356,7 +358,7 @@ def resting(fit: Fit, names: Collection[str]) -> str:
 
 
 def alike(best: Fit, others: Sequence[Fit]) -> str:
-    """Return which frequencies fit the samples alike, and what to record instead."""
+    """Return the frequencies that fit the samples equally well, and what to record instead."""
     frequencies = sorted(frequency_of(x) for x in (best, *others))
     words = [f'{x:.4g} Hz' for x in frequencies]
     if len(words) > _FEW_WORDS:

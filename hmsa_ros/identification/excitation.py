@@ -1,10 +1,10 @@
 """
-What to record: the sequence of levels with the most information on the parameters.
+Design of a recording: the sequence of levels with the most information on the parameters.
 
-D-optimal design (V. V. Fedorov, "Theory of Optimal Experiments", Academic Press 1972): of all
-sequences of a duration inside the limits of coil, slew and stretch, one with a large
-determinant of the information matrix, which makes the confidence ellipsoid small. A pattern of
-levels and dwells is repeated; levels and dwells are sought at random and improved one by one.
+D-optimal design (V. V. Fedorov, "Theory of Optimal Experiments", Academic Press 1972): among all
+sequences of a duration within the limits of coil, slew and stretch, find one with a large
+determinant of the information matrix, hence a small confidence ellipsoid. A pattern of levels and
+dwells is repeated; levels and dwells are drawn at random and improved one by one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,35 +31,35 @@ from hmsa_ros.planning.shapers.request import Request
 if TYPE_CHECKING:
     from hmsa_ros.identification.files import Belief
 
-_PATTERN = 5  # levels in the pattern that is repeated
-# Tries to find the largest pattern inside the limits, what they aim at, and what is large enough.
+_PATTERN = 5  # number of levels in the repeated pattern
+# Attempts to scale a pattern to the limits, target of the scaling, and sufficient scale.
 _SCALINGS, _AIM, _ALMOST = 5, 0.99, 0.97
-# Random patterns, how many of the best are improved in so many steps, and steps for the winner.
+# Number of random patterns, number and steps of improved ones, and steps for the best one.
 _FIRST, _KEPT, _FEW, _STEPS = 150, 5, 60, 300
-_LEAST_DWELL, _MOST_DWELL = 0.2, 6.0  # periods on a level
-_BEGIN = 0.2  # periods of rest before the first level
-_LAST = 3.0  # durations of a period that the last move and its rest take
-_SHORTEST = 3.0  # duration in periods that holds a sequence at all
-_PERIODS = 180.0  # duration unless another is given
-_MARGIN = 0.95  # of the way to the limits of the chains
-#: The paper's sequence, and a pass of unshaped steps; from rest.
+_LEAST_DWELL, _MOST_DWELL = 0.2, 6.0  # range of the time on a level, in periods
+_BEGIN = 0.2  # rest before the first level, in periods
+_LAST = 3.0  # duration of the last move and its rest, in periods
+_SHORTEST = 3.0  # minimum duration of a sequence, in periods
+_PERIODS = 180.0  # default duration
+_MARGIN = 0.95  # fraction of the range to the limits of the chains
+#: The sequence of the paper, and one of unshaped steps; from rest.
 PAPER = (0.1, 0.2, 0.4)
 PLAIN = (0.1, 0.4, 0.0)
-_WEIGHT = 4.0  # of the worst parameter against the volume
+_WEIGHT = 4.0  # of the worst parameter relative to the volume
 _WINDOW = 30.0  # periods over which patterns are compared
-_REST = 1e-3  # deviation from rest at the end, stretch
+_REST = 1e-3  # maximum deviation from rest at the end, stretch
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """What a sequence has to keep within."""
+    """Limits of a sequence."""
 
     flux_density_min: float = -0.5  # in T
     flux_density_max: float = 0.5  # in T
     slew_limit: float = math.inf  # in T/s; infinite for steps
-    # Of the whole motion; default 0.6, a deflection of -0.6 for a beam.
+    # Range of the motion; default 0.6 to 2, for the deflection of a beam -0.6 to 0.6.
     stretch_min: float | None = None
-    stretch_max: float | None = None  # default 2, or 0.6
+    stretch_max: float | None = None
 
     def __post_init__(self) -> None:
         if not self.flux_density_min <= 0.0 < self.flux_density_max < math.inf:
@@ -74,13 +74,13 @@ class Bounds:
     def of(
             cls, belief: 'Belief', stretch_min: float | None,
             stretch_max: float | None) -> 'Bounds':
-        """Return the limits of the coil in a parameter file, with those of the motion."""
+        """Return the limits of the coil in a parameter file and those of the motion."""
         return cls(
             belief.number('flux_density_min', -0.5), belief.number('flux_density_max', 0.5),
             belief.number('slew_limit', 0.0) or math.inf, stretch_min, stretch_max)
 
     def of_motion(self, actuator: ActuatorParameters) -> tuple[float, float]:
-        """Return the range of an actuator's motion; `BadInputError` if it lacks rest."""
+        """Return the range of an actuator's motion; raise `BadInputError` if it excludes rest."""
         what, rest = actuator.coordinate, actuator.rest
         least = what.usual[0] if self.stretch_min is None else self.stretch_min
         most = what.usual[1] if self.stretch_max is None else self.stretch_max
@@ -89,26 +89,26 @@ class Bounds:
                 f'{what.plural} from {least:g} to {most:g}: expected a range with {rest:g} inside')
         if actuator.law is None:
             return least, most
-        # Beyond the ends of a table nothing is known of the motion.
+        # Beyond the ends of a table the force is unknown.
         ends = [rest + _MARGIN * (x - rest) for x in actuator.law.limits]
         return max(least, ends[0]), min(most, ends[1])
 
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """A sequence of levels and the information in it."""
+    """A sequence of levels and its information."""
 
     level_times: Array  # in s
     levels: Array  # flux density in T from each time on
-    std: dict[str, float]  # that its recording leaves, relative but for what may be 0
+    std: dict[str, float]  # expected standard deviations, relative except for signed values
     information: float  # logarithm of the determinant of the information matrix
-    reach: tuple[float, float]  # least and largest stretch
-    ends_at_rest: bool  # whether nothing moves at the end
+    reach: tuple[float, float]  # minimum and maximum stretch
+    ends_at_rest: bool  # whether the motion ends at rest
 
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """The sequence to record, beside others of the same duration."""
+    """The sequence to record, and others of the same duration for comparison."""
 
     duration: float  # in s
     best: Program
@@ -118,10 +118,10 @@ class Excitation:
     @property
     def gains(self) -> dict[str, float]:
         """
-        Ratio of the deviations of the unshaped steps to those of the best, by parameter.
+        Ratio of the standard deviations after unshaped steps to those of the best, by parameter.
 
-        The bias of the sensor is left out: it is the noise over the root of the number of
-        samples, whatever moves.
+        The bias of the sensor is omitted: it is the noise over the square root of the number of
+        samples for any motion.
         """
         return _ratios(self.plain.std, self.best.std)
 
@@ -132,17 +132,18 @@ class Excitation:
 
 
 def _ratios(one: Mapping[str, float], other: Mapping[str, float]) -> dict[str, float]:
-    """Return how much larger deviations are than others, of all but the sensor's bias."""
+    """Return the ratios of standard deviations, except for the bias of the sensor."""
     names = [x for x in one if x != 'stretch_bias'] or list(one)
     return {x: one[x] / other[x] for x in names}
 
 
 class Designer:
     """
-    Searches sequences for one actuator.
+    Search for the best sequence for an actuator.
 
     The duration is in s (default 180 periods of the block), the rate in samples per second, and
-    the noise the standard deviation of a sample. A duration that holds no sequence is refused.
+    ``noise`` the standard deviation of a sample. Raise `BadInputError` if the duration is too
+    short.
     """
 
     def __init__(
@@ -198,7 +199,7 @@ class Designer:
         return respond(course, self._values, free, rtol=rtol)
 
     def judge(self, level_times: Array, levels: Array) -> Program | None:
-        """Return the information in a sequence, None if its motion cannot be followed."""
+        """Return a sequence with its information, None if its motion cannot be simulated."""
         coarse = self._respond(self._dense, level_times, levels, 1e-6)
         if coarse is None:
             return None
@@ -222,11 +223,11 @@ class Designer:
             level_times, levels, std, float(size) if sign > 0.0 else -math.inf, reach, rest)
 
     def _ended(self, level_times: Array, levels: Array) -> tuple[Array, Array]:
-        """Return a sequence with a move to rest without field at its end."""
+        """Return a sequence with a final move to rest without field."""
         end = self.duration - _LAST * self.period
         keep = level_times < end
         level_times, levels = level_times[keep], levels[keep]
-        # Ramps have to be over before the last move begins.
+        # Ramps have to end before the last move starts.
         state = self._respond(
             np.linspace(0.0, end, 50, dtype=np.float64), level_times, levels, 1e-9)
         time, unit = self._actuator.time_unit, self._actuator.flux_density_unit
@@ -244,7 +245,7 @@ class Designer:
     def _planned(
             self, setpoints: Sequence[Setpoint], begin: float,
             request: Request | NondimensionalParameters) -> Array | None:
-        """Return times in s, from a begin on, and levels in T of a plan; None without one."""
+        """Return times in s, from a begin on, and levels in T of a plan; None if there is none."""
         time, unit = self._actuator.time_unit, self._actuator.flux_density_unit
         try:
             segments = plan_sequence(setpoints, request)
@@ -254,7 +255,7 @@ class Designer:
                          for x in segments for y in x.move.levels])
 
     def _pattern(self, targets: Array, dwells: Array) -> tuple[Array, Array]:
-        """Return the levels of a pattern that is repeated; the first is rest without field."""
+        """Return the levels of a repeated pattern; the first is rest without field."""
         spans = dwells * self.period
         most = math.ceil(self.duration / float(np.min(spans)))
         times = np.cumsum(np.append(_BEGIN * self.period, np.resize(spans, most)))
@@ -263,7 +264,7 @@ class Designer:
         return np.append(0.0, times), np.append(0.0, levels)
 
     def _excess(self, level_times: Array, levels: Array) -> float:
-        """Return the largest motion from rest as a share of what its limits allow."""
+        """Return the largest motion from rest relative to its limits."""
         response = self._respond(self._dense, level_times, levels, 1e-4)
         if response is None:
             return math.inf
@@ -273,17 +274,17 @@ class Designer:
             (float(np.max(response.stretch)) - rest) / (high - rest))
 
     def _score(self, found: Program | None) -> float:
-        """Return the information of a sequence inside the limits, with a rest at its end."""
+        """Return the score of a sequence within the limits that ends at rest."""
         low, high = self._reach
         if found is None or not found.ends_at_rest or (
                 found.reach[0] < low or found.reach[1] > high):
             return -math.inf
-        # The volume, and with as much weight the worst parameter against unshaped steps.
+        # The volume, and with a weight the worst parameter relative to unshaped steps.
         worst = min(_ratios(self._reference, found.std).values())
         return found.information + _WEIGHT * len(self._free) * math.log(max(worst, 1e-300))
 
     def _judged(self, point: Array) -> tuple[float, Program | None]:
-        """Judge a pattern, as large as the limits of the stretch let it be."""
+        """Return score and program of a pattern, scaled to the limits of the stretch."""
         small, share = 0.0, 1.0
         for _ in range(_SCALINGS):
             excess = self._excess(*self._pattern(share * point[:_PATTERN], point[_PATTERN:]))
@@ -291,7 +292,8 @@ class Designer:
                 small = max(small, share)
             if _ALMOST <= excess <= 1.0 or small == 1.0:
                 break
-            # What moves more is driven in proportion, and what cannot be followed by much less.
+            # Scale in proportion to the excess, and by much less if the motion cannot be
+            # simulated.
             share = min(share * max(_AIM / excess, 0.3), 1.0)
         if not small:
             return -math.inf, None
@@ -301,12 +303,12 @@ class Designer:
 
     def search(self, seed: int = 0) -> Program:
         """
-        Return the best sequence that is found; the same seed gives the same one.
+        Return the best sequence found; the result is reproducible for a seed.
 
-        Raises `BadInputError` if none keeps within the limits.
+        Raise `BadInputError` if no sequence is within the limits.
         """
         if self.duration > _WINDOW * self.period >= FEWEST / self._rate:
-            # What is best in the long run is so already over some tens of periods.
+            # The best pattern for a long time is already found over some tens of periods.
             part = Designer(
                 self._actuator, self._bounds, _WINDOW * self.period, rate=self._rate,
                 noise=self._noise, free=self._free)
@@ -319,7 +321,7 @@ class Designer:
             self._reference = plain.std
         random = np.random.default_rng(seed)
         low, high = self._range
-        # Large steps to both sides, each with the time to ring; and at random, long and short.
+        # Large steps to both sides, each with time to ring; and random long and short ones.
         points: list[Array] = [
             np.append([0.5 * high, high, low, 0.0, 0.3 * high], np.full(_PATTERN, 4.0)),
             *(np.append(random.uniform(low, high, _PATTERN), np.exp(
@@ -340,7 +342,7 @@ class Designer:
     def _improved(
             self, score: float, best: Program | None, point: Array, steps: int,
             random: np.random.Generator) -> tuple[float, Program | None, Array]:
-        """Change the numbers of a pattern one by one, and keep what is better."""
+        """Change the values of a pattern one by one, and keep improvements."""
         low, high = self._range
         width = 0.5
         for i in range(steps):
@@ -358,7 +360,7 @@ class Designer:
         return score, best, point
 
     def plain(self, targets: Sequence[float] = PLAIN) -> Program | None:
-        """Return one pass of unshaped steps, smaller where they would break the limits."""
+        """Return a sequence of unshaped steps, smaller if they would exceed the limits."""
         span = self.duration / len(targets)
         times = np.append(0.0, span * (np.arange(len(targets)) + 1e-3))
         for share in np.linspace(1.0, 0.1, 19).tolist():
@@ -368,7 +370,7 @@ class Designer:
         return None
 
     def paper(self) -> Program | None:
-        """Return the paper's sequence, shaped; None where there is no plan."""
+        """Return the paper's shaped sequence; None if it cannot be planned."""
         span = self.duration / len(PAPER)
         levels = self._planned(
             [Setpoint(self._group.rest + x, span / self._actuator.time_unit) for x in PAPER],
@@ -382,11 +384,11 @@ def excite(
         duration: float | None = None, rate: float = 1000.0, noise: float = 1e-3,
         free: Sequence[str] = quantities.DEFAULT_FREE) -> Excitation:
     """
-    Design the sequence to record for identification, beside unshaped steps and the paper's.
+    Design the sequence to record for identification; compare it with unshaped steps and the paper.
 
-    The actuator is given as far as it is known, the duration in s (default 180 periods of the
-    block), the rate in samples per second, and the noise as the standard deviation of a sample.
-    Bounds or numbers that allow no sequence are refused.
+    The actuator contains prior values, the duration is in s (default 180 periods of the block),
+    the rate in samples per second, and ``noise`` the standard deviation of a sample. Raise
+    `BadInputError` if bounds or numbers allow no sequence.
     """
     designer = Designer(actuator, bounds or Bounds(), duration, rate=rate, noise=noise, free=free)
     best = designer.search()

@@ -1,9 +1,9 @@
 """
-The parameter file that an identification leaves, and what is read back out of one.
+The parameter file of an identification, and its reading.
 
-It is the YAML that planner and plant take. How well the parameters are known travels in it as
+It is the YAML file of planner and plant. The uncertainty of the parameters is stored as
 ``identification.names``, ``identification.values`` and ``identification.covariance``, which the
-planner takes as the prior of its feedback.
+planner uses as the prior of its feedback.
 """
 
 from collections.abc import Sequence
@@ -31,22 +31,22 @@ from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.planning.shapers.request import as_errors, LARGEST_ERROR
 from hmsa_ros.recordings.parameters import Entries, entries_of, values_of
 
-# What coil and sensor have, named in parameter files as here.
+# Parameters of coil and sensor, with their names in parameter files.
 _OTHERS = (
     'coil_time_constant', 'stretch_bias', 'stretch_gain', 'sensor_latency', 'initial_stretch')
 _LISTS = dict(zip(
     ('viscoelastic.ratio', 'viscoelastic.time', *(f'viscoelastic.{x}' for x in CONSTANTS)),
     zip(*map(tuple.__add__, quantities.BRANCHES, quantities.FLOWING), strict=True), strict=True))
-# Half of a 95 % interval, or half an axis of the ellipsoid of so many, in standard deviations.
+# Half a 95 % interval, or half an axis of the ellipsoid by dimension, in standard deviations.
 _HALF_95 = (0.0, 1.96, 2.448, 2.795, 3.080)
-# What changes how a block moves, in the order of `hmsa_ros.model.mismatch.Errors`.
+# Parameters of the motion, in the order of `hmsa_ros.model.mismatch.Errors`.
 _MISMATCH = ('shear_modulus', 'damping_coefficient', 'chain_limit', 'remanence')
 _RANKS = {'': 1, PLANT: 2, PLANNER: 3}
 
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """What a parameter file says of an actuator and of how well it is known."""
+    """Contents of a parameter file: an actuator, and the uncertainty of its parameters."""
 
     actuator: ActuatorParameters
     others: dict[str, float]  # of coil and sensor
@@ -66,22 +66,22 @@ def read_belief(path: Path | None, entries: Entries | None = None) -> Belief:
     Parameters
     ----------
     path : Path, optional
-        YAML as ROS 2 has it; without one everything has its default.
+        YAML file for ROS 2; without one all parameters have their defaults.
     entries : list, optional
-        What is in it, if it was read before.
+        Its contents, if already read.
 
     Returns
     -------
     Belief
-        With the defaults of the nodes for what the file leaves out.
+        With the defaults of the nodes for missing parameters.
 
     Raises
     ------
     BadInputError
-        If the file cannot be read or a value is none.
+        If the file cannot be read or a value is invalid.
 
     """
-    # A node's own goes before what is meant for all, and the planner's before the plant's.
+    # Parameters of a node override those for all nodes, and the planner's those of the plant.
     if entries is None:
         entries = [] if path is None else entries_of(path)
     settings: dict[str, Any] = {
@@ -109,12 +109,12 @@ def read_belief(path: Path | None, entries: Entries | None = None) -> Belief:
 
 def errors_of(belief: Belief, others: tuple[float, float, float]) -> Uncertainty:
     """
-    Return how far off the block may be, as the shaper minimax takes it.
+    Return the uncertainty of the block for the shaper minimax.
 
-    Where the block is with a probability of 95 %, in shares of its values: the ellipsoid of G,
-    damping coefficient, J_lim and remanence by their covariance, or intervals if no two of them
-    were identified. ``others`` are the shares of G, damping coefficient and J_lim that hold for
-    those that were not identified.
+    It is a 95 % region, relative to the values: the ellipsoid of G, damping coefficient, J_lim and
+    remanence from their covariance, or intervals if fewer than two of them were identified.
+    ``others`` are the relative errors of G, damping coefficient and J_lim for those that were not
+    identified.
     """
     sizes = [*others, 0.0]
     covariance = np.diag(np.square(sizes))
@@ -129,16 +129,16 @@ def errors_of(belief: Belief, others: tuple[float, float, float]) -> Uncertainty
         a, b, c = (min(math.sqrt(x), LARGEST_ERROR) for x in np.diag(covariance)[:3])
         return a, b, c
     lengths, axes = np.linalg.eigh(covariance)
-    # The shortest of four is left out: it would double the cases.
+    # The shortest of four axes is left out: it would double the cases.
     found = [math.sqrt(max(lengths[i], 0.0)) * axes[:, i] for i in (3, 2, 1)]
     return Ellipsoid(tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in found))
 
 
 def errors_from(file: str, others: Sequence[float]) -> Uncertainty:
     """
-    Return `errors_of` of what ``hmsa identify --out`` wrote, or the others for no file.
+    Return `errors_of` for a file written by ``hmsa identify --out``, or the others without a file.
 
-    Raises `BadInputError` if the file cannot be read or has no covariance.
+    Raise `BadInputError` if the file cannot be read or has no covariance.
     """
     errors = as_errors(others)
     if not file or isinstance(errors, Ellipsoid):
@@ -152,7 +152,7 @@ def errors_from(file: str, others: Sequence[float]) -> Uncertainty:
 
 
 def _has(flow: Flow, key: str) -> bool:
-    """Return whether a list of numbers of branches is one of a flow, or of all."""
+    """Return whether a list of values per branch belongs to a flow rule, or to all."""
     name = key.removeprefix('viscoelastic.')
     return name not in CONSTANTS or CONSTANTS[name] in flow.constants
 
@@ -166,7 +166,7 @@ def _number(path: Path | None, name: str, value: object) -> float:
 
 def file_text(found: Identification, belief: Belief, run: str, now: datetime) -> str:
     """
-    Return the parameter file of an identification; the run is what was recorded, for comments.
+    Return the parameter file of an identification; ``run`` names the recording in comments.
 
     Settings of the belief that were not identified are kept.
     """
@@ -209,7 +209,7 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
     for key, value in belief.settings.items():
         if not key.startswith(PREFIX):
             written.setdefault(key, _line(key, value, found))
-    # What the recording does not determine has no covariance.
+    # Undetermined parameters have no covariance.
     lines += [*written.values(), *known_lines(Known(
         found.names, tuple(float(found.values[x]) for x in found.names), found.covariance)
         if np.all(np.isfinite(found.covariance)) else Known())]
@@ -217,13 +217,13 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
 
 
 def belief_in(text: str) -> Belief:
-    """Return what a text of `file_text` says."""
+    """Return the contents of a text of `file_text`."""
     settings = yaml.safe_load(text)['/**']['ros__parameters']
     return read_belief(None, [('', x, y) for x, y in settings.items()])
 
 
 def known_lines(known: Known, joint: str = '') -> list[str]:
-    """Return the lines of a parameter file that say how well parameters are known."""
+    """Return the lines of a parameter file for the uncertainty of the parameters."""
     return [
         '    # The parameters named, their values and the covariance of these, row after row, in '
         'SI units.',
@@ -231,7 +231,7 @@ def known_lines(known: Known, joint: str = '') -> list[str]:
 
 
 def _line(key: str, value: Any, found: Identification, *names: str) -> str:
-    """Return the line of a value with the deviations and intervals of what was sought of it."""
+    """Return the line of a value, with standard deviations and intervals of its estimates."""
     line, notes = f'    {key}: {yaml_text(value)}', []
     for name in names:
         label, estimate = found.shown(name)

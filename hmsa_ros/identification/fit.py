@@ -1,7 +1,7 @@
 """
-Maximum likelihood by Levenberg and Marquardt, robust against outliers.
+Maximum likelihood by Levenberg-Marquardt, robust against outliers.
 
-Residuals count in full up to three deviations, less and less from there on and not at all
+Residuals have full weight up to three standard deviations, then a decreasing one, and none
 beyond six (Hampel, "Robust Statistics", Wiley 1986, sec. 2.6), where the deviation is estimated
 from the residuals themselves. Under normal noise that costs 0.1 % of the accuracy.
 """
@@ -21,48 +21,48 @@ from hmsa_ros.model.equations import Array
 
 _FULL, _NONE = 3.0, 6.0
 _MAX_PASSES = 60
-# A step this small against the standard deviations is the last one.
+# Step, in standard deviations, below which the search has converged.
 _SMALL = 1e-2
 _MAX_DAMPING = 1e10
 _MOST_DERIVATIVE = 1e100
-# Largest change of a coordinate's logarithm in one step.
+# Maximum change of a logarithmic coordinate in one step.
 _STRIDE = 0.7
-# Root mean square error of the simulation, which is no smooth function of the parameters.
+# RMS error of the simulation, which makes it a non-smooth function of the parameters.
 _NUMERICAL = 1e-8
-#: No deviation is below this: a few errors of the simulation.
+#: Minimum standard deviation: a few errors of the simulation.
 LEAST_SCALE = 3.0 * _NUMERICAL
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A minimum that was found."""
+    """A local minimum."""
 
     recording: Recording
     free: tuple[str, ...]  # columns of the Jacobian
     response: Response
-    residual: Array  # measured less simulated stretch, shape (n,)
-    weights: Array  # how far each sample counts, 0 to 1
+    residual: Array  # measured minus simulated stretch, shape (n,)
+    weights: Array  # weight of each sample, 0 to 1
     scale: float  # robust standard deviation of the residuals
-    converged: bool  # whether the last step was small against the standard deviations
-    passes: int  # simulations that it took
-    spread: Array  # deviation of each sample over that of one at rest
-    # Information on each uncertain switch besides the samples, for a noise of 1.
+    converged: bool  # whether the last step was small relative to the standard deviations
+    passes: int  # number of simulations
+    spread: Array  # standard deviation of each sample relative to that of one at rest
+    # Prior information on each uncertain switch, for unit noise.
     prior: float = 0.0
 
     @property
     def values(self) -> dict[str, Any]:
-        """Values of all quantities, and the law."""
+        """Values of all quantities, and the hyperelastic model."""
         return self.response.values
 
     @cached_property
     def root(self) -> Array:
-        """By which residuals and derivatives are multiplied to count as they should."""
+        """Square root of the weights of residuals and derivatives."""
         found: Array = np.sqrt(self.weights) / self.spread
         return found
 
     @cached_property
     def jacobian(self) -> Array:
-        """Derivatives by the coordinates, less what uncertain switches could do; (n, p)."""
+        """Derivatives by the coordinates, after removal of uncertain switches; (n, p)."""
         jacobian, extra = self.response.jacobian, self.response.by_switch
         weighted = self.root[:, None] ** 2 * extra
         matrix = extra.T @ weighted + self.prior * np.eye(extra.shape[1])
@@ -71,16 +71,16 @@ class Fit:
 
     @cached_property
     def information(self) -> Array:
-        """Information matrix by the coordinates, for a noise of 1; shape (p, p)."""
+        """Information matrix by the coordinates, for unit noise; shape (p, p)."""
         matrix: Array = self.response.jacobian.T @ (self.root[:, None] ** 2 * self.jacobian)
         return 0.5 * (matrix + matrix.T)
 
 
 def robust_scale(residual: Array, fitted: int = 0) -> float:
     """
-    Return the standard deviation of residuals of which a few may be outliers.
+    Return the standard deviation of residuals that may include outliers.
 
-    So many of them as parameters were fitted may be none, whatever the noise is.
+    As many of them as there are fitted parameters may be zero, whatever the noise is.
     """
     last = len(residual) - 1
     rest = max(last - fitted, 0)
@@ -90,7 +90,7 @@ def robust_scale(residual: Array, fitted: int = 0) -> float:
 
 
 def weights_of(residual: Array, scale: float, *, convex: bool = False) -> Array:
-    """Return how far each residual counts; convex: by Huber, none is left out altogether."""
+    """Return the weight of each residual; convex: by Huber, so that none is left out."""
     u = np.abs(residual) / scale
     if convex:
         all_count: Array = _FULL / np.maximum(u, _FULL)
@@ -114,7 +114,7 @@ def loss(residual: Array, scale: float, *, convex: bool = False) -> float:
 
 
 def moved(values: Mapping[str, Any], free: Sequence[str], step: Array) -> dict[str, Any]:
-    """Return values after a step of the coordinates, kept in their ranges."""
+    """Return values after a step of the coordinates, clipped to their ranges."""
     return quantities.values_at(values, free, quantities.coordinates(values, free) + step)
 
 
@@ -122,9 +122,9 @@ def fit(
         recording: Recording, values: Mapping[str, float], free: Sequence[str], *,
         most: int = _MAX_PASSES, spread: Array | None = None) -> Fit | None:
     """
-    Descend from start values of all quantities to a minimum; None if they cannot be followed.
+    Search a minimum from start values of all quantities; None if they cannot be simulated.
 
-    The spread is the deviation of each sample over that of one at rest; all alike without it.
+    ``spread`` is the standard deviation of each sample relative to one at rest; default 1.
     """
     return _Search(recording, tuple(free), most, np.ones(
         len(recording.time)) if spread is None else spread).run(values)
@@ -132,14 +132,14 @@ def fit(
 
 @dataclass(eq=False)
 class _Search:
-    """A descent, with the uncertain switches beside the parameters."""
+    """A search in parameters and uncertain switches."""
 
     _recording: Recording
     _free: tuple[str, ...]
     _most: int
     _spread: Array
     _passes: int = 0
-    _convex: bool = True  # whether no sample is left out
+    _convex: bool = True  # whether all samples are used
 
     @property
     def _middle(self) -> float:
@@ -148,7 +148,7 @@ class _Search:
     def _respond(self, values: Mapping[str, float], shifts: Array) -> Response | None:
         self._passes += 1
         response = respond(self._recording, values, self._free, shifts=shifts)
-        # Nothing that so much depends on can be measured.
+        # Such sensitivity cannot be measured.
         return response if response is not None and np.max(
             np.abs(response.jacobian), initial=0.0) < _MOST_DERIVATIVE else None
 
@@ -156,7 +156,7 @@ class _Search:
         return (self._recording.stretch - response.stretch) / self._spread
 
     def _prior(self, scale: float) -> float:
-        # A switch lies anywhere in its interval: as far off as that in the mean.
+        # The prior of a switch is uniform in its interval; use its variance.
         deviation = self._recording.earlier / math.sqrt(12.0)
         return (scale / deviation) ** 2 if deviation else 0.0
 
@@ -166,7 +166,7 @@ class _Search:
                 + 0.5 * self._prior(scale) * apart / scale ** 2)
 
     def run(self, values: Mapping[str, float]) -> Fit | None:
-        """Descend from start values."""
+        """Search from start values."""
         shifts: Array = np.full(len(self._recording.uncertain), self._middle)
         response = self._respond(values, shifts)
         if response is None:
@@ -175,7 +175,7 @@ class _Search:
         count = len(self._free)
         scale = robust_scale(residual, count)
         damping = 1e-4
-        # First no sample is left out, so that the few in motion are not taken for outliers.
+        # First use all samples, so that the few in motion are not taken for outliers.
         for self._convex in (True, False):
             converged = False
             while not converged and self._passes < self._most:
@@ -209,7 +209,7 @@ class _Search:
                 if trial is None or damping > _MAX_DAMPING:
                     damping = 1e-4
                     break
-                # Switches at the end of their intervals never come to rest: the loss does.
+                # Switches at the end of their intervals do not converge: the loss does.
                 converged = damping <= 1.0 and stride == 1.0 and (
                     float(scaled @ matrix @ scaled) <= (_SMALL * scale) ** 2
                     or before - after < _SMALL ** 2)
@@ -219,7 +219,7 @@ class _Search:
                 now = robust_scale(residual, count)
                 if self._convex and not converged or scale >= 2.0 * now:
                     # Fixed once samples may be left out (Yohai, Ann. Statist. 15 (1987) 642), and
-                    # never rising, so that it comes to an end.
+                    # never increasing, so that the search ends.
                     scale = min(scale, now)
                 damping = max(0.1 * damping, 1e-12)
         return Fit(
@@ -230,7 +230,7 @@ class _Search:
     def _normal(
             self, response: Response, residual: Array, weights: Array, shifts: Array,
             scale: float) -> tuple[Array, Array, Array]:
-        """Return the normal equations, scaled to a diagonal of 1, and the scales."""
+        """Return the normal equations, scaled to a unit diagonal, and the scales."""
         jacobian = response.jacobian
         if len(shifts):
             jacobian = np.hstack([jacobian, response.by_switch])
@@ -245,7 +245,7 @@ class _Search:
 
 
 def _stride(values: Mapping[str, float], free: Sequence[str], step: Array) -> float:
-    """Return the share of a step that no logarithm, and no J_lim, leaps with."""
+    """Return the fraction of a step that limits the change of logarithms and J_lim."""
     share = 1.0
     for name, change in zip(free, step.tolist(), strict=True):
         quantity, limit = quantities.quantity_of(name), _STRIDE
@@ -264,6 +264,6 @@ def _stride(values: Mapping[str, float], free: Sequence[str], step: Array) -> fl
 
 
 def _at_bottom(matrix: Array, gradient: Array, count: int, scale: float) -> bool:
-    """Whether the next full step is small against the deviations, or within the errors."""
+    """Return whether the next full step is within the standard deviations or numerical errors."""
     step = np.linalg.solve(matrix + 1e-12 * np.eye(len(gradient)), gradient)
     return float(gradient @ step) <= (_SMALL * scale) ** 2 + count * _NUMERICAL ** 2

@@ -1,4 +1,4 @@
-"""Identification from start to verdict."""
+"""Identification: from start values to the verdict."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -21,11 +21,11 @@ from hmsa_ros.interfaces.actuator import parameters_of
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 
-# Times that the errors of the stamps are estimated anew.
+# Maximum number of iterations for the timestamp errors.
 _MOST_SPREADS = 3
-# Probability of residuals to be white below which no chance makes them look like this.
+# Probability of white residuals below which they are certainly not white.
 _CERTAIN = 1e-4
-# A run whose fastest motion after a change of level is this much slower than a step's is shaped.
+# Maximum relative overshoot of a shaped run.
 _SHAPED = 0.15
 
 
@@ -34,21 +34,21 @@ def identify(
         actuator: ActuatorParameters | None = None, known: Mapping[str, float] | None = None,
         uncertain: Mapping[str, float] | None = None) -> Identification:
     """
-    Find the parameters of an actuator in a recording of its motion.
+    Identify the parameters of an actuator from a recording of its motion.
 
     Parameters
     ----------
     recording : Recording
-        What was measured.
+        Measured samples and levels.
     free : sequence of str
-        What is sought, names of `hmsa_ros.identification.quantities.QUANTITIES`.
+        Parameters to identify, keys of `hmsa_ros.identification.quantities.QUANTITIES`.
     actuator : ActuatorParameters, optional
-        The block as far as it is known, its law included; default the paper's.
+        Prior values of the block, including its hyperelastic model; default the paper's.
     known : mapping of str to float, optional
-        What is known besides, in SI: of coil and sensor, or of the block. A gain of the sensor
-        that is not among these may be 2 % off: where that would not show, intervals hold it.
+        Other known values in SI units: of coil and sensor, or of the block. An unknown gain of the
+        sensor may have an error of 2 %: if this would not be detected, intervals include it.
     uncertain : mapping of str to float, optional
-        Standard deviations of what is known, by name; intervals hold what they do.
+        Standard deviations of known values, by name; intervals include their effect.
 
     Returns
     -------
@@ -78,13 +78,13 @@ def identify(
                    for name, (x, i) in constants.items()}
     sought = [time for ratio, time in quantities.BRANCHES if ratio in free]
     if len(sought) > 1:
-        # From the swing on to what is left at the end.
+        # From the swing to slow creep at the end.
         span = 0.2 * float(recording.time[-1] - recording.time[0])
         values |= {x: y for x, y in zip(sought, np.geomspace(
             min(2.0 * values['time_unit'], 0.2 * span), span, len(sought)).tolist(), strict=True)
             if x in free and x not in known}
     if 'chain_limit' in free:
-        # Endless chains are no start: the derivative by their inverse is taken of the limit.
+        # Infinite J_lim is no start value: the derivative is by its inverse.
         values['chain_limit'] = min(values['chain_limit'], 1e9)
     at_rest = begins_at_rest(recording) and not {'initial_stretch', 'initial_rate'} & set(free)
     if at_rest != recording.at_rest:
@@ -104,7 +104,7 @@ def identify(
 
 
 def _check_uncertain(uncertain: Mapping[str, float], free: Sequence[str]) -> None:
-    """Raise `BadInputError` for standard deviations that are none, or of what is sought."""
+    """Raise `BadInputError` for invalid standard deviations, or those of free parameters."""
     for name, std in uncertain.items():
         quantities.quantity_of(name)
         if name in free:
@@ -118,9 +118,9 @@ def _check_uncertain(uncertain: Mapping[str, float], free: Sequence[str]) -> Non
 
 def _with_errors_of_stamps(best: Fit) -> tuple[Fit, Array]:
     """
-    Return a fit in which samples in motion count less, if errors of the stamps show there.
+    Return a fit in which samples in motion have less weight, if timestamp errors show there.
 
-    With it comes the variance of its coordinates, with what is not known of these errors.
+    Also return the variance of its coordinates due to the uncertainty of these errors.
     """
     found, recording = best, best.recording
     for _ in range(_MOST_SPREADS):
@@ -128,7 +128,7 @@ def _with_errors_of_stamps(best: Fit) -> tuple[Fit, Array]:
         if np.array_equal(spread, found.spread):
             return found, variance
         again = fit(recording, found.values, found.free, spread=spread)
-        # What the model leaves out is larger in motion too, but not from sample to sample.
+        # Errors of the model are also larger in motion, but are correlated between samples.
         if again is None or not again.converged or whiteness(
                 again.root * again.residual).p_value < _CERTAIN or (
                 robust_scale(again.residual) > 2.0 * diagnosis.DISTANT * float(
@@ -144,8 +144,8 @@ def _conclude(
     """
     Return the result of a fit.
 
-    With it come the variance of its coordinates where stamps may be off, others that are nearly as
-    good, and what the caller knows, with standard deviations.
+    ``variance`` is that of its coordinates due to timestamp errors, ``others`` are fits that are
+    nearly as good, and ``given`` are values known to the caller, with standard deviations.
     """
     known = precision_of(best, variance, given)
     found, marks = known.whiteness, known.missing.signatures
@@ -163,7 +163,7 @@ def _conclude(
     verdict: Verdict = 'model_rejected'
     reason = diagnosis.misfit(best, found, marks, alike)
     if weak:
-        # What the model lacks widens all intervals, and may be why nothing is held.
+        # Errors of the model widen all intervals, and may be why nothing is determined.
         verdict = 'not_identifiable'
         reason = f'{weak}; besides, {reason}' if reason else weak
     elif not reason and (still or others):
@@ -179,7 +179,7 @@ def _conclude(
         reason = (
             f'{len(best.free)} parameters from {len(best.recording.time)} samples with a noise of '
             f'{known.deviation:.3g}')
-    # A beam's modulus is known as Young's.
+        # The modulus of a beam is reported as Young's modulus.
     reason = reason.replace('shear_modulus', quantities.modulus_of(best.values.get('law'))[0])
     parameters, matrix = estimates_of(best, known, lost)
     outliers = int(np.count_nonzero(best.weights == 0.0))
@@ -194,7 +194,7 @@ def _conclude(
 
 def _warnings(
         best: Fit, known: Precision, outliers: int, given: Collection[str]) -> list[str]:
-    """Return what a reader should know besides the verdict, a sentence each."""
+    """Return further information for the reader, one sentence each."""
     found, recording = [], best.recording
     if outliers:
         found.append(
@@ -223,7 +223,7 @@ def _warnings(
 
 
 def _shaped(best: Fit) -> bool:
-    """Whether hardly any motion goes past the stretch that it comes to rest at."""
+    """Return whether hardly any motion overshoots its final stretch."""
     fitted, before = best.response.stretch, None
     past = []
     for begin, end, _, _ in segments(best.recording, 6):

@@ -1,4 +1,4 @@
-"""How exactly samples determine the parameters: covariance, intervals, profiles."""
+"""Precision of the parameters: covariance, intervals, profiles."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,30 +15,30 @@ from hmsa_ros.identification.response import respond
 from hmsa_ros.identification.result import Estimate, Identification
 from hmsa_ros.model.equations import Array
 
-# Share of what is allowed from which on a deviation is looked at twice.
+# Fraction of the allowed standard deviation above which it is checked by a profile.
 _NEARLY_LOST = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class Precision:
-    """How exactly the coordinates of a fit are known; factors are on their deviations."""
+    """Precision of the coordinates of a fit; factors multiply their standard deviations."""
 
     deviation: float  # of a sample
-    freedom: float  # samples that count, less parameters
+    freedom: float  # weighted number of samples minus parameters
     whiteness: Whiteness
-    inverse: Array  # of the information for a noise of 1
-    correlated: Array  # factors by correlation of the noise
-    proved: Array  # factors without what residuals only hint at, which is not to lose a number
+    inverse: Array  # of the information for unit noise
+    correlated: Array  # factors due to correlation of the noise
+    proved: Array  # factors without likely departures, to decide which values are determined
     covariance: Array
     missing: Departures
 
 
 def precision_of(best: Fit, variance: Array, given: Mapping[str, float | None]) -> Precision:
     """
-    Work out how exactly a fit is known.
+    Compute the precision of a fit.
 
-    Given are the variance of its coordinates where stamps may be off, and the names of what the
-    caller knows, with standard deviations, None for exactly.
+    ``variance`` is that of its coordinates due to timestamp errors; ``given`` contains parameters
+    known to the caller, with standard deviations, None if exact.
     """
     weighted = best.root * best.residual
     freedom = max(float(np.sum(best.weights)) - len(best.free), 1.0)
@@ -59,21 +59,21 @@ def precision_of(best: Fit, variance: Array, given: Mapping[str, float | None]) 
 
 
 def stamp_error(best: Fit, deviation: float) -> float:
-    """Return the root mean square error of the stamps in s, as far as one was estimated."""
+    """Return the RMS timestamp error in s, if one was estimated."""
     place = int(np.argmax(best.spread))
     return deviation * math.sqrt(float(best.spread[place]) ** 2 - 1.0) / max(
         abs(float(best.response.rate[place])), 1e-300)
 
 
 def _blurred(best: Fit, deviation: float, columns: Array, inverse: Array) -> Array:
-    """Return the squares of what the curvature of the motion moves where stamps are off."""
+    """Return the squared bias of the coordinates due to curvature with timestamp errors."""
     error = stamp_error(best, deviation)
     nothing: Array = np.zeros(len(best.free))
     late = {**best.values, 'sensor_latency': best.values['sensor_latency'] + error}
     after = respond(best.recording, late, ()) if error else None
     if after is None:
         return nothing
-    # In the mean a sample lies half the square of the error times the acceleration off.
+    # On average, the error is half the squared time error times the acceleration.
     missed = 0.5 * error * best.values['stretch_gain'] * (best.response.rate - after.rate)
     shift: Array = inverse @ (columns.T @ (best.root * missed))
     return shift ** 2
@@ -81,10 +81,10 @@ def _blurred(best: Fit, deviation: float, columns: Array, inverse: Array) -> Arr
 
 def _bent(best: Fit, inverse: Array, deviation: float, held: Array) -> Array:
     """
-    Return by how much deviations are larger than the information at the optimum says.
+    Return the factors by which standard deviations exceed those from the information matrix.
 
-    Looked at where a parameter is nearly lost: two deviations off, the best fit of the others
-    has to be as much worse as those say.
+    Poorly determined parameters are checked: at two standard deviations, the best fit of the
+    others has to be worse by the expected amount.
     """
     std = np.sqrt(np.diag(inverse)) * deviation * held
     limits, weights = diagnosis.allowed(best), best.root ** 2
@@ -105,7 +105,7 @@ def _bent(best: Fit, inverse: Array, deviation: float, held: Array) -> Array:
 
 
 def _inverse(information: Array) -> Array:
-    """Return the inverse of an information matrix, large where it is singular."""
+    """Return the inverse of an information matrix, large if it is singular."""
     size = np.sqrt(np.maximum(np.diag(information), 1e-12))
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
     values = np.maximum(values, 1e-13 * values[-1])
@@ -116,15 +116,15 @@ def _inverse(information: Array) -> Array:
 def estimates_of(
         best: Fit, known: Precision, lost: set[str]) -> tuple[dict[str, Estimate], Array]:
     """
-    Return all parameters with intervals, and the covariance of the free values in SI.
+    Return all parameters with intervals, and the covariance of the free values in SI units.
 
-    What is considered widens the intervals alone: with the same sizes and the same sensor what
-    the values predict is as good as without.
+    Undetectable errors only widen the intervals: for the same sizes and sensor, predictions from
+    the values do not depend on them.
     """
-    # Slow to load, and no use to a planner that estimates.
+    # Slow to import, and not needed by a planner that estimates.
     from scipy.special import stdtrit
 
-    # The noise is estimated too: Student's interval.
+    # The noise is estimated, too: use Student's t.
     quantile = float(stdtrit(known.freedom, 0.975))
     whole = np.sqrt(np.diag(known.covariance) + sum(
         x ** 2 for x in known.missing.considered.values()))
@@ -158,22 +158,22 @@ def profile(
         found: Identification, name: str, points: int = 11
 ) -> list[tuple[float, float]]:
     """
-    Return the profile likelihood of a parameter: the best of all others at each of its values.
+    Return the profile likelihood of a parameter: the best fit of the others at each of its values.
 
     Parameters
     ----------
     found : Identification
         The optimum.
     name : str
-        Of a free parameter.
+        Name of a free parameter.
     points : int
-        Values over its interval of four deviations on either side.
+        Number of values in an interval of four standard deviations on either side.
 
     Returns
     -------
     list of (float, float)
-        Value, and how much the deviance, twice the negative logarithm of the likelihood, lies
-        above that of the optimum: 3.84 at the ends of a 95 % interval.
+        Values, and excess of the deviance (twice the negative log likelihood) over that of the
+        optimum: 3.84 at the ends of a 95 % interval.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""How well parameters are known: what an identification, or feedback, leaves for the next run."""
+"""Uncertainty of parameters, from an identification or feedback, for the next run."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,18 +10,18 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.quantities import check_free
 from hmsa_ros.model.equations import Array
 
-#: Where parameter files have it.
+#: Prefix in parameter files.
 PREFIX = 'identification.'
-# Smallest eigenvalue of the correlation.
+# Minimum eigenvalue of the correlation matrix.
 _SINGULAR = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Values of parameters and their covariance, in SI; empty if nothing was identified."""
+    """Values of parameters and their covariance, in SI units; empty if none were identified."""
 
     names: tuple[str, ...] = ()
-    values: tuple[float, ...] = ()  # empty if they are only known from elsewhere
+    values: tuple[float, ...] = ()  # empty if given elsewhere
     # Of shape (p, p).
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
@@ -45,10 +45,10 @@ class Known:
 
     @classmethod
     def read(cls, settings: Mapping[str, Any]) -> 'Known':
-        """Return what parameters by dotted name say; `BadInputError` if they cannot be used."""
+        """Return the values in parameters by dotted name; raise `BadInputError` if unusable."""
         names, values, flat = (
             settings.get(PREFIX + x) or [] for x in ('names', 'values', 'covariance'))
-        # Constants of a law are not estimated on: what is known of the others stands by itself.
+        # Constants of a model are not estimated further: keep only the other parameters.
         kept = [i for i, x in enumerate(names) if not x.startswith('law.')]
         if not kept:
             return cls()
@@ -67,7 +67,7 @@ class Known:
         return cls(free, numbers, matrix)
 
     def value(self, name: str) -> float | None:
-        """Return a value; None where there is none."""
+        """Return a value; None if unknown."""
         if name not in self.names or not self.values:
             return None
         return self.values[self.names.index(name)]

@@ -1,9 +1,9 @@
 """
-Learning from repeats: levels of a sequence, corrected by the residuals that were measured.
+Learning from repeats: levels of a sequence, corrected by the measured residuals.
 
-What a model lacks, such as hysteresis or a second mode, is the same in each repeat. The next
-levels follow from the last residual and the derivatives of the model, as in norm-optimal iterative
-learning control (N. Amann, D. H. Owens, E. Rogers, IEE Proc. D 143, 217 (1996)).
+Effects outside the model, such as hysteresis or a second mode, are the same in each repeat. The
+next levels follow from the last residual and the derivatives of the model, as in norm-optimal
+iterative learning control (N. Amann, D. H. Owens, E. Rogers, IEE Proc. D 143, 217 (1996)).
 """
 
 from collections.abc import Sequence
@@ -19,21 +19,21 @@ from hmsa_ros.model.equations import Array, natural_frequency
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.simulation import simulate
 
-# Parts of a move in which the level may differ, and the end of them, in durations of the move.
+# Number of parts of a move in which the level may change, and their end, in durations of the move.
 _PARTS, _END = 4, 1.5
-# Largest change of a level at once and standard deviation of what is expected of it, as shares of
-# the range of the levels; and a change for derivatives.
+# Maximum change of a level, its expected standard deviation, and increment for derivatives, all
+# relative to the range of the levels.
 _LARGEST, _EXPECTED, _CHANGE = 0.2, 0.05, 1e-4
-# Frequencies and dampings at which a second mode is sought, and by how many variances of the noise
-# it must explain the residual better.
+# Frequencies and damping ratios to try for a second mode, and the minimum improvement of the
+# residual, in variances of the noise.
 _FREQUENCIES, _DAMPINGS, _CERTAIN = (np.geomspace(1.5, 12.0, 120), (0.003, 0.02, 0.06), 40.0)
-# Periods after a move that count: later ones show where the frequency of the model is wrong.
+# Periods after a move that count: later ones mainly show errors of the model's frequency.
 _PERIODS = 4.0
-# Samples a period, of the second mode, that are needed to see it.
+# Minimum number of samples per period of the second mode.
 _FEWEST = 4.0
-# Delays of the samples that are tried, in periods.
+# Delays of the samples to try, in periods.
 _DELAYS = np.linspace(0.0, 0.5, 101)
-# Error of the times of levels, in periods, and from how many levels on a move is smooth.
+# Error of the times of levels, in periods, and number of levels above which a move is smooth.
 _OFF, _MANY = 0.01, 16
 
 
@@ -66,7 +66,7 @@ class Trial:
                     f'{len(times)} {name} of a repeat: expected finite ones, at rising times')
 
     def at(self, times: Array) -> Array:
-        """Return the levels in force at some times, 0 before the first."""
+        """Return the levels at some times, 0 before the first."""
         place = np.searchsorted(self.level_times, times, 'right')
         found: Array = np.append(0.0, self.levels)[place]
         return found
@@ -74,18 +74,18 @@ class Trial:
 
 @dataclass(frozen=True)
 class Target:
-    """A stretch, and from when to when in s a sequence is to hold it, its move included."""
+    """A stretch, and the start and end in s of its setpoint, including the move."""
 
     stretch: float
     begin: float
     end: float
-    #: when it rests by its plan, in s; levels after that follow creep; None: with its last level
+    #: planned arrival in s; later levels follow creep; None: the last level
     arrival: float | None = None
 
 
 @dataclass(frozen=True)
 class Left:
-    """What a repeat left at a target, as shares of the step."""
+    """Residual of a repeat at a target, relative to the step."""
 
     vibration: float  #: peak to peak in the first period
     offset: float
@@ -93,17 +93,17 @@ class Left:
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """The next levels, and what the repeats before have left."""
+    """The next levels, and the residuals of the previous repeats."""
 
     level_times: Array  #: shape (m,), in s
     levels: Array  #: shape (m,), in T
     left: tuple[tuple[Left, ...], ...]  #: by repeat and target
-    best: int  #: place of the repeat that left least
-    frequency: float  #: of the second mode in Hz; NaN where none shows
+    best: int  #: index of the repeat with the smallest residual
+    frequency: float  #: of the second mode in Hz; NaN if none is found
 
 
 class _Sequence:
-    """Knots of a sequence, and windows in which it is to rest."""
+    """Knots of a sequence, and its windows of rest."""
 
     def __init__(
             self, first: Trial, targets: Sequence[Target], actuator: ActuatorParameters) -> None:
@@ -114,7 +114,7 @@ class _Sequence:
         knots: list[float] = []
         self.rests = []
         for target, period in zip(targets, self.period, strict=True):
-            # What a device says of its times is off by the error of its clock.
+            # Reported times have errors due to the clock of the device.
             off = _OFF * float(period)
             until = target.end - 2.0 * off if target.arrival is None else target.arrival
             own = first.level_times[
@@ -124,7 +124,7 @@ class _Sequence:
                     f'no level belongs to the setpoint {target.stretch:g}: expected one or more')
             length = float(own[-1] - own[0]) or 0.5 * float(period)
             parts = own[0] + length / _PARTS * np.arange(round(_END * _PARTS) + 1)
-            # Of both that are about the same those of the sequence count, if it is not smooth.
+            # Prefer knots of the sequence to those nearby, unless it is smooth.
             own = own if len(own) <= _MANY else own[:1]
             knots += [*own, *(x for x in parts if np.min(np.abs(own - x)) > 0.05 * length)]
             self.rests.append(float(own[0]) + _END * length)
@@ -134,7 +134,7 @@ class _Sequence:
                     f'after its move: expected at least a period, {period:.3g} s, to see what is '
                     'left')
         self.knots = np.array(sorted(knots))
-        # Of all levels; those that follow creep change as the last knot before them does.
+        # All levels; those that follow creep change with the last knot before them.
         others = first.level_times[first.level_times > self.knots[0]]
         near = np.min(np.abs(others[:, None] - self.knots), axis=1)
         self.times = np.sort(np.append(
@@ -147,12 +147,12 @@ class _Sequence:
             raise BadInputError('a setpoint repeats the one before: expected steps')
 
     def levels(self, trial: Trial) -> Array:
-        """Return the level of a repeat from each time on, read in the middle until the next."""
+        """Return the levels of a repeat, read in the middle between times."""
         gaps = np.diff(self.times, append=self.times[-1] + 2e-3)
         return trial.at(self.times + 0.5 * np.minimum(gaps, 0.05))
 
     def windows(self, time: Array) -> list[Places]:
-        """Return the places of samples at rest at each target; too few are a `BadInputError`."""
+        """Return the indices of samples at rest by target; raise `BadInputError` if too few."""
         found = [np.flatnonzero(
             (time >= begin) & (time < min(x.end, begin + _PERIODS * float(period))))
             for begin, x, period in zip(self.rests, self.targets, self.period, strict=True)]
@@ -164,20 +164,20 @@ class _Sequence:
         return found
 
     def residual(self, time: Array, stretch: Array) -> Array:
-        """Return what is left, so that each target counts as much as another."""
+        """Return the residual, with equal weights of the targets."""
         return np.concatenate([
             (stretch[x] - target.stretch) / step / math.sqrt(len(x))
             for x, target, step in zip(
                 self.windows(time), self.targets, self.steps, strict=True)])
 
     def left(self, trial: Trial, mode: '_Mode | None') -> tuple[Left, ...]:
-        """Return what a repeat left, at the frequencies of a model and a second mode."""
+        """Return the residual of a repeat, at the frequencies of the model and a second mode."""
         found = []
         for x, target, step, period in zip(
                 self.windows(trial.time), self.targets, self.steps, self.period, strict=True):
             time, off = trial.time[x], (trial.stretch[x] - target.stretch) / step
             first = off[time < time[0] + period]
-            # Noise is not vibration: the amplitude of a fit counts.
+            # Use the amplitude of a fit, so that noise does not count as vibration.
             fitted = _ringing(time[:len(first)], [
                 2.0 * math.pi / float(period), *([] if mode is None else [mode.frequency])])
             curve = fitted @ np.linalg.lstsq(fitted, first, rcond=1e-6)[0]
@@ -193,7 +193,7 @@ class _Sequence:
         return found
 
     def delay(self, trial: Trial) -> float:
-        """Return by how much in s the samples are later than the model, by lag and latency."""
+        """Return the delay of the samples after the model in s, due to lag and latency."""
         seen, shown = trial.stretch, self.simulated(self.levels(trial), trial.time)
         delays = float(np.min(self.period)) * _DELAYS
         off = [float(np.sum((seen - np.interp(trial.time - x, trial.time, shown))**2))
@@ -210,7 +210,7 @@ class _Sequence:
 
 
 def _ringing(time: Array, frequencies: Sequence[float]) -> Array:
-    """Return a constant, and cosine and sine of some frequencies in rad/s, shape (n, 1 + 2 f)."""
+    """Return columns of a constant, and of cosine and sine of frequencies in rad/s."""
     since = time - time[0]
     return np.column_stack([np.ones(len(time)), *(
         f(x * since) for x in frequencies for f in (np.cos, np.sin))])
@@ -218,14 +218,14 @@ def _ringing(time: Array, frequencies: Sequence[float]) -> Array:
 
 @dataclass(frozen=True)
 class _Mode:
-    """A second mode: rad/s, share of critical damping, and stretch per T at rest."""
+    """A second mode: frequency in rad/s, damping ratio, and static stretch per T."""
 
     frequency: float
     damping: float
     gain: float = 1.0
 
     def driven(self, times: Array, levels: Array, time: Array) -> Array:
-        """Return its response at some times, from the first on, to levels from others on."""
+        """Return its response at some times to levels from others on."""
         power = self.frequency * complex(-self.damping, math.sqrt(1.0 - self.damping**2))
         states, state = [], 0j
         for change, fade in zip(
@@ -241,10 +241,10 @@ class _Mode:
 
 
 def _second_mode(sequence: _Sequence, trial: Trial, noise: float) -> _Mode | None:
-    """Find a mode that the levels excite, beside the first one and twice its frequency."""
+    """Find a mode that the levels excite, other than the first one and its second harmonic."""
     levels = sequence.levels(trial)
     places = sequence.windows(trial.time)
-    # Only these samples count.
+    # Use only samples at rest.
     time, stretch = (x[np.concatenate(places)] for x in (trial.time, trial.stretch))
     windows = np.split(np.arange(len(time)), np.cumsum([len(x) for x in places])[:-1])
     first = 2.0 * math.pi / float(np.min(sequence.period))
@@ -260,7 +260,7 @@ def _second_mode(sequence: _Sequence, trial: Trial, noise: float) -> _Mode | Non
     seen = without(stretch)
 
     def explained(frequency: float, damping: float) -> tuple[float, float]:
-        """Return by how much the sum of squares falls, and the gain."""
+        """Return the reduction of the sum of squares, and the gain."""
         shape = without(_Mode(frequency, damping).driven(sequence.times, levels, time))
         power = float(shape @ shape)
         gain = float(shape @ seen) / power if power > 0.0 else 0.0
@@ -289,24 +289,24 @@ def learn(
     Parameters
     ----------
     trials : sequence of Trial
-        Repeats in their order, the first as it was planned, each of the others with the levels
-        that this function returned for those before it.
+        Repeats in order: the first with the planned levels, each further one with the levels that
+        this function returned for the previous ones.
     targets : sequence of Target
-        At least one.
+        At least one target.
     actuator : ActuatorParameters
-        As it was planned with.
+        The actuator used for planning.
     limits : (float, float)
-        Least and largest level in T.
+        Minimum and maximum level in T.
 
     Returns
     -------
     Learnt
-        With the same targets, in the same time.
+        With the same targets and times.
 
     Raises
     ------
     BadInputError
-        If there is nothing to learn from.
+        If there are no repeats or targets.
 
     """
     if not trials or not targets:
@@ -327,7 +327,7 @@ def learn(
                              for one in np.eye(len(sequence.knots))]) / step / math.sqrt(len(x))
             for x, step in zip(sequence.windows(trial.time), sequence.steps, strict=True)])
     size = float(np.ptp(np.append(levels, 0.0)))
-    # As the noise, and what is expected of the changes, have it.
+    # Regularisation by the ratio of the noise to the expected change.
     weight = max(noise, 1e-7) / min(map(abs, sequence.steps)) / math.sqrt(
         len(residual) / len(targets)) / (_EXPECTED * size)
     change = np.linalg.lstsq(

@@ -1,10 +1,10 @@
 """
-What the residuals say of the noise, and what it makes of the covariance.
+Properties of the noise from the residuals, and their effect on the covariance.
 
-White residuals leave the inverse of the information. Correlated ones (a filter in the camera,
-quantisation, drift) hold less information than their number says: the covariance is widened by
-two sandwiches, one with the autocorrelation of the residuals and one with that of the scores
-(Newey and West, Econometrica 55 (1987) 703), whichever is larger.
+For white residuals the covariance is the inverse information. Correlated ones (a filter in the
+camera, quantisation, drift) contain less information than their number suggests: the covariance is
+widened by the larger of two sandwich estimates, with the autocorrelation of the residuals and with
+that of the scores (Newey and West, Econometrica 55 (1987) 703).
 """
 
 from dataclasses import dataclass
@@ -15,43 +15,43 @@ import numpy as np
 from hmsa_ros.identification.fit import LEAST_SCALE, loss, robust_scale, weights_of
 from hmsa_ros.model.equations import Array
 
-# Below this probability residuals are not white.
+# Probability below which residuals are not white.
 _WHITE = 1e-3
 _LAGS = 20
-# A window of this many correlation times (A. Sokal, "Monte Carlo methods in statistical
+# Window length in correlation times (A. Sokal, "Monte Carlo methods in statistical
 # mechanics", 1997).
 _WINDOW = 6.0
-# Deviation at the fastest motion over that at rest, as tried.
+# Ratios of the standard deviation at the fastest motion to that at rest to try.
 _LARGEST_SPREADS = np.geomspace(0.5, 200.0, 13)
 
 
 @dataclass(frozen=True, eq=False)
 class Whiteness:
-    """How the residuals hang together."""
+    """Correlation of the residuals."""
 
     autocorrelation: Array  # from lag 0 on, over samples
-    p_value: float  # of as much in white noise (Ljung and Box, Biometrika 65 (1978) 297)
-    window: int  # lags that matter; 0 where the residuals are white
+    p_value: float  # of this or more in white noise (Ljung and Box, Biometrika 65 (1978) 297)
+    window: int  # number of significant lags; 0 if the residuals are white
 
     @property
     def white(self) -> bool:
-        """Whether they may be white."""
+        """Whether the residuals may be white."""
         return self.window == 0
 
     @property
     def taper(self) -> Array:
-        """Weights of the lags that matter."""
+        """Weights of the significant lags."""
         return 1.0 - np.arange(self.window + 1) / (self.window + 1.0)
 
 
 def autocorrelation(values: Array) -> Array:
-    """Return the autocorrelation of values over their lags, biased, from 1 on; shape (n,)."""
+    """Return the biased autocorrelation of values by lag, from 1 on; shape (n,)."""
     found = _products(values)
     return found / found[0] if found[0] > 0.0 else np.append(1.0, np.zeros(len(values) - 1))
 
 
 def _products(columns: Array) -> Array:
-    """Return the sums of products of each column with itself, over their lags."""
+    """Return the sums of products of each column with itself, by lag."""
     n = len(columns)
     size = 1 << (2 * n - 1).bit_length()
     spectrum = np.abs(np.fft.rfft(columns, size, axis=0)) ** 2
@@ -61,7 +61,7 @@ def _products(columns: Array) -> Array:
 
 def whiteness(residual: Array) -> Whiteness:
     """Test weighted residuals for correlation."""
-    # Slow to load, and no use to a planner that estimates.
+    # Slow to import, and not needed by a planner that estimates.
     from scipy.special import chdtrc
 
     n = len(residual)
@@ -69,7 +69,7 @@ def whiteness(residual: Array) -> Whiteness:
     lags = max(1, min(_LAGS, n // 5))
     k = np.arange(1, lags + 1)
     q = n * (n + 2.0) * float(np.sum(rho[1:lags + 1] ** 2 / (n - k)))
-    # Parameters of a motion, unlike those of a filter of the noise, cost no degrees of freedom.
+    # Parameters of a motion, unlike those of a noise filter, cost no degrees of freedom.
     p_value = float(chdtrc(lags, q))
     if p_value > _WHITE:
         return Whiteness(rho, p_value, 0)
@@ -80,19 +80,19 @@ def whiteness(residual: Array) -> Whiteness:
 
 def errors_of_stamps(jacobian: Array, residual: Array, rate: Array) -> tuple[Array, Array]:
     """
-    Weigh how far off the stamps may be: their errors add to the noise in proportion to the rate.
+    Estimate the timestamp errors, which add noise in proportion to the rate.
 
-    Noise at rest and errors of the stamps have a variance each. How likely each ratio of the two
-    is says the restricted likelihood of a linear model (H. D. Patterson and R. Thompson,
-    Biometrika 58 (1971) 545); beforehand, exact stamps are as likely as all errors together.
+    Noise at rest and timestamp errors have a variance each. The restricted likelihood of a linear
+    model (H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545) gives the probability of each
+    ratio of the two; a priori, exact timestamps are as likely as all errors together.
 
-    Returned are the deviation of each sample over that of one at rest, all 1 where exact stamps
-    are likelier, and the variance of the coordinates, with what is not known of the ratio.
+    Return the standard deviation of each sample relative to one at rest, all 1 if exact timestamps
+    are more likely, and the variance of the coordinates due to the uncertainty of the ratio.
     """
     fastest = float(np.max(np.abs(rate), initial=0.0))
     largest = np.append(0.0, _LARGEST_SPREADS if fastest > 0.0 else [])
     spreads = np.sqrt(1.0 + np.square(np.outer(largest, rate / max(fastest, 1e-300))))
-    # Outliers are those of the likeliest, or the ratios could not be compared.
+    # Use the outliers of the most likely ratio for all, so that they can be compared.
     scaled = residual / min(spreads, key=lambda x: _surprise(residual, x))
     weights = weights_of(scaled, robust_scale(scaled))
     size = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-100)
@@ -119,7 +119,7 @@ def errors_of_stamps(jacobian: Array, residual: Array, rate: Array) -> tuple[Arr
 
 
 def _surprise(residual: Array, spread: Array) -> float:
-    """Return the negative logarithm of the likelihood, outliers bounded."""
+    """Return the negative log likelihood, with bounded outliers."""
     scaled = residual / spread
     scale = robust_scale(scaled)
     return len(scaled) * math.log(scale) + float(np.sum(np.log(spread))) + loss(scaled, scale)
@@ -127,9 +127,9 @@ def _surprise(residual: Array, spread: Array) -> float:
 
 def widening(jacobian: Array, residual: Array, inverse: Array, found: Whiteness) -> Array:
     """
-    Return by how much correlation widens the deviations, factors of at least 1, shape (p,).
+    Return the factors, at least 1, by which correlation widens standard deviations, shape (p,).
 
-    Jacobian and residual are weighted; the inverse is that of the information for a noise of 1.
+    Jacobian and residual are weighted; the inverse is that of the information for unit noise.
     """
     count = jacobian.shape[1]
     if found.white:
@@ -153,7 +153,7 @@ def _sum_of_lags(columns: Array, weights: Array) -> Array:
 
 
 def inflation(column: Array, found: Whiteness) -> float:
-    """Return the factor on the deviation of a projection of the residuals on a column."""
+    """Return the factor on the standard deviation of the projection of residuals on a column."""
     if found.white:
         return 1.0
     norm = float(column @ column)

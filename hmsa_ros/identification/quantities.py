@@ -1,4 +1,4 @@
-"""What can be estimated: names, units, ranges, and the coordinate in which each is sought."""
+"""Parameters that can be estimated: names, units, ranges, and coordinates of the search."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,12 +23,12 @@ class Quantity:
     """One parameter of actuator, coil or sensor."""
 
     unit: str  # in plain text
-    default: float = math.nan  # without a file or a caller's; NaN for what the actuator always has
-    # Coordinate of the search: 'log', 'inverse' (0 for chains without a limit) or 'linear'.
+    default: float = math.nan  # unless given; NaN for parameters of the actuator
+    # Coordinate of the search: 'log', 'inverse' (0 for infinite J_lim) or 'linear'.
     scale: str = 'log'
-    least: float = 0.0  # admissible
-    most: float = math.inf  # admissible
-    advice: str = ''  # what to record, or to measure, where the data do not hold it
+    least: float = 0.0  # minimum
+    most: float = math.inf  # maximum
+    advice: str = ''  # what to record or measure if the data do not determine it
 
 
 _STEP = 'record unshaped steps that ring, at a rate above twice the frequency of the ringing'
@@ -36,9 +36,9 @@ _SCALE = ('only ratios of shear_modulus, density and remanence act on the motion
           'them (weigh the actuator for the density) and leave it out of --free')
 _CREEP = 'record rest far from that without field for several times the time of the creep'
 _NUMBERS = ('', '_2', '_3')
-#: Fields of `ActuatorParameters` that are measured with a ruler, and are never sought.
+#: Fields of `ActuatorParameters` that are measured with a ruler, and never estimated.
 GEOMETRY = ('half_length', 'half_thickness')
-#: By name; those of the actuator are named as its parameters are.
+#: Quantities by name; those of the actuator have the names of its parameters.
 QUANTITIES: dict[str, Quantity] = {
     'shear_modulus': Quantity('Pa', advice=_STEP),
     'density': Quantity('kg/m^3', advice=_SCALE),
@@ -77,21 +77,21 @@ QUANTITIES: dict[str, Quantity] = {
        for name, constant in CONSTANTS.items() for x in _NUMBERS},
     **dict.fromkeys(GEOMETRY, Quantity('m')),
 }
-#: Ratio and time of each branch of creep.
+#: Ratio and time of each viscoelastic branch.
 BRANCHES = tuple((f'viscoelastic_ratio{x}', f'viscoelastic_time{x}') for x in _NUMBERS)
-#: Constants of the flow of each branch.
+#: Constants of the flow rule of each branch.
 FLOWING = tuple(tuple(f'viscoelastic_{y}{x}' for y in CONSTANTS) for x in _NUMBERS)
-#: Constants of the laws, by the name of their parameter.
+#: Constants of the hyperelastic models, by the name of their parameter.
 _OF_LAWS = {
     x.name: Quantity(
         x.unit, scale='inverse' if x.inverse else 'linear', least=x.minimum, most=x.maximum,
         advice='record larger stretches of both signs, and rest at three or more levels; or '
                'choose a law with fewer constants')
     for law in LAWS.values() for x in law.constants if x.place >= 0}
-#: Free unless others are named.
+#: Free by default.
 DEFAULT_FREE = (
     'shear_modulus', 'damping_coefficient', 'chain_limit', 'remanence', 'stretch_bias')
-#: What levels at rest alone hold, if the frequency is not known.
+#: Parameters that levels at rest determine, even if the frequency is unknown.
 STATIC = {'chain_limit', 'stretch_bias', 'stretch_gain', 'initial_stretch'}
 
 
@@ -99,11 +99,10 @@ def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, .
     """
     Return the names of free parameters, each once.
 
-    ``actuator.`` or ``law.`` before a name is dropped, and the modulus may have the name that it
-    has in the law. With a law in place of Gent J_lim is not sought, but constants of the
-    law may be: ``law.c10``, or for all of a list ``law.mu`` and for its first ``law.mu.1``. Raises
-    `BadInputError` if a name is unknown, none is given, or two exclude each other, or
-    the law is driven by a voltage.
+    A prefix ``actuator.`` or ``law.`` is dropped, and the modulus may have its name in the model.
+    Models other than Gent exclude J_lim, but allow their constants: ``law.c10``, or for all
+    elements of a list ``law.mu`` and for its first ``law.mu.1``. Raise `BadInputError` if a name
+    is unknown, none is given, two exclude each other, or the actuator is driven by a voltage.
     """
     if law is not None and law.volts:
         raise BadInputError(
@@ -145,10 +144,10 @@ def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, .
 def free_of(
         text: str, law: Elastic | None = None, known: Iterable[str] = ()) -> tuple[str, ...]:
     """
-    Return the names of free parameters that a text of a command line means.
+    Return the names of free parameters from a command line.
 
-    Names replace the default list, without what is known; ``+NAME`` adds to it and ``-NAME``
-    takes from it. Raises `BadInputError` if that is not free, and as `check_free` does.
+    Names replace the default list, without known ones; ``+NAME`` adds to it and ``-NAME`` removes
+    from it. Raise `BadInputError` if the latter is not free, and as `check_free` does.
     """
     names = [x.strip() for x in text.split(',') if x.strip()]
     free = [x for x in names if x[0] not in '+-']
@@ -167,9 +166,9 @@ def free_of(
 @lru_cache(maxsize=64)
 def constants_of(law: Elastic | None) -> dict[str, tuple[Constant, int]]:
     """
-    Return the constants of a law that may be sought, by name.
+    Return the constants of a model that can be estimated, by name.
 
-    With each comes its place in its list, of which it has the number after a point, from 1 on.
+    Each comes with its index in its list; the name has this number, from 1 on, after a point.
     """
     found = {}
     for constant in LAWS[law.law].constants if law is not None else ():
@@ -183,10 +182,10 @@ def constants_of(law: Elastic | None) -> dict[str, tuple[Constant, int]]:
 
 def complete(values: Mapping[str, Any], free: Iterable[str]) -> dict[str, Any]:
     """
-    Return values in which the density and the time unit agree, and the law and its constants.
+    Return values with consistent density and time unit, and with the model from its constants.
 
-    Where the time unit is free the density follows from it, else the other way round. Raises
-    `BadInputError` if there is no law with such constants.
+    If the time unit is free, it determines the density, otherwise vice versa. Raise
+    `BadInputError` if no model has such constants.
     """
     done = dict(values)
     law: Elastic | None = done['law']
@@ -209,9 +208,9 @@ def complete(values: Mapping[str, Any], free: Iterable[str]) -> dict[str, Any]:
 
 def quantity_of(name: str) -> Quantity:
     """
-    Return what is known of a parameter, a constant of a law included.
+    Return a parameter by name, including constants of a model.
 
-    Raises `BadInputError` if there is none of that name.
+    Raise `BadInputError` if there is none with this name.
     """
     found = QUANTITIES.get(name) or _OF_LAWS.get('.'.join(name.split('.')[:2]))
     if found is None:
@@ -224,10 +223,10 @@ def values_of(
         actuator: ActuatorParameters, others: Mapping[str, float] | None = None
 ) -> dict[str, Any]:
     """
-    Return values of all quantities, and the law under the name ``law``.
+    Return values of all quantities, with the hyperelastic model as ``law``.
 
-    Others take the place of those of the actuator and of the defaults. Raises `BadInputError` if a
-    name of them is unknown or a value out of range.
+    ``others`` replace those of the actuator and defaults. Raise `BadInputError` if a name is
+    unknown or a value out of range.
     """
     others = {x: float(y) for x, y in (others or {}).items()}
     actuator = replace(
@@ -244,7 +243,7 @@ def values_of(
 
 
 def actuator_of(values: Mapping[str, Any]) -> ActuatorParameters:
-    """Return the block of values as `values_of` returns them."""
+    """Return the block with values from `values_of`."""
     return ActuatorParameters(
         shear_modulus=values['shear_modulus'], density=values['density'],
         half_length=values['half_length'], half_thickness=values['half_thickness'],
@@ -254,7 +253,7 @@ def actuator_of(values: Mapping[str, Any]) -> ActuatorParameters:
 
 
 def flow_of(values: Mapping[str, Any], free: Iterable[str]) -> Flow:
-    """Return how branches flow: the flow that has a constant which is sought, or is not 1."""
+    """Return the flow rule of the branches: the one with a constant that is free, or not 1."""
     sought = set(free)
     for flow in FLOWS.values():
         if any(name in sought or values[name] != 1.0 for x in flow.constants
@@ -264,13 +263,13 @@ def flow_of(values: Mapping[str, Any], free: Iterable[str]) -> Flow:
 
 
 def group_of(values: Mapping[str, Any]) -> NondimensionalParameters:
-    """Return the group of values as `values_of` returns them, and the law, without damping."""
+    """Return the dimensionless group of values from `values_of`, without damping."""
     return NondimensionalParameters(
         0.0, values['chain_limit'], geometry_of(values).c1, values.get('law'))
 
 
 def modulus_of(law: Elastic | None) -> tuple[str, float]:
-    """Return what the stiffness is known by, and its ratio to the shear modulus: E of a beam."""
+    """Return the name of the reported modulus, and its ratio to the shear modulus: E of a beam."""
     if law is None or not law.section:
         return 'shear_modulus', 1.0
     name, ratio = law.given[0]
@@ -278,23 +277,23 @@ def modulus_of(law: Elastic | None) -> tuple[str, float]:
 
 
 def geometry_of(values: Mapping[str, Any]) -> Geometry:
-    """Return what the sizes among some values, and the law, make of parameters in SI units."""
+    """Return the geometric factors of values of all quantities."""
     return Geometry(values['half_length'], values['half_thickness'], values.get('law'))
 
 
 def damping_unit(values: Mapping[str, Any]) -> float:
-    """Return the damping coefficient in N s/m of zeta 1, for values of all quantities."""
+    """Return the damping coefficient in N s/m for zeta 1, for values of all quantities."""
     return geometry_of(values).damping_unit(values['density'], values['shear_modulus'])
 
 
 def to_coordinate(name: str, value: float) -> float:
-    """Return the coordinate of a value in the search."""
+    """Return the coordinate of a value."""
     scale = quantity_of(name).scale
     return math.log(value) if scale == 'log' else 1.0 / value if scale == 'inverse' else value
 
 
 def from_coordinate(name: str, x: float) -> float:
-    """Return the value of a coordinate; a J_lim beyond all data is infinite."""
+    """Return the value of a coordinate; J_lim is limited to 1e9."""
     scale = quantity_of(name).scale
     if scale == 'log':
         return math.exp(min(max(x, -230.0), 230.0))
@@ -309,7 +308,7 @@ def coordinates(values: Mapping[str, Any], free: Iterable[str]) -> Array:
 
 
 def values_at(values: Mapping[str, Any], free: Sequence[str], z: Array) -> dict[str, Any]:
-    """Return values with those of the coordinates of the free parameters, kept in their ranges."""
+    """Return values with the free ones at coordinates, clipped to their ranges."""
     found = dict(values)
     for name, x in zip(free, z.tolist(), strict=True):
         quantity = quantity_of(name)

@@ -1,4 +1,4 @@
-"""What was measured: samples of the stretch and the levels of the field, as arrays."""
+"""Measured data: samples of the stretch and levels of the field, as arrays."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,18 +13,18 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import Coordinate, STRETCH
 from hmsa_ros.model.moves import Level
 
-#: Fewer samples than this hold no motion and five parameters.
+#: Minimum number of samples for a motion and five parameters.
 FEWEST = 12
-# Motion below this share of the stretch, or of the scatter from sample to sample, is none.
+# Minimum motion, relative to the stretch, and to the scatter between samples.
 _LEAST_MOTION = 1e-7
 _TIMES_SCATTER = 6.0
-# A crest is cut off where the value stays exactly at an extreme between samples that differ by
-# this share of the whole range.
+# A crest is clipped if the value is constant at an extreme between samples that differ by at least
+# this fraction of the range.
 _CLIPPED_SLOPE = 0.01
 _CLIPPED_SAMPLES = 3
-# So many values in motion that come again, and more than half of all, are a staircase.
+# Number of repeated values in motion, more than half of all, that show quantisation in time.
 _STAIRS = 4
-# The share of the samples on either side that may be none, and the largest flux density of a coil
+# Fraction of samples on either side that may be invalid, and the maximum flux density of a coil
 # in T.
 _FEW, _STRONGEST = 0.02, 5.0
 
@@ -41,20 +41,20 @@ class Recording:
     stretch : ndarray, shape (n,)
         Measured stretch, or deflection of a beam.
     level_times, levels : ndarray, shape (m,)
-        Flux density in T in force from each time on, increasing in time; m of at least 1.
+        Flux density in T from each time on, increasing in time; m of at least 1.
     slew_limit : float
         Rate in T/s at which the amplifier ramps; infinite for steps.
     earlier : float
-        By how much in s the levels may have switched before their times, as where they were
-        sampled; 0 where the times are true.
+        Maximum time in s by which the levels may have switched before their times, for instance
+        if they were sampled; 0 if the times are exact.
     label : str
-        Name for people.
+        Name of the recording.
     notes : tuple of str
-        What a reader should know, one sentence each.
+        Information for the reader, one sentence each.
     coordinate : Coordinate
-        What the samples are.
+        Kind of position that the samples measure.
     at_rest : bool
-        Whether the motion begins at rest, as `identify` finds out.
+        Whether the motion begins at rest, as determined by `identify`.
 
     Raises
     ------
@@ -121,7 +121,7 @@ class Recording:
                 f'expected at most {_STRONGEST:g} T; if they are in mT, write '
                 '"flux_density [mT]" in the header of the CSV')
         spread = float(np.quantile(self.stretch, 0.99) - np.quantile(self.stretch, 0.01))
-        # White noise spreads by 4.65 of its deviation, and so much from one sample to the next.
+        # The range of white noise is 4.65 standard deviations, as is that of its increments.
         jitter = float(np.median(np.abs(np.diff(self.stretch)))) / 0.954
         first, last = self.place(self.time[[0, -1]])
         driven = np.ptp(self.levels[first:last + 1]) > 0.0
@@ -147,8 +147,8 @@ class Recording:
                 'within its range; the crests are lost, and a fit would be wrong without a sign')
 
     def _check_scale(self) -> None:
-        """Refuse what the coordinate cannot be."""
-        # A few samples may have lost the actuator.
+        """Raise `BadInputError` for samples that are impossible for this kind of position."""
+        # A few samples may be invalid.
         low, middle, high = np.quantile(self.stretch, (_FEW, 0.5, 1.0 - _FEW)).tolist()
         without = self.stretch[self.levels[self.place(self.time)] == 0.0]
         seen = len(without) >= _CLIPPED_SAMPLES
@@ -173,7 +173,7 @@ class Recording:
             + f': expected {what.meaning}; if it is ' + looks)
 
     def _unmoved(self, jitter: float) -> bool:
-        """Whether nothing differs between the levels, nor from sample to sample but noise."""
+        """Return whether neither levels nor samples differ by more than noise."""
         edges = np.searchsorted(self.time, self.level_times)
         parts = [x for x in np.split(self.stretch, np.unique(edges)) if len(x) >= 4]
         if len(parts) < 2:
@@ -186,9 +186,9 @@ class Recording:
 
     def _flat(self) -> tuple[int, int]:
         """
-        Return how many crests are cut off by the end of the sensor's range, 0 for none.
+        Return the number of crests that are clipped at the end of the sensor's range.
 
-        With it comes how many times values in motion come, 0 unless most of them come again.
+        Also return how often values in motion repeat, 0 unless most of them do.
         """
         y = self.stretch
         edges = np.flatnonzero(np.diff(y) != 0.0) + 1
@@ -207,18 +207,18 @@ class Recording:
         return (clipped if clipped > 1 else 0), 0
 
     def place(self, time: Array) -> NDArray[np.intp]:
-        """Return the places of the levels in force at some times; the first before all."""
+        """Return the indices of the levels at some times; the first one before all."""
         return np.searchsorted(self.level_times, time, side='right').clip(1) - 1
 
     @cached_property
     def changes(self) -> Array:
-        """Times in s at which the level changes, after that of the first one."""
+        """Times in s of changes of level, after that of the first one."""
         found: Array = self.level_times[1:][np.diff(self.levels) != 0.0]
         return found
 
     @property
     def uncertain(self) -> NDArray[np.int64]:
-        """Places of the levels that switch at an uncertain time while samples are taken."""
+        """Indices of the levels that switch at an uncertain time during sampling."""
         if self.earlier == 0.0:
             return np.zeros(0, np.int64)
         inside = (self.level_times > self.time[0]) & (self.level_times <= self.time[-1])
@@ -231,7 +231,7 @@ class Recording:
 
     @cached_property
     def quantum(self) -> float:
-        """Step in which the values come; 0 where they are not quantised."""
+        """Quantisation step of the values; 0 if they are not quantised."""
         values = np.unique(self.stretch)
         if len(values) > 0.5 * len(self.stretch) or len(values) < 2:
             return 0.0
@@ -244,7 +244,7 @@ class Recording:
 @dataclass(frozen=True, eq=False)
 class Course:
     """
-    What may be recorded: samples to come, not checked, as a search makes thousands.
+    A recording to simulate, without checks, as a search creates thousands.
 
     The fields are those of a `Recording`.
     """
@@ -258,7 +258,7 @@ class Course:
 
     @property
     def uncertain(self) -> NDArray[np.int64]:
-        """Places of the levels that switch at an uncertain time: none."""
+        """Indices of the levels that switch at an uncertain time: none."""
         return np.zeros(0, np.int64)
 
 
@@ -266,11 +266,11 @@ def pieces(
         times: Array, levels: Array, slew: float, begin: float
 ) -> tuple[Array, Array, Array]:
     """
-    Return the amplifier's level in T as pieces of lines: begins, values and slopes.
+    Return the amplifier's level in T as linear pieces: begins, values and slopes.
 
-    From each of the begins on it is ``values + slopes (t - begins)``. The level in force at the
-    given begin, in s, has been reached; from there the amplifier ramps by a slew rate in T/s,
-    infinite for steps.
+    From each begin on it is ``values + slopes (t - begins)``. At the given begin, in s, the level
+    at that time has been reached; from then on the amplifier ramps at a slew rate in T/s, infinite
+    for steps.
     """
     first = max(int(np.searchsorted(times, begin, side='right')) - 1, 0)
     level = float(levels[first])
@@ -281,6 +281,6 @@ def pieces(
     ahead = [Level(*x) for x in zip(
         times[first + 1:].tolist(), levels[first + 1:].tolist(), strict=True)]
     table = np.array([(begin, level, 0.0), *ramps(ahead, level, math.inf, slew)[0]])
-    # Of pieces that begin at once the last one counts.
+    # Of pieces with the same begin the last one applies.
     keep = np.append(np.diff(table[:, 0]) > 0.0, True)
     return table[keep, 0].copy(), table[keep, 1].copy(), table[keep, 2].copy()

@@ -1,10 +1,10 @@
 """
-Whether residuals repeat with the levels, which noise does not.
+Test whether residuals repeat with the levels, unlike noise.
 
-What follows on equal changes of level is laid over one another. A model that lacks something
-leaves the same after each of them. Noise is as likely to have either sign, in all of what follows
-on one change at once, whatever it does from sample to sample: how often random signs of whole
-repeats agree as well as the residuals do is how likely chance is.
+Residuals after equal changes of level are overlaid. An incomplete model leaves the same residuals
+after each of them. Noise after each change has either sign with equal probability, jointly for all
+samples, whatever its correlation: the p-value is the probability that random signs of whole
+repeats agree as well as the residuals do.
 """
 
 from dataclasses import dataclass
@@ -16,30 +16,30 @@ from hmsa_ros.identification.fit import Fit
 from hmsa_ros.identification.start import segments
 from hmsa_ros.model.equations import Array
 
-# Draws of the signs, first and where these do not make it clear.
+# Numbers of random draws: first, and if the result is not clear.
 _DRAWS, _CLEAR = (199, 3999), 0.04
-_MOST = 48  # repeats of one change; of more several share a sign
+_MOST = 48  # maximum number of repeats of one change; beyond it several share a sign
 _FEWEST = 4  # samples on a level
-# Shares of the time on a level that are looked at, and the rest that its mean is of.
+# Fractions of the time on a level to test, and the last part that determines its mean.
 _WINDOWS, _REST = (0.125, 0.25, 0.5, 1.0), 2.0 / 3.0
-_FINEST = 12.0  # parts of a period that one place in time is
+_FINEST = 12.0  # time bins per period
 
 
 @dataclass(frozen=True)
 class Repeated:
-    """What of the residuals follows on equal changes of level alike."""
+    """Part of the residuals that repeats after equal changes of level."""
 
-    p_value: float  # of as much by chance
+    p_value: float  # probability by chance
     size: float  # root mean square over all samples, stretch
-    cost: float  # largest peak to peak, over the median change of the stretch
+    cost: float  # largest peak-to-peak value, relative to the median change of the stretch
 
 
 def repeated(fit: Fit, period: float, floor: float = 0.0) -> Repeated | None:
     """
-    Return what repeats; None if no change of level does.
+    Return the repeating part; None if no change of level repeats.
 
-    The period is that of the motion in s. What is below the floor, a root mean square, is none:
-    the steps of the values make it.
+    The period is that of the motion in s. Values below the floor, an RMS value, are ignored: they
+    are due to quantisation.
     """
     found = segments(fit.recording, _FEWEST)
     groups: dict[tuple[float, float], list[tuple[int, int, float]]] = {}
@@ -82,7 +82,7 @@ def _apart(rows: Array) -> Array:
 
 
 def _chance(grams: list[list[Array]]) -> float:
-    """Return how often random signs of the repeats agree in any window as well as none do."""
+    """Return the probability that random signs of the repeats agree as well in any window."""
     random = np.random.default_rng(0)
     for draws in _DRAWS:
         drawn: Array = np.zeros((draws + 1, len(grams[0])))
@@ -102,7 +102,7 @@ def _chance(grams: list[list[Array]]) -> float:
 def _folded(
         time: Array, residual: Array, group: list[tuple[int, int, float]], width: float
 ) -> tuple[Array, Array]:
-    """Return residuals by repeat and place in time, 0 where none is, and how many there are."""
+    """Return residuals and their numbers by repeat and time bin; 0 in empty bins."""
     places = [((time[begin:end] - when) / width).astype(np.int64) for begin, end, when in group]
     size = min(int(x[-1]) for x in places) + 1
     rows = min(len(group), _MOST)

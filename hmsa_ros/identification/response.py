@@ -1,4 +1,4 @@
-"""The simulated measurement of a recording, with its derivatives by the free parameters."""
+"""Simulated measurement of a recording, with derivatives by the free parameters."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,11 +25,11 @@ from hmsa_ros.motion import theta as places
 RTOL = 1e-8
 _NOTHING: Array = np.empty(0)
 _SENSOR = ('stretch_bias', 'stretch_gain', 'sensor_latency')
-# Parameters that numbers of theta are proportional to, in their order.
+# Parameters to which values of theta are proportional, by index.
 _LINEAR = {
     'shear_modulus': places.STIFFNESS, 'damping_coefficient': places.DAMPING,
     'remanence': places.DRIVE, 'constant_force': places.FORCE}
-# Parameters that are numbers of theta as they are.
+# Parameters that are values of theta, by index.
 _PLACES = {
     'coil_time_constant': places.LAG, 'initial_stretch': places.STRETCH,
     'initial_rate': places.RATE,
@@ -41,7 +41,7 @@ _PLACES = {
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """What the sensor would have shown."""
+    """Simulated reading of the sensor."""
 
     values: dict[str, Any]  # of all quantities, as `quantities.complete` returns them
     stretch: Array  # measured, shape (n,)
@@ -84,7 +84,7 @@ def _chain(
         elif name in _LINEAR:
             chain[name] = {_LINEAR[name]: by_value[_LINEAR[name]]}
             if name == 'shear_modulus' and 'time_unit' in free:
-                # The density that goes with a time unit, L sqrt(rho/G).
+                # The density changes with the time unit, L sqrt(rho/G).
                 for i, x in per_density.items():
                     chain[name][i] = chain[name].get(i, 0.0) + x * density / values[name]
         elif name == 'time_unit':
@@ -95,7 +95,7 @@ def _chain(
             chain[name] = {places.CONSTANT: -1.0 / values[name] ** 2}
         elif name not in _SENSOR:
             constant, i = quantities.constants_of(values['law'])[name]
-            # The scale of the law stays: constants in Pa change its force in proportion.
+            # The scale of the model stays: constants in Pa change its force in proportion.
             chain[name] = {places.CONSTANT + constant.place + 2 * i: (
                 1.0 / values['shear_modulus'] if constant.unit == 'Pa' else 1.0)}
     return theta, chain
@@ -103,18 +103,18 @@ def _chain(
 
 @lru_cache(maxsize=32)
 def _packed(limit: float, c1: float, law: Elastic | None) -> Array:
-    """Return the packed law; finding its limits takes a while."""
+    """Return the packed material; computing its limits is slow."""
     return pack(0.0, limit, c1, law)
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What the motion needs of values, and how its derivatives make those by free parameters."""
+    """Arguments of the motion for some values, and the chain rule to the free parameters."""
 
-    theta: Array  # as `hmsa_ros.motion.theta` names its places
-    material: Array  # the packed law
-    branches: int  # of creep
-    # Places in theta, or of constants of the law, by which to differentiate, shape (w,).
+    theta: Array  # with indices as in `hmsa_ros.motion.theta`
+    material: Array  # the packed material
+    branches: int  # number of viscoelastic branches
+    # Indices in theta, or of constants of the model, to differentiate by, shape (w,).
     wanted: NDArray[np.int64]
     # Derivatives of these by the coordinates of the free parameters; 0 for the sensor's.
     mixing: Array
@@ -124,10 +124,10 @@ class Setup:
             cls, values: Mapping[str, Any], free: Sequence[str], more: Sequence[int] = ()
     ) -> 'Setup':
         """
-        Work it out for values as `quantities.complete` returns them, with arrays of its own.
+        Return the setup for values from `quantities.complete`, with its own arrays.
 
-        Maxwell branches may be given under the name ``creep``. More places to differentiate by
-        come last, and each is a column of its own.
+        Maxwell branches may be given as ``creep``. Indices in ``more`` to differentiate by come
+        last, with a column each.
         """
         given: Creep | None = values.get('creep')
         branches = len(given.ratios) if given else max((
@@ -155,12 +155,12 @@ def respond(
         rtol: float = RTOL, shifts: Array | None = None, more: Sequence[int] = ()
 ) -> Response | None:
     """
-    Simulate what the sensor would have shown; None if the motion meets the limits of the chains.
+    Simulate the reading of the sensor; None if the motion meets the limits of the chains.
 
     The motion begins at rest at its first level, or else with ``initial_stretch`` and
-    ``initial_rate`` at the first sample. Shifts, shape (u,), say by how much in s the uncertain
-    switches are later than recorded; by default half of what they may be earlier. More places of
-    the motion to differentiate by are columns of the Jacobian, after those of the free parameters.
+    ``initial_rate`` at the first sample. ``shifts``, shape (u,), are the delays in s of uncertain
+    switches after their recorded times; default minus half their uncertainty. Indices in ``more``
+    give columns of the Jacobian after those of the free parameters.
     """
     try:
         values = quantities.complete(values, free)
@@ -205,9 +205,9 @@ def sensed(
         values: Mapping[str, float], free: Sequence[str], stretch: Array, rate: Array, by: Array
 ) -> tuple[Array, Array]:
     """
-    Return what the sensor shows of a motion, and its derivatives.
+    Return the reading of the sensor for a motion, and its derivatives.
 
-    Given are those by parameters of the motion; the columns of the sensor's own are filled in.
+    ``by`` contains those by parameters of the motion; columns of sensor parameters are filled in.
     """
     gain = values['stretch_gain']
     by_sensor: dict[str, float | Array] = {

@@ -1,4 +1,4 @@
-"""What an identification has found, as one frozen record."""
+"""Result of an identification, as a frozen record."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -16,7 +16,7 @@ from hmsa_ros.table import Column, Table
 Verdict = Literal['identified', 'not_identifiable', 'model_rejected']
 #: Correlation from which two parameters count as confounded.
 CONFOUNDED = 0.95
-#: Share of a step up to which what a model lacks may be accepted.
+#: Maximum error of the model, relative to a step, that may be accepted.
 ACCEPTABLE = 0.05
 
 
@@ -28,15 +28,15 @@ class Estimate:
     Attributes
     ----------
     value, std : float
-        Value and standard deviation in SI; NaN where the data do not hold it; ``std`` is 0 for
-        one that was not free.
+        Value and standard deviation in SI units; NaN if undetermined; ``std`` is 0 for a parameter
+        that was not free.
     low, high : float
-        Ends of the 95 % interval, which also holds what does not show in the samples, such as
-        a gain of the sensor that nobody gave.
+        Ends of the 95 % interval, which also includes undetectable errors, such as an unknown
+        gain of the sensor.
     unit : str
         In plain text.
     free : bool
-        Whether it was sought.
+        Whether it was estimated.
 
     """
 
@@ -51,20 +51,20 @@ class Estimate:
 @dataclass(frozen=True)
 class Signature:
     """
-    Something that the model leaves out, looked for in the residuals.
+    A departure from the model, tested on the residuals.
 
     Attributes
     ----------
     name : str
-        What it is.
+        Description.
     share : float
-        Share of the residuals' sum of squares that it explains, 0 to 1.
+        Fraction of the residuals' sum of squares that it explains, 0 to 1.
     deviations : float
         Its size in standard deviations.
     found : bool
-        Whether it is there.
+        Whether it is significant.
     remedy : str
-        What to add to the free parameters for it; empty if there is nothing.
+        Parameters to free for it; empty if there are none.
 
     """
 
@@ -78,44 +78,44 @@ class Signature:
 @dataclass(frozen=True, eq=False)
 class Identification:
     """
-    Parameters out of a recording, and how far they can be trusted.
+    Parameters from a recording, with their uncertainty and a verdict.
 
     Attributes
     ----------
     verdict : str
         ``identified``, ``not_identifiable`` or ``model_rejected``.
     reason : str
-        Why, in sentences.
+        Reason for the verdict.
     warnings : tuple of str
-        What else a reader should know.
+        Further information for the reader.
     parameters : dict of str to Estimate
-        By name; numbers that the data do not hold are NaN.
+        Parameters by name; undetermined values are NaN.
     names : tuple of str
         Free parameters, in the order of the covariance.
     covariance : ndarray, shape (p, p)
-        Of their values in SI; NaN where the data do not hold them.
+        Covariance of their values in SI units; NaN if undetermined.
     noise_std : float
         Standard deviation of a sample.
     residual_rms : float
-        Of all residuals, outliers included.
+        RMS of all residuals, including outliers.
     samples, outliers : int
-        How many samples there are, and how many of them did not count.
+        Number of samples, and number of those with zero weight.
     recording : Recording
-        What was measured.
+        The measured data.
     fit : Fit
-        The optimum: simulated stretch, residuals, and how far each sample counted.
+        The optimum: simulated stretch, residuals, and weight of each sample.
     whiteness : Whiteness
         Of the residuals.
     signatures : tuple of Signature
-        What was looked for in the residuals.
+        Departures tested on the residuals.
     widened : float
-        Largest factor by which correlation widened a deviation.
+        Largest factor by which correlation widened a standard deviation.
     values : dict of str to object
-        Of all quantities, and the law, at the optimum, whatever the verdict.
+        Values of all quantities, and the model, at the optimum, for any verdict.
     starts, agreed : int
-        Start values that were tried, and how many of them ended at this optimum.
+        Number of start values, and number of those that converged to this optimum.
     cost : float
-        What the model lacks of the motion, peak to peak, over a step; 0 if nothing shows.
+        Peak-to-peak error of the model relative to a step; 0 if none is significant.
 
     """
 
@@ -141,18 +141,18 @@ class Identification:
 
     @property
     def actuator(self) -> ActuatorParameters:
-        """The block at the optimum; trust it only if the verdict is ``identified``."""
+        """The block at the optimum; use it only if the verdict is ``identified``."""
         return actuator_of(self.values)
 
     @property
     def acceptable(self) -> bool:
-        """Whether what the model lacks is small enough to plan with."""
+        """Whether the error of the model is small enough for plans."""
         return (
             self.verdict == 'model_rejected' and 0.0 < self.cost <= ACCEPTABLE
             and all(math.isfinite(self.parameters[x].std) for x in self.names))
 
     def shown(self, name: str) -> tuple[str, Estimate]:
-        """Return a parameter as readers know it: the modulus of a beam is Young's."""
+        """Return a parameter under its usual name: the modulus of a beam is Young's."""
         label, ratio = modulus_of(self.values.get('law'))
         found = self.parameters[name]
         if name != 'shear_modulus' or label == name:
@@ -178,7 +178,7 @@ class Identification:
             if abs(matrix[i, j]) >= CONFOUNDED]
 
     def report(self) -> Table:
-        """Return the free parameters with their deviations and 95 % intervals."""
+        """Return a table of the free parameters with standard deviations and 95 % intervals."""
         rows = []
         for key in self.names:
             name, x = self.shown(key)
@@ -196,7 +196,7 @@ class Identification:
                   for one, other, x in confounded), *self.warnings))
 
     def record(self) -> dict[str, Any]:
-        """Return what ``hmsa identify --json`` prints, with NaN where that has null."""
+        """Return the output of ``hmsa identify --json``, with NaN for its null."""
         parameters = dict([self.shown('shear_modulus')]) | self.parameters
         return {
             'verdict': self.verdict, 'reason': self.reason, 'warnings': list(self.warnings),

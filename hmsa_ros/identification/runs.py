@@ -1,4 +1,4 @@
-"""Recordings out of bags."""
+"""Recordings from bags."""
 
 import math
 from pathlib import Path
@@ -20,9 +20,9 @@ def read_bag(
     """
     Read the recording of one actuator from a bag: a folder, or an ``.mcap`` file.
 
-    Returned are the recording, with times from the first sample on, the actuator as given or as
-    the planner took it to be, and what the planner knew of the coil. Raises `BadInputError` if
-    there is no bag, or several actuators and none is named.
+    Return the recording, with times from the first sample on, the given or planned actuator, and
+    the planner's parameters of the coil. Raise `BadInputError` if there is no bag, or several
+    actuators and ``joint`` is empty.
     """
     return recording_of(read_run(path, joint=joint), actuator)
 
@@ -30,9 +30,9 @@ def read_bag(
 def recording_of(
         run: Run, actuator: ActuatorParameters | None = None
 ) -> tuple[Recording, ActuatorParameters, dict[str, float]]:
-    """Return the recording that a run is, as `read_bag`; no level is a `BadInputError`."""
+    """Return the recording of a run, as `read_bag`; raise `BadInputError` if it has no level."""
     block = actuator or run.planner
-    # A recorder gets the latched changes of before after the first new one.
+    # A recorder receives earlier latched changes after the first new one.
     levels = run.reported or in_force((x,) for x in without_repeats(run.commands)[0])
     if not levels:
         raise BadInputError(
@@ -41,12 +41,12 @@ def recording_of(
     stamps = np.array([(x.stamp - zero) / NANOSECONDS for x in levels])
     fields = np.array([x.flux_density for x in levels])
     if stamps[0] > 0.0:
-        # Before the first command the field is that of the first sample, as far as it is known.
+        # Before the first command use the field of the first sample, if known.
         field = float(run.flux_density[0])
         stamps = np.append(0.0, stamps)
         fields = np.append(field if math.isfinite(field) else 0.0, fields)
     slew = run.number('planner.slew_limit') or run.number('plant.slew_limit')
-    # Of levels at one time the last one holds.
+    # Of levels at the same time the last one applies.
     keep = np.append(np.diff(stamps) > 0.0, True)
     notes = () if actuator is not None else tuple(
         x.rstrip('.') for x in run.notes if 'unshaped steps' not in x)

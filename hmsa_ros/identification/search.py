@@ -1,4 +1,4 @@
-"""The search for the best fit, from as many starts as it takes, and for others as good."""
+"""Search for the best fit from several starts, and for others that are as good."""
 
 from collections.abc import Mapping, Sequence
 import math
@@ -15,42 +15,41 @@ from hmsa_ros.identification.response import respond, sensed, Setup
 from hmsa_ros.identification.start import at_units, scan, seeks_time, segments, starts, static
 from hmsa_ros.model.equations import Array
 
-# Residuals this near to the scatter of their differences are white enough for a first look.
+# Ratio of residuals to their increments up to which they are white enough for a first check.
 _NEAR_WHITE = 1.5
-# Neighbours that are both outliers, as a share of all, from which on they may be motion.
+# Fraction of samples that are outliers next to outliers, above which they may be motion.
 _ADJACENT = 0.002
-# Simulations for each of the starts; the best one goes on. Once there is a fit, the others get
-# fewer, and the rest only if the loss is within this factor of the best.
+# Simulations for each start; the best fit continues. Once there is a fit, further starts get fewer
+# simulations, and more only if their loss is within this factor of the best.
 _FIRST_PASSES, _FEW_PASSES, _PROMISING = 25, 8, 4.0
-# A time unit seen in the data is tried before the others up to this factor from the given one.
+# A time unit found in the data is tried first if it is within this factor of the given one.
 _FAR = 4.0
-# Outliers so unlikely to lie in motion by chance make a fit one to go on from.
+# Probability that outliers lie in motion by chance, below which a fit is not used.
 _DOUBT = 0.05
-# As many fits at one optimum end the search.
+# Number of fits at one optimum that ends the search.
 _ENOUGH = 2
-# Fits within this share of the deviations, or of the scale, are one optimum.
+# Relative tolerance within which fits are one optimum.
 _SAME = 0.02
-# Fewer samples, or fewer of them a period, may be fitted by several frequencies.
+# With fewer samples, or fewer per period, several frequencies may fit.
 _FEW_SAMPLES, _FEW_A_PERIOD = 200, 2.0
-# Frequencies to start from, the highest in sampling rates, and the share of critical damping.
+# Number of start frequencies, the highest in sampling rates, and the damping ratio.
 _FREQUENCIES, _HIGHEST, _DECAY = 33, 5.0, 0.1
-# Fits whose chi-squared is this much larger at most are rivals, if their frequencies are this
-# factor apart.
+# Maximum excess of chi-squared of a rival fit, and minimum ratio of its frequency.
 _RIVAL, _ANOTHER = 10.0, 1.05
-# Chance of as much motion in samples of an actuator at rest, below which they show some.
+# Probability of such motion in samples of an actuator at rest, below which they show motion.
 _MOVES = 1e-3
 
 
 def _near(found: Fit) -> bool:
-    """Whether a fit came to its end near the motion, whatever did not count."""
+    """Return whether a fit converged near the motion, whatever the outliers are."""
     return found.converged and found.scale < diagnosis.DISTANT * float(
         np.std(found.recording.stretch)) and not diagnosis.mistaken(found, _DOUBT)
 
 
 def _good(found: Fit) -> bool:
-    """Whether a fit leaves little but white noise, and outliers here and there."""
+    """Return whether a fit leaves only white noise and isolated outliers."""
     out = found.weights < 0.5
-    # Of few samples a level even what is far off differs from one to the next.
+    # With few samples per level even large residuals differ from one to the next.
     return _near(found) and bool(
         found.scale < _NEAR_WHITE * robust_scale(np.diff(found.residual)) / math.sqrt(2.0)
         and np.count_nonzero(out[1:] & out[:-1]) <= _ADJACENT * len(out))
@@ -60,9 +59,9 @@ def search(
         recording: Recording, values: Mapping[str, float], free: Sequence[str]
 ) -> tuple[Fit, int, int]:
     """
-    Return the best of the fits, how many there are, and how many ended there.
+    Return the best fit, the number of fits, and how many of them agree with it.
 
-    Raises `BadInputError` if no start leads to a motion.
+    Raise `BadInputError` if no start leads to a motion.
     """
     found: list[Fit] = []
 
@@ -73,10 +72,10 @@ def search(
 
     given = starts(recording, values, free)
     nearest = min((given[0], given[-1]), key=lambda x: _miss(recording, x))
-    # A frequency far from that of the values given may be one of the noise.
+    # A frequency far from that of the given values may be due to noise.
     near = abs(math.log(nearest['time_unit'] / values['time_unit'])) < math.log(_FAR)
     if not near or not tried([nearest]):
-        # All time units, and what else was seen in the data; the likeliest first.
+        # Try all time units and other values found in the data, the most likely first.
         others = [*scan(recording, values, free),
                   *(x for x in given if not near or x is not nearest)]
         tried(sorted(others, key=lambda x: _miss(recording, x)))
@@ -92,7 +91,7 @@ def search(
 
 
 def _best(found: Sequence[Fit]) -> tuple[Fit, int]:
-    """Return the likeliest fit, and how many ended there."""
+    """Return the most likely fit, and the number of fits that agree with it."""
     scale = min(x.scale for x in found)
     losses = [loss(x.residual, scale) for x in found]
     agreed = sum(x < (1.0 + _SAME) * min(losses) for x in losses)
@@ -100,20 +99,20 @@ def _best(found: Sequence[Fit]) -> tuple[Fit, int]:
 
 
 def _promising(found: Sequence[Fit], one: Fit) -> bool:
-    """Whether a fit that has not ended may still become the likeliest."""
+    """Return whether a fit that has not converged may still become the best."""
     best, _ = _best([x for x in found if x.converged] or found)
     return loss(one.residual, best.scale, convex=True) < _PROMISING * loss(
         best.residual, best.scale, convex=True)
 
 
 def _settled(found: Sequence[Fit]) -> bool:
-    """Whether several starts ended at the likeliest fit, though it leaves more than noise."""
+    """Return whether several starts agree on the best fit, even if it leaves more than noise."""
     best, agreed = _best(found)
     return agreed >= _ENOUGH and _near(best)
 
 
 def _miss(recording: Recording, candidate: Mapping[str, float]) -> float:
-    """Return how far the motion of some values is from the recorded one in the mean."""
+    """Return the mean deviation of the simulated from the recorded motion."""
     response = respond(recording, candidate, (), rtol=1e-4)
     return math.inf if response is None else float(
         np.mean(np.abs(recording.stretch - response.stretch)))
@@ -122,7 +121,7 @@ def _miss(recording: Recording, candidate: Mapping[str, float]) -> float:
 def _descended(
         found: list[Fit], recording: Recording, start: Mapping[str, float], free: Sequence[str]
 ) -> bool:
-    """Add the fit from a start, if any; in full where it may become the likeliest."""
+    """Add the fit from a start, if any, in full if it may become the best; return whether."""
     few = any(x.converged for x in found)
     one = fit(recording, start, free, most=_FEW_PASSES if few else _FIRST_PASSES)
     if few and one is not None and not one.converged and _promising(found, one):
@@ -136,8 +135,8 @@ def rivals(best: Fit) -> tuple[Fit, list[Fit]]:
     """
     Return the best fit, and those of other frequencies that are nearly as good.
 
-    Looked for where samples are few, or fewer than two a period: from frequencies all over the
-    range that they could have come from.
+    They are only searched if there are few samples, or fewer than two per period, from frequencies
+    over the whole possible range.
     """
     recording = best.recording
     gap = recording.gap
@@ -168,11 +167,11 @@ def rivals(best: Fit) -> tuple[Fit, list[Fit]]:
 
 def unmoved(best: Fit) -> set[str]:
     """
-    Return what only motion shows, if rest at each level explains the samples as well as motion.
+    Return undetermined parameters, if rest at each level explains the samples as well as motion.
 
-    As well is what the test of Fisher cannot tell apart, of as many frequencies as are tried.
+    The test is Fisher's, corrected for the number of frequencies tried.
     """
-    # Slow to load, and no use to a planner that estimates.
+    # Slow to import, and not needed by a planner that estimates.
     from scipy.special import fdtrc
 
     recording, values = best.recording, best.values

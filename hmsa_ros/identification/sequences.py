@@ -1,4 +1,4 @@
-"""Repeats of a sequence out of recorded runs, and the sequence that is learnt from them."""
+"""Repeats of a sequence from recorded runs, and the learnt sequence."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,8 +20,8 @@ def learn_from(runs: Sequence[Run]) -> tuple[Learnt, list[Target]]:
     Parameters
     ----------
     runs : sequence of Run
-        In their order; the first one with setpoints, each of the others with the levels that were
-        learnt from those before it.
+        Runs in order: the first one with setpoints, each further one with the levels learnt from
+        the previous ones.
 
     Returns
     -------
@@ -57,11 +57,11 @@ def learn_from(runs: Sequence[Run]) -> tuple[Learnt, list[Target]]:
 
 
 def _begin(run: Run) -> int:
-    """Return when the first level of a run took effect, in ns."""
+    """Return the time in ns at which the first level of a run took effect."""
     largest = max((abs(x.flux_density) for x in run.levels), default=0.0)
     asked = run.requests[0].sent if run.requests else int(run.time[0])
     for x in run.levels:
-        # Less is what a device rounds to, or leaves of a core that it compensates.
+        # Smaller levels are due to rounding, or compensate the remanence of a core.
         if abs(x.flux_density) > ROUNDED * largest:
             if x.stamp < asked:
                 break
@@ -72,11 +72,11 @@ def _begin(run: Run) -> int:
 
 
 def _trial(run: Run, begin: int) -> Trial:
-    """Return a repeat, by the time since its first level."""
+    """Return a repeat, with times from its first level."""
     since = (run.time - begin) / NANOSECONDS
     levels = [x for x in run.levels if x.stamp >= begin]
     times = np.array([(x.stamp - begin) / NANOSECONDS for x in levels])
-    # Of levels at one time the last one holds.
+    # Of levels at the same time the last one applies.
     keep = np.append(np.diff(times) > 0.0, True)
     seen = (since >= 0.0) & np.isfinite(run.stretch)
     return Trial(
@@ -85,7 +85,7 @@ def _trial(run: Run, begin: int) -> Trial:
 
 
 def sequence_text(found: Learnt, targets: Sequence[Target], runs: Sequence[Path]) -> str:
-    """Return a learnt sequence as YAML, which ``hmsa run --levels`` takes."""
+    """Return a learnt sequence as YAML for ``hmsa run --levels``."""
     end = targets[-1].end
     rows = [*zip(found.level_times.tolist(), found.levels.tolist(), strict=True),
             (end, float(found.levels[-1]))]
@@ -104,7 +104,7 @@ def levels_in(path: Path) -> list[tuple[float, float]]:
     Raises
     ------
     BadInputError
-        If it is none.
+        If the file contains none.
 
     """
     import yaml

@@ -1,10 +1,10 @@
 """
-Start values out of the data alone: levels at rest, and the spectrum of the ringing.
+Start values from the data alone: levels at rest, and the spectrum of the ringing.
 
-The mean stretch at the end of each level gives the drive and J_lim; a decaying
+The mean stretch at the end of each level gives the drive and J_lim. A decaying
 oscillation fitted after each change of level gives frequency and decay, and with the inertia
-the modulus and the damping. Frequencies above half the rate of the samples appear folded, so
-that several are handed out.
+the modulus and the damping. Frequencies above half the sampling rate are aliased, so that several
+candidates are returned.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,35 +26,35 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.law import EQUILIBRIUM, evaluate, FORCE, pack
 from hmsa_ros.model.units import MU_0
 
-_FEWEST = 6  # samples on a level that may ring
-_FEWEST_AT_REST = 4  # samples before the first change of level that show whether it is at rest
-_BY_CHANCE = 1e-4  # of as much scatter there as is taken for motion
-_MOST_SAMPLES = 150  # of a level that are looked at
+_FEWEST = 6  # minimum samples on a level for ringing
+_FEWEST_AT_REST = 4  # minimum samples before the first change of level to test for rest
+_BY_CHANCE = 1e-4  # probability of scatter there that counts as motion
+_MOST_SAMPLES = 150  # maximum samples of a level to use
 _MOST_LEVELS = 3
 _CHAIN_LIMITS = (1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 15.0, 40.0, 1000.0)
 _FREQUENCIES = 160
 _DECAYS = (0.02, 0.1, 0.3)
-# Of the scan over the time unit: from one on over the other, and samples that count.
+# Scan of the time unit: range, points, damping ratios, and number of samples.
 _SCAN_RANGE, _SCAN_POINTS, _SCAN_DECAYS, _SCAN_SAMPLES = 12.0, 192, (0.05, 0.4), 300
-# Best ones of the scan that are taken of each damping, and the least factor between their time
-# units. Where few samples fall on the ringing, much damping leads there from farther away.
+# Number of best candidates per damping ratio, and minimum ratio of their time units. With few
+# samples in the ringing, strong damping converges from farther away.
 _BEST, _APART = 5, 1.06
-_SHORTEST = 0.02  # time unit in intervals of the samples
+_SHORTEST = 0.02  # minimum time unit, in sampling intervals
 
 
 @dataclass(frozen=True)
 class Static:
-    """What the levels at rest say."""
+    """Properties of the levels at rest."""
 
-    per_tesla: float  # load psi' that 1 T holds, Br/(mu0 G); NaN if nothing came to rest
-    chain_limit: float  # the best of a few
-    # Begin of the level in s, flux density in T, mean stretch at its end.
+    per_tesla: float  # load psi' held by 1 T, Br/(mu0 G); NaN without rest
+    chain_limit: float  # best of several values
+    # Start of the level in s, flux density in T, mean stretch at its end.
     rests: tuple[tuple[float, float, float], ...]
 
 
 def segments(
         recording: Recording, fewest: int = _FEWEST) -> list[tuple[int, int, float, float]]:
-    """Return first and last place, begin in s and flux density of each level with samples."""
+    """Return first and last index, start in s and flux density of each level with samples."""
     times, levels = recording.level_times, recording.levels
     changed = np.flatnonzero(np.append(True, np.diff(levels) != 0.0))
     edges = np.searchsorted(recording.time, np.append(times[changed], math.inf))
@@ -68,7 +68,7 @@ def segments(
 
 
 def deviations(values: Array, parts: NDArray[np.int64]) -> Array:
-    """Return the standard deviations of parts of values from first to last places, shape (n,)."""
+    """Return the standard deviations of parts of values, given by first and last indices."""
     apart = values - np.mean(values)
     begins, ends = parts.T
     sums = np.append(0.0, np.cumsum(apart)), np.append(0.0, np.cumsum(apart ** 2))
@@ -78,8 +78,8 @@ def deviations(values: Array, parts: NDArray[np.int64]) -> Array:
 
 
 def begins_at_rest(recording: Recording) -> bool:
-    """Whether the samples before the first change of level show no motion."""
-    # Slow to load, and no use to a planner that estimates.
+    """Return whether the samples before the first change of level show no motion."""
+    # Slow to import, and not needed by a planner that estimates.
     from scipy.special import fdtri
 
     before = recording.stretch[recording.time <= np.min(recording.changes, initial=math.inf)]
@@ -89,11 +89,11 @@ def begins_at_rest(recording: Recording) -> bool:
                       for begin, end, _, _ in segments(recording, _FEWEST_AT_REST)],
                      np.int64).reshape(-1, 2)
     size = tails[:, 1] - tails[:, 0]
-    # Of white noise second differences have a deviation of sqrt(6).
+    # Second differences of white noise have a standard deviation larger by sqrt(6).
     steps = np.where(size < 2 * _FEWEST_AT_REST, math.inf, deviations(
         np.diff(recording.stretch, 2), tails - np.array([0, 2])) / math.sqrt(6.0))
     quiet = np.minimum(deviations(recording.stretch, tails) * np.sqrt(size / (size - 1.0)), steps)
-    # Of the quietest end of a level; a short one may be quiet by chance.
+    # Use the quietest end of a level, with a margin for short ones that are quiet by chance.
     chance = fdtri(len(before) - 1.0, size - 1.0, 1.0 - _BY_CHANCE)
     allowed = np.maximum(4.0, np.sqrt(chance)) * np.maximum(
         quiet, max(0.5 * recording.quantum, 1e-6))
@@ -108,14 +108,14 @@ def _evaluated(what: int, values: Array, material: Array) -> Array:
 
 def static(
         recording: Recording, values: Mapping[str, float], free: Sequence[str]) -> Static:
-    """Return what the levels at rest say; law and J_lim, unless that is free, are kept."""
+    """Return properties of the levels at rest; the model, and J_lim unless free, are kept."""
     limits = _CHAIN_LIMITS if 'chain_limit' in free else (values['chain_limit'],)
     usual = 5.0 if 'chain_limit' in free else values['chain_limit']
     rests = []
     for begin, end, when, level in segments(recording, 1):
         tail = recording.stretch[begin + (end - begin) * 2 // 3:end]
         rests.append((when, level, median(tail.tolist())))
-    # Each level once: short ones have not come to rest, but ring about it.
+    # Take the median of each level: short ones do not come to rest, but ring about it.
     fields = np.unique([x[1] for x in rests])
     if len(fields) < 2:
         return Static(math.nan, usual, tuple(rests))
@@ -123,7 +123,7 @@ def static(
     low, high = float(np.min(recording.stretch)), float(np.max(recording.stretch))
     best = (math.inf, math.nan, usual)
     group = quantities.group_of(values)
-    # Motion may go further than what can be held, but not where there is no force.
+    # Motion may exceed the range that can be held, but not that of the force.
     ends = group.rest + 1.002 * (np.array([low, high]) - group.rest)
     shape = np.full(len(limits), group.c1)
     for limit, material in zip(
@@ -143,10 +143,10 @@ def static(
 def ringing(recording: Recording, rests: Sequence[tuple[float, float, float]]) -> list[
         tuple[float, float, float]]:
     """
-    Return candidates of frequency (rad/s), decay (1/s) and the stretch that it rings about.
+    Return candidates of frequency (rad/s), decay (1/s) and the stretch of equilibrium.
 
-    For each frequency and decay of a grid the amplitude follows by least squares; how much of
-    the motion they explain is added up over the levels, in units of the frequency at rest.
+    For each frequency and decay of a grid, least squares give the amplitude; the explained part of
+    the motion is summed over the levels, relative to the frequency at rest.
     """
     means = {when: mean for when, _, mean in rests}
     spans = [x for x in segments(recording) if x[2] in means]
@@ -192,7 +192,7 @@ def _oscillations(t: Array, y: Array) -> list[tuple[float, float, float]]:
 def starts(
         recording: Recording, values: Mapping[str, float], free: Sequence[str]
 ) -> list[dict[str, float]]:
-    """Return start values, the likeliest first; the values given come last."""
+    """Return start values, the most likely first; the given values come last."""
     given = dict(values)
     if 'stretch_gain' in free:
         given['stretch_gain'] = 1.0
@@ -220,9 +220,9 @@ def scan(
         recording: Recording, values: Mapping[str, float], free: Sequence[str]
 ) -> list[dict[str, float]]:
     """
-    Return start values by trying time units and dampings on the first of the data.
+    Return start values from trials of time units and damping ratios on the first part of the data.
 
-    That finds them where nothing rings, or where the samples are too few to see it.
+    They succeed without ringing, or with too few samples to resolve it.
     """
     found = static(recording, values, free)
     changes = np.searchsorted(recording.time, recording.level_times)
@@ -234,7 +234,7 @@ def scan(
     tried: list[tuple[float, float, dict[str, float]]] = []
     timed = seeks_time(values, free)
     factors = np.geomspace(1.0 / _SCAN_RANGE, _SCAN_RANGE, _SCAN_POINTS) if timed else np.ones(1)
-    # Once each: samples far apart make many of them the shortest.
+    # Without duplicates: at low sampling rates many equal the shortest.
     units = np.unique(np.maximum(factors * values['time_unit'], shortest))
     for decay in _SCAN_DECAYS if 'damping_coefficient' in free else (0.0,):
         for candidate in at_units(values, free, units, decay, found):
@@ -254,7 +254,7 @@ def scan(
 def at_units(
         values: Mapping[str, float], free: Sequence[str], units: Array, decay: float,
         found: Static) -> list[dict[str, float]]:
-    """Return start values of time units in s, and of a share of critical damping about rest."""
+    """Return start values for time units in s, and a damping ratio about rest."""
     group = quantities.group_of(values)
     critical = float(equations.critical_zeta(group.rest, group))
     candidates = [_candidate(values, free, x, found) for x in units.tolist()]
@@ -266,12 +266,12 @@ def at_units(
 
 
 def seeks_time(values: Mapping[str, Any], free: Sequence[str]) -> bool:
-    """Whether a free parameter sets the time unit."""
+    """Return whether a free parameter changes the time unit."""
     return bool({'shear_modulus', 'density', 'time_unit', *_stresses(values)}.intersection(free))
 
 
 def _stresses(values: Mapping[str, Any]) -> list[str]:
-    """Return the constants of the law that make its modulus."""
+    """Return the constants of the model that determine its modulus."""
     return [x for x, (constant, _) in quantities.constants_of(values.get('law')).items()
             if constant.unit == 'Pa']
 
@@ -279,7 +279,7 @@ def _stresses(values: Mapping[str, Any]) -> list[str]:
 def _candidate(
         given: Mapping[str, float], free: Sequence[str], unit: float, found: Static
 ) -> dict[str, float]:
-    """Return values with a time unit and what the levels at rest say."""
+    """Return values with a time unit and the properties of the levels at rest."""
     values = dict(given)
     if 'chain_limit' in free:
         values['chain_limit'] = found.chain_limit

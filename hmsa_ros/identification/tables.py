@@ -1,4 +1,4 @@
-"""Recordings out of CSV files, with what is wrong in them said."""
+"""Recordings from CSV files, with notes and errors."""
 
 import math
 from pathlib import Path
@@ -12,20 +12,21 @@ from hmsa_ros.identification.recording import FEWEST, Recording
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import Coordinate, STRETCH
 
-# Of what is left out: more than this is not a few bad rows.
+# Maximum fraction of rows to leave out.
 _MOST_LEFT_OUT = 0.2
-# A jump of the stamps this many intervals long is said; a level for nearly every sample is a
-# measured field.
+# Interval, in median ones, above which a gap is noted; and ratio of levels to samples above which
+# the column is a measured field.
 _GAP = 20.0
-# As many rows in order on either side of a jump back by so many intervals are a clock set back.
+# A clock was set back if this many rows are in order on either side of a jump back by this many
+# intervals.
 _RUN, _OVERTAKEN = 10, 3.0
 _MEASURED_FIELD = 0.3
 _FEW_LEVELS = 8
-# More unknown times of switches than this take too long.
+# Maximum number of unknown switching times, for speed.
 _MOST_SWITCHES = 300
-# Times further apart, in s, are of clocks that began at different times.
+# Difference of times, in s, above which clocks started at different times.
 _ANOTHER_CLOCK = 1e8
-# Levels whose times fit the motion so much better in another unit are in that unit.
+# Units of levels to test, and the improvement of the fit of the motion that shows another unit.
 _OTHER_UNITS = {1e3: 'ms', 1e6: 'us', 1e9: 'ns'}
 _BETTER = 0.5
 
@@ -34,8 +35,8 @@ def read_levels(path: Path) -> tuple[Array, Array, tuple[str, ...]]:
     """
     Read the levels of the field from CSV: times in s, flux densities in T, and notes.
 
-    The columns are ``time`` (s) and ``flux_density`` (T); each level holds from its time on.
-    `BadInputError` says why a file cannot be used.
+    The columns are ``time`` (s) and ``flux_density`` (T); each level applies from its time on.
+    Raise `BadInputError` if the file cannot be used.
     """
     table = read_table(path, ('time', 'flux_density'))
     if not len(table.lines):
@@ -47,7 +48,7 @@ def read_levels(path: Path) -> tuple[Array, Array, tuple[str, ...]]:
         raise BadInputError(
             f'{path} line {table.lines[back[0] + 1]} goes back in time from '
             f'{times[back[0]]:.9g} to {times[back[0] + 1]:.9g} s: expected increasing times')
-    # Of levels at one time the last one holds.
+    # Of levels at the same time the last one applies.
     keep = np.append(np.diff(times) > 0.0, True)
     return times[keep], levels[keep], table.notes
 
@@ -56,11 +57,11 @@ def read_csv(
         path: Path, commands: Path | None = None, *, slew_limit: float = math.inf,
         coordinate: Coordinate = STRETCH) -> Recording:
     """
-    Read a recording from CSV, with notes on what was left out.
+    Read a recording from CSV, with notes on rows that were left out.
 
-    It has the columns ``time`` (s) and ``stretch``, and ``flux_density`` (T) where there is no
-    other file with the levels; that has ``time`` and ``flux_density``, in force from that time on.
-    `BadInputError` says what cannot be used, got and expected.
+    The columns are ``time`` (s) and ``stretch``, and ``flux_density`` (T) unless another file
+    contains the levels as ``time`` and ``flux_density``, which apply from that time on. Raise
+    `BadInputError` if a file cannot be used.
     """
     own = () if commands is not None else ('flux_density',)
     table = read_table(path, ('time', 'stretch', *own), kind='a CSV or the folder of a bag')
@@ -84,21 +85,21 @@ def read_csv(
                 f'{commands} begins at {times[0]:.9g} s, after the last sample of {path} at '
                 f'{time[-1]:.9g} s: expected times of one clock')
         if times[0] > time[0]:
-            # As a coil is before anybody commands it.
+            # The field is zero before the first command.
             times, levels = np.append(time[0], times), np.append(0.0, levels)
             notes.append(f'before the first level at {times[1]:.6g} s the field is taken to be 0')
         earlier = 0.0
     else:
         times, levels, earlier = _sampled_levels(
             path, time, table.columns['flux_density'][keep], notes)
-    # From the first sample on: seconds of an epoch leave no digits for what happens between.
+    # Subtract the first time: seconds since an epoch leave few digits for differences.
     return Recording(
         time - time[:1], stretch, times - time[:1], levels, slew_limit, earlier, str(path),
         tuple(notes), coordinate)
 
 
 def _kept(path: Path, table: Table, notes: list[str]) -> NDArray[np.int64]:
-    """Return the rows that can be used, by time, and note the others; refuse too many of them."""
+    """Return the usable rows by time, and note the others; raise an error if too many are lost."""
     time, stretch = table.columns['time'], table.columns['stretch']
     places: NDArray[np.int64] = np.flatnonzero(np.isfinite(time) & np.isfinite(stretch))
     lost = len(time) - len(places)
@@ -125,13 +126,13 @@ def _kept(path: Path, table: Table, notes: list[str]) -> NDArray[np.int64]:
 def _ordered(
         path: Path, table: Table, places: NDArray[np.int64], notes: list[str]
 ) -> NDArray[np.int64]:
-    """Return rows sorted by time, as points of a figure need; refuse a clock that was set back."""
+    """Return rows sorted by time; raise `BadInputError` if a clock was set back."""
     time = table.columns['time'][places]
     steps = np.diff(time)
     back = np.flatnonzero(steps < 0.0)
     if not len(back):
         return places
-    # Samples in order before and after, and more than frames that overtook each other.
+    # Samples in order before and after, beyond frames that overtook each other.
     runs = np.diff(np.concatenate([[0], back + 1, [len(time)]]))
     usual = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else math.inf
     clock = back[(np.minimum(runs[:-1], runs[1:]) >= _RUN) & (-steps[back] > _OVERTAKEN * usual)]
@@ -151,9 +152,9 @@ def _ordered(
 def _check_units(
         path: Path, time: Array, stretch: Array, commands: Path, times: Array, levels: Array
 ) -> None:
-    """Refuse times of samples and of levels that are in different units."""
+    """Raise `BadInputError` if times of samples and of levels have different units."""
     def unexplained(factor: float) -> float:
-        # How much of the motion is left when each level has a mean of its own.
+        # Variance that remains if each level has its own mean.
         place = np.searchsorted(factor * times, time, side='right') - 1
         _, group = np.unique(np.where(place < 0, 0.0, levels[place]), return_inverse=True)
         mean = np.bincount(group, stretch) / np.bincount(group)
@@ -173,7 +174,7 @@ def _check_units(
 def _sampled_levels(
         path: Path, time: Array, field: Array, notes: list[str]
 ) -> tuple[Array, Array, float]:
-    """Return the levels of a column beside the samples, and how much earlier they may be."""
+    """Return the levels of a column of the samples, and the uncertainty of their times."""
     good = np.isfinite(field)
     if not np.all(good):
         raise BadInputError(
