@@ -1,9 +1,9 @@
 """
-Which verdict of a planner answers which request, as far as a recording shows it.
+Matching of a planner's verdicts to the requests in a recording.
 
-A request with a name is answered by that. One without is answered by the nearest verdict that
-says something new: of a request that came just before it was planned, or just after it, since a
-recorder may receive a planner's answer before the request itself.
+Requests with a name are matched by it. Others are matched to the nearest verdict with new content:
+of requests shortly before it was planned, or shortly after, since a recorder may receive a
+planner's answer before the request itself.
 """
 
 from bisect import bisect_left
@@ -13,28 +13,28 @@ from typing import Protocol
 from hmsa_ros.model.status import Code
 from hmsa_ros.recordings.record import Verdict
 
-# In ns: by how much later a message may be recorded than one that was sent after it.
+# In ns: maximum delay of recording relative to a message sent later.
 _LATE = 50_000_000
-# In ns: the longest that a request is planned.
+# In ns: maximum duration of planning.
 _PLANNED = 2_000_000_000
-# Of requests that leave the plan as it is, beside those that are refused.
+# Codes of verdicts that leave the plan unchanged, besides errors.
 _IDLE = {Code.UNCHANGED.value, Code.SUPERSEDED.value}
 
 
 class Request(Protocol):
-    """A request: when it was recorded, in ns, and its name, if it has one."""
+    """A request: the time of recording, in ns, and its name, if any."""
 
     @property
     def sent(self) -> int:
-        """When it was recorded."""
+        """Time of recording in ns."""
 
     @property
     def name(self) -> str:
-        """Its name, empty if it has none."""
+        """Name, empty if there is none."""
 
 
 def beginning(verdicts: Iterable[Verdict], number: int = 0) -> Iterator[Verdict]:
-    """Yield the first verdict on each new plan; a planner that starts anew counts from 0."""
+    """Yield the first verdict on each new plan; after a restart, a planner counts from 0."""
     for verdict in verdicts:
         if verdict.plan not in (0, number):
             yield verdict
@@ -43,10 +43,10 @@ def beginning(verdicts: Iterable[Verdict], number: int = 0) -> Iterator[Verdict]
 
 def plans_of(verdicts: Sequence[Verdict], plans: Sequence[int]) -> dict[int, int]:
     """
-    Return the plans that were published right before a verdict, where only records are known.
+    Return the plans that were published right before a verdict, if only recording times are known.
 
-    Both by time; plans are given by when they were recorded, in ns, and so are the verdicts
-    returned. The first verdict may be of a plan of before the recording.
+    Both are ordered by time. Plans are given by their recording time, in ns, as are the returned
+    verdicts. The first verdict may belong to a plan from before the recording.
     """
     found: dict[int, int] = {}
     for verdict in beginning(verdicts, verdicts[0].plan if verdicts else 0):
@@ -60,9 +60,9 @@ def answered(
         requests: Sequence[Request], verdicts: Sequence[Verdict],
         ) -> tuple[list[tuple[Verdict | None, bool]], list[Verdict]]:
     """
-    Return each request's answer and whether it was taken, and the verdicts on other new plans.
+    Return the answer of each request and whether it was accepted, and verdicts on other new plans.
 
-    Both are given by time. A request without an answer was taken if nothing came after it.
+    Both are ordered by time. A request without an answer was accepted if nothing came after it.
     """
     begun = list(beginning(verdicts))
     new = {x.sent: x for x in begun}
@@ -86,13 +86,13 @@ def answered(
             claimed.add(answer.sent)
             found.append((answer, answer.sent in new if begun else answer.level != 'error'))
         else:
-            # Without numbers of plans, news of a request before look like an answer.
+            # Without plan numbers, repeats of an earlier verdict look like an answer.
             found.append((None, answer.level != 'error'))
     return found, [x for x in begun if x.sent not in claimed and x is not verdicts[0]]
 
 
 def _answers(verdicts: Sequence[Verdict], new: Collection[int]) -> Iterator[Verdict]:
-    """Yield the verdicts that may answer a request; the times of those on new plans are known."""
+    """Yield the verdicts that may answer a request; ``new`` are times of those on new plans."""
     before: Verdict | None = None
     for verdict in verdicts:
         fresh = before is None or (verdict.code, verdict.message) != (before.code, before.message)
@@ -105,7 +105,7 @@ def _answers(verdicts: Sequence[Verdict], new: Collection[int]) -> Iterator[Verd
 def _nearest(
         times: Sequence[int], time: int, before: int, after: int, without: Container[int],
         ) -> int | None:
-    """Return the nearest of some increasing times within a span of another; None if none is."""
+    """Return the time nearest to another within a range, without some; None if there is none."""
     begin, end = bisect_left(times, time - before), bisect_left(times, time + after)
     return min((x for x in times[begin:end] if x not in without),
                key=lambda x: abs(x - time), default=None)

@@ -1,8 +1,8 @@
 """
-Runs, read from a bag.
+Reading of runs from a bag.
 
-Topics are found by the end of their name and their type, so that any namespace will do; the
-bag may come from this package's recorder, from rosbag2, from a simulated plant or from a coil.
+Topics are found by the end of their name and their type, so that any namespace is possible. The
+bag may be recorded by this package or rosbag2, from a simulated plant or a coil.
 """
 
 from bisect import bisect_left, bisect_right
@@ -27,10 +27,10 @@ from hmsa_ros.recordings.record import LearntSensor, RecordedRequest, Run, Verdi
 from hmsa_ros.recordings.samples import nanoseconds_of, SampleReader
 from hmsa_ros.recordings.topics import topics_by_joint
 
-# Between two calls of the progress.
+# Messages between two calls of the progress callback.
 _PROGRESS_MESSAGES = 20_000
 _MOST_NOTES = 20
-# In ns, between what a planner published and the next, so that a request fits between.
+# In ns, minimum time between messages of a planner, so that a request fits in between.
 _APART = 2
 _LEVELS = ('ok', 'warning', 'error')
 
@@ -47,20 +47,20 @@ def read_runs(
     path : str or Path
         Folder of a bag, or an ``.mcap`` file.
     parameters : mapping of str to object, optional
-        What the block and its coil really are, as `read_parameter_file` returns it; default
-        what the bag contains.
+        True parameters of the block and its coil, from `read_parameter_file`; default those in
+        the bag.
     joints : sequence of str
-        Names of the actuators in the joint states; default all that have commands of their own,
-        or the one that the nodes name.
+        Names of the actuators in the joint states; default all that have their own commands, or
+        the one that the nodes name.
     max_chunk_size : int
         As for `BagReader`.
     progress : callable
-        Called with what is going on and the share that is done.
+        Called with a description of the work and the completed fraction.
 
     Returns
     -------
     list of Run
-        At least one, in order of namespace and joint.
+        At least one, ordered by namespace and joint.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def read_runs(
                 except BadInputError as error:
                     reasons.append(error)
     if not runs:
-        # What was left out may be the reason.
+        # Skipped messages may be the reason.
         notes = [x for each in collected.values() for x in each.notes]
         raise BadInputError('; '.join([str(reasons[0]), *notes[:1]]))
     return runs
@@ -101,7 +101,7 @@ def read_runs(
 def read_run(
         path: Path, *, joint: str = '',
         progress: Callable[[str, float], None] = lambda what, share: None) -> Run:
-    """Read the one run of a bag, as `read_runs`; several of them are a `BadInputError`."""
+    """Read the single run of a bag, as `read_runs`; raise `BadInputError` if there are several."""
     runs = read_runs(path, joints=[joint] if joint else [], progress=progress)
     if len(runs) > 1:
         raise BadInputError(
@@ -114,7 +114,7 @@ def _collect(
         reader: BagReader, spaces: Mapping[str, Mapping[str, Mapping[str, str]]],
         progress: Callable[[str, float], None]) -> 'dict[str, _Collected]':
     """Read all messages of some topics, by namespace."""
-    # A namespace's own topics, and in it those of each joint.
+    # The topics of a namespace, and those of each joint in it.
     found = {topic: (space, role, joint) for space, by_joint in spaces.items()
              for joint, topics in by_joint.items() for role, topic in topics.items()}
     decoders: dict[str, Callable[[bytes], Any]] = {}
@@ -140,7 +140,7 @@ def _collect(
 class _Point:
     """A point of a trajectory: time from its start in ns, and values by joint."""
 
-    time: int | None  # None for a setpoint that is held until the next
+    time: int | None  # None if held until the next setpoint
     positions: tuple[float, ...]
     velocities: tuple[float, ...]
     effort: tuple[float, ...]
@@ -148,18 +148,18 @@ class _Point:
 
 @dataclass(frozen=True)
 class _Trajectory:
-    """A request or a plan as it was received, with its stamp in ns."""
+    """A request or a plan as received, with its timestamp in ns."""
 
     sent: int
     joints: tuple[str, ...]
     stamp: int
     points: tuple[_Point, ...]
     name: str  # of the request, if it has one
-    taken: bool = True  # whether it is not known that the planner refused it
+    taken: bool = True  # False if the planner is known to have refused it
 
     @classmethod
     def of(cls, sent: int, message: Any) -> '_Trajectory':
-        """Take it from a message."""
+        """Return the trajectory in a message."""
         return cls(sent, tuple(message.joint_names), nanoseconds_of(message.header.stamp), tuple(
             _Point(nanoseconds_of(x.time_from_start), *(
                 tuple(map(float, y)) for y in (x.positions, x.velocities, x.effort)))
@@ -167,7 +167,7 @@ class _Trajectory:
 
 
 class _Collected:
-    """What has been read of the actuators of one namespace so far; dictionaries are by joint."""
+    """Data read so far for the actuators of one namespace; dictionaries are by joint."""
 
     def __init__(self) -> None:
         self.samples = SampleReader()
@@ -175,14 +175,14 @@ class _Collected:
         self.applied: defaultdict[str, list[Level]] = defaultdict(list)
         self.forces: defaultdict[str, list[tuple[int, int, float]]] = defaultdict(list)
         self.refused = Counter[str]()
-        # Of all joints; plans and verdicts are known once they are in order.
+        # Of all joints; plans and verdicts are assigned after sorting.
         self.plans: list[_Trajectory] = []
         self.requests: list[_Trajectory] = []
-        self.stops: list[int] = []  # when plans without a request were recorded
+        self.stops: list[int] = []  # recording times of plans without a request
         self.verdicts: list[Verdict] = []
-        # Plans and verdicts, and when each was published, by the clock of the planner.
+        # Plans and verdicts, with the time of publishing by the planner's clock.
         self.published: list[tuple[int, _Trajectory | Verdict]] = []
-        # With the joint that each is of.
+        # With the joint of each.
         self.sensors: list[tuple[str, LearntSensor]] = []
         self.notes: list[str] = []
         self.left_out = 0
@@ -190,11 +190,11 @@ class _Collected:
     def take(
             self, role: str, joint: str, message: Message,
             decode: Callable[[bytes], Any]) -> None:
-        """Take in a message, or count and note it if it is not what its topic is for."""
+        """Add a message, or count and note it if it does not fit its topic."""
         try:
             self._take(role, joint, message, decode(message.data))
         except (AttributeError, TypeError, ValueError, OverflowError, BagError) as error:
-            # The bag brings the definition along, and may call anything by that name.
+            # The bag contains the definition, which may be anything.
             reason = str(error) if isinstance(error, BagError) else (
                 f'a message of topic {message.topic} is not as {roles.TYPES[role]} is defined in '
                 f'ROS 2: {error}')
@@ -240,11 +240,11 @@ class _Collected:
 
     def order(self) -> None:
         """
-        Put plans and verdicts in the order in which the planner published them.
+        Sort plans and verdicts into the order in which the planner published them.
 
-        Both are latched: whoever subscribes receives old ones, perhaps after what is new. They
-        count as received no later than what was published after them, and no two at one time:
-        between two ticks of a clock everything is recorded at the same.
+        Both are latched: new subscribers receive old ones, perhaps after newer ones. Each counts
+        as received no later than those published after it, and all at different times, although
+        everything between two ticks of a clock is recorded at the same time.
         """
         if all(time in (0, x.sent) for time, x in self.published):
             self._pair()
@@ -260,7 +260,7 @@ class _Collected:
         self._answer(times)
 
     def _pair(self) -> None:
-        """Put plans right before their verdicts where only times of recording are known."""
+        """Put plans right before their verdicts if only recording times are known."""
         verdicts = sorted(
             (x for _, x in self.published if isinstance(x, Verdict)), key=lambda x: x.sent)
         before = answers.plans_of(verdicts, sorted(
@@ -271,10 +271,10 @@ class _Collected:
 
     def _answer(self, times: Sequence[int]) -> None:
         """
-        Find out which requests were taken, and put each right before its own plan and verdict.
+        Determine which requests were accepted, and put each right before its plan and verdict.
 
-        A recorder may receive a request after them, and latched news of an earlier one after it.
-        The times are those of all plans and verdicts, in order.
+        A recorder may receive a request after them, and a latched earlier verdict after it.
+        ``times`` are those of all plans and verdicts, in order.
         """
         plans = {x.sent for x in self.plans}
 
@@ -300,7 +300,7 @@ class _Collected:
             self.requests[i] = replace(request, sent=sent, taken=taken)
 
     def _plans(self, joint: str) -> Iterator[tuple[Level, ...]]:
-        """Return the plans of a joint, or of the one that they are of."""
+        """Return the plans of a joint, or those without joint names."""
         for plan in self.plans:
             place = _place(plan.joints, joint)
             if place is None:
@@ -311,7 +311,7 @@ class _Collected:
                 for x in plan.points
                 if min(len(x.positions), len(x.velocities), len(x.effort)) > place]
             if len(plan.joints) > 1:
-                # There is a point wherever one of them changes, from what is in force on.
+                # The plan has a point for each change of any joint, from the present levels on.
                 first = bisect_right(levels, plan.sent, key=lambda x: x.stamp)
                 levels = levels[max(first - 1, 0):]
                 levels = [x for i, x in enumerate(levels) if i == 0
@@ -319,7 +319,7 @@ class _Collected:
             yield tuple(levels)
 
     def _requests(self, joint: str) -> Iterator[RecordedRequest]:
-        """Return what was asked of a joint, by time."""
+        """Return the requests for a joint, by time."""
         for asked in sorted(self.requests, key=lambda x: x.sent):
             place = _place(asked.joints, joint)
             if place is not None:
@@ -336,7 +336,7 @@ class _Collected:
     def finish(
             self, label: str, reader: BagReader, summary: BagSummary, topics: Mapping[str, str],
             given: Mapping[str, object], key: str, joint: str) -> Run:
-        """Return the run of one joint, whose topics have its name in them or not."""
+        """Return the run of one joint, with or without the joint's name in the topics."""
         states = topics[roles.JOINT_STATES]
         parameters = recorded(reader.custom_data, states[:-len(roles.JOINT_STATES)])
         planned = [x for plan in self.plans for x in plan.joints]
@@ -379,7 +379,7 @@ class _Collected:
 
 
 def _begun(levels: Sequence[Level], first: int) -> tuple[Level, ...]:
-    """Return what took effect, where time 0 is before a recording whose first sample is given."""
+    """Return the changes that took effect; time 0 means before the first sample."""
     known = any(0 < x.stamp <= first for x in levels)
     return tuple(
         x if x.stamp else replace(x, stamp=min(x.sent, first)) for x in levels
@@ -387,7 +387,7 @@ def _begun(levels: Sequence[Level], first: int) -> tuple[Level, ...]:
 
 
 def _place(names: Sequence[str], joint: str) -> int | None:
-    """Return a joint's place among some names: the first if it does not matter."""
+    """Return the index of a joint among names; the first if there are no names or no joint."""
     if joint in names:
         return list(names).index(joint)
     return 0 if not joint or not names else None

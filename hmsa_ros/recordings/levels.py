@@ -11,9 +11,9 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.schedule import CommandSchedule, Superseding
 from hmsa_ros.model.units import NANOSECONDS
 
-#: By how much hardware may round a level, as a share of the largest.
+#: Maximum rounding error of a level by the hardware, relative to the largest.
 ROUNDED = 1e-3
-#: By how much the clock of a device may be off in the stamps of what took effect, in ns.
+#: Maximum clock error of a device in reported timestamps, in ns.
 ROUNDED_STAMP = 100_000
 
 
@@ -21,15 +21,15 @@ ROUNDED_STAMP = 100_000
 class Level:
     """A command, or a change of level in a plan."""
 
-    stamp: int  # time in ns from which it applies
+    stamp: int  # start time in ns
     flux_density: float  # in T
-    sent: int  # time in ns at which it was recorded
-    stretch: float = math.nan  # predicted at the stamp; NaN for a command
-    rate: float = math.nan  # likewise, in 1/s
+    sent: int  # recording time in ns
+    stretch: float = math.nan  # predicted at the timestamp; NaN for a command
+    rate: float = math.nan  # predicted at the timestamp, in 1/s
 
 
 def in_force(messages: Iterable[Sequence[Level]]) -> tuple[Level, ...]:
-    """Return the levels left when each message has superseded all at or after its first stamp."""
+    """Return the remaining levels; each message replaces all at or after its first timestamp."""
     levels: Superseding[Level] = Superseding()
     for message in messages:
         for level in sorted(message, key=lambda x: x.stamp):
@@ -38,13 +38,13 @@ def in_force(messages: Iterable[Sequence[Level]]) -> tuple[Level, ...]:
 
 
 def held_at(levels: Sequence[Level], stamps: NDArray[np.int64]) -> Array:
-    """Return the level in T, of those by stamp, in force at stamps in ns; NaN before the first."""
+    """Return the level in T at timestamps in ns, for levels by time; NaN before the first."""
     place = np.searchsorted([x.stamp for x in levels], stamps, side='right')
     return np.array([math.nan, *(x.flux_density for x in levels)])[place]
 
 
 def without_repeats(commands: Sequence[Level]) -> tuple[tuple[Level, ...], int]:
-    """Return the commands that change something, and the number of those that change nothing."""
+    """Return the commands that change the level, and the number of those that do not."""
     schedule = CommandSchedule(math.nan)
     kept = tuple(x for x in commands if schedule.insert(x.stamp, x.flux_density))
     return kept, len(commands) - len(kept)
@@ -53,21 +53,21 @@ def without_repeats(commands: Sequence[Level]) -> tuple[tuple[Level, ...], int]:
 def lateness_of(
         commands: Sequence[Level], applied: Sequence[Level], last: int) -> tuple[Array, int]:
     """
-    Return how long after its stamp each command took effect, and how many never did.
+    Return the lateness of each command, and the number of commands that never took effect.
 
-    The lateness is in s, one for each command as `without_repeats` returns them: NaN for one that
-    never took effect, empty if nobody reported what took effect. The number is of the changes of
-    level that were due before ``last`` (ns), not superseded, and never took effect.
+    The lateness is in s, for each command from `without_repeats`: NaN for one that never took
+    effect, empty if changes were not reported. The number counts changes of level that were due
+    before ``last`` (ns), were not replaced, and never took effect.
     """
     if not applied:
         return np.empty(0), 0
     result = np.full(len(commands), np.nan)
     unapplied = 0
-    # What was replaced before its time never took effect.
+    # Commands that were replaced before their time never took effect.
     standing = in_force((x,) for x in commands)
     places = {x: i for i, x in enumerate(commands)}
     same = _same_for(commands)
-    # What was in force when the first command was due; applied levels may be older than that.
+    # The level when the first command was due; reported levels may be older.
     begin = standing[0].stamp if standing else 0
     before: Level | None = max(
         (x for x in applied if x.stamp <= begin), key=lambda x: x.stamp,
@@ -86,6 +86,6 @@ def lateness_of(
 
 
 def _same_for(commands: Sequence[Level]) -> Callable[[Level, Level], bool]:
-    """Return what says whether hardware may have rounded one of two levels to the other."""
+    """Return a function that tests whether two levels are equal up to rounding by hardware."""
     rounding = ROUNDED * max((abs(x.flux_density) for x in commands), default=0.0)
     return lambda one, other: abs(one.flux_density - other.flux_density) <= rounding

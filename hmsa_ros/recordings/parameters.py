@@ -1,4 +1,4 @@
-"""Parameters of a run: as a recorder stored them, or from a parameter file of the nodes."""
+"""Parameters of a run, from a recording or from a parameter file of the nodes."""
 
 from collections.abc import Iterable, Iterator, Mapping
 import json
@@ -16,15 +16,15 @@ from hmsa_ros.interfaces.topics import PLANNER, PLANT
 from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 
-# Parameter files have some dozens of entries.
+# Parameter files have a few dozen entries.
 _LARGEST_FILE = 1 << 20
 
-#: Node, dotted name and value of each parameter in a file; no node if all are meant.
+#: Node, dotted name and value of each parameter in a file; the node is empty for all nodes.
 Entries = list[tuple[str, str, object]]
 
 
 def of_joint(parameters: Mapping[str, object], joint: str, name: str) -> object:
-    """Return what is set for one joint, or else for all; None for what is not set."""
+    """Return the value for one joint, or else for all; None if it is not set."""
     node, _, parameter = name.partition('.')
     own = parameters.get(f'{node}.{joint}.{parameter}')
     return parameters.get(name) if own is None else own
@@ -43,7 +43,7 @@ def recorded(custom_data: Mapping[str, str], space: str) -> dict[str, object]:
 
 
 def named_joint(parameters: Mapping[str, object]) -> str:
-    """Return the joint that the nodes of a single one name; empty if they do not."""
+    """Return the joint name in the parameters of nodes with one joint; empty if there is none."""
     for node in (PLANT, PLANNER):
         several = parameters.get(f'{node}.joints')
         if isinstance(several, list) and several:
@@ -57,13 +57,12 @@ def actuators(
         parameters: Mapping[str, object], given: Mapping[str, object], joint: str
 ) -> tuple[ActuatorParameters, ActuatorParameters, bool, list[str]]:
     """
-    Return the block of the plant and of the planner, whether they are known, and notes.
+    Return the blocks of plant and planner, whether they are known, and notes.
 
-    Raises `BadInputError` if the parameters given are of an actuator whose position is another
-    quantity.
+    Raise `BadInputError` if the given parameters belong to an actuator with another kind of
+    position.
     """
-    # What is given in a parameter file is what the block really is. The example block is taken
-    # where nothing is known.
+    # Given parameters are those of the real block. Without any parameters, use the example block.
     found: dict[str, ActuatorParameters] = {}
     notes = []
     for node in (PLANT, PLANNER):
@@ -108,14 +107,14 @@ def actuators(
 
 
 def creep_of(parameters: Mapping[str, object], joint: str, node: str = PLANT) -> Creep:
-    """Return the Maxwell branches of the plant of a run, or those that its planner knows."""
+    """Return the viscoelastic branches of the plant or of the planner of a run."""
     return creep_from(_own(parameters, joint, node, shared.VISCOELASTIC))
 
 
 def _own(
         parameters: Mapping[str, object], joint: str, node: str, specs: Iterable[ParameterSpec]
 ) -> dict[str, Any]:
-    """Return what is set of some parameters, for a joint or for all."""
+    """Return the values that are set for some parameters, for a joint or for all."""
     found = {x.name: of_joint(parameters, joint, f'{node}.{x.name}') for x in specs}
     return values_of(
         {f'{node}.{name}': value for name, value in found.items()}, node,
@@ -129,12 +128,12 @@ _NAMES = tuple(
 def read_parameter_file(
         path: str | Path, entries: Entries | None = None) -> dict[str, object]:
     """
-    Read a YAML parameter file, or take its entries; return values by ``'node.name'``.
+    Read a YAML parameter file, or use its entries; return values by ``'node.name'``.
 
-    Raises `BadInputError` if the file cannot be read or sets no parameter of the actuator.
+    Raise `BadInputError` if the file cannot be read or sets no parameter of the actuator.
     """
     entries = entries_of(Path(path)) if entries is None else entries
-    # What is meant for all nodes comes first, so that a node's own goes before it.
+    # Parameters for all nodes come first, so that those of a node override them.
     found = {f'{node}.{name}': value for own in (False, True) for node in (PLANNER, PLANT)
              for key, name, value in entries if key == (node if own else '')}
     if not any(name.partition('.')[2].endswith(x.name) for name in found for x in shared.BLOCK):
@@ -148,9 +147,9 @@ def values_of(
         parameters: Mapping[str, object], node: str, specs: Iterable[ParameterSpec]
 ) -> dict[str, Any]:
     """
-    Return a node's values by name: what is set as ``'node.name'``, else the default.
+    Return a node's values by name: those set as ``'node.name'``, else the defaults.
 
-    Raises `BadInputError` if a value is of another type or out of range.
+    Raise `BadInputError` if a value has the wrong type or is out of range.
     """
     return {x.name: x.taken(parameters.get(f'{node}.{x.name}', x.default)) for x in specs}
 

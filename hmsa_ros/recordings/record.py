@@ -1,4 +1,4 @@
-"""The record of a run: what was measured, commanded, planned and known of one actuator."""
+"""Record of a run: measurements, commands, plans and parameters of one actuator."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -28,66 +28,66 @@ Times = NDArray[np.int64]
 class RecordedRequest:
     """A request to the planner."""
 
-    sent: int  # time in ns at which it was recorded
+    sent: int  # recording time in ns
     stamp: int  # start of the sequence in ns; 0 for at once
-    # Stretch, and time in ns from the start until which it lasts; None for a setpoint that is held
-    # until the next.
+    # Stretch, and end time in ns from the start; None for a setpoint that is held until the
+    # next.
     points: tuple[tuple[float, int | None], ...]
-    # End in ns from the start of a path, whose one point is where it ends; None for rests.
+    # End of a path in ns from the start, whose one point is its end; None for setpoints.
     path: int | None = None
-    name: str = ''  # if it has one
-    taken: bool = True  # whether it is not known that the planner refused it
+    name: str = ''  # if any
+    taken: bool = True  # False if the planner is known to have refused it
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the planner said of a request."""
+    """The planner's verdict on a request."""
 
-    sent: int  # time in ns at which it was recorded
+    sent: int  # recording time in ns
     level: str  # ``'ok'``, ``'warning'`` or ``'error'``
     code: str
     message: str
-    plan: int = 0  # number of the request that is carried out, from 1; 0 where not told
-    request: str = ''  # its name, if it has one
+    plan: int = 0  # number of the running request, from 1; 0 if not reported
+    request: str = ''  # name of the request, if any
 
 
 @dataclass(frozen=True)
 class LearntSensor:
-    """What the planner took a sensor to be from a time on."""
+    """The planner's estimate of a sensor from a time on."""
 
-    sent: int  # time in ns at which it was recorded
+    sent: int  # recording time in ns
     sensor: Sensor
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What is known of one actuator in one run; tuples are in the order recorded."""
+    """Data of one actuator in one run; tuples are in recorded order."""
 
-    label: str  # name for people
-    joint: str  # name in the joint states; empty if it is not known
+    label: str  # name for display
+    joint: str  # name in the joint states; empty if unknown
     path: Path  # the bag or table
-    time: Times  # shape (n,), n of at least 1: stamps in ns, increasing
-    logged: Times  # shape (n,): when the samples were recorded, in ns
+    time: Times  # shape (n,), n of at least 1: timestamps in ns, increasing
+    logged: Times  # shape (n,): recording times of the samples in ns
     stretch: Array  # shape (n,)
-    rate: Array  # shape (n,): in 1/s, from the stretch if it was not recorded
-    flux_density: Array  # shape (n,): in T, NaN if it was not recorded
+    rate: Array  # shape (n,): in 1/s, computed from the stretch if not recorded
+    flux_density: Array  # shape (n,): in T, NaN if not recorded
     commands: tuple[Level, ...] = ()
     applied: tuple[Level, ...] = ()  # changes of the field that took effect, as reported
-    forces: tuple[tuple[int, int, float], ...] = ()  # recorded at, stamp (ns), newton
+    forces: tuple[tuple[int, int, float], ...] = ()  # recording time, timestamp (ns), newtons
     plans: tuple[tuple[Level, ...], ...] = ()
     requests: tuple[RecordedRequest, ...] = ()
     verdicts: tuple[Verdict, ...] = ()  # each once
-    stops: tuple[int, ...] = ()  # when plans were recorded for which no request was, in ns
-    sensors: tuple[LearntSensor, ...] = ()  # by time; as given before the first
-    # Of the nodes, by ``'node.name'``
+    stops: tuple[int, ...] = ()  # recording times in ns of plans without a recorded request
+    sensors: tuple[LearntSensor, ...] = ()  # by time; the given sensor applies before
+    # Parameters of the nodes, by ``'node.name'``
     parameters: Mapping[str, object] = field(default_factory=dict)
-    plant: ActuatorParameters = field(default_factory=paper_actuator)  # as it was
-    # As the planner took it to be
+    plant: ActuatorParameters = field(default_factory=paper_actuator)  # true parameters
+    # Parameters used by the planner
     planner: ActuatorParameters = field(default_factory=paper_actuator)
-    parameters_known: bool = False  # else it is the example block
+    parameters_known: bool = False  # if False, those of the example block
     left_out: int = 0  # messages or rows that could not be used
-    notes: tuple[str, ...] = ()  # what a reader should know, one sentence each
-    # Of each role (`hmsa_ros.recordings.topics`)
+    notes: tuple[str, ...] = ()  # information for the reader, one sentence each
+    # Topic names by role (`hmsa_ros.recordings.topics`)
     topics: Mapping[str, str] = field(default_factory=dict)
     summary: 'BagSummary | None' = None  # None for a table
     origin: str = 'recorded'  # or simulated
@@ -102,7 +102,7 @@ class Run:
                 'at least one sample, and increasing times')
 
     def lost(self, *names: str) -> list[str]:
-        """Return how many messages of roles the recorder lost, as ``'3 of /name'``."""
+        """Return the numbers of messages that the recorder lost, as ``'3 of /name'``."""
         counts = {} if self.summary is None else {x.name: x.lost for x in self.summary.topics}
         return [f'{count} of {name}' for x in names
                 if (name := self.topics.get(x)) and (count := counts.get(name))]
@@ -115,9 +115,9 @@ class Run:
     @property
     def reported(self) -> tuple[Level, ...]:
         """
-        What the plant reported as applied, by stamp.
+        Levels that the plant reported as applied, by time.
 
-        None if some of that was lost and there are commands to take instead.
+        Empty if some reports were lost and there are commands to use instead.
         """
         if self.commands and self.lost(APPLIED):
             return ()
@@ -126,10 +126,11 @@ class Run:
     @property
     def levels(self) -> tuple[Level, ...]:
         """
-        Changes of the field in force, by stamp.
+        Changes of the field, by time.
 
-        What the plant reported as applied; else, or where some of that was lost, the commands that
-        were not superseded; else changes of the measured flux density, known to one sample.
+        These are the levels that the plant reported as applied; without complete reports the
+        commands that were not replaced; else changes of the measured flux density, accurate to one
+        sample.
         """
         if reported := self.reported:
             return reported

@@ -1,4 +1,4 @@
-"""Joint states as columns: read, picked by joint, put in order."""
+"""Joint states as columns: reading, selection of a joint, sorting."""
 
 from array import array
 from collections import defaultdict
@@ -11,40 +11,40 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces.parameters import JOINT
 from hmsa_ros.model.units import NANOSECONDS
 
-# Samples may overtake one another on their way; further back goes only a clock, in ns.
+# Maximum step back in time, in ns, due to samples that overtake one another; more is a clock.
 _CLOCK_JUMP = 100_000_000
-# A sample whose stamp is this far from the others' is of another sender, or garbage; in ns.
+# Distance of a timestamp from the others, in ns, above which the sample is invalid.
 _FAR = 30 * 86_400 * NANOSECONDS
-# What lies beyond is no motion of a block, and nothing could be drawn beside it; the rate in 1/s.
+# Larger values are not a motion of a block and cannot be plotted; the rate is in 1/s.
 _LARGEST_STRETCH, _LARGEST_RATE = 1e6, 1e12
 
-#: Of a run, by name, all of shape (n,): see `hmsa_ros.recordings.record.Run`.
+#: Columns of a run by name, of shape (n,); see `hmsa_ros.recordings.record.Run`.
 Columns = dict[str, Any]
 _COLUMNS = ('logged', 'time', 'stretch', 'rate', 'flux_density')
 
 
 def nanoseconds_of(stamp: Any) -> int:
-    """Return a stamp or a duration in ns."""
+    """Return a timestamp or a duration in ns."""
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
-# Names, and how many positions, velocities and efforts.
+# Names, and numbers of positions, velocities and efforts.
 _Shape = tuple[tuple[str, ...], int, int, int]
 
 
 class SampleReader:
-    """Reads joint states, of all joints and shapes."""
+    """Reader of joint states with any joints and shapes."""
 
     def __init__(self) -> None:
-        # Log time and stamp, and the numbers, row after row.
+        # Recording times and timestamps, and the values, row by row.
         self._columns: defaultdict[_Shape, tuple[array[int], array[float]]] = defaultdict(
             lambda: (array('q'), array('d')))
 
     def take(self, logged: int, message: Any) -> None:
-        """Take in a sample."""
+        """Add a sample."""
         numbers = [tuple(x) for x in (message.position, message.velocity, message.effort)]
         position, velocity, effort = map(len, numbers)
-        # Both are made first: what cannot be kept leaves no half of it behind.
+        # Convert both first, so that an error leaves no partial row.
         times = array('q', (logged, nanoseconds_of(message.header.stamp)))
         row = array('d', chain.from_iterable(numbers))
         kept = self._columns[tuple(message.name), position, velocity, effort]
@@ -53,16 +53,16 @@ class SampleReader:
 
     @property
     def names(self) -> set[str]:
-        """Joints that the samples name."""
+        """Names of joints in the samples."""
         return {x for shape in self._columns for x in shape[0]}
 
     def columns(
             self, where: str, joint: str, *, required: bool) -> tuple[Columns, list[str], int]:
         """
-        Return a joint's samples in order, what a reader should know, and how many were left out.
+        Return a joint's sorted samples, notes for the reader, and the number of rejected samples.
 
-        Another joint will do unless ``required``. Raises `BadInputError` if there is no such
-        joint, or none of its samples can be used; ``where`` names what is read.
+        Unless ``required``, another joint may be used. Raise `BadInputError` if there is no such
+        joint, or none of its samples can be used; ``where`` names the source.
         """
         if not self._columns:
             raise BadInputError(f'{where} holds no message: expected samples of the actuator')
@@ -113,7 +113,7 @@ def _rows(columns: Columns, rows: Any) -> Columns:
 
 
 def _tidy(where: str, columns: Columns) -> tuple[Columns, list[str], int]:
-    """Leave out what cannot be a motion, sort by stamp and complete the rate; see `columns`."""
+    """Reject impossible samples, sort by timestamp and complete the rate; see `columns`."""
     notes = []
     if not columns['time'].any():
         columns['time'] = columns['logged'].copy()
@@ -136,7 +136,7 @@ def _tidy(where: str, columns: Columns) -> tuple[Columns, list[str], int]:
         notes.append(
             'The timestamps of the samples jump back: the samples are sorted by timestamp. Was '
             'the clock reset in the run?')
-    # Of samples with one stamp the first counts, so that time increases.
+    # Of samples with equal timestamps use the first, so that time increases.
     columns = _rows(columns, np.unique(columns['time'], return_index=True)[1])
     stamps, stretch, rate = columns['time'], columns['stretch'], columns['rate']
     missing = ~(np.abs(rate) < _LARGEST_RATE)

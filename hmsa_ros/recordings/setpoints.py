@@ -1,9 +1,9 @@
 """
-The setpoints of a run as they were requested, through all plans that were made anew.
+Setpoints of a run as requested, with their results after replanning.
 
-Requests say what was wanted and by when, statuses which of them were taken, and plans when each
-setpoint is reached. Where there is no plan, levels show it; where there is no request, a level
-that lasts for a period of the actuator holds a setpoint.
+Requests contain setpoints and their times, statuses show which requests were accepted, and plans
+contain the arrivals. Without plans, arrivals follow from levels; without requests, each level that
+lasts for at least a period of the actuator gives a setpoint.
 """
 
 from collections.abc import Container, Iterator, Sequence
@@ -26,14 +26,14 @@ from hmsa_ros.recordings.levels import (
 from hmsa_ros.recordings.record import RecordedRequest, Run
 from hmsa_ros.recordings.topics import COMMAND
 
-#: Stretches that differ by less are one setpoint.
+#: Smaller differences of stretch do not change a setpoint.
 SAME = 1e-6
-# Rest, to the precision of a planner, and of levels that follow creep: shares of the step, and of
-# the step in the time of a radian.
+# Tolerances for rest, to the precision of a planner, and of creep tails: relative to the step, and
+# to the step per radian of vibration.
 _AT_REST = ((0.0, 1e-3), (2e-3, 1e-2))
-# A field in T that is none.
+# Flux density in T that counts as zero.
 _NO_FIELD = 1e-9
-# Codes of plans that were made anew in need; feedback corrects others.
+# Codes of plans that were replaced because of a deviation; feedback replaces others.
 _NEEDED = {'replanned', 'saturated'}
 
 
@@ -42,28 +42,28 @@ class Requested:
     """A setpoint as it was requested, with its result."""
 
     setpoint: Setpoint
-    due: int | None  #: until when it was requested in ns; None if it was to be held on
+    due: int | None  #: requested end in ns; None if it was to be held on
     last: bool = False  #: whether it is held after the end of the sequence
-    #: When plans were made anew, by the recorder, and their arrivals, in ns; None: left out.
+    #: Recording times of changed plans, and their arrivals, in ns; None if it was skipped.
     moves: tuple[tuple[int, int | None], ...] = ()
-    corrected: bool = False  #: whether feedback made them anew, and not need
-    left_out: bool = False  #: whether the levels leave it out
-    until: int | None = None  #: when the next request took its place in ns, if one did
+    corrected: bool = False  #: whether the plan was changed by feedback, not due to a deviation
+    left_out: bool = False  #: whether the levels skip it
+    until: int | None = None  #: start of the request that replaced it, in ns, if any
 
     @property
     def missed(self) -> bool:
-        """Whether it was left out in the end."""
+        """Whether it was finally skipped."""
         return self.left_out or bool(self.moves) and self.moves[-1][1] is None
 
     @property
     def arrival(self) -> int | None:
-        """Planned rest at the target in ns; None where it is only approached."""
+        """Planned rest at the target in ns; None if only approached."""
         return self.moves[-1][1] if self.moves else self.setpoint.arrival
 
 
 @dataclass(frozen=True)
 class _Act:
-    """A request that was taken, or a stop (None); when it was, and when it begins, in ns."""
+    """An accepted request, or a stop (None); its recording time and its start, in ns."""
 
     request: RecordedRequest | None
     sent: int
@@ -71,7 +71,7 @@ class _Act:
 
 
 def setpoints_of(run: Run) -> list[Requested]:
-    """Return the setpoints that were requested in a run, else those that its levels hold."""
+    """Return the setpoints that were requested in a run, or else those held by its levels."""
     levels = in_force((x,) for x in without_repeats(run.commands)[0])
     acts = _acts(run, levels)
     found: list[Requested] = []
@@ -80,7 +80,7 @@ def setpoints_of(run: Run) -> list[Requested]:
         after = acts[i + 1] if i + 1 < len(acts) else None
         mine = [] if act.request is None else list(
             _of(run, act, act.request, after, levels, previous))
-        # A setpoint that another request replaced before it was reached was not missed.
+        # A setpoint that another request replaced before arrival was not missed.
         found += mine if after is None else [
             replace(x, until=after.begin) for x in mine
             if (x.setpoint.begins if x.arrival is None else x.arrival) < after.begin]
@@ -92,7 +92,7 @@ def setpoints_of(run: Run) -> list[Requested]:
 # -- requests -----------------------------------------------------------------------------------
 
 def _acts(run: Run, levels: Sequence[Level]) -> list[_Act]:
-    """Return what changed the plan, by time."""
+    """Return the changes of the plan, by time."""
     acts = [_Act(x, x.sent, _begin(run, x, levels)) for x in run.requests
             if x.taken and all(math.isfinite(y) for y, _ in x.points)]
     acts += (_Act(None, x, _new(run, _plan_at(run, x)) or x) for x in run.stops)
@@ -100,7 +100,7 @@ def _acts(run: Run, levels: Sequence[Level]) -> list[_Act]:
 
 
 def _begin(run: Run, request: RecordedRequest, levels: Sequence[Level]) -> int:
-    """Return from when on a request is carried out."""
+    """Return the start of a request's execution in ns."""
     later = [x for x in levels if x.sent >= request.sent]
     place = next((i for i, x in enumerate(run.plans) if x and x[0].sent >= request.sent), None)
     by_plan = () if place is None else (_under_way(run, place, later), _new(run, place))
@@ -111,17 +111,18 @@ def _begin(run: Run, request: RecordedRequest, levels: Sequence[Level]) -> int:
 
 def _under_way(run: Run, place: int, levels: Sequence[Level]) -> int | None:
     """
-    Return the first stamp of a plan that begins with a level that was sent for it already.
+    Return the first timestamp of a plan that starts with a level already sent for it.
 
-    It holds what is left of it then. ``levels`` are those that were sent since it was requested.
+    Such a plan contains the rest of the running motion. ``levels`` are those sent since the
+    request.
     """
     plan = run.plans[place]
     old = {(x.stamp, x.flux_density) for x in (run.plans[place - 1] if place else ())}
     new = [x for x in levels if (x.stamp, x.flux_density) not in old]
-    # Who takes over sends what is in force.
+    # A new controller first sends the present level.
     if new and _in_force(run, new[0]):
         del new[0]
-    # One that comes late takes effect later than its time.
+    # A late level takes effect after its time.
     return new[0].stamp if any(
         x.stamp <= plan[0].stamp + ROUNDED_STAMP and math.isclose(
             x.flux_density, plan[0].flux_density, rel_tol=ROUNDED, abs_tol=_NO_FIELD)
@@ -129,19 +130,19 @@ def _under_way(run: Run, place: int, levels: Sequence[Level]) -> int | None:
 
 
 def _in_force(run: Run, level: Level) -> bool:
-    """Return whether a level is the field that was measured last before its time."""
+    """Return whether a level equals the last field measured before its time."""
     place = int(np.searchsorted(run.time, level.stamp)) - 1
     return place >= 0 and math.isclose(
         level.flux_density, run.flux_density[place], rel_tol=ROUNDED, abs_tol=_NO_FIELD)
 
 
 def _plan_at(run: Run, sent: int) -> int | None:
-    """Return the place of the newest plan at a time of the recorder."""
+    """Return the index of the newest plan at a recording time."""
     return max((i for i, x in enumerate(run.plans) if x and x[0].sent <= sent), default=None)
 
 
 def _new(run: Run, place: int | None) -> int | None:
-    """Return the first stamp of a plan that the one before does not have."""
+    """Return the first timestamp of a plan that is not in the previous one."""
     if place is None:
         return None
     plan, before = run.plans[place], run.plans[place - 1] if place else ()
@@ -149,19 +150,19 @@ def _new(run: Run, place: int | None) -> int | None:
             plan[0].stamp < plan[0].sent or _uncommanded(run, plan[0])) and (
             abs(float(balance(run, plan[:1])[0]) - plan[0].stretch) <= ROUNDED
             or _in_force(run, plan[0])):
-        # It was in force, and holds what was there.
+        # The level was already applied, and holds the initial stretch.
         plan = plan[1:]
     fresh = _fresh(plan, before)
     return None if fresh == math.inf else int(fresh)
 
 
 def _uncommanded(run: Run, level: Level) -> bool:
-    """Return whether no command has the stamp of a level: simulated time of a recorder lags."""
+    """Return whether no command has a level's timestamp: simulated time of a recorder lags."""
     return bool(run.commands) and all(x.stamp != level.stamp for x in run.commands)
 
 
 def _begun(plan: Sequence[Level], before: Sequence[Level]) -> bool:
-    """Return whether the first level was in force, perhaps from another time on than planned."""
+    """Return whether the first level was already applied, perhaps not at its planned time."""
     return bool(before) and plan[0].stamp < plan[0].sent
 
 
@@ -169,15 +170,15 @@ def _fresh(
         plan: Sequence[Level], before: Sequence[Level],
         sent: Container[int] | None = None) -> float:
     """
-    Return from when on a plan is not as the one before; infinite if it goes on as that.
+    Return the time from which a plan differs from the previous one; infinite if it continues it.
 
-    If it is known of which stamps commands were sent, those that never were are missing in it.
+    ``sent`` are the timestamps of commands, if known: levels that were never sent are missing.
     """
     if not plan:
         return math.inf
     begun = _begun(plan, before)
     new = {(x.stamp, x.flux_density) for x in plan[begun:]}
-    # What is in force took effect when the device says, perhaps a little before its time.
+    # The present level took effect at the time reported, perhaps slightly before its timestamp.
     old = {(x.stamp, x.flux_density) for x in before if plan[0].stamp < x.stamp and not (
         begun and x.stamp <= plan[0].sent
         and math.isclose(x.flux_density, plan[0].flux_density, rel_tol=ROUNDED))}
@@ -188,7 +189,7 @@ def _fresh(
 
 
 def start_of(run: Run, stamp: int) -> float:
-    """Return the stretch before a time: planned if that is known, else measured."""
+    """Return the stretch before a time: planned if known, else measured."""
     planned = next((x.stretch for x in in_force(run.plans) if x.stamp == stamp), None)
     if planned is not None:
         return planned
@@ -223,7 +224,7 @@ def _of(
             arrival, left_out = moves.pop(0)[1] if moves else None, False
         else:
             arrival, moves = _by_levels(run, levels, here), []
-            # Where commands were not recorded nothing is known but requests and samples.
+            # Without recorded commands only requests and samples are known.
             left_out = setpoint.step > SAME and COMMAND in run.topics and not _within(
                 levels, here)
         yield Requested(
@@ -234,7 +235,7 @@ def _of(
 
 def _described(
         run: Run, target: float, start: float, begins: int, end: int | None) -> Setpoint:
-    """Return a setpoint with what the model of the planner says of it."""
+    """Return a setpoint with frequency, decay and range from the planner's model."""
     material, unit = run.planner.nondimensional, run.planner.time_unit
     low, high = stretch_limits(material)
     inside = min(max(target, low + SAME), high - SAME)
@@ -244,7 +245,7 @@ def _described(
 
 
 def _within(levels: Sequence[Level], setpoint: Setpoint) -> list[Level]:
-    """Return the changes of level while a setpoint is to be reached and held."""
+    """Return the changes of level during a setpoint."""
     end = math.inf if setpoint.end is None else setpoint.end
     return [x for x in levels if setpoint.begins <= x.stamp < end]
 
@@ -252,10 +253,10 @@ def _within(levels: Sequence[Level], setpoint: Setpoint) -> list[Level]:
 def _arrivals(
         run: Run, plans: Sequence[Sequence[Level]], sent: Container[int] | None,
         setpoint: Setpoint, earliest: int, *, last: bool) -> Iterator[tuple[int, int | None]]:
-    """Yield when plans were shown that change a setpoint, and when each arrives at it."""
+    """Yield the recording times of plans that change a setpoint, and the arrival of each."""
     before: Sequence[Level] = ()
     arrival = None
-    rests: set[int] = set()  # stamps of the levels that bring it to rest, by any plan
+    rests: set[int] = set()  # timestamps of the final levels in any plan
     for plan in plans:
         fresh, begun = _fresh(plan, before, sent), _begun(plan, before)
         goes_on = before and fresh > before[-1].stamp and not last
@@ -265,15 +266,15 @@ def _arrivals(
             continue
         new = [x for x in plan[begun:] if x.stamp >= fresh]
         if begun and not _within(new, setpoint) and _rest(run, plan[:1], setpoint) is not None:
-            # It rests there, and no level changes that.
+            # The actuator rests at the setpoint, and no level changes that.
             continue
         if setpoint.end is not None and plan[0].stamp >= setpoint.end and any(
                 x in (sent or ()) for x in rests):
-            # It was carried out, and is over.
+            # The setpoint was carried out, and is over.
             continue
         found = _rest(run, new, setpoint)
         if found is None and arrival is not None:
-            # One that is left out makes room for the next.
+            # A skipped setpoint leaves its time to the next one.
             found = _rest(run, new, replace(setpoint, begins=earliest))
         if found is not None:
             rests.add(max((x.stamp for x in plan if x.stamp <= found), default=found))
@@ -283,7 +284,7 @@ def _arrivals(
 
 
 def _rest(run: Run, plan: Sequence[Level], setpoint: Setpoint) -> int | None:
-    """Return when a plan rests at a setpoint; None if it does not."""
+    """Return the time at which a plan rests at a setpoint; None if it does not."""
     for share, slow in _AT_REST:
         for level in _within(plan, setpoint):
             if abs(level.stretch - setpoint.target) <= SAME + share * setpoint.step and (
@@ -294,17 +295,17 @@ def _rest(run: Run, plan: Sequence[Level], setpoint: Setpoint) -> int | None:
 
 
 def _ramp(run: Run, levels: Sequence[Level], level: Level) -> int:
-    """Return for how long in ns the amplifier goes on to a level."""
+    """Return the duration in ns of the amplifier's ramp to a level."""
     slew = run.number('plant.slew_limit') or run.number('planner.slew_limit')
     before = max((x for x in levels if x.stamp < level.stamp), key=lambda x: x.stamp, default=None)
     if not slew or before is None:
         return 0
-    # A bag may contain any slew limit.
+    # A bag may contain any slew limit: bound the result.
     return round(min(abs(level.flux_density - before.flux_density) / slew, 1e6) * NANOSECONDS)
 
 
 def _by_levels(run: Run, levels: Sequence[Level], setpoint: Setpoint) -> int | None:
-    """Return when the level came that holds a setpoint; None where one step leads to it."""
+    """Return the start of the level that holds a setpoint; None if a single step leads to it."""
     inside = _within(levels, setpoint)
     if setpoint.step <= SAME:
         return setpoint.begins
@@ -318,14 +319,14 @@ def _by_levels(run: Run, levels: Sequence[Level], setpoint: Setpoint) -> int | N
 
 
 def balance(run: Run, levels: Sequence[Level]) -> Array:
-    """Return the stretches that levels hold by the planner's parameters."""
+    """Return the equilibrium stretches of levels with the planner's parameters."""
     return equilibrium_stretch(
         [run.planner.units.of_level(x.flux_density) for x in levels],
         run.planner.nondimensional)
 
 
 def _held(run: Run, levels: Sequence[Level]) -> list[Requested]:
-    """Return setpoints where nobody requested one: what is held for a period."""
+    """Return setpoints of a run without requests: levels that are held for a period."""
     held = balance(run, levels)
     found: list[Requested] = []
     begin, start = 0, start_of(run, levels[0].stamp if levels else 0)

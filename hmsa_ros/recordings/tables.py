@@ -20,10 +20,10 @@ SUFFIXES = ('.csv', '.parquet', '.mat')
 
 def samples_of(run: Run) -> dict[str, Array]:
     """
-    Return the samples of a run by the name of their column.
+    Return the samples of a run by column name.
 
-    ``time`` in s from the first sample, ``stretch``, ``stretch_rate`` in 1/s and ``flux_density``
-    in T: measured, else the level in force, else NaN.
+    The columns are ``time`` in s from the first sample, ``stretch``, ``stretch_rate`` in 1/s and
+    ``flux_density`` in T: measured, else the present level, else NaN.
     """
     field = run.flux_density
     if not np.isfinite(field).any():
@@ -34,10 +34,10 @@ def samples_of(run: Run) -> dict[str, Array]:
 
 def levels_of(run: Run) -> dict[str, Array]:
     """
-    Return the levels that drove a run by the name of their column.
+    Return the levels that drove a run by column name.
 
-    ``time`` in s from the first sample and ``flux_density`` in T, in force from then on: applied,
-    else commanded, else as measured.
+    The columns are ``time`` in s from the first sample and ``flux_density`` in T from that time
+    on: applied, else commanded, else measured.
     """
     stamps = np.array([x.stamp for x in run.levels], dtype=np.int64)
     return {'time': _seconds(run, stamps),
@@ -52,8 +52,8 @@ def write_run(path: Path, run: Run) -> list[Path]:
     """
     Write samples and levels; return the files.
 
-    The levels go to a file whose name ends in _levels, or into that of Matlab as ``level_time``
-    and ``level_flux_density``. Raises `BadInputError` as `write_table`.
+    The levels go to a file whose name ends in _levels, or into the same Matlab file as
+    ``level_time`` and ``level_flux_density``. Errors are those of `write_table`.
     """
     samples, levels = samples_of(run), levels_of(run)
     if path.suffix.lower() == '.mat':
@@ -73,10 +73,10 @@ def levels_beside(path: Path) -> Path:
 
 def write_table(path: Path, columns: Mapping[str, Array]) -> None:
     """
-    Write columns as CSV, Parquet or Matlab file, by the ending of the name, in full precision.
+    Write columns as CSV, Parquet or Matlab file, by the suffix of the name, in full precision.
 
-    NaN is left empty in CSV. Raises `BadInputError` if the name ends otherwise, pyarrow is
-    missing, or the file cannot be written.
+    NaN is left empty in CSV. Raise `BadInputError` if the suffix is unknown, pyarrow is missing,
+    or the file cannot be written.
     """
     kind = path.suffix.lower()
     if kind not in SUFFIXES:
@@ -89,9 +89,9 @@ def write_table(path: Path, columns: Mapping[str, Array]) -> None:
             parquet.write_table(arrow.table(dict(columns)), beside)
         return
     if kind == '.mat':
-        from scipy.io import savemat  # not all need it
+        from scipy.io import savemat  # slow to import
 
-        # Opened here: what savemat raises if it cannot does not say why.
+        # Open the file here, since errors of savemat do not give the reason.
         with replacing(path) as beside, beside.open('wb') as matrix:
             savemat(matrix, dict(columns), oned_as='column')
         return

@@ -1,4 +1,4 @@
-"""Which topics of a bag belong to which actuator: by the ends of their names."""
+"""Assignment of the topics of a bag to actuators, by the ends of their names."""
 
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
@@ -11,22 +11,22 @@ from hmsa_ros.interfaces import topics as declared
 if TYPE_CHECKING:
     from hmsa_ros.bag.reader import BagReader
 
-#: Message type by role: the end of a topic's name.
+#: Message type by role, the end of a topic's name.
 TYPES = {
     declared.from_outside(x.name, declared.PLANNER): x.type for x in (
         declared.JOINT_STATES, declared.FLUX_DENSITY_COMMAND, declared.FLUX_DENSITY_APPLIED,
         declared.DISTURBANCE_FORCE, declared.PLAN, declared.JOINT_TRAJECTORY, declared.SETPOINT,
         declared.STATUS, declared.ESTIMATE)}
 JOINT_STATES, COMMAND, APPLIED, FORCE, PLAN, TRAJECTORY, SETPOINT, STATUS, ESTIMATE = TYPES
-# Roles whose topics are one for each joint where there are several.
+# Roles with a topic for each joint if there are several.
 _OF_A_JOINT = (COMMAND, APPLIED, FORCE, SETPOINT)
 
 
 def topics_by_joint(reader: 'BagReader') -> dict[str, dict[str, dict[str, str]]]:
     """
-    Return topics by namespace, joint (empty for the only one) and role.
+    Return topics by namespace, joint (empty for a single one) and role.
 
-    Raises `BadInputError` if there are no joint states, or commands in other namespaces only.
+    Raise `BadInputError` if there are no joint states, or only commands in other namespaces.
     """
     found: dict[str, dict[str, str]] = {role: {} for role in TYPES}  # topics by namespace
     for topic in reader.topics.values():
@@ -37,7 +37,7 @@ def topics_by_joint(reader: 'BagReader') -> dict[str, dict[str, dict[str, str]]]
             if f'/{topic.name}'.endswith(f'/{role}'):
                 found[role].setdefault(topic.name[:-len(role)].rstrip('/'), topic.name)
             elif role == SETPOINT and re.search(rf'/{node}/[^/]+/{last}$', f'/{topic.name}'):
-                # .../planner/JOINT/setpoint goes with .../JOINT/flux_density_command.
+                # .../planner/JOINT/setpoint belongs to .../JOINT/flux_density_command.
                 space, _, joint = topic.name[:-len(last) - 1].rpartition('/')
                 found[role].setdefault(f'{space[:-len(node)]}{joint}', topic.name)
     if not found[JOINT_STATES]:
@@ -73,18 +73,18 @@ def _topics_in(found: Mapping[str, Mapping[str, str]], space: str) -> dict[str, 
             topics[role] = topic_in[space]
         elif len(topic_in) == len(found[JOINT_STATES]) == 1 and (
                 role not in _OF_A_JOINT or len(found[COMMAND]) == 1):
-            # Planner and plant in namespaces of their own, remapped to each other.
+            # Planner and plant are in different namespaces, remapped to each other.
             topics[role], = topic_in.values()
     return topics
 
 
 def unanswered(reader: 'BagReader') -> Iterator[str]:
-    """Yield a sentence for each topic of sequences that holds some without a verdict."""
+    """Yield a sentence for each topic of sequences that contains some without a verdict."""
     for topic, known in sorted(reader.topics.items()):
         if known.type != TYPES[TRAJECTORY] or not f'/{topic}'.endswith(f'/{TRAJECTORY}'):
             continue
         status = f'{topic[:-len(TRAJECTORY)]}{STATUS}'
-        # Whose requests have no names cannot be told.
+        # Requests without names cannot be checked.
         answered = {'', *_texts(reader, status, lambda x: next(
             (y.value for y in x.values if y.key == 'request'), ''))}
         names = _texts(reader, topic, lambda x: x.header.frame_id)
@@ -97,9 +97,9 @@ def unanswered(reader: 'BagReader') -> Iterator[str]:
 
 
 def _texts(reader: 'BagReader', topic: str, text_in: Callable[[Any], str]) -> list[str]:
-    """Return a text of each message of a topic, as far as they can be read."""
+    """Return a text of each message of a topic, as far as messages can be decoded."""
     texts: list[str] = []
-    # Damage is noted elsewhere, and the bag brings the definition along.
+    # Damage is reported elsewhere, and the bag contains the definition.
     with contextlib.suppress(HmsaError, AttributeError, TypeError):
         decode = reader.decoder(topic)
         for message in reader.messages([topic]):

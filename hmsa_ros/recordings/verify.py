@@ -1,11 +1,11 @@
 """
-Checking a run against the model: what drove the actuator, integrated once more.
+Check of a run against the model: its commands, simulated again.
 
-The state is that of the first sample; from there on every sample of the stretch must come out
-again. Where the plant reported which levels took effect and when, these are integrated, so that
-late, refused and repeated commands and its watchdog are accounted for; recorded disturbing
-forces are applied too, and the Maxwell branches of an elastomer that creeps are integrated.
-Measurement noise is not: it is the difference that is left.
+The simulation starts from the state of the first sample and must reproduce all later samples of
+the stretch. If the plant reported which levels took effect and when, these are used, so that late,
+refused and repeated commands and the watchdog are accounted for. Recorded disturbing forces are
+applied, and viscoelastic branches are simulated. Measurement noise is not: it remains as a
+difference.
 """
 
 from collections.abc import Iterator
@@ -30,32 +30,32 @@ from hmsa_ros.recordings.record import Run
 from hmsa_ros.recordings.topics import APPLIED, COMMAND, FORCE, JOINT_STATES
 
 if TYPE_CHECKING:
-    # Other commands on bags have no use for it.
+    # Not needed by other commands on bags.
     from hmsa_ros.model.simulation import ActuatorSimulation
 
-# Samples further from the others than this are of another run, or garbage; in ns.
+# Distance in time from other samples, in ns, above which samples belong to another run.
 _LARGEST_LEAP = 3600 * NANOSECONDS
 _COMMAND, _FORCE, _SAMPLE = range(3)
-# Distance from rest, in stretch, from which on branches that creep hold something.
+# Minimum distance from rest, in stretch, for branches to have an overstress.
 _AT_REST = 1e-6
 
 
 @dataclass(frozen=True)
 class Verification:
-    """Recorded against integrated motion."""
+    """Recorded and simulated motion compared."""
 
     states: str  # the topics compared
     commands: str
-    sample_count: int  # messages compared and applied
+    sample_count: int  # messages compared
     command_count: int
-    # Commands that came after their stamp, so that the moment of their effect is not known; none
-    # where the plant reported it.
+    # Commands received after their timestamp, so that the time of their effect is unknown; 0 if
+    # the plant reported it.
     late_count: int
     largest_difference: float  # of the stretch, or of a beam's deflection; dimensionless
-    where: float  # time of it after the first sample, in s
-    note: str = ''  # losses, noise, what was left out
-    left_out: int = 0  # messages that are not what their topic is for
-    unapplied_count: int = 0  # changes of level that never took effect, as reported
+    where: float  # its time after the first sample, in s
+    note: str = ''  # losses, noise, skipped messages
+    left_out: int = 0  # messages that do not fit their topic
+    unapplied_count: int = 0  # changes of level reported as never in effect
 
 
 def verify(path: str | os.PathLike[str]) -> list[Verification]:
@@ -65,10 +65,10 @@ def verify(path: str | os.PathLike[str]) -> list[Verification]:
 
 def verify_run(run: Run) -> Verification:
     """
-    Integrate what drove one actuator and compare with its samples.
+    Simulate the levels of one actuator and compare the result with its samples.
 
-    Raises `BadInputError` if there is nothing to integrate, the actuator is not known, or there
-    are several runs, `HmsaError` if the integration does not get through.
+    Raise `BadInputError` if there are no levels, the actuator is unknown, or there are several
+    runs, `HmsaError` if the integration fails.
     """
     if run.summary is not None and len(run.summary.files) > 1 and (
             jumps := run.summary.custom_data.get('time_jumps', '0')) != '0':
@@ -124,7 +124,7 @@ def verify_run(run: Run) -> Verification:
 
 
 def _commands(run: Run, first: int) -> Iterator[tuple[int, int, int, float]]:
-    """Return what took effect, which is known from the begin; or what was commanded."""
+    """Yield the levels that took effect, known from the start; or else the commands."""
     begin, logged = int(run.time[first]), int(run.logged[first])
     if run.applied or not run.commands:
         for level in run.levels:
@@ -137,14 +137,14 @@ def _commands(run: Run, first: int) -> Iterator[tuple[int, int, int, float]]:
 
 
 def _one_run(run: Run) -> slice:
-    """Return the samples without a leap of time between them; the most, if there are several."""
+    """Return the samples without a leap in time; the longest part if there are several."""
     ends = [0, *(np.flatnonzero(np.diff(run.time) > _LARGEST_LEAP) + 1).tolist(), len(run.time)]
     return max((slice(*x) for x in zip(ends, ends[1:], strict=False)),
                key=lambda x: x.stop - x.start)
 
 
 def _start(run: Run, first: int, creep: Creep) -> 'ActuatorSimulation':
-    """Return the simulation of the recorded actuator as it is at its first sample."""
+    """Return the simulation of the recorded actuator in the state of its first sample."""
     from hmsa_ros.model.equations import elastic_force
     from hmsa_ros.model.simulation import ActuatorSimulation
 
@@ -153,13 +153,13 @@ def _start(run: Run, first: int, creep: Creep) -> 'ActuatorSimulation':
         run.plant, time=stamp, slew_limit=run.number('plant.slew_limit') or math.inf,
         coil_time_constant=run.number('plant.coil_time_constant'),
         creep=creep)
-    # What had taken effect by then is in force; a slow coil may still be on its way there.
+    # Levels applied by then count; the field of a slow coil may not have settled yet.
     past = [x.flux_density for x in sorted(run.applied, key=lambda x: x.stamp)
             if x.stamp <= stamp]
     field = float(run.flux_density[first])
     if math.isnan(field):
         before = [x.flux_density for x in run.levels if x.stamp <= stamp]
-        # Else what holds the actuator there: it may have been held so before the recording began.
+        # Otherwise use the holding level: it may have been applied before the recording.
         field = before[-1] if before else float(run.plant.units.level(
             elastic_force(float(run.stretch[first]), run.plant.nondimensional)))
     try:
@@ -173,17 +173,17 @@ def _start(run: Run, first: int, creep: Creep) -> 'ActuatorSimulation':
 
 
 def _rests(simulation: 'ActuatorSimulation') -> bool:
-    """Whether an actuator is where its field would hold it, and stays."""
+    """Return whether an actuator is at equilibrium and at rest."""
     return abs(simulation.equilibrium() - simulation.stretch) < _AT_REST and (
         abs(simulation.rate) * simulation.actuator.time_unit < _AT_REST)
 
 
 def _unapplied(run: Run) -> int:
-    """Return how many changes of level were due and took no effect, as the plant reported."""
+    """Return how many due changes of level had no effect, according to the plant."""
     if APPLIED not in run.topics:
         return 0
     commands, last = without_repeats(run.commands)[0], int(run.time[-1])
-    # What is in force as the recording begins may be sent again without a change.
+    # The initial level may be sent again without a change.
     known = run.applied
     if math.isfinite(field := float(run.flux_density[0])):
         known = Level(int(run.time[0]), field, int(run.logged[0])), *known
@@ -193,7 +193,7 @@ def _unapplied(run: Run) -> int:
 
 
 def _notes(run: Run, left_out: int, unapplied: int) -> Iterator[str]:
-    """Return what makes the recorded samples differ from the motion, or is lost."""
+    """Yield reasons for differences between samples and motion, and lost messages."""
     lost = run.lost(COMMAND, APPLIED, FORCE)
     if lost:
         yield (f'the recorder lost messages, {" and ".join(lost)}: expected differences from '
