@@ -20,7 +20,7 @@
     const result = {
       ...layout, paper_bgcolor: 'rgba(0,0,0,0)', plot_bgcolor: 'rgba(0,0,0,0)',
       font: {color: colour('text'), size: narrow() ? 11 : 13, family: FONT},
-      // Above the figure is room for the toolbar, below it for the legend.
+      // Leave room for the toolbar above the figure, and for the legend below.
       margin: {...(narrow() ? {l: 46, r: 8, b: 40} : {l: 62, r: 14, b: 46}), t: coarse ? 8 : 38},
       legend: {
         orientation: 'h', x: 0, yref: 'container', y: 0, yanchor: 'bottom',
@@ -30,7 +30,7 @@
         bgcolor: 'rgba(0,0,0,0)', color: colour('soft'), activecolor: colour('accent'),
       },
       hoverlabel: {bgcolor: colour('panel'), font: {color: colour('text')}, namelength: -1},
-      // A finger on a figure scrolls the page.
+      // Touching a figure scrolls the page.
       dragmode: coarse ? false : 'zoom', uirevision: 'kept',
     };
     for (const key of Object.keys(layout)) {
@@ -46,7 +46,7 @@
     modeBarButtonsToRemove: ['select2d', 'lasso2d', 'autoScale2d'],
     toImageButtonOptions: {format: 'svg'},
   };
-  // A legend of many names makes its figure taller, not the plot lower.
+  // A long legend makes its figure taller, not the plot smaller.
   const grow = (element, figure) => {
     const legend = element.querySelector('.legend .bg');
     const rows = legend ? legend.getBoundingClientRect().height : 0;
@@ -59,7 +59,7 @@
     const now = coloured(figure);
     await Plotly.react(element, now.data, themed(now.layout), config);
     await grow(element, figure);
-    // The first time it may have been cut for want of room.
+    // At first it may have been cut for lack of room.
     await grow(element, figure);
   };
   const figures = given.figures.map(figure => [document.getElementById(figure.key), figure]);
@@ -69,7 +69,7 @@
     drawn.add(element);
     draw(element, figure);
   };
-  // What is far below is drawn when it comes near.
+  // Figures far below are drawn when they come near.
   const watcher = new IntersectionObserver(entries => {
     for (const entry of entries) {
       if (entry.isIntersecting) show(figures.find(([element]) => element === entry.target));
