@@ -1,6 +1,6 @@
 """
-Studies: what the plans are worth away from their assumptions, and plans over whole ranges.
+Studies of the plans outside their assumptions, and plans over whole parameter ranges.
 
-Everything here is nondimensional and imports no ROS. ``python -m hmsa_studies`` makes the
-tables and pictures of the documentation.
+All quantities are dimensionless, and the package does not depend on ROS. ``python -m
+hmsa_studies`` prints the tables of the documentation and draws its figures.
 """

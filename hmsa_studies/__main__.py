@@ -1,7 +1,7 @@
 """
-``python -m hmsa_studies``: the tables on robustness in the documentation, and its pictures.
+``python -m hmsa_studies``: robustness tables of the documentation, and their figures.
 
-The script that draws all pictures of the documentation (``make pictures``) draws these too.
+The script that draws all figures of the documentation (``make pictures``) draws these, too.
 """
 
 from collections.abc import Callable
@@ -29,9 +29,9 @@ from hmsa_studies.sweep_pictures import draw_sweep
 
 MOVES = ((1.0, 1.1), (1.0, 1.4), (1.0, 0.7))
 MATERIAL = NondimensionalParameters()
-#: Command periods in the table, as shares of tau_p; none divides it.
+#: Command periods in the table, as fractions of tau_p; no multiple of one equals tau_p.
 PERIODS = (0.03, 0.07, 0.13, 0.23, 0.33, 0.45)
-#: Natural periods that smooth moves take in the table.
+#: Minimum durations of smooth moves in the table, in natural periods.
 PACES = (0.5, 1.0, 1.5, 2.0, 3.0)
 ZETAS = (2.2, 3.0, 4.0, 5.0, 6.0)
 
@@ -39,7 +39,7 @@ Table = list[tuple[str, ...]]
 
 
 def robustness_table(start: float, target: float) -> Table:
-    """Return header and rows comparing all shapers for one move at rest, errors up to 10 %."""
+    """Return header and rows that compare all shapers for one move, with errors up to 10 %."""
     case = Case(start, target, MATERIAL)
     rows: Table = [(
         'shaper', 'arrival', 'nominal', *(f'{name} ±10 %' for name in PARAMETERS),
@@ -56,7 +56,7 @@ def robustness_table(start: float, target: float) -> Table:
 
 
 def smooth_table() -> Table:
-    """Return header and rows of what smooth moves of several durations leave."""
+    """Return header and rows with the residual vibration of smooth moves of several durations."""
     rows: Table = [('smooth, at least', *(f'{x:g} periods' for x in PACES))]
     for start, target in MOVES:
         moves = [SHAPERS['smooth'](Request(State(start), target, MATERIAL, pace=Pace(x)))
@@ -70,7 +70,7 @@ def smooth_table() -> Table:
 
 
 def sampled_table() -> Table:
-    """Return header and rows of residuals of commands rounded to a grid."""
+    """Return header and rows with residuals of commands rounded to a sampling grid."""
     rows: Table = [('rounded, at worst', *(f'T = {x:g} tau_p' for x in PERIODS))]
     for start, target in MOVES:
         found = sampled_study(start, target, MATERIAL, np.array(PERIODS))
@@ -79,7 +79,7 @@ def sampled_table() -> Table:
 
 
 def damped_table(found: DampedStudy) -> Table:
-    """Return header and rows of times above critical damping, at the study's values of zeta."""
+    """Return header and rows with times above critical damping, at the study's values of zeta."""
     rows: Table = [('time to', *(f'zeta = {x:g}' for x in found.zetas))]
     rows.append(('unshaped step: within 1 %', *(f'{x:.2f}' for x in found.step)))
     for (least, most), settled, arrival in zip(
@@ -99,7 +99,7 @@ def tables() -> list[Table]:
 
 @cache
 def _compared() -> tuple[Case, list[Result]]:
-    """Return the move of the pictures, with what each shaper leaves of it."""
+    """Return the move of the figures, with the results of each shaper."""
     case = Case(1.0, 1.4, MATERIAL)
     return case, [study(case, x) for x in (
         *candidates(), Candidate('robust', 4), Candidate('minimax', 4))]
@@ -117,7 +117,7 @@ def _map(path: Path) -> None:
     draw_sweep([path], sweep.view(), {x: rows[x] for x in sweep.shown}, sweep.fixed, SCREEN)
 
 
-#: What draws each picture of the page, by its name.
+#: Functions that draw the figures of the page, by name.
 PICTURES: dict[str, Callable[[Path], None]] = {
     'robustness': _robustness,
     'front': lambda path: draw_front(path, [_compared()], SCREEN),

@@ -1,8 +1,8 @@
 """
-The axes of a sweep: grids and lists as text, tables of cases, and samples.
+Axes of a sweep: grids and lists as text, tables of cases, and samples.
 
-Samples are the scrambled points of Sobol (`scipy.stats.qmc`), one dimension for each column, made
-normal where that is asked for. They depend on their number and the seed alone.
+Samples are scrambled Sobol points (`scipy.stats.qmc`), with one dimension per column, transformed
+to normal distributions on request. They depend only on their number and the seed.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -16,21 +16,21 @@ import numpy as np
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import Array
 
-#: More values of one column, or cases, are refused: a sweep has no limit, but they are in memory.
+#: Maximum number of values of a column, or of cases, since they are kept in memory.
 MOST_VALUES = 10_000_000
 
 _GRID = (
     'VALUE, FIRST:LAST:POINTS, log:FIRST:LAST:POINTS, or several separated by commas; or '
     'sobol:LOW:HIGH or normal:MEAN:STD')
-# The ends of what a sample may be, as a share: no column is drawn infinite.
+# Minimum distance of a sample from 0 and 1, so that no value is infinite.
 _LEAST_SHARE = 2.0 ** -32
-# A variance below this share of its own is rounding.
+# Negative variances below this fraction are rounding errors.
 _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
 class Spread:
-    """What a column is drawn from: normal by mean and deviation, or uniform between two ends."""
+    """Distribution of a column: normal by mean and standard deviation, or uniform by two ends."""
 
     normal: bool
     first: float
@@ -39,7 +39,7 @@ class Spread:
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """Columns that are normal together, with their means (p,) and covariance (p, p)."""
+    """Columns with a joint normal distribution, with means (p,) and covariance (p, p)."""
 
     names: tuple[str, ...]
     mean: Array
@@ -55,7 +55,7 @@ def _too_many(column: str, points: int) -> BadInputError:
 
 
 def parse_values(text: str, column: str) -> Array | Spread:
-    """Read a grid, ``sobol:LOW:HIGH`` or ``normal:MEAN:STD``, or raise `BadInputError`."""
+    """Parse a grid, ``sobol:LOW:HIGH`` or ``normal:MEAN:STD``, or raise `BadInputError`."""
     kind, colon, rest = text.strip().partition(':')
     if not colon or kind not in {'sobol', 'normal'}:
         return parse_grid(text, column)
@@ -72,12 +72,12 @@ def parse_values(text: str, column: str) -> Array | Spread:
 
 def parse_grid(text: str, column: str) -> Array:
     """
-    Read a column's values and grids: ``0.2``, ``0:2:1000``, ``log:0.1:100:50``, with commas.
+    Parse a column's values and grids: ``0.2``, ``0:2:1000``, ``log:0.1:100:50``, with commas.
 
     Raises
     ------
     BadInputError
-        If the text is no grid, or a grid has an end that is not finite.
+        If the text is no grid, or an end of a grid is not finite.
 
     """
     parts = [_part(part.strip(), text, column) for part in text.split(',')]
@@ -88,7 +88,7 @@ def parse_grid(text: str, column: str) -> Array:
 
 
 def _part(part: str, text: str, column: str) -> Array:
-    """Read one value or one grid."""
+    """Parse one value or one grid."""
     logarithmic = part.startswith('log:')
     try:
         if ':' not in part:
@@ -112,7 +112,7 @@ def _part(part: str, text: str, column: str) -> Array:
 
 
 def read_cases(path: Path, columns: Collection[str]) -> dict[str, Array]:
-    """Read a CSV with some of the columns, numbers as they are, or raise `BadInputError`."""
+    """Read a CSV file with some of the columns, or raise `BadInputError`."""
     expected = ', '.join(columns)
     rows: list[list[float]] = []
     try:
@@ -147,7 +147,7 @@ def read_cases(path: Path, columns: Collection[str]) -> dict[str, Array]:
 
 
 def _case(cells: Sequence[str], names: Sequence[str], where: str) -> list[float]:
-    """Read a row of a table of cases."""
+    """Parse a row of a table of cases."""
     if len(cells) != len(names):
         raise BadInputError(f'{where}: {len(cells)} cells, expected {len(names)}')
     values = []
@@ -172,7 +172,7 @@ def draw(
     if seed < 0:
         raise BadInputError(f'the seed of the samples is {seed}: expected at least 0')
     factor = _factor(belief)
-    # A power of 2, which keeps the sequence balanced.
+    # A power of 2 keeps the sequence balanced.
     points = qmc.Sobol(size, seed=np.random.default_rng(seed)).random_base2(
         (count - 1).bit_length())[:count].T
     points = np.clip(points, _LEAST_SHARE, 1.0 - _LEAST_SHARE)
@@ -183,7 +183,7 @@ def draw(
             else (spread.second - spread.first) * share)
     normal = [ndtri(x) for x in points[len(spreads):]]
     for i, name in enumerate(belief.names):
-        # Added one by one: what libraries of matrices round depends on the machine.
+        # Sum terms one by one: the rounding of matrix libraries depends on the machine.
         values = np.full(count, belief.mean[i])
         for j in range(i + 1):
             values += factor[i][j] * normal[j]
@@ -192,7 +192,7 @@ def draw(
 
 
 def _factor(belief: Belief) -> list[list[float]]:
-    """Return the lower triangle whose square is the covariance (Cholesky)."""
+    """Return the lower triangular Cholesky factor of the covariance."""
     rows: list[list[float]] = []
     for i, given in enumerate(belief.covariance.tolist()):
         row: list[float] = []

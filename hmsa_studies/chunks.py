@@ -1,9 +1,9 @@
 """
-Chunks of a study: a file each, in one folder that any number of processes may share.
+Chunks of a study: one file each, in one folder that any number of processes may share.
 
-The name of a file holds the number of its chunk, a hash of the input and of the code that
-computes it, and a checksum of the content. So a folder says which chunks there are and whether
-they are whole, and nobody has to keep a list.
+The name of a file contains the number of its chunk, a hash of the input and of the code that
+computes it, and a checksum of the content. The folder thus shows which chunks exist and whether
+they are complete; no list is needed.
 """
 
 from collections import Counter
@@ -26,8 +26,8 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.files import make_folder, require_arrow, write_text
 from hmsa_studies.tables import open_writer, repeating
 
-#: Rows of a chunk: a thousandth of the study, at least 0.1 s and at most some 100 MB of work; a
-#: study whose rows take longer says so itself (``chunk_rows``).
+#: Rows of a chunk: a thousandth of the study, at least 0.1 s and at most about 100 MB of work; a
+#: study with slower rows sets its own limits (``chunk_rows``).
 SHARE, LEAST_ROWS, MOST_ROWS = 1000, 40_000, 500_000
 
 _SOURCES = ('.py', '.hpp', '.cpp')
@@ -43,7 +43,7 @@ class Study(Protocol):
 
     @property
     def digest(self) -> str:
-        """A hash of everything that the rows depend on, but the code."""
+        """A hash of all data that determine the rows, except the code."""
 
     def table(self, begin: int, end: int) -> Any:
         """Return rows as a `pyarrow.Table`, with the same columns in every block."""
@@ -51,16 +51,16 @@ class Study(Protocol):
 
 @dataclass(frozen=True)
 class Chunks:
-    """The chunks of a study, and the folder that they are in."""
+    """The chunks of a study, and their folder."""
 
     folder: Path  #: absolute
     digest: str  #: of the study and of the code that computes it
     size: int  #: rows of the study, at least 1
-    bounds: tuple[int, int] = (LEAST_ROWS, MOST_ROWS)  #: rows of a chunk, least and most
+    bounds: tuple[int, int] = (LEAST_ROWS, MOST_ROWS)  #: minimum and maximum rows of a chunk
 
     @classmethod
     def of(cls, study: Study, folder: Path) -> 'Chunks':
-        """Return the chunks of a study; nothing is written."""
+        """Return the chunks of a study without writing anything."""
         made = hashlib.sha256(f'{code()} {study.digest} {study.size}'.encode())
         return cls(
             Path(folder).resolve(), made.hexdigest(), study.size,
@@ -68,7 +68,7 @@ class Chunks:
 
     @property
     def rows(self) -> int:
-        """Return the rows of a chunk; the last one may have fewer."""
+        """Return the number of rows of a chunk; the last one may have fewer."""
         return min(max(-(-self.size // SHARE), self.bounds[0]), self.bounds[1])
 
     @property
@@ -77,11 +77,11 @@ class Chunks:
         return -(-self.size // self.rows)
 
     def span(self, index: int) -> tuple[int, int]:
-        """Return the first row of a chunk, and the first after it."""
+        """Return the first row of a chunk, and the row after its last."""
         return index * self.rows, min((index + 1) * self.rows, self.size)
 
     def check(self) -> None:
-        """Raise `BadInputError` if the folder is that of something else; nothing is written."""
+        """Raise `BadInputError` if the folder belongs to other data; write nothing."""
         described = self._described
         if described.exists():
             try:
@@ -99,7 +99,7 @@ class Chunks:
                 'folder or that of this study; name another with --out')
 
     def prepare(self) -> None:
-        """Make the folder unless it is there; raise `BadInputError` if it is of something else."""
+        """Create the folder if needed; raise `BadInputError` if it belongs to other data."""
         self.check()
         make_folder(self.folder / 'chunks')
         if not self._described.exists():
@@ -108,7 +108,7 @@ class Chunks:
                 'chunks': self.count, 'rows_of_a_chunk': self.rows}, indent=2) + '\n')
 
     def found(self) -> dict[int, list[Path]]:
-        """Return the files of this study's chunks by number; their content is not looked at."""
+        """Return the files of this study's chunks by number, without a check of their content."""
         files: dict[int, list[Path]] = {}
         for path in sorted((self.folder / 'chunks').glob('*.parquet')):
             name = _NAME.fullmatch(path.name)
@@ -117,7 +117,7 @@ class Chunks:
         return files
 
     def sound(self, paths: list[Path]) -> bool:
-        """Return whether one file of a chunk is as it was written; damaged ones are removed."""
+        """Return whether one file of a chunk is intact; remove damaged ones."""
         good = False
         for path in paths:
             if self._content(path) is None:
@@ -127,7 +127,7 @@ class Chunks:
         return good
 
     def write(self, index: int, table: Any, beside: Path) -> None:
-        """Write a chunk by way of another folder of the same file system, or raise `HmsaError`."""
+        """Write a chunk via another folder of the same file system, or raise `HmsaError`."""
         _, parquet = require_arrow()
         made = io.BytesIO()
         parquet.write_table(
@@ -162,14 +162,14 @@ class Chunks:
     def merge(
             self, path: Path, look: Callable[[Any], object] | None = None) -> dict[str, int]:
         """
-        Write the whole table, in the order of its rows; return how often each status occurs.
+        Write the whole table, in the order of its rows; return the count of each status.
 
         Parameters
         ----------
         path : Path
             File to write, CSV or Parquet.
         look : callable, optional
-            Called with each chunk's table of pyarrow.
+            Called with the pyarrow table of each chunk.
 
         Returns
         -------
@@ -192,7 +192,7 @@ class Chunks:
         return dict(counts)
 
     def merge_rows(self, path: Path) -> list[dict[str, Any]]:
-        """Write the whole table as `merge`, and return its rows."""
+        """Write the whole table as `merge` does, and return its rows."""
         rows: list[dict[str, Any]] = []
         self.merge(path, lambda table: rows.extend(table.to_pylist()))
         return rows
@@ -206,7 +206,7 @@ class Chunks:
 
     @staticmethod
     def _content(path: Path) -> bytes | None:
-        """Return what is in a file, None if that is not what its name says."""
+        """Return the content of a file, None if it does not match the checksum in its name."""
         try:
             content = path.read_bytes()
         except OSError:

@@ -1,7 +1,7 @@
 """
-What the paper's text says, computed: ``python -m hmsa_studies.claims``.
+Statements in the paper's text, computed: ``python -m hmsa_studies.claims``.
 
-Every line that is printed is in docs/validation/paper-comparison.md, which says what it means.
+Every printed line is part of docs/validation/paper-comparison.md, which explains it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,14 +25,14 @@ from hmsa_studies import paper_data
 from hmsa_studies.paper_data import Run
 
 _PAPER = NondimensionalParameters(zeta=0.2, j_lim=5.0)
-#: J_lim that makes no difference any more: the neo-Hookean solid.
+#: J_lim that is practically infinite: the neo-Hookean solid.
 _NO_LIMIT = 1e9
-#: Share of the step within which a response counts as settled.
+#: Fraction of the step within which a response counts as settled.
 _SETTLED = 0.05
 
 
 def lines() -> Iterator[str]:
-    """Yield every claim computed, a line a number or group; a claim's title ends in a colon."""
+    """Yield the computed statements, one line per number or group; titles end in a colon."""
     for section in (
             _limits, _critical, _damping_time, _damping, _mismatch, _inequality, _residuals,
             _settling, _cycles, _extensibility):
@@ -90,7 +90,7 @@ def _damping() -> Iterator[str]:
             yield (f'  {start:g} to {target:g}: tau_p {times[0]:.4f} to {times[1]:.4f} '
                    f'({times[1] / times[0] - 1.0:+.1%}), b_p {b_p[0]:.4f} to {b_p[1]:.4f} '
                    f'({b_p[1] / b_p[0] - 1.0:+.1%})')
-        # Sampled at the same times: the evenly spaced ones.
+        # Sampled at the same, evenly spaced times.
         time = np.linspace(0.0, paper_data.SPAN * len(targets), paper_data.SAMPLES)
         responses = [
             _resample(_shaped(targets, NondimensionalParameters(zeta, 5.0)), time)
@@ -186,14 +186,14 @@ def _cycles() -> Iterator[str]:
 
 def _unshaped(
         targets: Sequence[float], material: NondimensionalParameters, span: float) -> Run:
-    """Return the response to unshaped steps with spans so long that each move starts from rest."""
+    """Return the response to unshaped steps with durations so long that each starts from rest."""
     run, = paper_data.respond(
         '', targets, material, commands=('unshaped',), span=span, samples=30_001)
     return run
 
 
 def _unsettled(run: Run, span: float) -> list[tuple[float, float]]:
-    """Return for each setpoint when it begins and when the response is close for good."""
+    """Return for each setpoint its start and the time after which the response stays close."""
     parts = []
     for i, (start, target) in enumerate(zip((1.0, *run.targets), run.targets, strict=False)):
         begin, end = i * span, (i + 1) * span
@@ -253,7 +253,7 @@ def _names(targets: Sequence[float]) -> str:
 
 
 def _power(value: float) -> str:
-    """Return the power of ten above a value: what is left is rounding, which varies."""
+    """Return the power of ten above a value, since a rounding error varies."""
     return f'1e{max(math.ceil(math.log10(value)), -9)}' if value > 0.0 else '1e-9'
 
 

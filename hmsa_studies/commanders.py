@@ -1,4 +1,4 @@
-"""Who commands an actuator in the study of feedback: the controller itself, or linear control."""
+"""Controllers of an actuator in the study of feedback: the package's own, or linear control."""
 
 from abc import ABC, abstractmethod
 
@@ -15,18 +15,18 @@ from hmsa_ros.planning.planner import Options, Planner
 from hmsa_studies.linear import Controller, Predictive, Quadratic
 from hmsa_studies.scenario import Scenario, Strategy
 
-#: Largest load, and time in ns from a sample's arrival to the first level that depends on it.
+#: Maximum load, and time in ns from a sample's arrival to the first level that depends on it.
 LARGEST, REACTION = 2.0, 300_000
 # Bias of the sensor.
 _BIAS = 1e-3
-# A move that is expected to leave more than this share of the step takes longer.
+# Expected error, as a fraction of the step, above which a move takes longer.
 _TOLERANCE = 3e-5
 _JOINT = 'actuator'
 _LINEAR: dict[str, type[Controller]] = {'lqr': Quadratic, 'mpc': Predictive}
 
 
 class Commander(ABC):
-    """Commands one actuator of a scenario, whose G is off by a share."""
+    """Controller of one actuator of a scenario, with a relative error of G."""
 
     #: Whether a level follows each sample; else levels are planned ahead.
     steadily = False
@@ -52,18 +52,18 @@ class Commander(ABC):
     @property
     @abstractmethod
     def levels(self) -> list[tuple[int, float]]:
-        """Levels in T by stamps in ns that are in force or planned, by time."""
+        """Present and future levels in T with timestamps in ns, by time."""
 
     @abstractmethod
     def move(self, target: float) -> int:
-        """Go to a stretch; return when it is to rest there, in ns."""
+        """Move to a stretch; return the time of rest there, in ns."""
 
     @abstractmethod
     def run(self, until: int) -> None:
-        """Go on until a time in ns."""
+        """Continue until a time in ns."""
 
     def copy(self) -> ActuatorSimulation:
-        """Return the actuator as it is, with the levels that are planned by now."""
+        """Return a copy of the actuator with the levels planned so far."""
         setup, now, device = self.device.setups[0], self.now, self.device
         plant = ActuatorSimulation(
             setup.actuator, time=now, coil_time_constant=setup.coil_time_constant)
@@ -77,7 +77,7 @@ class Commander(ABC):
 
 
 def planner_of(scenario: Scenario, strategy: Strategy, lead: int = 0) -> Planner:
-    """Return a planner with the nominal parameters, whose commands are sent ns ahead."""
+    """Return a planner with the nominal parameters, which sends commands some ns ahead."""
     block = scenario.block
     unit = block.flux_density_unit
     return Planner(block, Options(
@@ -86,7 +86,7 @@ def planner_of(scenario: Scenario, strategy: Strategy, lead: int = 0) -> Planner
 
 
 class _Running(Commander):
-    """The controller as it is shipped, in open loop or with feedback."""
+    """The package's controller, in open loop or with feedback."""
 
     def __init__(
             self, scenario: Scenario, strategy: Strategy, error: float, seed: int) -> None:
@@ -114,7 +114,7 @@ class _Running(Commander):
 
 
 class _Steady(Commander):
-    """Commands a level after each sample, and has as long as a move that is cautious."""
+    """Controller that sets a level after each sample, with the duration of a cautious move."""
 
     steadily = True
 
@@ -161,6 +161,6 @@ class _Steady(Commander):
 
 def commander(
         scenario: Scenario, strategy: Strategy, error: float, seed: int) -> Commander:
-    """Return who carries out a strategy."""
+    """Return the controller of a strategy."""
     kind = _Steady if strategy.kind in _LINEAR else _Running
     return kind(scenario, strategy, error, seed)

@@ -1,7 +1,7 @@
 """
-Heavy damping: how long a move takes where no two-step command exists.
+Heavy damping: duration of a move if no two-step command exists.
 
-Above critical damping the unshaped step creeps in without overshoot; the minimum-time command,
+Above critical damping the unshaped step approaches without overshoot; the minimum-time command,
 which pushes and brakes within the load limits, arrives in finite time.
 """
 
@@ -18,11 +18,11 @@ from hmsa_ros.planning.shapers.minimum_time import minimum_time
 from hmsa_ros.planning.shapers.request import Request
 from hmsa_studies.residual import Actual, ringing
 
-#: Deviation from the target, as a share of the step, at which a motion counts as settled.
+#: Deviation from the target, as a fraction of the step, at which a motion counts as settled.
 SETTLED = 0.01
-#: Load limits that are compared, in units of the target's own load.
+#: Load limits to compare, relative to the load that holds the target.
 LIMITS = ((0.0, 1.2), (-2.0, 2.0))
-# e^-14 of the move is left of the slowest motion at the end.
+# At the end, e^-14 of the move remains of the slowest motion.
 _DECADES = 14.0
 _SAMPLES = 6001
 
@@ -35,7 +35,7 @@ class DampedStudy:
     target: float
     zetas: Array
     step: Array  #: (n,), settling time of the unshaped step
-    arrival: Array  #: (m, n), of the minimum-time command under each of LIMITS
+    arrival: Array  #: (m, n), move time of the minimum-time command under each of LIMITS
     settled: Array  #: (m, n), its settling time
 
 
@@ -48,7 +48,7 @@ def limits_of(target: float, material: NondimensionalParameters, number: int) ->
 
 def settling_time(
         move: Move, start: float, target: float, material: NondimensionalParameters) -> float:
-    """Return from when the stretch stays within 1 % of the step, or raise `HmsaError`."""
+    """Return the time after which the stretch stays within 1 % of the step, or `HmsaError`."""
     _, decay = ringing(target, material)
     times = np.linspace(0.0, move.levels[-1].time + _DECADES / decay, _SAMPLES)
     away = np.abs(Actual.off(material).response(move, start, times) - target)

@@ -1,8 +1,8 @@
 """
-The engine of studies: computes the chunks of a study on any `concurrent.futures.Executor`.
+Engine of studies: computes the chunks of a study on any `concurrent.futures.Executor`.
 
-A task is a number and a folder; the worker reads the study there, once, and writes the chunk
-there. So tasks are small, nothing comes back, and the table does not depend on where
+A task is a number and a folder. The worker reads the study from the folder once, and writes the
+chunks there. Tasks are therefore small, return nothing, and the table does not depend on where
 or in which order its chunks were computed.
 """
 
@@ -24,7 +24,7 @@ from hmsa_studies.executors import given, held_signals, here, Start
 
 #: Called with a sentence.
 Say = Callable[[str], object]
-#: A pool that loses workers so often without finishing a chunk is not started again.
+#: Maximum number of restarts of a pool that loses workers without finishing a chunk.
 MOST_LOSSES = 5
 #: Seconds that the futures of a broken pool have to end.
 PATIENCE = 10.0
@@ -32,14 +32,14 @@ PATIENCE = 10.0
 
 @dataclass
 class Outcome:
-    """How many chunks of its shard a call of `compute` has kept and computed."""
+    """Numbers of chunks of its shard that a call of `compute` kept and computed."""
 
     kept: int = 0
     computed: int = 0
 
 
 def parse_shard(text: str) -> tuple[int, int]:
-    """Read ``I/N``, I from 0 or from 1 on; return I from 0, and N, or raise `BadInputError`."""
+    """Parse ``I/N``, I from 0 or 1; return I from 0, and N, or raise `BadInputError`."""
     part, slash, parts = text.partition('/')
     if not (slash and part.isdecimal() and parts.isdecimal()
             and 0 <= int(part) <= int(parts) and int(parts) > 0):
@@ -58,25 +58,25 @@ def compute(
     Parameters
     ----------
     study : Study
-        It must be possible to pickle it.
+        The study, which must be picklable.
     folder : Path
-        Where the chunks go; all workers must see it under the same path.
+        Folder of the chunks; all workers must see it under the same path.
     executor : Executor or callable
-        An executor, for example of mpi4py.futures or submitit, or what makes one, which is called
-        again if its workers die. Default: this process.
+        An executor, for example of mpi4py.futures or submitit, or a function that creates one,
+        which is called again if workers die. Default: this process.
     shard : tuple of int
-        Which part, from 0, of how many.
+        Index, from 0, and number of parts.
     resume : bool
-        Keep the chunks that are there and whole.
+        Keep chunks that exist and are intact.
     say : callable
-        Called with a sentence where something goes wrong that can be mended.
+        Called with a message after an error that can be recovered.
     advance : callable, optional
-        Called with the rows done since the last call.
+        Called with the number of rows completed since the last call.
 
     Returns
     -------
     Outcome
-        What was done.
+        Numbers of chunks.
 
     Raises
     ------
@@ -109,7 +109,7 @@ def compute(
 
 
 def _share(study: Study, chunks: Chunks, scratch: Path) -> None:
-    """Make a folder of this run with the study in it, unless it is there."""
+    """Create the folder of this run with the study in it, if it does not exist."""
     if scratch.exists():
         return
     chunks.prepare()
@@ -136,13 +136,13 @@ def _work(scratch: str, index: int) -> None:
 def _compute(
         study: Study, chunks: Chunks, waiting: deque[int], start: Start, scratch: Path,
         outcome: Outcome, say: Say, advance: Callable[[int], object]) -> None:
-    """Compute the chunks that wait; where workers die, start anew with those that are lost."""
+    """Compute the waiting chunks; after a loss of workers, restart with the lost ones."""
     losses = 0
     while waiting:
         before = outcome.computed
         running: dict[Future[None], int] = {}
         try:
-            # Nothing is written before there is something that computes.
+            # Write nothing before there is an executor.
             with start() as (executor, ahead):
                 _share(study, chunks, scratch)
                 _feed(chunks, waiting, running, executor, ahead, scratch, outcome, advance)
@@ -163,7 +163,7 @@ def _feed(
         chunks: Chunks, waiting: deque[int], running: dict[Future[None], int],
         executor: Executor, ahead: int, scratch: Path, outcome: Outcome,
         advance: Callable[[int], object]) -> None:
-    """Keep an executor busy until nothing waits or runs."""
+    """Keep an executor busy until no task is waiting or running."""
     while waiting or running:
         with held_signals():
             while waiting and len(running) < ahead:
@@ -171,7 +171,7 @@ def _feed(
                 running[future] = waiting.popleft()
         done = wait_for(running, return_when=FIRST_COMPLETED).done
         if any(isinstance(x.exception(), BrokenExecutor) for x in done if not x.cancelled()):
-            # The others of a broken pool end at once too; some have their result.
+            # The others of a broken pool end at once, too; some have a result.
             done = wait_for(running, timeout=PATIENCE).done
         broken = None
         for future in done:

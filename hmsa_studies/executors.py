@@ -1,4 +1,4 @@
-"""Where the chunks of a study are computed: here, in local processes, or on a Dask cluster."""
+"""Executors for the chunks of a study: this process, local processes, or a Dask cluster."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -17,15 +17,15 @@ from typing import Any, TypeVar
 from hmsa_ros.errors import BadInputError, HmsaError
 
 Result = TypeVar('Result')
-#: Makes an executor, and says how many tasks to submit ahead.
+#: Creates an executor; also returns the number of tasks to submit ahead.
 Start = Callable[[], AbstractContextManager[tuple[Executor, int]]]
 
 #: Seconds that a Dask scheduler has for its first answer.
 PATIENCE = 15
-#: Chunks that wait at a Dask cluster: they are small there, and it grows by what waits.
+#: Chunks waiting at a Dask cluster: they are small there, and it scales with the queue.
 AHEAD = 1000
-# A cluster on this machine shares its cores with the plans. As Dask sets itself up, it watches
-# itself a hundred times a second, and its workers give each freed page back.
+# A cluster on this machine shares its cores with the plans. By default Dask monitors itself a
+# hundred times a second, and its workers return each freed page.
 _QUIET = {
     'distributed.worker.profile.enabled': False,
     'distributed.admin.tick.interval': '1s',
@@ -36,7 +36,7 @@ _QUIET = {
 
 
 class Here(Executor):
-    """Computes in this process, as soon as something is submitted."""
+    """Executor that computes in this process on submission."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> 'Future[Any]':
         """Call the function."""
@@ -50,13 +50,13 @@ class Here(Executor):
 
 @contextmanager
 def here() -> Iterator[tuple[Executor, int]]:
-    """Yield an executor of this process, and how many chunks to submit ahead."""
+    """Yield an executor of this process, and the number of chunks to submit ahead."""
     yield Here(), 1
 
 
 @contextmanager
 def local_processes(workers: int) -> Iterator[tuple[Executor, int]]:
-    """Yield a pool of fresh processes, and how many chunks to submit ahead; left, none lives."""
+    """Yield a pool of new processes, and the number of chunks to submit ahead; end all on exit."""
     pool = ProcessPoolExecutor(
         workers, mp_context=multiprocessing.get_context('spawn'), initializer=_end_with_parent)
     try:
@@ -70,12 +70,12 @@ def local_processes(workers: int) -> Iterator[tuple[Executor, int]]:
 
 def local(workers: int) -> Start:
     """
-    Return what makes an executor of so many processes; of one, of this process.
+    Return a function that creates an executor of some processes; of this process for one.
 
     Raises
     ------
     BadInputError
-        If there is to be none.
+        If the number is below 1.
 
     """
     if workers < 1:
@@ -96,7 +96,7 @@ def dask(address: str, workers: int | None = None) -> Iterator[tuple[Executor, i
             'take --workers or --shard') from error
     with ExitStack() as stack:
         if address == 'local':
-            # For as long as it lives: it may start workers again.
+            # For the lifetime of the cluster, which may start workers again.
             stack.enter_context(config.set(_QUIET))
             with held_signals():
                 target = stack.enter_context(LocalCluster(
@@ -106,7 +106,7 @@ def dask(address: str, workers: int | None = None) -> Iterator[tuple[Executor, i
             target = None if address.endswith('.json') else address
         try:
             if target is None:
-                # Dask waits for ever for the file.
+                # Dask would wait forever for a missing file.
                 Path(address).read_bytes()
             client = stack.enter_context(Client(
                 target, timeout=PATIENCE, scheduler_file=address if target is None else None))
@@ -120,14 +120,14 @@ def dask(address: str, workers: int | None = None) -> Iterator[tuple[Executor, i
 
 @contextmanager
 def given(executor: Executor) -> Iterator[tuple[Executor, int]]:
-    """Yield an executor that belongs to the caller, and how many chunks to submit ahead."""
+    """Yield an executor of the caller, and the number of chunks to submit ahead."""
     yield executor, AHEAD
 
 
 def in_order(
         start: Start, function: Callable[..., Result],
         tasks: Iterable[tuple[Any, ...]]) -> Iterator[Result]:
-    """Yield what a function returns for each of many arguments in order, or raise `HmsaError`."""
+    """Yield the results of a function for many arguments in order, or raise `HmsaError`."""
     running: deque[Future[Result]] = deque()
     try:
         with start() as (executor, ahead):
@@ -145,7 +145,7 @@ def in_order(
 
 
 def cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, 'sched_getaffinity'):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -153,11 +153,11 @@ def cores() -> int:
 
 @contextmanager
 def held_signals() -> Iterator[None]:
-    """Let signals wait; processes that start meanwhile never get SIGINT."""
-    # Ctrl-C goes to all processes of a terminal; the one that started the others ends them.
+    """Delay signals; processes started during this time never get SIGINT."""
+    # Ctrl-C reaches all processes of a terminal; their parent ends them.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    # A pool that is left half started cannot be shut down. The mask is this thread's alone: what
-    # another gets, Python answers in this one.
+    # A partially started pool cannot be shut down. The mask only applies to this thread: Python
+    # handles the signals of others in this one.
     noted: list[int] = []
     handlers = {
         x: handler for x in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -176,7 +176,7 @@ def held_signals() -> Iterator[None]:
 
 
 def _end_with_parent() -> None:
-    """Have this worker end when the process that started it is gone, even by kill -9."""
+    """End this worker when its parent process is gone, even by kill -9."""
     parent = multiprocessing.parent_process()
     if parent is None:
         raise HmsaError('not a worker: expected a process started by another')

@@ -1,9 +1,9 @@
 """
-What feedback leaves of moves when the model is in error, beside open loop.
+Results of moves with model errors, with feedback and in open loop.
 
-The actuator is simulated with its true parameters, and measured with noise, late, by a sensor with
-an unknown bias. Whoever commands it has the nominal ones. Open loop and feedback are the
-controller that nodes run, driven in simulated time.
+The actuator is simulated with its true parameters, and measured with noise and latency, by a
+sensor with an unknown bias. The controller has the nominal ones. Open loop and feedback use the
+controller of the nodes, in simulated time.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,25 +17,25 @@ from hmsa_studies.commanders import Commander, commander, LARGEST, planner_of
 from hmsa_studies.learning import carried_out, Learner
 from hmsa_studies.scenario import Scenario, Strategy
 
-# Samples before the first move, and points of a motion that is looked at.
+# Samples before the first move, and points of the evaluated motions.
 _BEFORE, _LOOK, _WATCHED = 50, 120, 40
-# A cycle, and after what time nothing moves, in nominal units of time.
+# A cycle, and time after which the motion has ended, in nominal time scales.
 CYCLE, _SETTLED = 1.45, 150.0
-# Cycles between the first move and the next one, and trials of a move that is learnt.
+# Cycles between the first move and the next one, and trials of learning.
 CYCLES, _TRIALS = 3, 4
 
 
 @dataclass(frozen=True)
 class Left:
-    """What would be left if the course in force were carried to its end, as shares of the step."""
+    """Residual if the present course were completed, relative to the step."""
 
-    #: Of a controller that commands a level after each sample, as seen in the cycle that follows.
+    #: Of a controller that sets a level after each sample, measured in the next cycle.
     vibration: float  #: peak to peak
-    offset: float  #: rest less target
-    motion: float = 0.0  #: peak to peak in the cycle that follows, in which the loop stays closed
+    offset: float  #: rest minus target
+    motion: float = 0.0  #: peak to peak in the next cycle, in which the loop stays closed
 
     def watched(self, seen: Sequence[float], *, steadily: bool) -> 'Left':
-        """Return it with what was seen in the cycle that follows, as shares of the step."""
+        """Return it with the motion of the next cycle, relative to the step."""
         motion = max(seen) - min(seen)
         if steadily:
             return Left(motion, sum(seen) / len(seen), motion)
@@ -43,7 +43,7 @@ class Left:
 
 
 def settle(plant: ActuatorSimulation, end: int, target: float, before: float) -> Left:
-    """Return what is left in four units of time from an arrival in ns on, and at rest."""
+    """Return the residual in four time scales from an arrival in ns on, and at rest."""
     unit = plant.actuator.time_unit * NANOSECONDS
     seen = []
     for i in range(_LOOK):
@@ -56,7 +56,7 @@ def settle(plant: ActuatorSimulation, end: int, target: float, before: float) ->
 
 
 def _moves(commanding: Commander, targets: Sequence[float]) -> Iterator[Left]:
-    """Yield what is left after the first move, after each cycle, and after the next ones."""
+    """Yield the residuals after the first move, after each cycle, and after the next moves."""
     scenario = commanding.scenario
     cycle = round(CYCLE * scenario.block.time_unit * NANOSECONDS)
     commanding.run(_BEFORE * round(scenario.period * NANOSECONDS))
@@ -80,20 +80,20 @@ def trial(
         scenario: Scenario, strategy: Strategy, error: float, seed: int,
         targets: Sequence[float] = ()) -> list[Left]:
     """
-    Run moves once.
+    Run one sequence of moves.
 
     Parameters
     ----------
     scenario : Scenario
         Actuator and sensor.
     strategy : Strategy
-        How to plan.
+        How to plan moves.
     error : float
-        Of the shear modulus, as a share.
+        Relative error of the shear modulus.
     seed : int
-        Of the noise.
+        Seed of the noise.
     targets : sequence of float
-        Stretches to go to; default those of the scenario.
+        Target stretches; default those of the scenario.
 
     Returns
     -------
@@ -111,7 +111,7 @@ def trial(
 def _learned(
         scenario: Scenario, strategy: Strategy, error: float, seed: int,
         target: float) -> Iterator[Left]:
-    """Yield what trials of the first move leave, each from rest with a sensor set to zero."""
+    """Yield the residuals of trials of the first move, each from rest with a zeroed sensor."""
     random, block = np.random.default_rng(seed), scenario.block
     plan = planner_of(scenario, strategy).setpoint(target, 0)
     learner = Learner(

@@ -1,4 +1,4 @@
-"""What an identification says of the parameters that a plan depends on, as columns of a sweep."""
+"""Uncertainty of a block from an identification, as columns of a sweep."""
 
 from pathlib import Path
 
@@ -8,12 +8,12 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.files import Belief as Known
 from hmsa_studies.axes import Belief
 
-# Identified names that are no parameters of the block by that name.
+# Identified names that differ from those of the block's parameters.
 _OTHERS = {'coil_time_constant': 'coil_time_constant', 'time_unit': 'actuator.density'}
 
 
 def belief_of(found: Known, path: Path) -> Belief:
-    """Return what a file says of the block in SI units; raise `BadInputError` if nothing."""
+    """Return the uncertainty of the block in a file; raise `BadInputError` if there is none."""
     numbers, known = found.actuator.numbers, found.known
     means, names, places = [], [], []
     slopes = np.eye(len(known.names))

@@ -1,8 +1,8 @@
 """
-Learning from trial to trial: the same move again and again, from rest, with better levels.
+Learning from trial to trial: the same move from rest, repeated with improved levels.
 
-First level, its duration and the last level are changed after each trial by what the samples after
-the arrival are off the target, through the Jacobian of the nominal block.
+After each trial, the first level, its duration and the last level are changed by the errors of the
+samples after the arrival, through the Jacobian of the nominal block.
 """
 
 from collections.abc import Iterator
@@ -14,10 +14,10 @@ from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.simulation import ActuatorSimulation
 from hmsa_ros.model.units import NANOSECONDS
 
-# Samples after the arrival that count, in units of time, and how far levels and durations, in
-# units, are changed for the Jacobian.
+# Duration of the samples after the arrival, in time scales, and increment of levels and durations
+# for the Jacobian, relative to their units.
 _SEEN, _SMALL = 2.0, 1e-3
-# Shortest and longest duration of the first level, as shares of the nominal one.
+# Minimum and maximum duration of the first level, relative to the nominal one.
 _RANGE = (0.3, 2.0)
 
 
@@ -43,12 +43,12 @@ class Learner:
         self._inverse: Array = np.linalg.pinv(slopes).astype(np.float64)
 
     def levels(self, unknowns: Array) -> tuple[tuple[int, float], ...]:
-        """Return stamps in ns and levels in T."""
+        """Return timestamps in ns and levels in T."""
         first, duration, last = unknowns * self._scale
         return ((self._begin, float(first)), (self._begin + round(duration), float(last)))
 
     def learn(self, off: Array) -> None:
-        """Change the levels by how far the samples were off the target."""
+        """Change the levels by the errors of the samples."""
         found = self.unknowns - self._inverse @ off
         bound = self._largest / self._scale[0]
         self.unknowns = np.clip(

@@ -1,9 +1,9 @@
 """
-Linear controllers of a block, as they are usually built: at each target, for small motion.
+Linear controllers of a block in their usual form, for small motion at each target.
 
-The block is linearised about the target and sampled exactly, levels that are still on their way
-included. A stationary Kalman filter gives stretch and rate. The sensor is set to zero on the block
-at rest before the first move.
+The block is linearised about the target and discretised exactly, including delayed levels. A
+stationary Kalman filter estimates stretch and rate. The sensor is zeroed on the block at rest
+before the first move.
 """
 
 from abc import ABC, abstractmethod
@@ -22,36 +22,36 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.units import NANOSECONDS
 
-# Load by which the block is asked how a level moves it.
+# Load increment for the linearisation.
 _SMALL = 1e-4
-# How far ahead the predictive controller looks, in units of time.
+# Horizon of the predictive controller, in time scales.
 _HORIZON = 6.0
 
 
 @dataclass(frozen=True)
 class Weights:
-    """How eager a controller is; the error weighs 1."""
+    """Weights of a controller, relative to that of the error."""
 
-    rate: float  #: by units of time
+    rate: float  #: per time scale
     effort: float  #: of the level
-    integral: float = 0.0  #: of the sum of errors over a unit of time, of a regulator alone
-    wander: float = 0.1  #: of a load that acts besides the level, in a unit of time
+    integral: float = 0.0  #: of the integrated error over a time scale, for the regulator only
+    wander: float = 0.1  #: of a disturbing load, in a time scale
 
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """A block about a stretch at which it rests, sampled: x(k + 1) = a x(k) + b u(k)."""
+    """A block linearised about an equilibrium and discretised: x(k + 1) = a x(k) + b u(k)."""
 
-    #: on stretch from the target, rate by units of time, and the levels still on their way, the
+    #: state: stretch from the target, rate in time scales, and the delayed levels, the
     #: newest first, shape (n, n)
     a: Array
-    b: Array  #: of a level, as a load above the one that holds the target, shape (n,)
+    b: Array  #: effect of a level, as a load above the holding one, shape (n,)
 
     @classmethod
     def at(
             cls, block: ActuatorParameters, target: float, holding: float, period: int,
             delay: int) -> 'Linearised':
-        """Linearise about a target that a level in T holds; delay of levels and period in ns."""
+        """Linearise about a target held by a level in T; delay of levels and period in ns."""
         whole, late = divmod(delay, period)
         by, left = _motion(block, target, holding, period)
         _, before = _motion(block, target, holding, late)
@@ -69,7 +69,7 @@ class Linearised:
         return cls(a, b)
 
     def observer(self, noise: float, wander: float) -> Array:
-        """Return the stationary Kalman gain on stretch, rate and a level that acts besides."""
+        """Return the stationary Kalman gain for stretch, rate and a disturbing level."""
         n = len(self.b)
         a = np.eye(3)
         a[:2, :2] = self.a[:2, :2]
@@ -85,7 +85,7 @@ class Linearised:
 def _motion(
         block: ActuatorParameters, target: float, holding: float, time: int
 ) -> tuple[Array, Array]:
-    """Return the derivatives of stretch and rate after a time in ns by those before, and load."""
+    """Return derivatives of stretch and rate after a time in ns by initial state, and by load."""
     unit, load = block.time_unit, block.flux_density_unit
     values = complete(values_of(block), ())
     ends = []
@@ -107,20 +107,20 @@ def _motion(
 
 class Controller(ABC):
     """
-    Commands a level after each sample.
+    Controller that sets a level after each sample.
 
     Parameters
     ----------
     block : ActuatorParameters
-        Nominal.
+        Nominal block.
     largest : float
-        Load that levels keep to, either way.
+        Maximum magnitude of the load.
     period, delay : int
-        Of the samples, and from a sample to the level that depends on it, in ns.
+        Sampling period, and delay from a sample to the level that depends on it, in ns.
     noise : float
         Standard deviation of a sample.
     weights : Weights
-        How eager it is.
+        Weights of the controller.
 
     """
 
@@ -140,14 +140,14 @@ class Controller(ABC):
 
     @abstractmethod
     def _design(self, model: Linearised) -> None:
-        """Make the law for a target."""
+        """Design the control law for a target."""
 
     @abstractmethod
     def _law(self, z: Array, error: float, low: float, high: float) -> float:
         """Return the level above the holding one, as a load, within bounds."""
 
     def move(self, target: float, holding: float) -> float:
-        """Go to a target and the level in T that holds it; return the level until a sample."""
+        """Move to a target held by a level in T; return the level until the next sample."""
         unit = self._block.flux_density_unit
         if self._model is None:
             self._zero = float(np.mean(self._before)) - self._block.rest
@@ -164,7 +164,7 @@ class Controller(ABC):
         return self._sent[0] * unit
 
     def seen(self, stretch: float) -> float | None:
-        """Take in a sample in order; return a level in T, or None before the first move."""
+        """Process a sample in order; return a level in T, or None before the first move."""
         if self._model is None:
             self._before.append(stretch)
             return None
@@ -174,7 +174,7 @@ class Controller(ABC):
         load = self._law(
             np.concatenate([self._x[:2], sent]), error,
             -self._largest - self._holding, self._largest - self._holding)
-        # On to the next sample.
+        # Predict the state at the next sample.
         beside = float(self._x[2])
         z = np.concatenate([self._x[:2], sent + beside])
         self._x[:2] = (self._model.a @ z + self._model.b * (load + beside))[:2]
@@ -184,7 +184,7 @@ class Controller(ABC):
 
 
 class Quadratic(Controller):
-    """A linear quadratic regulator with the sum of errors, kept while levels are clipped."""
+    """A linear quadratic regulator with integral action, which stops while levels are clipped."""
 
     _sum = 0.0
     _gains: Array = np.ones(1)
@@ -198,7 +198,7 @@ class Quadratic(Controller):
         before, weights = self._gains, self._weights
         self._gains = _regulator(a, b, np.diag(
             [1.0, weights.rate, *[0.0] * (n - 2), weights.integral]), weights.effort)[0]
-        # The level that it comes to stays.
+        # Keep the final level.
         self._sum *= before[-1] / self._gains[-1]
         self._share = share
 
@@ -212,7 +212,7 @@ class Quadratic(Controller):
 
 class Predictive(Controller):
     """
-    A linear model predictive controller without offset: it estimates a level that acts besides.
+    An offset-free linear model predictive controller, which estimates a disturbing level.
 
     G. Pannocchia and J. B. Rawlings, AIChE Journal 49 (2003) 426.
     """
@@ -251,7 +251,7 @@ class Predictive(Controller):
 
 
 def _regulator(a: Array, b: Array, weight: Array, effort: float) -> tuple[Array, Array]:
-    """Return the gains of the quadratic regulator and what a state costs."""
+    """Return the gains of the quadratic regulator and its cost matrix."""
     cost: Array = np.asarray(
         solve_discrete_are(a, b, weight, np.array([[effort]])), dtype=np.float64)
     gains = (b.T @ cost @ a) / (effort + float((b.T @ cost @ b)[0, 0]))

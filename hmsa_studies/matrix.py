@@ -1,4 +1,4 @@
-"""All strategies of feedback in all scenarios, and which leave no more than open loop."""
+"""All feedback strategies in all scenarios, compared with open loop."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,13 +12,13 @@ from hmsa_studies.feedback import CYCLE, CYCLES, Left, trial
 from hmsa_studies.scenario import CHAINED, Scenario, SCENARIOS, STRATEGIES, Strategy, TARGETS
 from hmsa_studies.tasks import Tasks
 
-#: Errors of the shear modulus that make a row together.
+#: Errors of the shear modulus that are combined into one row.
 ERRORS = ((0.0,), (-0.1, 0.1), (-0.2, 0.2))
-# How much more than the chain leaves is no worse.
+# Factor on the result of the chain up to which another one is no worse.
 _WORSE = 1.2
 #: Arguments of `trial`.
 Task = tuple[Scenario, Strategy, float, int]
-# Numbers of `Left`.
+# Fields of `Left`.
 _LEFT = ('vibration', 'offset', 'motion')
 
 
@@ -28,16 +28,16 @@ class Row:
 
     scenario: str
     strategy: str
-    error: float  #: of G, as a share
-    #: Root mean square over both signs and all seeds: after the first move, a cycle later, two
+    error: float  #: relative error of G
+    #: Root mean square over both signs and all seeds: after the first move, one cycle later, two
     #: cycles later, and after the next move; of learning, after each of four trials.
     left: 'tuple[Left, ...]'
     worst: tuple[float, ...]  #: largest vibration of all
-    no_worse: bool | None = None  #: whether no run leaves more than `allowed`; None for open loop
+    no_worse: bool | None = None  #: whether no run exceeds `allowed`; None for open loop
 
 
 def rms(trials: Iterable[Sequence[Left]]) -> list[Left]:
-    """Return the root mean square of trials, for each time that was looked at."""
+    """Return the root mean square over trials, for each time."""
     rows = np.array([[(x.vibration, x.offset, x.motion) for x in row] for row in trials])
     return [Left(*x) for x in np.sqrt(np.mean(np.square(rows), axis=0)).tolist()]
 
@@ -46,7 +46,7 @@ def rms(trials: Iterable[Sequence[Left]]) -> list[Left]:
 class Matrix:
     """All strategies in all scenarios."""
 
-    seeds: int  #: of the noise, for each error, on which open loop does not depend
+    seeds: int  #: number of noise seeds per error; open loop does not depend on them
     scenarios: Sequence[Scenario] = SCENARIOS
     strategies: Sequence[Strategy] = STRATEGIES
 
@@ -70,7 +70,7 @@ class Matrix:
             **dict.fromkeys(_LEFT, 'doubles')}, (4, 100))
 
     def rows(self, left: Iterator[list[Left]]) -> Iterator[Row]:
-        """Yield what trials have left, given in the order of the tasks, row after row."""
+        """Yield the rows of results given in the order of the tasks."""
         limits: dict[tuple[str, tuple[float, ...]], list[list[float]]] = {}
         for scenario, errors, strategy, tasks in self._trials():
             key = scenario.name, errors
@@ -96,14 +96,14 @@ def _row(scenario: Scenario, strategy: Strategy, error: float, seed: int) -> dic
 
 
 def left_of(row: Mapping[str, Any]) -> list[Left]:
-    """Return what `trial` did, out of the row of a table."""
+    """Return the result of `trial` from the row of a table."""
     return [Left(*x) for x in zip(*(row[name] for name in _LEFT), strict=True)]
 
 
 def allowed(scenario: Scenario, error: float) -> list[float]:
-    """Return the vibration, at each time, up to which a strategy is no worse than open loop."""
-    # A fifth more than what the chain of order 2 leaves, or, where nothing is wrong with the
-    # model, half of what noise alone shows from peak to peak in the samples of a cycle.
+    """Return the vibration at each time up to which a strategy is no worse than open loop."""
+    # A fifth more than that of the chain of order 2 or, without model errors, half of the
+    # peak-to-peak noise in the samples of a cycle.
     if error or scenario.truth or scenario.coil_time_constant:
         return [_WORSE * x.vibration for x in trial(scenario, CHAINED, error, 0)]
     count = CYCLE * scenario.block.time_unit / scenario.period
@@ -113,7 +113,7 @@ def allowed(scenario: Scenario, error: float) -> list[float]:
 
 
 def _range(count: float) -> float:
-    """Return the mean distance between the largest and the least of so many normal numbers."""
+    """Return the mean range of a number of normal values."""
     x = np.linspace(-8.0, 8.0, 4001)
     below = ndtr(x)
     return float(np.sum(1.0 - below ** count - (1.0 - below) ** count) * (x[1] - x[0]))

@@ -1,4 +1,4 @@
-"""The paper's Figs. 2 to 10 (Polymers 2022, 14, 3037) as pictures and tables."""
+"""Figs. 2 to 10 of the paper (Polymers 2022, 14, 3037) as figures and tables."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -21,14 +21,14 @@ STRETCH = style.axis('stretch', r'\lambda')
 RATE = style.axis('stretch rate', r'\dot{\lambda}')
 FLUX = style.axis('flux density', 'b')
 TAU_P = style.axis('time of first level', r'\tau_p')
-#: Critical damping as the paper quotes it, for 1 -> 1.1.
+#: Critical damping as quoted in the paper, for 1 -> 1.1.
 PAPER_CRITICAL = 2.14
 _COMMANDS = (('unshaped', style.UNSHAPED), ('shaped', style.SHAPED))
 _ALONE = looks.Look(looks.INDIGO, 1.2, (6.0, 1.5, 1.0, 1.5)).line()
 _CASES = (
     looks.Look(looks.BLUE, 1.0), looks.Look(looks.ORANGE, 1.5, (5.0, 1.5), order=3),
     looks.Look(looks.BLACK, 1.2, (1.0, 1.2), order=4))
-# Width in inches below which panels stand below each other.
+# Width in inches below which panels are stacked.
 _NARROW = 4.0
 
 
@@ -37,15 +37,15 @@ class PaperFigure:
     """A figure of the paper."""
 
     number: int
-    title: str  #: what it shows
-    compute: Callable[[int], Data]  #: its data from the number of samples, or points of a sweep
+    title: str  #: description
+    compute: Callable[[int], Data]  #: data from the number of samples, or points of a sweep
     draw: Callable[[Figure, Any], None]
     height: float  #: in inches
-    stacked: float  #: the same where panels stand below each other
+    stacked: float  #: height with stacked panels
 
     @property
     def default_points(self) -> int:
-        """Samples or points of the picture as published with this package."""
+        """Samples or points of the figure as published with this package."""
         sweep = self.compute in (paper_data.damping_sweep, paper_data.chain_limit_sweep)
         return paper_data.SWEEP_POINTS if sweep else paper_data.SAMPLES
 
@@ -53,8 +53,8 @@ class PaperFigure:
 def write_figure(
         figure: PaperFigure, folder: Path, *, points: int | None = None,
         paper: Paper | None = None, kinds: Sequence[str] = ('png',)) -> list[Path]:
-    """Write pictures and CSV, with so many samples or points of a sweep; return their paths."""
-    # The table is the picture's data.
+    """Write figures and CSV with a number of samples or points of a sweep; return their paths."""
+    # The table contains the data of the figure.
     paper = replace(paper or Paper(), data=False)
     images = named(folder, f'figure_{figure.number:02d}', kinds)
     table = images[0].with_suffix('.csv')
@@ -80,7 +80,7 @@ def _stacked(figure: Figure) -> bool:
 
 
 def _pair(figure: Figure) -> Any:
-    """Return two panels beside or below each other."""
+    """Return two panels, side by side or stacked."""
     return figure.subplots(2, 1) if _stacked(figure) else figure.subplots(1, 2)
 
 
@@ -89,7 +89,7 @@ def _find(runs: Sequence[Run], command: str) -> Run:
 
 
 def _plot_command(axes: Axes, run: Run, **look: Any) -> None:
-    """Draw the level of b, from 0 before the start to the end of the run."""
+    """Draw the level b, from 0 before the start to the end of the run."""
     end = float(run.time[-1])
     b = signed_root(run.loads)
     axes.plot(
@@ -98,7 +98,7 @@ def _plot_command(axes: Axes, run: Run, **look: Any) -> None:
 
 
 def _plot_targets(axes: Axes, run: Run) -> None:
-    """Mark each target over its span."""
+    """Mark each target during its setpoint."""
     for i, target in enumerate(run.targets):
         axes.plot(
             [i * paper_data.SPAN, (i + 1) * paper_data.SPAN], [target, target],
@@ -133,7 +133,7 @@ def _draw_multi_step(figure: Figure, runs: tuple[Run, ...]) -> None:
     style.finish(left, TAU, FLUX, 'a')
     for i, target in enumerate(run.targets):
         right.axhline(target, **style.TARGET)
-        # Beside the panel, where no curve runs.
+        # Beside the panel, where there are no curves.
         style.note(
             right, rf'$\lambda(b_{i + 1})={target:.2f}$', (1.0, target), (3, 0),
             xycoords=('axes fraction', 'data'), va='center', fontsize='small')

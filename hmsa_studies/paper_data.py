@@ -1,8 +1,8 @@
 """
-The numbers in the paper's Figs. 2 to 10 (Polymers 2022, 14, 3037), computed with this package.
+Data of Figs. 2 to 10 of the paper (Polymers 2022, 14, 3037), computed with this package.
 
-Everything is nondimensional as in the paper: time in L sqrt(rho/G), b = sqrt(Br B/(mu0 G))
-with the sign of the field. What the paper leaves open is settled here, as constants.
+All quantities are dimensionless as in the paper: time in L sqrt(rho/G), b = sqrt(Br B/(mu0 G))
+with the sign of the field. Constants here define parameters that the paper does not state.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,21 +22,21 @@ from hmsa_ros.planning.sequence import plan_sequence, Segment
 from hmsa_ros.planning.setpoint import Setpoint
 from hmsa_ros.planning.two_step import CODES, Groups, plan_two_step_batch
 
-#: Span of each setpoint, as stated in the paper.
+#: Duration of each setpoint, as stated in the paper.
 SPAN = 10.0
-#: The sequence of Figs. 4, 5 and 7; also taken for Fig. 2, whose levels the paper leaves open.
+#: The sequence of Figs. 4, 5 and 7; also used for Fig. 2, whose levels the paper does not state.
 EXPANSION = (1.10, 1.20, 1.40)
 SECOND_EXPANSION = (1.15, 1.25, 1.35)
 CONTRACTION = (0.90, 0.80, 0.70)
 SECOND_CONTRACTION = (0.85, 0.70, 0.85)
 DEEP_CONTRACTION = (0.90, 0.80, 0.60)
-#: Fig. 3 shows one move; the paper does not say which.
+#: Fig. 3 shows one move; the paper does not state which.
 SINGLE = (1.10,)
 ZETAS = (0.02, 0.40, 1.10)
 J_LIMS = (1.0, 3.0, 5.0)
-#: Third stretch of Fig. 9 over the limiting stretch. The paper says only that it is near.
-#: Much nearer than this, the unshaped step, unlike the shaped one, cannot be followed: it would
-#: swing closer to the limit than double precision can tell from it.
+#: Third stretch of Fig. 9 relative to the limiting stretch. The paper only states that it is near.
+#: For much nearer ones, the unshaped step, unlike the shaped one, cannot be simulated: it would
+#: swing closer to the limit than double precision resolves.
 NEAR_LIMIT = 0.95
 #: Range of Fig. 10.
 J_LIM_RANGE = (0.5, 10.0)
@@ -45,9 +45,9 @@ SWEEP_POINTS = 1000
 
 _PAPER = NondimensionalParameters(zeta=0.2, j_lim=5.0)
 _BOTH = ('shaped', 'unshaped')
-# Fig. 8 ends where beta_1 - beta_p falls below this: what is left of it is rounding.
+# Difference beta_1 - beta_p at which Fig. 8 ends, as it is then a rounding error.
 _RESOLVED = 1e-12
-# The response near the limiting stretch is this much faster than elsewhere.
+# Factor on the sampling rate near the limiting stretch, where the response is faster.
 _FASTER = 5
 
 
@@ -55,41 +55,41 @@ _FASTER = 5
 class Run:
     """A response of the actuator."""
 
-    name: str  #: what sets it apart in its figure, for instance ``zeta 0.02``
+    name: str  #: distinguishes it in its figure, for instance ``zeta 0.02``
     command: str  #: ``shaped``, ``unshaped`` or ``b_p alone``
     material: NondimensionalParameters
     targets: tuple[float, ...]
-    switches: Array  #: shape (m,): times at which a level of the load begins
+    switches: Array  #: shape (m,): start times of the levels
     loads: Array  #: shape (m,): the levels beta
-    time: Array  #: shape (n,), as stretch and rate; every switch is among them
+    time: Array  #: shape (n,), like stretch and rate; includes every switch
     stretch: Array
     rate: Array
 
     @property
     def load(self) -> Array:
-        """The load from each sample on."""
+        """The load at each sample."""
         level = np.searchsorted(self.switches, self.time, side='right') - 1
         return np.asarray(self.loads[level])
 
     def turning_points(self, begin: float, end: float) -> int:
-        """Count the changes of direction between two times; two a cycle."""
+        """Count the reversals between two times; two per cycle."""
         part = self.rate[(self.time > begin) & (self.time < end)]
         return int(np.count_nonzero(np.diff(np.signbit(part))))
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """The first move of a sequence over a parameter: zeta or j_lim varies."""
+    """The first move of a sequence over a parameter, zeta or j_lim."""
 
     start: float
     target: float
-    zeta: Array  #: shape (n,), as all arrays
+    zeta: Array  #: shape (n,), like all arrays
     j_lim: Array
-    status: tuple[str, ...]  #: ``two_step`` where there is a plan
-    tau_p: Array  #: NaN without a plan, as the loads
+    status: tuple[str, ...]  #: ``two_step`` if there is a plan
+    tau_p: Array  #: NaN without a plan, as are the loads
     beta_p: Array
     beta_1: Array
-    critical: float  #: linearised critical zeta at the target; NaN where zeta does not vary
+    critical: float  #: linearised critical zeta at the target; NaN if zeta does not vary
 
 
 Data = tuple[Run, ...] | Sweep
@@ -99,8 +99,8 @@ def respond(
         name: str, targets: Sequence[float], material: NondimensionalParameters, *,
         commands: Sequence[str] = _BOTH, span: float = SPAN,
         samples: int = SAMPLES, faster: int = 1) -> tuple[Run, ...]:
-    """Compute the response to targets, each for a span, that starts at rest; a run a command."""
-    # Of at least 2 evenly spaced samples; those of the last setpoint are so many times denser.
+    """Compute the response to targets of a given duration, from rest; one run per command."""
+    # With at least 2 evenly spaced samples, denser by a factor in the last setpoint.
     setpoints = [Setpoint(x, span) for x in targets]
     runs = []
     for command in commands:
@@ -128,7 +128,7 @@ def _levels(segments: Sequence[Segment]) -> tuple[Array, Array]:
 def _respond_all(
         sequences: Sequence[Sequence[float]], commands: Sequence[str],
         samples: int = SAMPLES) -> tuple[Run, ...]:
-    """Compute the responses of the paper's block to sequences, with so many samples a run."""
+    """Compute the responses of the paper's block to sequences, with a number of samples each."""
     return tuple(
         run for targets in sequences for run in respond(
             _names(targets), targets, _PAPER, commands=commands, samples=samples))
@@ -138,7 +138,7 @@ def _names(targets: Sequence[float]) -> str:
     return ', '.join(f'{x:g}' for x in targets)
 
 
-# Figs. 2 to 6, of the number of samples a run: one sequence or two.
+# Figs. 2 to 6 by number of samples per run: one sequence or two.
 multi_step = partial(_respond_all, (EXPANSION,), ('unshaped',))
 single_move = partial(_respond_all, (SINGLE,), (*_BOTH, 'b_p alone'))
 shaped_multi_step = partial(_respond_all, (EXPANSION,), _BOTH)
@@ -156,7 +156,7 @@ def damping_cases(samples: int = SAMPLES) -> tuple[Run, ...]:
 
 
 def damping_sweep(points: int = SWEEP_POINTS) -> Sweep:
-    """Compute Fig. 8: tau_p over zeta for 1 -> 1.1, up to where b_p cannot be told from b_1."""
+    """Compute Fig. 8: tau_p over zeta for 1 -> 1.1, while b_p differs from b_1 numerically."""
     start, target = 1.0, EXPANSION[0]
     critical = float(critical_zeta(target, _PAPER))
     near = critical * np.linspace(0.9, 1.1, 4001)
@@ -186,7 +186,7 @@ def chain_limit_cases(samples: int = SAMPLES) -> tuple[Run, ...]:
 
 
 def chain_limit_sweep(points: int = SWEEP_POINTS) -> Sweep:
-    """Compute Fig. 10: tau_p and b_p over J_lim for 1 -> 1.2, those of Fig. 9 among them."""
+    """Compute Fig. 10: tau_p and b_p over J_lim for 1 -> 1.2, including those of Fig. 9."""
     j_lim = np.union1d(np.linspace(*J_LIM_RANGE, points), J_LIMS)
     return _sweep(1.0, 1.2, np.full(j_lim.size, _PAPER.zeta), j_lim, float('nan'))
 
@@ -208,7 +208,7 @@ _SWEEP_COLUMNS = (
 
 
 def write_csv(path: Path, data: Data) -> None:
-    """Write a figure's numbers in full precision, a row each; loads hold from their time on."""
+    """Write a figure's data in full precision, by rows; loads apply from their time on."""
     with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
         writer = csv.writer(file, lineterminator='\n')
         if isinstance(data, Sweep):

@@ -1,4 +1,4 @@
-"""Pictures of the studies: robustness, sampled hardware, heavy damping."""
+"""Figures of the studies: robustness, sampled hardware, heavy damping."""
 
 from collections.abc import Mapping, Sequence
 import math
@@ -23,19 +23,19 @@ from hmsa_studies.residual import Actual
 from hmsa_studies.robustness import Candidate, Case, ORDERED, Result
 from hmsa_studies.sampled import ideal_move, PROMISED, rounded_move, SampledStudy, solved_move
 
-# Residuals below this are drawn on it.
+# Smaller residuals are drawn at this value.
 _FLOOR = 1e-4
 _SYMBOLS = {'G': '$G$', 'zeta': r'$\zeta$', 'J_lim': r'$J_\mathrm{lim}$'}
-# Of shapers of several orders, by order: whether markers are filled, and the width of the line.
+# Styles of orders of a shaper: fill of markers, and factor on the line width.
 _ORDERS = (('full', 1.0), ('none', 0.7), ('left', 0.5), ('top', 0.5))
-# Markers on a curve.
+# Number of markers on a curve.
 _MARKS = 5
 
 
 def draw_robustness(
         paths: Path | Sequence[Path], case: Case, results: Sequence[Result],
         paper: Paper | None = None) -> None:
-    """Draw what one move leaves: over each error alone, and the worst of all errors together."""
+    """Draw the residuals of one move: over each error alone, and the worst of all together."""
     shown = [x for x in results if x.move is not None]
     curves = _looks([x.candidate for x in shown])
     errors = 100.0 * case.errors()
@@ -47,7 +47,7 @@ def draw_robustness(
         rows = [['G', 'zeta'], ['J_lim' if 'J_lim' in names else 'box', 'box']]
     else:
         rows = [[x] for x in cells]
-    # In a column of a journal the panels are lower, so that all fit on its page.
+    # In a single column the panels are lower, so that all fit on a page.
     height = 2.3 if columns > 1 else 1.6
     with style.picture(paths, 1.4 + height * len(rows) + 0.3 * (3 - columns), paper) as figure:
         figure.suptitle(
@@ -58,7 +58,7 @@ def draw_robustness(
             axes = panels[name]
             for place, (result, (look, order)) in enumerate(zip(shown, curves, strict=True)):
                 fill, thin = _ORDERS[order % len(_ORDERS)]
-                # Markers of different curves stand apart.
+                # Offset markers of different curves.
                 every = max(len(errors) // _MARKS, 1)
                 axes.plot(
                     errors, 100.0 * np.maximum(result.curves[name], _FLOOR),
@@ -81,7 +81,7 @@ def draw_robustness(
 
 
 def _nominal(case: Case) -> str:
-    """Return the model in a title."""
+    """Return a description of the model for a title."""
     material = case.material
     whose = rf'$J_\mathrm{{lim}}$ = {material.j_lim:g}' if material.law is None else (
         f'law {material.law.law}')
@@ -89,7 +89,7 @@ def _nominal(case: Case) -> str:
 
 
 def _looks(candidates: Sequence[Candidate]) -> list[tuple[Look, int]]:
-    """Return how each is drawn, and the how manieth order of its shaper it is."""
+    """Return the look of each candidate, and the index of its order."""
     orders = list(dict.fromkeys(x.order for x in candidates if x.shaper in ORDERED))
     return [
         (looks.SHAPERS.get(x.shaper, Look(looks.BLACK)),
@@ -99,7 +99,7 @@ def _looks(candidates: Sequence[Candidate]) -> list[tuple[Look, int]]:
 def draw_front(
         paths: Path | Sequence[Path], studies: Sequence[tuple[Case, Sequence[Result]]],
         paper: Paper | None = None) -> None:
-    """Draw the worst residuals over the duration of a move, a panel for each."""
+    """Draw the worst residuals over the duration of a move, with a panel for each move."""
     paper = paper or Paper()
     columns = paper.columns(max(min(len(studies), 3), 1))
     rows = max(-(-len(studies) // columns), 1)
@@ -144,7 +144,7 @@ def _draw_point(figure: style.Picture, panel: Axes, result: Result, look: Look) 
     if result.candidate.shaper in ORDERED:
         style.note(panel, f'{result.candidate.order}', (result.arrival, both[0]), (6, -3),
                    **style.SOFT)
-    # Of a shaper of several orders there is one entry.
+    # A shaper of several orders has a single entry.
     name = result.candidate.name.partition(',')[0]
     if name not in panel.get_legend_handles_labels()[1]:
         panel.plot([], [], color=look.colour, linestyle='none', marker=look.marker,
@@ -152,7 +152,7 @@ def _draw_point(figure: style.Picture, panel: Axes, result: Result, look: Look) 
 
 
 def _label(result: Result) -> str:
-    """Name a curve; a shaper that fell back says to what."""
+    """Return the label of a curve, with the code of a shaper that fell back."""
     name = result.candidate.name
     return f'{name}: {result.code}' if result.reason else name
 
@@ -160,7 +160,7 @@ def _label(result: Result) -> str:
 def _bars(
         axes: Axes, case: Case, results: Sequence[Result], curves: Sequence[Look],
         letter: str) -> None:
-    """Draw the worst in the box of all errors."""
+    """Draw the worst residuals in the box of all errors."""
     worst = np.array([x.worst.residual for x in results])
     lengths = 100.0 * np.nan_to_num(np.maximum(worst, _FLOOR), nan=_FLOOR)
     places = np.arange(len(results))
@@ -184,7 +184,7 @@ def _bars(
 def draw_sampled(
         path: Path, study: SampledStudy, paper: Paper | None = None, *,
         period: float = 0.28) -> None:
-    """Draw residuals over the command period, and a run at one (share of tau_p)."""
+    """Draw residuals over the command period, and a run at one period (fraction of tau_p)."""
     with style.picture(path, 3.9, paper) as figure:
         figure.suptitle(
             rf'Commands every period $T$, $\lambda$ = {study.start:g} to {study.target:g}, '
@@ -241,7 +241,7 @@ def _draw_moves(
         panels: Mapping[str, Axes], study: SampledStudy | DampedStudy,
         material: NondimensionalParameters, moves: Sequence[tuple[Move, dict[str, Any]]],
         end: float, count: int, unit: float = 1.0) -> None:
-    """Draw commands, their loads over a unit, and the responses to them, each in its look."""
+    """Draw commands, their loads over a unit, and their responses, each in its look."""
     times = np.linspace(0.0, end, count, dtype=np.float64)
     for move, look in moves:
         loads = [x.load / unit for x in move.levels]
@@ -257,7 +257,7 @@ def _draw_moves(
 def draw_damped(
         path: Path, study: DampedStudy, paper: Paper | None = None, *,
         zeta: float = 4.0) -> None:
-    """Draw settling times over zeta, and one zeta's commands and responses."""
+    """Draw settling times over zeta, and commands and responses at one zeta."""
     material = NondimensionalParameters(zeta)
     holding = float(elastic_force(study.target, material))
     kinds = (

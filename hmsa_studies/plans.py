@@ -1,4 +1,4 @@
-"""The plans of many rows: by the batch wherever it plans what is asked for, else one by one."""
+"""Plans of many rows: by the batch if it supports them, else one by one."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -21,7 +21,7 @@ from hmsa_ros.planning.two_step import CODES, Groups, plan_two_step_batch
 from hmsa_studies.residual import Actual, arrival_of
 from hmsa_studies.settings import Setting
 
-#: All codes; plans have their places.
+#: All codes; plans contain their indices.
 STATUS = tuple(Code)
 _PLACES = np.array([STATUS.index(CODES[x]) for x in sorted(CODES)])
 _TWO_STEP, _LIMIT, _BAD = (
@@ -30,9 +30,9 @@ _TWO_STEP, _LIMIT, _BAD = (
 
 @dataclass(frozen=True)
 class Plans:
-    """Plans of n rows, nondimensional; NaN where there is no such level or duration."""
+    """Plans of n rows, dimensionless; NaN for missing levels or durations."""
 
-    codes: NDArray[np.int64]  #: (n,), places in STATUS
+    codes: NDArray[np.int64]  #: (n,), indices in STATUS
     numbers: Array  #: (3, n): first level, duration and last level
 
     @classmethod
@@ -43,7 +43,7 @@ class Plans:
     def put(
             self, rows: NDArray[np.int64] | int, codes: NDArray[np.int64] | int,
             numbers: ArrayLike) -> None:
-        """Put plans in the places of their rows."""
+        """Store plans at their rows."""
         self.codes[rows] = codes
         self.numbers[:, rows] = numbers
 
@@ -62,7 +62,7 @@ def by_settings(
         target: Array, shapers: NDArray[np.str_], *, workers: int = 0) -> Plans:
     """Return plans from rest; each row has the setting at `which`, None if out of range."""
     plans = Plans.none(len(which))
-    # Laws by place: comparing tables would take longer than planning.
+    # Models by index: comparing tables would take longer than planning.
     laws: dict[Elastic | None, int] = {}
     groups = np.full(len(settings), -2)
     for i, setting in enumerate(settings):
@@ -106,11 +106,11 @@ def carried_out(
         settings: Sequence[Setting | None], actuals: Sequence[Setting | None],
         which: NDArray[np.int64], start: Array, target: Array,
         shapers: NDArray[np.str_]) -> tuple[Plans, Array, Array]:
-    """Return plans, and vibration and offset that they leave on `actuals`, shares of the step."""
+    """Return plans, and their vibration and steady-state error on `actuals`, per step."""
     plans = Plans.none(len(which))
-    # NaN where there is no plan, no move, or a motion that cannot be followed.
+    # NaN without a plan or a move, or if a motion cannot be simulated.
     left = np.full((2, len(which)), math.nan)
-    # Rows that differ in the actuator alone have one plan.
+    # Rows that differ only in the actuator share a plan.
     made: dict[tuple[Setting, float, float, str], tuple[_Planned, float]] = {}
     rows = zip(which.tolist(), start.tolist(), target.tolist(), shapers.tolist(), strict=True)
     for row, (place, begin, end, shaper) in enumerate(rows):
@@ -134,7 +134,7 @@ def carried_out(
 
 @dataclass(frozen=True)
 class _Planned:
-    """A plan of one row: its code, its command if there is one, and the load that holds it."""
+    """A plan of one row: its code, its command if there is one, and the holding load."""
 
     code: Code
     move: Move | None

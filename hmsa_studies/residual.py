@@ -1,4 +1,4 @@
-"""What is left of a move on an actuator that is not the one it was planned for."""
+"""Residual of a move on an actuator that differs from the model."""
 
 from dataclasses import dataclass
 import math
@@ -26,19 +26,19 @@ from hmsa_studies.settings import Setting
 
 __all__ = ['Actual', 'arrival_of', 'Errors']
 
-# Peak-to-peak of a decaying motion is final after one period, or once it has died out.
+# The peak-to-peak value of a decaying motion is final after one period, or after its decay.
 _PERIODS = 2.0
 _DECADES = 12.0
-# 150 samples a period miss 2e-4 of an extremum.
+# 150 samples per period miss 2e-4 of an extremum.
 _SAMPLES = 301
 _EXACT = Errors()
 
 
 def arrival_of(
         move: Move, start: float, target: float, material: NondimensionalParameters) -> float:
-    """Return from when (in the model's time) what still moves counts as residual vibration."""
-    # The end of the command. An unshaped step, which never arrives, counts from when the two-step
-    # command would; where there is none, from half a natural period on.
+    """Return the time (of the model) from which motion counts as residual vibration."""
+    # The end of the command. For an unshaped step, which never arrives, use the arrival of the
+    # two-step command; if there is none, half a natural period.
     if math.isfinite(move.duration):
         return move.duration
     if not material.creep:
@@ -49,7 +49,7 @@ def arrival_of(
 
 
 def ringing(stretch: float, material: NondimensionalParameters) -> tuple[float, float]:
-    """Return the period (infinite if there is none) and the decay of small motion about rest."""
+    """Return the period (infinite if there is none) and decay of small motion about rest."""
     frequency = float(natural_frequency(stretch, material))
     ratio = material.zeta / float(critical_zeta(stretch, material))
     if ratio < 1.0:
@@ -59,11 +59,11 @@ def ringing(stretch: float, material: NondimensionalParameters) -> tuple[float, 
 
 @dataclass(frozen=True)
 class Actual:
-    """An actuator that carries out moves planned with, and in the units of, another model."""
+    """An actuator that carries out moves planned with another model, in the model's units."""
 
     model: NondimensionalParameters
     material: NondimensionalParameters  #: of the actuator, in its own units
-    time: float = 1.0  #: the actuator's units in those of the model
+    time: float = 1.0  #: the actuator's units relative to those of the model
     load: float = 1.0
     delivery: Delivery = IDEAL  #: in the actuator's units; commands are those of the move
 
@@ -71,20 +71,20 @@ class Actual:
     def off(
             cls, model: NondimensionalParameters, errors: Errors = _EXACT,
             delivery: Delivery = IDEAL) -> 'Actual':
-        """Return the actuator of a model in error, under a coil that is as the model has it."""
+        """Return the actuator for errors of a model, with the same coil."""
         return cls(
             model, errors.actual(model), 1.0 / errors.faster, errors.stiffer,
             errors.delivery(delivery))
 
     @classmethod
     def of(cls, model: Setting, actual: Setting) -> 'Actual':
-        """Return an actuator with parameters of its own."""
+        """Return an actuator with its own parameters."""
         return cls(
             model.material, actual.material, actual.units.time / model.units.time,
             actual.units.load / model.units.load, actual.delivery)
 
     def response(self, move: Move, start: float, times: Floats) -> Array:
-        """Sample the stretch from rest where the model's load for the start really holds it."""
+        """Sample the stretch from the true equilibrium under the model's initial load."""
         held = float(elastic_force(start, self.model)) / self.load
         stretch: Array = sampled(
             [Level(x.time / self.time, x.load / self.load) for x in move.levels],
@@ -94,13 +94,13 @@ class Actual:
         return stretch
 
     def rest(self, move: Move) -> float:
-        """Return the stretch at which the last level of a move really holds the actuator."""
+        """Return the true equilibrium stretch under the last level of a move."""
         return float(equilibrium_stretch(move.levels[-1].load / self.load, self.material))
 
     def residual(self, move: Move, start: float, target: float, arrival: float) -> float:
-        """Return the peak-to-peak stretch after arrival as a share of the commanded step."""
-        # A steady offset, from a load that holds another stretch than the model says, is no
-        # vibration and does not count.
+        """Return the peak-to-peak stretch after arrival as a fraction of the commanded step."""
+        # A steady-state error, due to an error of the holding load, is no vibration and does not
+        # count.
         period, decay = ringing(self.rest(move), self.material)
         horizon = min(_PERIODS * period, _DECADES / decay if decay > 0.0 else math.inf)
         times = arrival + np.linspace(0.0, horizon * self.time, _SAMPLES)
@@ -109,5 +109,5 @@ class Actual:
             step=target - start)
 
     def offset(self, move: Move, start: float, target: float) -> float:
-        """Return how far beyond the target a move comes to rest, as a share of the step."""
+        """Return the steady-state error of a move beyond the target, as a fraction of the step."""
         return (self.rest(move) - target) / (target - start)

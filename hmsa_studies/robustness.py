@@ -1,9 +1,8 @@
 """
-Robustness: what each shaper leaves of a move when the model is in error.
+Robustness: residuals of each shaper's moves with model errors.
 
-Each shaper plans with the nominal parameters; the plan is carried out by an actuator whose
-shear modulus G, damping coefficient and J_lim are others, each alone and all together
-anywhere in a box.
+Each shaper plans with the nominal parameters. The plan is carried out by an actuator with errors
+in shear modulus G, damping coefficient and J_lim, each alone and all together anywhere in a box.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,18 +29,18 @@ from hmsa_ros.planning.shapers.request import Request
 from hmsa_studies.residual import Actual, arrival_of, Errors
 from hmsa_studies.tasks import Tasks
 
-#: Parameters in error: name for a person, name in `Errors`.
+#: Parameters with errors: display name, and name in `Errors`.
 PARAMETERS = {'G': 'shear_modulus', 'zeta': 'zeta', 'J_lim': 'j_lim'}
-#: Orders that are compared of the shapers that have one.
+#: Orders to compare of shapers that have one.
 ORDERS = (2, 3)
 ORDERED = ('robust', 'minimax')
-#: A chain is of no use long before this order.
+#: Maximum order, far beyond useful ones.
 MOST_ORDER = 100
-#: Values a parameter takes in the curves, besides the edges of the box.
+#: Number of values of a parameter in the curves, besides the edges of the box.
 _POINTS = 41
-# Values a parameter takes in the box, edges and centre included.
+# Number of values of a parameter in the box, including edges and centre.
 _BOX_POINTS = 9
-#: Largest error that is studied.
+#: Maximum error.
 LARGEST = 0.9
 
 _NAMES = {
@@ -52,13 +51,13 @@ _LINEAR = ('zv', 'zvd', 'ei', 'umzv')
 
 @dataclass(frozen=True)
 class Candidate:
-    """A shaper to be compared."""
+    """A shaper to compare."""
 
     shaper: str
-    order: int = 2  #: of those in ORDERED
+    order: int = 2  #: for shapers in ORDERED
 
     def __post_init__(self) -> None:
-        """Check both."""
+        """Check shaper and order."""
         get_shaper(self.shaper)
         if not 1 <= self.order <= MOST_ORDER:
             raise BadInputError(
@@ -66,25 +65,25 @@ class Candidate:
 
     @property
     def name(self) -> str:
-        """Name for a person."""
+        """Display name."""
         if self.shaper in ORDERED:
             return f'{self.shaper}, order {self.order}'
         return _NAMES.get(self.shaper, self.shaper)
 
     @property
     def linear(self) -> bool:
-        """Whether it is a shaper of linear theory, a reference for comparison."""
+        """Whether it is a linear shaper, as a reference."""
         return self.shaper in _LINEAR
 
     @property
     def label(self) -> str:
-        """Name that says what a reference is designed for."""
+        """Name with the design point of a reference."""
         return f'{self.name} (linear, designed at the target)' if self.linear else self.name
 
 
 @dataclass(frozen=True)
 class Case:
-    """A move between stretches at rest, its model, and errors of it; in the model's units."""
+    """A move between stretches at rest, its model, and errors; in the model's units."""
 
     start: float
     target: float
@@ -92,7 +91,7 @@ class Case:
     limits: Limits = field(default_factory=Limits)
     delivery: Delivery = IDEAL
     box: float = 0.1  #: half the width of the box of errors, above 0
-    span: float = 0.2  #: largest error in the curves, at least that of the box
+    span: float = 0.2  #: maximum error in the curves, at least that of the box
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -110,13 +109,13 @@ class Case:
 
     @property
     def parameters(self) -> dict[str, str]:
-        """Which of `PARAMETERS` the law of the model has."""
+        """Those of `PARAMETERS` that the model has."""
         limited = self.material.law is None and math.isfinite(self.material.j_lim)
         return {x: y for x, y in PARAMETERS.items() if y != 'j_lim' or limited}
 
     @property
     def nominal(self) -> str:
-        """The model in a line."""
+        """One-line description of the model."""
         material = self.material
         whose = f'J_lim {material.j_lim:g}' if material.law is None else f'law {material.law.law}'
         return f'nominal zeta {material.zeta:g}, {whose}, c1 {material.c1:g}'
@@ -126,7 +125,7 @@ class Case:
         return Actual.off(self.material, errors, self.delivery)
 
     def errors(self) -> Array:
-        """Return the errors of one parameter in the curves, with 0 and both edges of the box."""
+        """Return the errors of a parameter in the curves, with 0 and both edges of the box."""
         grid = np.linspace(-self.span, self.span, _POINTS)
         grid[_POINTS // 2] = 0.0
         edges = np.array([-self.box, self.box])
@@ -136,25 +135,25 @@ class Case:
 
 @dataclass(frozen=True)
 class Worst:
-    """The largest residual among errors, and where."""
+    """The largest residual over some errors, and its errors."""
 
-    residual: float  #: as a share of the step; NaN if a motion could not be followed
+    residual: float  #: as a fraction of the step; NaN if a motion could not be simulated
     errors: Errors
 
 
 @dataclass(frozen=True)
 class Result:
-    """One shaper in one case."""
+    """Result of one shaper in one case."""
 
     candidate: Candidate
-    code: Code  #: another one than the shaper's own where it fell back or refused
-    reason: str  #: why it did
-    move: Move | None  #: None if refused; what follows is empty then, and the numbers NaN
-    arrival: float  #: time from which the residual counts, nominal
+    code: Code  #: differs from the shaper's own if it fell back or refused
+    reason: str  #: reason for that
+    move: Move | None  #: None if refused; the other fields are then empty or NaN
+    arrival: float  #: nominal time from which the residual counts
     nominal: float  #: residual without errors
-    curves: dict[str, Array]  #: by parameter: residual at `Case.errors` of it alone
-    alone: dict[str, Worst]  #: by parameter: the worst of it alone, up to the box's edges
-    worst: Worst  #: in the box of all three
+    curves: dict[str, Array]  #: by parameter: residuals for `Case.errors` of it alone
+    alone: dict[str, Worst]  #: by parameter: worst residual of it alone, up to the box's edges
+    worst: Worst  #: worst residual in the box of all three
 
 
 def candidates(
@@ -169,7 +168,7 @@ def candidates(
 
 
 def study(case: Case, candidate: Candidate) -> Result:
-    """Plan a move with the nominal parameters and carry it out with others."""
+    """Plan a move with the nominal parameters and carry it out with errors."""
     try:
         request = Request(
             State(case.start), case.target, case.material, case.limits, case.delivery,
@@ -185,7 +184,7 @@ def study(case: Case, candidate: Candidate) -> Result:
         except BadInputError:
             raise
         except HmsaError:
-            # Too close to a limiting stretch to follow.
+            # Too close to a limiting stretch to simulate.
             return math.nan
 
     curves = {
@@ -205,7 +204,7 @@ def _refused(candidate: Candidate, code: Code, reason: str) -> Result:
 
 
 def _alone(case: Case, curves: Mapping[str, Array]) -> dict[str, Worst]:
-    """Return the worst of each curve within the box."""
+    """Return the worst residual of each curve within the box."""
     grid = case.errors()
     inside = np.abs(grid) <= case.box
     return {
@@ -215,20 +214,20 @@ def _alone(case: Case, curves: Mapping[str, Array]) -> dict[str, Worst]:
 
 
 def _worst(residuals: Array, errors: Sequence[Errors]) -> Worst:
-    # argmax takes NaN for the largest, which it is here: nothing bounds it.
+    # argmax returns NaN as the largest, which is right here: nothing bounds it.
     index = int(np.argmax(residuals))
     return Worst(float(residuals[index]), errors[index])
 
 
-# What was varied is a parameter, or 'box' for the worst in the box; residual and offset, how far
-# beyond the target the actuator comes to rest, are shares of the step.
+# The column varied contains a parameter, or 'box' for the worst in the box; residual and offset,
+# the steady-state error beyond the target, are fractions of the step.
 _COLUMNS = (
     'start', 'target', 'zeta', 'j_lim', 'c1', 'shaper', 'order', 'status', 'varied',
     'error_G', 'error_zeta', 'error_J_lim', 'residual', 'offset')
 
 
 def write_csv(path: Path, studies: Sequence[tuple[Case, Sequence[Result]]]) -> None:
-    """Write all residuals, one a row, in full double precision; an old file is replaced."""
+    """Write all residuals, one per row, in full double precision; replace an old file."""
     with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
         writer = csv.writer(file, lineterminator='\n')
         writer.writerow(_COLUMNS)
@@ -284,7 +283,7 @@ def _row(case: Case, candidate: Candidate) -> dict[str, Any]:
 
 
 def result_of(case: Case, candidate: Candidate, row: Mapping[str, Any]) -> Result:
-    """Return what `study` did, out of the row of a table."""
+    """Return the result of `study` from the row of a table."""
     code, reason = Code(row['status']), row['reason']
     if not row['times']:
         return _refused(candidate, code, reason)

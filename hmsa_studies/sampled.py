@@ -1,8 +1,8 @@
 """
-Sampled hardware: what a fixed command period leaves of a move.
+Sampled hardware: residuals of a move with a fixed command period.
 
-Either the two-step command is solved for on the grid, or the ideal one is taken and its switch
-put on the nearest point of the grid.
+Either the two-step command is solved for on the sampling grid, or the switching time of the ideal
+one is rounded to the grid.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.shapers.two_step import two_step
 from hmsa_studies.residual import Actual
 
-#: Longest command period, as a share of tau_p, up to which the residual is to stay exact.
+#: Maximum command period, as a fraction of tau_p, for which the residual should be exact.
 PROMISED = 1.0 / 3.0
 
 
@@ -32,11 +32,11 @@ class SampledStudy:
     target: float
     material: NondimensionalParameters
     tau_p: float  #: of the ideal command
-    periods: Floats  #: as shares of tau_p
-    solved: Array  #: of the command solved on the grid; NaN where there is none
-    rounded: Array  #: of the ideal command with its switch on the nearest point of the grid
-    #: The worse of the ideal command with its switch half a period early and late: what rounding
-    #: can do where the period is not tuned to tau_p.
+    periods: Floats  #: as fractions of tau_p
+    solved: Array  #: of the command solved for on the grid; NaN if there is none
+    rounded: Array  #: of the ideal command with its switching time rounded to the grid
+    #: The worse of the ideal command switched half a period early and late: the worst rounding
+    #: error if the period is not matched to tau_p.
     bound: Array
 
 
@@ -51,12 +51,12 @@ def ideal_move(start: float, target: float, material: NondimensionalParameters) 
 
 
 def rounded_move(move: Move, period: float) -> Move:
-    """Return a two-step command switched at the nearest point of a grid after its start."""
+    """Return a two-step command with its switching time rounded to a grid after its start."""
     return _switched_at(move, max(1, round(move.duration / period)) * period)
 
 
 def _switched_at(move: Move, time: float) -> Move:
-    """Return a two-step command with another time of its switch, which is its duration."""
+    """Return a two-step command with another switching time, which is its duration."""
     first, last = move.levels
     return Move(move.code, (first, Level(time, last.load)), time)
 
@@ -74,7 +74,7 @@ def solved_move(
 def sampled_study(
         start: float, target: float, material: NondimensionalParameters,
         periods: Floats) -> SampledStudy:
-    """Compute residuals over the command period, in shares of tau_p."""
+    """Compute residuals over the command period, as fractions of tau_p."""
     ideal = ideal_move(start, target, material)
     tau_p = ideal.duration
 

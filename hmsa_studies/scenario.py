@@ -1,4 +1,4 @@
-"""What feedback is compared on: actuators with errors, a sensor, and ways to plan their moves."""
+"""Scenarios for the comparison of feedback: actuators with errors, sensors, and strategies."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -7,12 +7,12 @@ from hmsa_ros.estimation.prior import TRACKED
 from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_studies.linear import Weights
 
-#: How far from rest a first move, and after it another one, go.
+#: Distances of the first and the next target from rest.
 TARGETS = (0.4, 0.1)
-# Between two samples of a camera, in units of time.
+# Sampling interval of a camera, in time scales.
 _INTERVAL = 0.114
-# Of some 100 tried, those with the least vibration and offset over G as known and 20 % off; others
-# where the coil lags, since the loop rings with these.
+# Best of about 100 combinations, by vibration and steady-state error with G exact and with a 20 %
+# error; others if the coil lags, since the loop rings with these.
 _WEIGHTS = {'lqr': Weights(0.05, 0.01, 3.0), 'mpc': Weights(0.3, 0.03)}
 _CAREFUL = {'lqr': Weights(0.3, 0.3, 1.0), 'mpc': Weights(1.0, 0.03, wander=0.03)}
 
@@ -22,30 +22,30 @@ class Scenario:
     """Actuator and sensor; times in s."""
 
     name: str
-    period: float  #: between two samples
-    delay: float  #: until a sample is there
+    period: float  #: sampling period
+    delay: float  #: from the measurement to the arrival of a sample
     noise: float  #: standard deviation of a sample of stretch
-    half_length: float = 0.01  #: m; sets the unit of time, 4.4 ms for 0.01 m
-    truth: Mapping[str, float] = field(default_factory=dict)  #: factors beside that of G
+    half_length: float = 0.01  #: in m; determines the time scale, 4.4 ms for 0.01 m
+    truth: Mapping[str, float] = field(default_factory=dict)  #: true factors in addition to G's
     coil_time_constant: float = 0.0  #: unknown to the model
     free: tuple[str, ...] = TRACKED
     weights: Mapping[str, Weights] = field(default_factory=lambda: _WEIGHTS)
-    nominal: ActuatorParameters | None = None  #: in place of the example block
+    nominal: ActuatorParameters | None = None  #: instead of the example block
 
     @property
     def targets(self) -> tuple[float, ...]:
-        """Where moves go."""
+        """Targets of the moves."""
         return tuple(self.block.rest + x for x in TARGETS)
 
     @property
     def block(self) -> ActuatorParameters:
-        """Nominal."""
+        """The nominal block."""
         return self.nominal or ActuatorParameters.from_nondimensional(
             NondimensionalParameters(), shear_modulus=1e4, density=1900.0,
             half_length=self.half_length, remanence=0.1)
 
     def actuator(self, error: float) -> ActuatorParameters:
-        """Return the true one, for an error of the shear modulus as a share."""
+        """Return the true block, for a relative error of the shear modulus."""
         block = self.block
         return replace(
             block, shear_modulus=block.shear_modulus * (1.0 + error),
@@ -53,7 +53,7 @@ class Scenario:
 
 
 def scenario_of(actuator: ActuatorParameters) -> Scenario:
-    """Return the scenario of an actuator that a camera sees: some thirty samples a period."""
+    """Return the scenario of an actuator measured by a camera, about thirty samples per period."""
     period = _INTERVAL * actuator.time_unit
     return Scenario(
         f'{1.0 / period:.3g} Hz, {2e3 * period:.3g} ms late, noise 1e-3, T '
@@ -74,13 +74,13 @@ SCENARIOS = (
 
 @dataclass(frozen=True)
 class Strategy:
-    """How moves are planned."""
+    """A way to plan moves."""
 
     name: str
     shaper: str
     order: int = 1
-    #: What samples do: nothing; 'adapt' corrects moves that take longer where much is expected to
-    #: be left; 'lqr' and 'mpc' set a level after each; 'learning' tries the first move again.
+    #: Use of samples: none; 'adapt' corrects moves, which take longer if a large error is
+    #: expected; 'lqr' and 'mpc' set a level after each; 'learning' repeats the first move.
     kind: str = 'open'
 
 

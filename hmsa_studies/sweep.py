@@ -1,8 +1,8 @@
 """
 Sweeps: plans over grids, tables of cases and samples of parameters.
 
-A sweep is a product of axes. It is planned in blocks, so that its size is bounded by the disk
-and not by the memory, and a row that cannot be planned says why in its status.
+A sweep is a product of axes. It is planned in blocks, so that its size is limited by the disk and
+not by the memory. The status of a row that cannot be planned contains the reason.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,14 +29,14 @@ from hmsa_studies.views import Axis, View
 
 __all__ = ['parse_grid', 'ROW_BYTES', 'Rows', 'Sweep']
 
-#: Roughly: bytes of a row as Parquet.
+#: Approximate size of a row in Parquet, in bytes.
 ROW_BYTES = 50
-# Roughly: rows a second and core of an idle machine, and rows of a chunk, least and most: by the
-# batch alone, by the batch after a block was made of each row, and one by one.
+# Approximate rows per second and core of an idle machine, and minimum and maximum rows of a chunk:
+# by the batch alone, by the batch with a block per row, and one by one.
 _RATES = (400_000.0, 15_000.0, 3_000.0)
 _CHUNKS = ((LEAST_ROWS, MOST_ROWS), (5_000, 50_000), (500, 5_000))
 _LAW, _SHAPER = 'law', 'shaper'
-#: What a plan leaves when it is carried out.
+#: Columns for results of the simulated plans.
 _LEFT = ('residual', 'offset')
 _STATUS = np.array([str(x) for x in STATUS])
 
@@ -46,11 +46,11 @@ Places = tuple[NDArray[np.int64], ...]
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of a sweep, planned: columns of shape (n,) by name, in order."""
+    """Planned rows of a sweep: columns of shape (n,) by name, in order."""
 
     inputs: dict[str, Column]
-    codes: NDArray[np.int64]  #: places in `hmsa_studies.plans.STATUS`
-    results: dict[str, Array]  #: NaN where there is no such number
+    codes: NDArray[np.int64]  #: indices in `hmsa_studies.plans.STATUS`
+    results: dict[str, Array]  #: NaN for missing values
 
     @property
     def status(self) -> NDArray[np.str_]:
@@ -58,12 +58,12 @@ class Rows:
         return _STATUS[self.codes]
 
     def to_pydict(self) -> dict[str, list[Any]]:
-        """Return the columns as lists, as a table of pyarrow does."""
+        """Return the columns as lists, as a pyarrow table does."""
         columns = {**self.inputs, 'status': self.status, **self.results}
         return {name: x.tolist() for name, x in columns.items()}
 
     def arrow(self) -> Any:
-        """Return the columns as a table of pyarrow."""
+        """Return the columns as a pyarrow table."""
         arrow, _ = require_arrow()
         status = arrow.DictionaryArray.from_arrays(self.codes, _STATUS.tolist())
         return arrow.table(
@@ -77,33 +77,33 @@ class Sweep:
     Parameters
     ----------
     grids : mapping of str to array_like, shape (n,)
-        Values by column; a column of the system that is named nowhere has its default.
+        Values by column; a column of the system that is not given has its default.
     cases, samples : mapping of str to array_like, shape (m,), optional
-        Columns of tables, taken row by row. Their values may be out of range: the plan of such a
-        row says so.
+        Columns of tables, used row by row. Their values may be out of range: the status of
+        such a row contains the reason.
     laws, shapers : sequence of str
-        Names that are compared; they have columns if given.
+        Names to compare; they have columns if given.
     system : System, optional
-        Units of the columns; default nondimensional.
+        Units of the columns; default dimensionless.
     residual : bool
-        Carry the plans out, and return what they leave; so do columns of the actuator.
+        Whether to simulate the plans and return the results; implied by columns of the actuator.
 
     Attributes
     ----------
     size : int
         Number of rows. The cases vary slowest, then the samples, then the columns in order.
     columns, results : tuple of str
-        Names of all columns of the table, and of those that are computed numbers.
+        Names of all columns of the table, and of computed numbers.
     rate : float
-        Roughly: rows a second and core.
+        Approximate rows per second and core.
     chunk_rows : tuple of int
-        Rows of a chunk, least and most.
+        Minimum and maximum rows of a chunk.
 
     Raises
     ------
     BadInputError
-        If a column is unknown, empty, out of range or named twice, or those of a table differ in
-        length.
+        If a column is unknown, empty, out of range or given twice, or columns of a table differ
+        in length.
 
     """
 
@@ -137,7 +137,7 @@ class Sweep:
                 raise BadInputError(
                     f'law {law!r} is unknown: expected one of {", ".join(LAWS)}')
             if not any(x.startswith('law.') for x in seen):
-                # Constants that no row can have are not left to the rows.
+                # Report invalid constants here if no row can have them.
                 self._system.setting({**defaults, LAW_NAME.name: law})
         for shaper in shapers:
             get_shaper(shaper)
@@ -161,20 +161,20 @@ class Sweep:
 
     @property
     def shown(self) -> tuple[str, ...]:
-        """Return the columns that are drawn unless others are named."""
+        """Return the columns to draw by default."""
         if self._carried:
             return _LEFT
         return ('tau_p', 'beta_p') if self._system.roots else ('time_p', 'flux_density_p')
 
     def view(self) -> View:
-        """Return how the sweep is drawn; raise `BadInputError` where there is no picture of it."""
+        """Return how to draw the sweep; raise `BadInputError` if there is no figure of it."""
         return View.of([
             Axis.of(axis, samples=i == self._sampled) for i, axis in enumerate(self._axes)
             if self._shape[i] > 1])
 
     @property
     def fixed(self) -> dict[str, float]:
-        """Return the columns of numbers that are the same in all rows."""
+        """Return the numeric columns that are constant over all rows."""
         return {
             name: float(column[0]) for axis, size in zip(self._axes, self._shape, strict=True)
             for name, column in axis.items() if size == 1 and column.dtype.kind == 'f'}
@@ -192,7 +192,7 @@ class Sweep:
         return made.hexdigest()
 
     def rows(self, begin: int, end: int, *, workers: int = 0) -> Rows:
-        """Plan rows from one number up to another, on so many threads; 0 for one a core."""
+        """Plan a range of rows on a number of threads; 0 for one per core."""
         places = np.unravel_index(np.arange(begin, end), self._shape)
         values = {
             name: column[place]
@@ -222,12 +222,12 @@ class Sweep:
     def _occurring(
             self, inputs: Mapping[str, Column],
             places: Places) -> tuple[list[dict[str, Any]], NDArray[np.int64]]:
-        """Return all values of the columns that make a block, and which are where."""
+        """Return all combinations of columns that define a block, and the index of each row's."""
         names = [x for x in self._inputs if x not in ('start', 'target', _SHAPER)]
         number = np.zeros(len(inputs['start']), np.int64)
         for axis, place, size in zip(self._axes, places, self._shape, strict=True):
             if set(axis) & set(names):
-                # Within a block only differences count, and the product of all may be too large.
+                # Renumber within a block, since the product of all axes may be too large.
                 _, number = np.unique(number * size + place, return_inverse=True)
         _, first, which = np.unique(number, return_index=True, return_inverse=True)
         columns = [inputs[name][first].tolist() for name in names]
@@ -238,7 +238,7 @@ class Sweep:
     def _results(
             self, plans: Plans, time: Array | float, load: Array | float,
             *left: Array) -> dict[str, Array]:
-        """Return the columns of numbers, for units of time and load."""
+        """Return the numeric columns, for scales of time and load."""
         first, duration, last = plans.numbers
         more = dict(zip(_LEFT, left or (duration,) * 2, strict=True)) if self._carried else {}
         if self._system.roots:
@@ -250,18 +250,18 @@ class Sweep:
             'flux_density_1': last * load, **more}
 
     def table(self, begin: int, end: int) -> Any:
-        """Plan rows from one number up to another on one core; return a table of pyarrow."""
+        """Plan a range of rows on one core; return a pyarrow table."""
         return self.rows(begin, end, workers=1).arrow()
 
     def blocks(self, rows: int) -> Iterator[Rows]:
-        """Plan the sweep and yield its rows in order, in blocks of so many."""
+        """Plan the sweep and yield its rows in order, in blocks."""
         for begin in range(0, self.size, rows):
             yield self.rows(begin, min(begin + rows, self.size))
 
 
 def _setting(
         make: Callable[[Mapping[str, Any]], Setting], values: Mapping[str, Any]) -> Setting | None:
-    """Return a setting, None where values are out of range."""
+    """Return a setting, None if values are out of range."""
     try:
         return make(values)
     except BadInputError:
@@ -269,7 +269,7 @@ def _setting(
 
 
 def _table(words: str, table: Mapping[str, ArrayLike]) -> dict[str, Column]:
-    """Return the columns of a table, which must have one length."""
+    """Return the columns of a table, which must have equal lengths."""
     found: dict[str, Column] = {
         name: np.asarray(x, dtype=np.float64) for name, x in table.items()}
     if len({x.size for x in found.values()}) > 1:
@@ -278,7 +278,7 @@ def _table(words: str, table: Mapping[str, ArrayLike]) -> dict[str, Column]:
 
 
 def _checked(name: str, values: ArrayLike, limits: tuple[float, float]) -> Array:
-    """Return the values of a column unless no plan can have them."""
+    """Return the values of a column; raise `BadInputError` for impossible ones."""
     found = np.asarray(values, dtype=np.float64)
     wrong = ~((found >= limits[0]) & (found <= limits[1]))
     if np.any(wrong):

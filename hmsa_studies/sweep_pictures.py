@@ -1,4 +1,4 @@
-"""Pictures of sweeps: curves, maps with the region without a plan, and how samples spread."""
+"""Figures of sweeps: curves, maps with the region without a plan, and distributions of samples."""
 
 from collections.abc import Mapping, Sequence
 import math
@@ -20,7 +20,7 @@ from hmsa_ros.report.paper import Paper
 from hmsa_studies.settings import ACTUAL, BLOCK_OF, Nondimensional
 from hmsa_studies.views import Axis, View
 
-#: Shares of the samples between which the bands are, and the one that maps show.
+#: Quantiles of the samples that limit the bands, and the quantile that maps show.
 BANDS, MAPPED = ((0.05, 0.95), (0.25, 0.75)), 0.95
 
 _STEP = '% of step'
@@ -38,26 +38,26 @@ _NAMES = {
     'error.shear_modulus': 'error in $G$ (%)', 'error.j_lim': r'error in $J_\mathrm{lim}$ (%)',
     'error.zeta': r'error in $\zeta$ (%)', 'error.remanence': 'error in $B_r$ (%)',
     'time_p': 'time of first level $t_p$ (s)', 'flux_density_1': 'holding flux density $B_1$ (T)'}
-# Shares, drawn in percent.
+# Fractions, drawn in percent.
 _SHARES = ('residual', 'offset', *Nondimensional.actual)
 _UNITS = {x.name: x.unit for x in PLANNED}
 _HATCH: dict[str, Any] = {'facecolor': '#F0F0F0', 'edgecolor': '#9A9A9A', 'hatch': '////'}
 _CONTOURS = 7
-# A map whose middle value is in this share of its scale shows a single colour; then the scale is
-# logarithmic, and ends where so many of the values do.
+# Position of the median in the scale of a map below which it would show a single colour; the scale
+# is then logarithmic and ends at this quantile.
 _LOPSIDED, _MOST = 0.2, 0.97
-# A scale is logarithmic where numbers are all above 0 and spread by so much.
+# Ratio of positive values above which a scale is logarithmic.
 _DECADES = 30.0
 
 
 def draw_sweep(
         paths: Sequence[Path], view: View, columns: Mapping[str, Array],
         fixed: Mapping[str, float] | None = None, paper: Paper | None = None) -> None:
-    """Draw a sweep's columns, NaN where there is no plan, titled by what is fixed."""
+    """Draw a sweep's columns, NaN without a plan, with the constant columns as a title."""
     values = {name: _scale(name) * view.arranged(x) for name, x in columns.items()}
     rows = len(view.labels) if view.y else 1
     paper = paper or Paper()
-    # Columns below each other where the paper is too narrow for them.
+    # Stack the columns if the paper is too narrow.
     stacked = paper.columns(len(values)) < len(values)
     with style.picture(paths, 1.1 + 2.5 * rows * (len(values) if stacked else 1), paper) as figure:
         panels = figure.subplots(
@@ -86,7 +86,7 @@ def draw_sweep(
 
 
 def worded(label: str) -> str:
-    """Return the label of a curve or map with the symbols of the columns that it names."""
+    """Return the label of a curve or map with symbols for the columns that it names."""
     parts = (x.rpartition(' ') for x in label.split(', '))
     return ', '.join(
         _with_value(name, float(value)) if name in _NAMES else f'{name}{space}{value}'
@@ -94,13 +94,13 @@ def worded(label: str) -> str:
 
 
 def _with_value(name: str, value: float) -> str:
-    """Return what a column is, and its value with the unit."""
+    """Return the description of a column, and its value with the unit."""
     quantity, bracket, unit = label_of(name).partition(' (')
     return f'{quantity} = {value:g}{" " if bracket else ""}{unit.removesuffix(")")}'
 
 
 def label_of(name: str) -> str:
-    """Return what an axis or a column is, with its unit if it has one."""
+    """Return the description of an axis or a column, with its unit if any."""
     if name in _NAMES:
         return _NAMES[name]
     planned = f'{BLOCK_OF}{name.removeprefix(ACTUAL)}'
@@ -115,20 +115,20 @@ def _scale(name: str) -> float:
 
 
 def _quantile(values: Array, share: float) -> Array:
-    """Return a quantile over the last axis of those that are numbers, NaN where none is."""
+    """Return a quantile over the last axis without NaN, or NaN if all are."""
     missing = np.all(np.isnan(values), axis=-1)
     found: Array = np.nanquantile(np.where(missing[..., None], 0.0, values), share, axis=-1)
     return np.where(missing, np.nan, found)
 
 
 def _wide(values: Array) -> bool:
-    """Return whether numbers spread over decades."""
+    """Return whether values extend over decades."""
     known = values[np.isfinite(values)]
     return bool(known.size and known.min() > 0.0 and known.max() > _DECADES * known.min())
 
 
 def _even(axis: Axis) -> bool:
-    """Return whether an axis is better linear: by which spacing its values are more even."""
+    """Return whether an axis is better linear, since its values are then more even."""
     places = View.places(axis)
     if not _wide(places):
         return True
@@ -139,7 +139,7 @@ def _even(axis: Axis) -> bool:
 def _map(
         figure: style.Picture, panel: Axes, axes: tuple[Axis, Axis], name: str,
         values: Array) -> None:
-    """Draw a map with contours; hatched where there is no plan."""
+    """Draw a map with contours, hatched where there is no plan."""
     places = [_scale(x.name) * View.places(x) for x in axes]
     orders = [np.argsort(x, kind='stable') for x in places]
     x, y = (place[order] for place, order in zip(places, orders, strict=True))
@@ -155,11 +155,11 @@ def _map(
         bar = figure.colorbar(mesh, ax=panel, label=label_of(name), pad=0.02,
                               extend='max' if values[known].max() > high else 'neither')
         if isinstance(norm, LogNorm) and high < _DECADES * low:
-            # No power of ten may be on the scale.
+            # There may be no power of ten on the scale.
             bar.set_ticks([z for z in MaxNLocator(5).tick_values(low, high) if low <= z <= high])
             bar.formatter = FormatStrFormatter('%g')
             bar.minorticks_off()
-        # At quantiles of the values, lines are spread over the whole map.
+        # At quantiles of the values, contours are spread over the whole map.
         levels = sorted({float(f'{z:.2g}') for z in np.quantile(
             values[known], np.arange(1, _CONTOURS + 1) / (_CONTOURS + 1))})
         levels = [z for z in levels if values[known].min() < z < values[known].max()]
@@ -186,7 +186,7 @@ def _norm(values: Array) -> tuple[Normalize, tuple[float, float]]:
 
 
 def _apart(place: int, count: int, points: int) -> tuple[int, int]:
-    """Return first marker and distance of markers so that those of several curves stand apart."""
+    """Return first marker and interval of markers, so that several curves do not overlap."""
     every = max(points // 6, 1)
     return place * every // count, every
 
@@ -194,7 +194,7 @@ def _apart(place: int, count: int, points: int) -> tuple[int, int]:
 def _curves(
         figure: style.Picture, panel: Axes, view: View, axis: Axis, name: str,
         values: Array) -> None:
-    """Draw curves over one axis, or the bands between which samples lie."""
+    """Draw curves over one axis, or bands of samples."""
     x = _scale(axis.name) * View.places(axis)
     order = np.argsort(x, kind='stable')
     x, values = x[order], values[:, order]
@@ -229,7 +229,7 @@ def _curves(
 
 
 def _shares(panel: Axes, view: View, name: str, values: Array) -> None:
-    """Draw the share of the samples below a number, with the median and 5 to 95 %."""
+    """Draw the cumulative distribution of the samples, with the median and 5 to 95 %."""
     for place, (label, found) in enumerate(
             zip(map(worded, view.labels), values, strict=True)):
         look = looks.case(place)
@@ -252,13 +252,13 @@ def _shares(panel: Axes, view: View, name: str, values: Array) -> None:
 
 
 def _notes(figure: Figure, panel: Axes, view: View, values: Mapping[str, Array]) -> None:
-    """Say below what curves, bands and hatches are."""
+    """Add a legend below for curves, bands and hatches."""
     curves: tuple[list[Any], list[str]] = ([], [])
     if view.y is None and view.x is not None and view.labels != ('',):
         curves = panel.get_legend_handles_labels()
     missing = max(float(np.mean(np.isnan(x))) for x in values.values())
     handles, labels = list(curves[0]), list(curves[1])
-    # Curves end where only one of them has no plan.
+    # Hatches appear where all curves lack a plan.
     over = (0, 3) if view.y is None else (3,)
     if view.x and any(np.any(np.all(np.isnan(x), axis=over)) for x in values.values()):
         handles.append(Patch(linewidth=0.0, **_HATCH))

@@ -1,4 +1,4 @@
-"""Tables of studies, written a block at a time, as CSV or Parquet."""
+"""Tables of studies, written block by block, as CSV or Parquet."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, ExitStack
@@ -12,14 +12,14 @@ from hmsa_ros.files import replacing, require_arrow
 
 
 class Block(Protocol):
-    """Some rows: a table of pyarrow, or what ``arrow()`` makes one of."""
+    """Some rows: a pyarrow table, or an object with ``arrow()``."""
 
     def to_pydict(self) -> Mapping[str, list[Any]]:
         """Return the columns as lists."""
 
 
 def repeating(table: Any) -> list[str]:
-    """Return the columns whose values repeat, which a dictionary makes smaller."""
+    """Return the columns with repeating values, which a dictionary compresses."""
     head = table.slice(0, 1000)
     return [x.name for x in head.schema if not x.type.num_fields
             and len(head[x.name].unique()) <= max(1, head.num_rows // 2)]
@@ -28,7 +28,7 @@ def repeating(table: Any) -> list[str]:
 @contextmanager
 def open_writer(
         path: Path | None, columns: Sequence[str]) -> Iterator[Callable[[Block], None]]:
-    """Yield what writes blocks to a file or, without one, to stdout; or raise `BadInputError`."""
+    """Yield a function that writes blocks to a file or stdout, or raise `BadInputError`."""
     if path is None:
         yield _csv_writer(sys.stdout, columns)
         sys.stdout.flush()
@@ -50,14 +50,14 @@ def open_writer(
 
 
 def _csv_writer(file: TextIO, columns: Sequence[str]) -> Callable[[Block], None]:
-    """Return what writes blocks as CSV, numbers in full double precision, below a header."""
+    """Return a function that writes blocks as CSV in full double precision, after a header."""
     writer = csv.writer(file, lineterminator='\n')
     writer.writerow(columns)
     return lambda block: writer.writerows(zip(*block.to_pydict().values(), strict=True))
 
 
 def _parquet_writer(path: Path, stack: ExitStack) -> Callable[[Block], None]:
-    """Return what writes blocks as Parquet, a row group each; the stack writes the footer."""
+    """Return a function that writes blocks as Parquet row groups; the stack writes the footer."""
     arrow, parquet = require_arrow()
     writer: Any = None
 

@@ -1,4 +1,4 @@
-"""Studies whose rows are tasks: what a function returns for each of many arguments."""
+"""Studies whose rows are tasks: results of a function for each of many arguments."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -15,15 +15,15 @@ class Tasks:
     Parameters
     ----------
     function : callable
-        Returns a row, values by column, for the arguments of a task. It must be possible to
-        pickle it, and the arguments.
+        Returns a row, values by column, for the arguments of a task. Function and arguments
+        must be picklable.
     tasks : sequence of tuple
-        Arguments; ``repr`` must show all that a row depends on.
+        Arguments; ``repr`` must show all data that a row depends on.
     columns : mapping of str to str
         Types of the columns, in order: ``string``, ``int64``, ``double``, or ``doubles`` for a
         list of them.
     chunk_rows : tuple of int
-        Rows of a chunk, least and most.
+        Minimum and maximum rows of a chunk.
 
     """
 
@@ -40,7 +40,7 @@ class Tasks:
         return hashlib.sha256(f'{name} {self._columns} {self._tasks!r}'.encode()).hexdigest()
 
     def table(self, begin: int, end: int) -> Any:
-        """Carry out tasks from one number up to another; return a table of pyarrow."""
+        """Carry out a range of tasks; return a pyarrow table."""
         arrow, _ = require_arrow()
         rows = [self._function(*x) for x in self._tasks[begin:end]]
         return arrow.table({

@@ -1,7 +1,7 @@
 """
-What a picture of a sweep shows: curves, maps, or how samples spread, by what its axes are.
+Layout of a figure of a sweep: curves, maps, or distributions of samples, depending on its axes.
 
-A column with more than one number is an axis of the picture; laws, shapers, cases and columns of a
+A column with several numbers is an axis of the figure; models, shapers, cases and columns with a
 few values are curves or rows of panels; samples become quantiles.
 """
 
@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import Array
 
-#: Rows of a sweep that are drawn, at most: they are in memory.
+#: Maximum number of rows of a sweep to draw, as they are kept in memory.
 MOST_ROWS = 4_000_000
-# Points of an axis that a picture can show, curves in a panel, and maps below each other.
+# Maximum number of points of an axis, of curves in a panel, and of stacked maps.
 _MOST_POINTS, _MOST_CURVES, _MOST_MAPS = 1000, 8, 4
-# Numbers of a column that are curves rather than an axis, if there is another axis.
+# Maximum number of values of a column for curves instead of an axis, if there is another axis.
 _FEW = 5
 
 
@@ -31,8 +31,8 @@ class Axis:
 
     name: str  #: of its column, or of all columns of a table
     size: int
-    values: Array | None = None  #: of a column of numbers
-    labels: tuple[str, ...] = ()  #: of a few values without an order that are no samples
+    values: Array | None = None  #: of a numeric column
+    labels: tuple[str, ...] = ()  #: of a few unordered values that are no samples
     sampled: bool = False
 
     @classmethod
@@ -54,25 +54,25 @@ class Axis:
             for row in zip(*columns, strict=True)))
 
     def as_labels(self) -> 'Axis':
-        """Return a column of a few numbers as curves."""
+        """Return a column of a few values as curves."""
         values = [] if self.values is None else self.values.tolist()
         return Axis(self.name, self.size, labels=tuple(f'{self.name} {x:g}' for x in values))
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """How rows of a sweep are drawn: a map over x and y, curves over x, or shares of samples."""
+    """Layout of the rows of a sweep: a map over x and y, curves over x, or a distribution."""
 
     x: Axis | None
     y: Axis | None
     labels: tuple[str, ...]  #: of each curve or map
-    samples: int  #: at each point; 1 for none
+    samples: int  #: number at each point; 1 for none
     _sizes: tuple[int, ...]
     _order: tuple[int, ...]
 
     @classmethod
     def of(cls, axes: Sequence[Axis]) -> 'View':
-        """Choose a view of the axes of several values; raise `BadInputError` if there is none."""
+        """Choose a layout for axes with several values; raise `BadInputError` if there is none."""
         rows = math.prod(x.size for x in axes)
         if rows > MOST_ROWS:
             raise BadInputError(
@@ -97,7 +97,7 @@ class View:
             raise BadInputError(
                 f'no picture of {len(labels)} {"maps" if maps else "curves"}: expected at most '
                 f'{most}; give fewer values')
-        # Rows vary slowest in the first axis: it goes up, the last one to the right.
+        # The first axis varies slowest: it is vertical, the last one horizontal.
         order = [*others, *numbers, *([samples] if samples else [])]
         places = [x.name for x in axes]
         return cls(
@@ -106,7 +106,7 @@ class View:
             tuple(places.index(x.name) for x in order))
 
     def arranged(self, values: Array) -> Array:
-        """Return a column of all rows as (labels, y, x, samples), thinned to what can be seen."""
+        """Return a column of all rows as (labels, y, x, samples), thinned to the resolution."""
         columns = 1 if self.x is None else self.x.size
         rows = 1 if self.y is None else self.y.size
         found: Array = values.reshape(self._sizes).transpose(self._order).reshape(
@@ -115,7 +115,7 @@ class View:
 
     @staticmethod
     def places(axis: Axis) -> Array:
-        """Return the values of an axis, thinned alike."""
+        """Return the values of an axis, thinned in the same way."""
         values: Array = np.zeros(0) if axis.values is None else axis.values
         return values[::_stride(axis.size)]
 

@@ -1,4 +1,4 @@
-"""What commands share that compute a study in chunks: options, executor, progress and end."""
+"""Common parts of commands that compute a study in chunks: options, executor, progress, end."""
 
 import argparse
 from collections.abc import Callable, Iterator
@@ -30,7 +30,7 @@ def options(workers: str) -> tuple[Row, ...]:
 
 
 def asked(arguments: argparse.Namespace) -> list[str]:
-    """Return the options of chunks that are given; raise `BadInputError` if they do not fit."""
+    """Return the given chunk options; raise `BadInputError` if they exclude each other."""
     if arguments.workers is not None and arguments.workers < 1:
         raise BadInputError(f'--workers is {arguments.workers}: expected at least 1')
     if arguments.dask is not None and arguments.workers is not None and arguments.dask != 'local':
@@ -39,7 +39,7 @@ def asked(arguments: argparse.Namespace) -> list[str]:
 
 
 def engine(arguments: argparse.Namespace, workers: int) -> 'tuple[Start, int]':
-    """Return what computes, unless said on so many cores, and on how many as far as is known."""
+    """Return the executor, by default on the given number of cores, and the number of cores."""
     from hmsa_studies.executors import cores, dask, local
 
     if arguments.dask is not None:
@@ -49,7 +49,7 @@ def engine(arguments: argparse.Namespace, workers: int) -> 'tuple[Start, int]':
 
 
 def shard_of(arguments: argparse.Namespace) -> tuple[int, int]:
-    """Return which part is computed, from 0, of how many."""
+    """Return the index, from 0, and the number of parts."""
     from hmsa_studies.engine import parse_shard
 
     return (0, 1) if arguments.shard is None else parse_shard(arguments.shard)
@@ -58,7 +58,7 @@ def shard_of(arguments: argparse.Namespace) -> tuple[int, int]:
 def compute_chunks(
         study: 'Study', folder: Path, arguments: argparse.Namespace, start: 'Start', words: str,
         finish: 'Callable[[Chunks, Outcome], int]') -> int:
-    """Compute what is asked for of a study, and `finish` it if all chunks are there."""
+    """Compute the requested chunks of a study, and `finish` it if all chunks exist."""
     from hmsa_ros.files import require_arrow
     from hmsa_studies.chunks import Chunks
     from hmsa_studies.engine import compute
@@ -84,13 +84,13 @@ def compute_chunks(
 
 
 def say(sentence: str) -> None:
-    """Print a sentence on standard error."""
+    """Print a message on standard error."""
     print(sentence, file=sys.stderr)
 
 
 @contextmanager
 def progress(words: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show rows done, rate and time left, on a terminal only."""
+    """Show rows completed, rate and remaining time, only on a terminal."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,

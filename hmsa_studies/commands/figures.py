@@ -27,7 +27,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the figures and print what was written."""
+    """Write the figures and print their files."""
     folder: Path = arguments.out
     paper, kinds = paper_of(arguments), formats_of(arguments)
     # Before the slow imports: a bad folder is reported immediately.

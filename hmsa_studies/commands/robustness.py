@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from hmsa_studies.robustness import Case, Result
 
 _MOVES = ((1.0, 1.1), (1.0, 1.4), (1.0, 0.7))
-# Of a beam, which rests at 0.
+# Default moves of a beam, which rests at 0.
 _BENDS = ((0.0, 0.1), (0.0, 0.4))
 
 
@@ -75,7 +75,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Study, print and write."""
+    """Run the study, print its results and write the files."""
     paper_of(arguments), formats_of(arguments)
     in_chunks = bool(chunked.asked(arguments))
     start, _ = chunked.engine(arguments, 1)
@@ -134,7 +134,7 @@ def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> 
 def _show(
         studies: 'list[tuple[Case, list[Result]]]', files: list[Path], unit: float | None, *,
         as_json: bool) -> int:
-    """Print the results, in seconds too where the unit of time is known in s, and the files."""
+    """Print the results, also in seconds if the time scale is known, and the files."""
     if as_json:
         print(json_text({
             'moves': [_record(case, results, unit) for case, results in studies],
@@ -149,7 +149,7 @@ def _show(
 def _write(
         folder: Path, studies: 'list[tuple[Case, list[Result]]]',
         arguments: argparse.Namespace) -> list[Path]:
-    """Write the numbers and the pictures."""
+    """Write the numbers and the figures."""
     from hmsa_ros.report.paper import named
     from hmsa_studies.pictures import draw_front, draw_robustness
     from hmsa_studies.robustness import write_csv
@@ -170,7 +170,7 @@ def _write(
 
 def _record(
         case: 'Case', results: 'list[Result]', unit: float | None) -> dict[str, Any]:
-    """Return a case as the JSON output shows it; null where there is no such number."""
+    """Return a case for the JSON output; null for missing values."""
     from hmsa_studies.robustness import ORDERED, PARAMETERS
 
     errors = case.errors().tolist()
@@ -260,7 +260,7 @@ def _print_table(case: 'Case', results: 'list[Result]', unit: float | None) -> N
 
 
 def _feedback(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> int:
-    """Compare open loop with corrections."""
+    """Compare open loop with feedback."""
     from hmsa_ros.identification.files import read_belief
     from hmsa_studies.executors import in_order
     from hmsa_studies.feedback import trial
@@ -295,7 +295,7 @@ def _feedback(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) ->
 
 def _show_matrix(
         seeds: int, rows: 'Iterator[Row]', *, as_json: bool, table: Path | None = None) -> int:
-    """Print rows as they are worked out."""
+    """Print rows as they are computed."""
     if as_json:
         found = {'seeds': seeds, 'rows': [asdict(x) for x in rows]}
         print(json_text(found if table is None else {**found, 'files': [table]}))

@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from hmsa_studies.sweep import Sweep
     from hmsa_studies.views import View
 
-#: What takes less time on a core, in s, is planned at once, without chunks.
+#: Time on one core, in s, up to which a sweep is planned at once, without chunks.
 _SMALL = 3.4
-#: From so many points on, what a sweep takes is said before.
+#: Number of points above which the cost of a sweep is announced.
 _LARGE = 1_000_000
-# Option of a column, and what it is.
+# Options of columns, with descriptions.
 _AXES = (
     ('--start', 'initial stretch, at rest (default 1; of a beam 0)'),
     ('--target', 'target stretch (default 1.1)'),
@@ -89,7 +89,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Plan and write."""
+    """Plan the sweep and write its table."""
     sweep = _sweep(arguments)
     in_chunks = _in_chunks(sweep, arguments)
     picture = _Picture(sweep, arguments)
@@ -221,7 +221,7 @@ def _names(text: str | None) -> list[str]:
 
 
 def _in_chunks(sweep: 'Sweep', arguments: argparse.Namespace) -> bool:
-    """Return whether chunks are kept; refuse options that do not fit."""
+    """Return whether to use chunks; raise `BadInputError` for options that exclude each other."""
     asked = [*(['--workers'] if arguments.workers is not None else []), *chunked.asked(arguments)]
     out: Path | None = arguments.out
     if out is None:
@@ -231,7 +231,7 @@ def _in_chunks(sweep: 'Sweep', arguments: argparse.Namespace) -> bool:
         return False
     if _is_folder(out) or asked:
         return True
-    # What could not be written in the end is refused at the beginning, without a chunk.
+    # Outputs that could not be written are rejected at the start, without chunks.
     return sweep.size > _SMALL * sweep.rate and out.suffix.lower() in {'.csv', '.parquet'} and \
         not out.is_dir() and out.parent.is_dir() and (
             out.suffix.lower() == '.parquet' or _has_arrow())
@@ -289,7 +289,7 @@ def _plan_in_chunks(
 
 
 def _places(out: Path) -> tuple[Path, Path]:
-    """Return where the table goes and where the chunks."""
+    """Return the path of the table and the folder of the chunks."""
     if _is_folder(out):
         return out / 'table.parquet', out
     if out.suffix.lower() not in {'.csv', '.parquet'}:
@@ -300,7 +300,7 @@ def _places(out: Path) -> tuple[Path, Path]:
 
 
 def _estimate(sweep: 'Sweep', folder: Path, cores: int, shard: tuple[int, int]) -> None:
-    """Say what a large sweep takes, and refuse one that the disk has no room for."""
+    """Announce the cost of a large sweep, and refuse one that exceeds the free disk space."""
     from hmsa_studies.chunks import Chunks
     from hmsa_studies.sweep import ROW_BYTES
 
