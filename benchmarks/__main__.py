@@ -8,18 +8,18 @@ Measure speed and accuracy.
                              [--picture FILE] [--quick]
 
 NAME is judge, planner, plant, preemption, joints, controller, recorder, player or crash; without
-one all of these are run. judge holds verdicts on simulated setpoints against the truth.
-Those of recorder, player and crash take some seven minutes together. faults injects faults into
-running nodes and fails if one is not answered as it should be; soak runs for hours; feedback
-moves actuators that are not as planned with, in real time, for some three minutes;
-identification fits thousands of simulated runs; defects those of actuators that are not as the
-model has them; harm holds feedback against open loop in random laboratories, for half an hour;
-laboratory tunes laboratories behind a serial board, for a quarter of an hour; line has cables,
-boards, amplifiers and sensors fail there, for two minutes;
-studies kills the workers of a study; rates measures how many plans a second studies make, for some
-seven minutes; lockstep compares the kernel of batches with C.
-A page is a Markdown file with marks ``<!-- begin NAME -->`` and ``<!-- end NAME -->``, between
-which a table is put.
+a name, all of these run. judge compares verdicts on simulated setpoints with the truth.
+recorder, player and crash take about seven minutes together. The others run only on request:
+faults injects faults into running nodes and fails if the response to one is not as expected.
+soak runs for hours. feedback moves actuators that differ from the planner's model, in real time,
+for about three minutes. identification fits thousands of simulated runs; defects fits those of
+actuators that deviate from the model. harm compares feedback with open loop in random
+laboratories, for half an hour. laboratory tunes laboratories behind a serial board, for a quarter
+of an hour; line makes cables, boards, amplifiers and sensors fail there, for two minutes. studies
+kills the workers of a study. rates measures how many plans per second studies compute, for about
+seven minutes. lockstep compares the kernel of batches with C.
+A page is a Markdown file; a table replaces the text between its marks ``<!-- begin NAME -->`` and
+``<!-- end NAME -->``.
 """
 
 import argparse
@@ -35,12 +35,12 @@ from rich.console import Console
 from benchmarks.measure import machine, Report
 from benchmarks.sheet import Sheet
 
-# Of a table that goes to a file.
+# Of a table that is written to a file.
 _WIDTH = 120
 
 NAMES = ('judge', 'planner', 'plant', 'preemption', 'joints', 'controller', 'recorder', 'player',
          'crash')
-#: Not run unless asked for: they take long and need the machine for themselves.
+#: Only run on request: they take long and need the machine for themselves.
 LONG = ('faults', 'soak', 'feedback', 'identification', 'defects', 'harm', 'laboratory',
         'line', 'studies', 'rates', 'lockstep')
 
@@ -198,7 +198,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def renewed(page: str, texts: dict[str, str]) -> str:
-    """Replace what stands between the marks of a page."""
+    """Replace the text between the marks of a page."""
     for name, text in texts.items():
         begin, end = f'<!-- begin {name} -->', f'<!-- end {name} -->'
         head, mark, rest = page.partition(begin)
@@ -209,7 +209,7 @@ def renewed(page: str, texts: dict[str, str]) -> str:
 
 
 def _has_ros(name: str) -> bool:
-    """Tell whether ROS 2 is installed, and say so if it is not."""
+    """Return whether ROS 2 is installed; print a line if it is not."""
     if importlib.util.find_spec('rclpy') is None:
         print(f'{name}: ROS 2 (rclpy) is not installed')
         return False

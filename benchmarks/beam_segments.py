@@ -1,8 +1,8 @@
 """
 A beam as a chain of rigid links with springs and dashpots between them, in a plane.
 
-It has as many modes as links, bends as far as it likes, and knows nothing of the package's one
-mode: what a plan for that mode leaves in the others is measured on it.
+It has as many modes as links and allows large deflections. It is independent of the package's
+single mode, so it measures how much a plan for that mode excites the others.
 """
 
 from collections.abc import Sequence

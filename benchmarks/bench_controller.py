@@ -1,4 +1,4 @@
-"""What a cycle of planner and plant in one process costs, and how the loop keeps time."""
+"""Measure the cost of a cycle of planner and plant in one process, and the loop's lateness."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,8 +14,8 @@ from hmsa_ros.interfaces import topics
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes.conversions import to_trajectory
 
-#: Work of a cycle that 99 of 100 are promised to stay below, in us, beside what a bare loop of
-#: the same work exceeds its own median by: the machine adds that to whatever runs on it.
+#: Bound in us of the 99 % quantile of a cycle's processor time, beyond the excess of a bare loop's
+#: 99 % quantile over its median, which is due to the machine.
 LARGEST = 300.0
 _PERIOD_NS = 1_000_000
 _LOOP = 'controller: loop'
@@ -31,7 +31,7 @@ def _run(seconds: float, *, moves: bool, readers: bool, folder: Path) -> dict[st
         rig.start('controller', {'lead_time': _LEAD})
         rig.ready(topics.PLANNER)
         rig.spin_until(lambda: _LOOP in rig.diagnostics, 'diagnostics of the loop')
-        # The start is forgotten: more cycles than the loop remembers.
+        # Discard the start: run more cycles than the loop's statistics cover.
         rig.spin(5.0)
         before = dict(rig.diagnostics[_LOOP])
         if moves:
@@ -57,14 +57,14 @@ def _sum(count: int) -> float:
 
 
 def _spent(work: Callable[[], object]) -> float:
-    """Return the processor time in us that work takes."""
+    """Return the processor time of a call in us."""
     begin = thread_time_ns()
     work()
     return (thread_time_ns() - begin) / 1e3
 
 
 def _bare(median: float, cycles: int) -> dict[str, float]:
-    """Return figures of a loop that adds numbers for about so many us each ms, and no more."""
+    """Return the figures of a loop that only adds numbers, for about ``median`` us each ms."""
     count = 1000
     per_number = min(_spent(lambda: _sum(count)) for _ in range(100)) / count
     count = round(median / per_number)
@@ -77,7 +77,7 @@ def _bare(median: float, cycles: int) -> dict[str, float]:
 
 
 def compare(*, quick: bool) -> Sheet:
-    """Measure at rest, moved, and moved while somebody reads all; each beside a bare loop."""
+    """Measure at rest, moved, and moved with a reader of all topics; each beside a bare loop."""
     cases = {
         'at rest': {'moves': False, 'readers': False},
         'moved twice a second': {'moves': True, 'readers': False},

@@ -1,11 +1,11 @@
 """
-How much is lost when the recorder is killed.
+Measure how much is lost when the recorder is killed.
 
     python -m benchmarks crash [--quick]
 
-While another process publishes, recorders are started and each killed with SIGKILL at a random
-moment, fifty in all. Each bag is recovered, read by an independent reader, and the loss
-measured: the time from the last message in the bag to the kill.
+While another process publishes, recorders are started and each is killed with SIGKILL at a random
+moment, fifty in all. Each bag is recovered and read by an independent reader. The loss is the
+time from the last message in the bag to the kill.
 """
 
 import os
@@ -25,7 +25,7 @@ TOGETHER = 5
 
 
 def source(rate):
-    """Publish numbers at a rate until told to end."""
+    """Publish numbers at a rate until the process is terminated."""
     import rclpy
     from std_msgs.msg import Float64
     rclpy.init()
@@ -39,7 +39,7 @@ def source(rate):
 
 
 class Recorder:
-    """A recorder that is going to be killed."""
+    """A recorder to be killed."""
 
     def __init__(self, folder):
         self.folder = folder
@@ -59,7 +59,7 @@ class Recorder:
             time.sleep(0.05)
 
     def kill(self):
-        """Kill it."""
+        """Kill the process and note the time."""
         self.killed = time.time_ns()
         self.process.kill()
 
@@ -75,7 +75,7 @@ class Recorder:
         with Reader(recovered) as reader:
             stamps = [stamp for _, stamp, _ in reader.messages()]
         sequences = [message.sequence for message in BagReader(recovered).messages()]
-        # What the middleware lost while the processor was busy: not the kill's doing.
+        # The middleware dropped these while the processor was busy; the kill did not.
         gaps = sequences[-1] - sequences[0] + 1 - len(sequences)
         return (self.killed - stamps[-1]) * 1e-9, len(stamps), gaps
 
@@ -103,7 +103,7 @@ def compare(*, quick):
                     for i in range(min(TOGETHER, kills - len(losses)))]
                 for recorder in recorders:
                     recorder.wait()
-                # At moments of their own within three flush periods.
+                # At separate moments within three flush periods.
                 for recorder in recorders:
                     time.sleep(dice.uniform(0.0, 3.0 * FLUSH_PERIOD / len(recorders)))
                     recorder.kill()

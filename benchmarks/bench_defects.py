@@ -1,15 +1,15 @@
 """
-What `hmsa identify` says of actuators that are not as the model has them.
+Evaluate `hmsa identify` on actuators that deviate from the model.
 
     python -m benchmarks defects [--runs N] [--quick]
 
-Recordings come from `benchmarks.defects`: SciPy integrates actuators with damping, J_lim,
-modulus and remanence drawn at random, each with one defect of a size drawn at random, and a sensor
-with white, coloured, quantised or jittered noise, at 4 to 60 samples a period. Others have no
-defect but few samples of large noise, or samples at rest alone. The fit begins from a data sheet
-with errors up to 30 %. An answer is wrong if it is ``identified`` and an interval does not cover
-the true value. Without a defect one interval in twenty does not: there an answer is wrong if an
-error is twice what the interval allows.
+Recordings come from `benchmarks.defects`: SciPy integrates actuators with random damping, J_lim,
+modulus and remanence. Each has one defect of random size and a sensor with white, coloured,
+quantised or jittered noise, at 4 to 60 samples a period. Others have no defect but few samples
+with large noise, or samples at rest alone. The fit starts from a data sheet with errors up to
+30 %. A result is wrong if it is ``identified`` and an interval does not cover the true value.
+Without a defect, one interval in twenty does not by design: there a result is wrong if an error
+is more than twice what the interval allows.
 """
 
 from dataclasses import replace
@@ -25,10 +25,10 @@ from hmsa_ros.identification.identify import identify
 from hmsa_ros.identification.quantities import DEFAULT_FREE
 from hmsa_ros.identification.result import Estimate
 
-#: Recordings of each defect, and how many times as many without one.
+#: Recordings of each defect, and the factor for those without one.
 RUNS, _EXACT = 30, 4
 _SENSORS = ('white', 'coloured', 'quantised', 'jittered')
-#: Size of each defect, low and high, and what is recorded.
+#: Description of each kind of recording, and the range of size of its defect.
 KINDS: dict[str, tuple[str, dict[str, tuple[float, float]]]] = {
     'exact': ('nothing', {}),
     'friction': ('Coulomb friction, 0.3 to 3 % of G', {'friction': (0.003, 0.03)}),
@@ -42,15 +42,15 @@ KINDS: dict[str, tuple[str, dict[str, tuple[float, float]]]] = {
     'slow': ('0.7 to 2 samples a period', {}),
     'rest': ('16 samples, all of them at rest', {})}
 _SEED = 1
-# Of a step, whose stretch cannot determine J_lim.
+# For a step, whose stretch cannot determine J_lim.
 _WITHOUT_LIMIT = tuple(x for x in DEFAULT_FREE if x != 'chain_limit')
-# What may be wrong of a kind, the least share that is identified where the model is right, and
-# between what the coverage of its intervals lies but by this chance.
+# Allowed wrong results of a kind; where the model is right, the minimum fraction identified, the
+# range of the coverage of the intervals, and the chance of missing it.
 _WRONG, _IDENTIFIED, _COVERAGE, _CHANCE = 1, 0.97, (0.93, 0.97), 0.01
 
 
 def drawn(kind: str, count: int, seed: int = _SEED) -> list[tuple[str, list[float]]]:
-    """Identify recordings of a kind; return verdicts, and errors over what intervals allow."""
+    """Identify recordings of a kind; return verdicts, and errors relative to their intervals."""
     found: list[tuple[str, list[float]]] = []
     given = plants(count, seed, **KINDS[kind][1])
     layout = {'one': sequence(given, (1.3,), 1, 110.0), 'rest': sequence(
@@ -89,13 +89,13 @@ def drawn(kind: str, count: int, seed: int = _SEED) -> list[tuple[str, list[floa
 
 
 def _reach(found: Estimate, true: float) -> float:
-    """Return the error of a value over how far its interval reaches to that side."""
+    """Return the error of a value relative to the half of its interval on that side."""
     end = found.high if true > found.value else found.low
     return (true - found.value) / (end - found.value)
 
 
 def compare(*, quick: bool, runs: int = RUNS) -> Sheet:
-    """Identify all of them; passed if the goals hold."""
+    """Identify recordings of all kinds; passed if the goals are met."""
     rows, figures, passed = [], {}, True
     for kind, (words, _) in KINDS.items():
         answers = drawn(kind, (4 if quick else runs) * (_EXACT if kind == 'exact' else 1))
@@ -112,7 +112,7 @@ def compare(*, quick: bool, runs: int = RUNS) -> Sheet:
         rows.append([words, str(len(answers)), *map(str, counts.values()),
                      str(wrong), f'{100.0 * cover:.1f} %' if inside else '-'])
         if kind == 'exact':
-            from scipy.stats import binom  # others need not wait for it
+            from scipy.stats import binom  # slow to import
             passed &= counts['identified'] >= _IDENTIFIED * len(answers) and (
                 binom.ppf(_CHANCE, len(inside), _COVERAGE[0]) <= sum(inside)
                 <= binom.ppf(1.0 - _CHANCE, len(inside), _COVERAGE[1]))

@@ -1,10 +1,10 @@
 """
-Inject faults into running nodes, and hold what is seen against what was expected.
+Inject faults into running nodes and compare the response with the expected one.
 
-Each row starts real processes in a ROS domain of its own, makes its fault, and judges from the
-samples of the plant and the changes of flux density that it reports, not from logs. What is
-expected stands beside the row's code, written before the run; a row that does not meet it makes
-the run fail.
+Each row starts real processes in a ROS domain of its own and injects its fault. It judges from the
+plant's samples and the changes of flux density that the plant reports, not from logs. The
+expected response stands beside the row's code, written before the run; the run fails if a row
+does not meet it.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from benchmarks.measure import ros_domain
 def run(
         console: Console, *, only: Sequence[str] = (),
         quick: bool = False) -> tuple[list[Outcome], int]:
-    """Inject the faults whose keys begin so and print the table; return it and the exit status."""
+    """Inject the faults whose keys start so; print the table; return outcomes and exit status."""
     from benchmarks.faults.rows import FAULTS, QUICK
 
     faults = [
@@ -31,7 +31,7 @@ def run(
     outcomes: list[Outcome] = []
     for number, fault in enumerate(faults):
         print(f'{number + 1}/{len(faults)} {fault.key}', end=': ', file=sys.stderr, flush=True)
-        # The next domain, so that nobody waits for the lease of a killed process.
+        # A new domain, so that no process waits for the lease of a killed one.
         outcomes.append(inject(fault, 1 + (first - 1 + number) % 101))
         seen = outcomes[-1].seen
         print(f'{"met" if seen.met else "NOT MET"} ({seen.figure}): {seen.text}',
@@ -51,7 +51,7 @@ def run(
 
 
 def record(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
-    """Return the table for a JSON file, one dict a row."""
+    """Return the table for a JSON file, one dict per row."""
     return [
         {'key': x.fault.key, 'fault': x.fault.name, 'how': x.fault.how,
          'expected': x.fault.expected, 'seen': x.seen.text, 'figure': x.seen.figure,

@@ -1,9 +1,9 @@
 """
-What feedback leaves of moves when G is not as planned with, through real nodes, from a bag.
+Measure the errors of moves with feedback when G is off, with real nodes, from a bag.
 
-In real time the actuator moves from 1 to 1.4, to 1.1 and back, several times with feedback, which
-forgets what it has learnt in between, and then in open loop. rosbags reads what was recorded, and
-NumPy judges the samples.
+In real time, the actuator moves from 1 to 1.4, to 1.1 and back, several times with feedback, which
+is reset in between, and then in open loop. rosbags reads the recording, and NumPy judges the
+samples.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,27 +26,28 @@ from hmsa_studies.scenario import Scenario, SCENARIOS
 
 #: Stretches of a first move from 1, and of the next one.
 TARGETS = (1.4, 1.1)
-#: Errors of G that make a row together, by their size.
+#: Errors of G grouped by size, one row each.
 SIZES = ((0.0, (0.0,)), (0.1, (-0.1, 0.1)), (0.2, (-0.2, 0.2)))
 _SEEDS, _BIAS, _LIMIT = 3, 1e-3, 0.25
-# What feedback may leave of the next move.
+# Allowed vibration and offset of the next move with feedback.
 _LARGEST = 0.02
-# Of a move in open loop, until the first one is looked at, and the next one, cautious or not,
-# which takes longer where G is known to be lower; a cycle is in units of time.
+# From the start of a move to its arrival, in tau_p of open loop: first move, and next move by
+# cautious, longer where G turns out lower. A cycle is in time scales.
 _FIRST, _NEXT, _CYCLE = 3.0, {True: 3.4, False: 1.25}, 1.45
-# What a cautious move may be expected to leave.
+# Allowed residual that a cautious move is predicted to leave.
 _TOLERANCE = 3e-4
-# How much longer than the others the move back lasts, until nothing rings, and samples at rest
+# How many times longer the move back lasts, until vibration has decayed, and samples at rest
 # before the next first move, as in the study.
 _BACK, _BEFORE = 1.5, 50
-# Share of the largest change of a move that begins it, and of a setpoint, from its end, at rest.
+# Fraction of the largest change of a move that marks its start, and final fraction of a setpoint
+# that counts as at rest.
 _BEGINS, _RESTS = 0.25, 0.3
 _TOPICS = ('/joint_states', '/flux_density_applied', '/planner/setpoint', '/planner/status')
 
 
 @dataclass(frozen=True)
 class Graph:
-    """Nodes in one process or in two, an actuator with its samples, and a setpoint's time in s."""
+    """Nodes in one process or in two, an actuator with its samples, and setpoint times in s."""
 
     name: str
     scenario: Scenario
@@ -54,7 +55,7 @@ class Graph:
     hold: float
     lead: float
     cautious: bool
-    factor: float = 1.0  # simulated s a second of ours
+    factor: float = 1.0  # simulated s per s of real time
 
 
 GRAPHS = (
@@ -65,9 +66,9 @@ GRAPHS = (
 @dataclass(frozen=True)
 class Seen:
     """
-    A move, in shares of its step: vibration from its arrival on and a cycle later, and offset.
+    A move, as fractions of its step: vibration from its arrival and a cycle later, and offset.
 
-    ``late`` counts commands that were sent after their stamp.
+    ``late`` counts commands that were sent after their timestamp.
     """
 
     target: float
@@ -79,7 +80,7 @@ class Seen:
 
 def run(
         graph: Graph, error: float, folder: Path, seeds: int = _SEEDS) -> dict[str, list[Seen]]:
-    """Move with feedback, so many times, and without; return what a bag shows of both."""
+    """Move with feedback ``seeds`` times, and without; return both as read from a bag."""
     bag, scenario = folder / 'bag', graph.scenario
     plant: dict[str, object] = {
         **parameters_of(scenario.block), 'mismatch.shear_modulus': 1.0 + error,
@@ -119,7 +120,7 @@ def run(
 
 
 def read(bag: Path) -> dict[str, np.ndarray]:
-    """Return time in s and values by topic: of samples and levels by their stamps."""
+    """Return time in s and values by topic; samples and levels by their timestamps."""
     rows: dict[str, list[tuple[float, ...]]] = {x: [] for x in _TOPICS}
     with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         for connection, stamp, data in reader.messages():
@@ -144,7 +145,7 @@ def _values(topic: str, message: Any) -> tuple[float, ...]:
 
 def judge(
         recorded: Mapping[str, np.ndarray], unit: float, *, cautious: bool = False) -> list[Seen]:
-    """Return what is seen of all moves but those back; the unit of time is in s."""
+    """Return the results of all moves but those back; ``unit`` is the time scale in s."""
     samples, applied, requests, verdicts = (recorded[x] for x in _TOPICS)
     found = []
     previous = 1.0
@@ -171,14 +172,14 @@ def judge(
 
 
 def _vibration(samples: np.ndarray, begin: float, span: float) -> float:
-    """Return how far the stretch goes from peak to peak: its rate, which has no noise, summed."""
+    """Return the peak-to-peak stretch, integrated from the rate, which has no noise."""
     time, _, rate = samples[(samples[:, 0] >= begin) & (samples[:, 0] <= begin + span)].T
     moved = np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(time))
     return float(np.ptp(np.append(0.0, moved)))
 
 
 def compare(*, quick: bool) -> Sheet:
-    """Run all, and show the root mean square over signs and repetitions beside open loop."""
+    """Run all graphs; show the RMS over signs and repetitions beside open loop."""
     rows: list[list[str]] = []
     figures: dict[str, Any] = {}
     passed = True

@@ -1,12 +1,12 @@
 """
-Whether feedback does harm: random laboratories, each once in open loop and once with feedback.
+Measure whether feedback does harm: random laboratories in open loop and with feedback.
 
     python -m benchmarks harm [--runs N] [--picture FILE] [--page FILE] [--quick]
 
-Laboratories come from `benchmarks.laboratory`, whose plant shares nothing with the package. The
-controller is the shipped one, in virtual time. A move is judged as its sensor would read it
-without noise and bias: vibration from peak to peak from its arrival on, or at its end if that is
-more, and the distance from the target at its end.
+Laboratories come from `benchmarks.laboratory`, whose plant shares no code with the package. The
+controller is the shipped one, in virtual time. A move is judged by its sensor's reading without
+noise and bias: the peak-to-peak vibration from its arrival on, or at its end if that is larger,
+and the distance from the target at its end.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,21 +27,21 @@ from hmsa_ros.control.records import EstimateChanged, Output, Settings, StatusCh
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Options, Planner
 
-#: Benches, and the seed of the first; those before it are for development.
+#: Benches, and the seed of the first; earlier seeds are for development.
 RUNS, SEED = 400, 90_000
-#: What a move may leave more than in open loop, as a share of its step, the share of benches in
-#: which one does so, and the median of the second move.
+#: Allowed excess of a move over open loop, as a fraction of its step; allowed fraction of benches
+#: in which a move exceeds that; allowed median of the second move.
 WORSE, HARMED, SECOND = 0.005, 0.01, 0.003
-# Offset or vibration, as a share of the step, from which on a move is to have a verdict, and those
-# that count.
+# Offset or vibration, as a fraction of the step, above which a move must be reported, and the
+# codes that count as a report.
 _FAILED = 0.03
 _VERDICTS = {'off_target', 'vibrating', 'undecided', 'unobserved', 'corrected',
              'feedback_ended'}
 # Largest field in T, and how far ahead commands are sent, in ns.
 _LIMIT, _LEADS = 0.5, (2_000_000, 50_000_000)
-# Units of time before the first move, after a move, and of a look at the vibration.
+# Duration before the first move, of a hold, and of a window for the vibration, in time scales.
 _BEFORE, _HOLD, _LOOK = 15.0, 22.0, 3.0
-#: The ways to control: open loop, feedback, and cautious feedback.
+#: Control modes: open loop, feedback, and cautious feedback.
 WAYS: dict[str, dict[str, Any]] = {
     'open loop': {'feedback': 'off'}, 'adapt': {'feedback': 'adapt'},
     'cautious': {'feedback': 'adapt', 'feedback_cautious': True}}
@@ -49,12 +49,12 @@ WAYS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Left:
-    """What a move leaves, as shares of its step, and what was reported of it."""
+    """The errors a move leaves, as fractions of its step, and what was reported about it."""
 
     vibration: float
     offset: float
-    codes: tuple[str, ...]  # of verdicts, and of what was measured until then
-    words: str  # the sentence of the estimate at its end
+    codes: tuple[str, ...]  # of verdicts, and of observations up to then
+    words: str  # message of the estimate at its end
 
     @property
     def size(self) -> float:
@@ -71,12 +71,12 @@ def run(bench: Bench, way: str) -> list[Left]:
         PlannerGroup({'a': Planner(bench.given, Options(
             flux_density_min=-_LIMIT, flux_density_max=_LIMIT, lead_time=lead))}),
         Settings(takeover_timeout=0, heartbeat_period=0, **WAYS[way]), device)
-    told: list[Output] = []
-    loop.deliver = told.append
+    outputs: list[Output] = []
+    loop.deliver = outputs.append
     loop.run(device.time + round(_BEFORE * unit))
     found, start, words = [], 1.0, ''
     for target in bench.targets:
-        told.clear()
+        outputs.clear()
         begin = loop.now
         loop.runtime.request(Target('a', target))
         loop.serve()
@@ -86,12 +86,13 @@ def run(bench: Bench, way: str) -> list[Left]:
         seen, look = bench.shown(stretch), _LOOK * unit
         early, late = (time >= arrival) & (time < arrival + look), time >= loop.now - look
         step = abs(target - start)
-        words = next((x.message for x in reversed(told) if isinstance(x, EstimateChanged)), words)
+        words = next(
+            (x.message for x in reversed(outputs) if isinstance(x, EstimateChanged)), words)
         found.append(Left(
             max(float(np.ptp(seen[early])), float(np.ptp(seen[late]))) / step,
             abs(float(np.mean(seen[late])) - target) / step,
             tuple(dict.fromkeys(
-                str(code) for x in told if isinstance(x, StatusChanged)
+                str(code) for x in outputs if isinstance(x, StatusChanged)
                 for code in (x.verdict.code, *(y.verdict for y in x.findings.values())))),
             words))
         start = target
@@ -99,7 +100,7 @@ def run(bench: Bench, way: str) -> list[Left]:
 
 
 def compare_one(seed: int, ways: Sequence[str] = tuple(WAYS)) -> dict[str, list[Left]]:
-    """Run a bench in several ways."""
+    """Run a bench in several modes."""
     bench = drawn(seed)
     return {x: run(bench, x) for x in ways}
 
@@ -107,7 +108,7 @@ def compare_one(seed: int, ways: Sequence[str] = tuple(WAYS)) -> dict[str, list[
 def all_of(
         seeds: Iterable[int], ways: Sequence[str] = tuple(WAYS)
 ) -> dict[int, dict[str, list[Left]]]:
-    """Run benches on all cores; return what moves leave by seed and way."""
+    """Run benches on all cores; return the errors of moves by seed and mode."""
     seeds = list(seeds)
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         return dict(zip(
@@ -115,12 +116,12 @@ def all_of(
 
 
 def harm(found: Mapping[str, Sequence[Left]], way: str) -> list[float]:
-    """Return how much more than open loop each move of a bench leaves, as a share of its step."""
+    """Return the excess over open loop of each move of a bench, as a fraction of its step."""
     return [x.size - y.size for x, y in zip(found[way], found['open loop'], strict=True)]
 
 
 def compare(*, quick: bool, runs: int = RUNS, picture: Path | None = None) -> Sheet:
-    """Run benches in all ways; passed if the goals hold for both kinds of feedback."""
+    """Run benches in all modes; passed if both kinds of feedback meet the goals."""
     found = all_of(range(SEED, SEED + (8 if quick else runs)))
     groups: dict[str, list[int]] = {x: [] for x in GROUPS}
     bounds = {}
@@ -166,19 +167,19 @@ def compare(*, quick: bool, runs: int = RUNS, picture: Path | None = None) -> Sh
 def _sizes(
         found: Mapping[int, Mapping[str, Sequence[Left]]], seeds: Sequence[int], way: str
 ) -> NDArray[np.float64]:
-    """Return what moves leave in a way, by bench and move."""
+    """Return the errors of moves in a mode, by bench and move."""
     return np.array([[x.size for x in found[seed][way]] for seed in seeds])
 
 
 def _is_silent(left: Left) -> bool:
-    """Return whether a move failed and nothing was reported of it."""
+    """Return whether a move failed without a report."""
     return max(left.vibration, left.offset) > _FAILED and not _VERDICTS & set(left.codes)
 
 
 def draw(
         path: Path, found: Mapping[int, Mapping[str, Sequence[Left]]],
         groups: Mapping[str, Sequence[int]]) -> None:
-    """Draw what feedback leaves more than open loop, each move a point, by what is wrong."""
+    """Draw the excess of feedback over open loop, one point per move, by kind of mismatch."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.0, 4.0), layout='constrained', dpi=120)

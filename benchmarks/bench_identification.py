@@ -1,4 +1,4 @@
-"""How near identification comes to the Cramer-Rao bound, how its intervals cover, how fast."""
+"""Compare identification with the Cramer-Rao bound; check its coverage; measure its speed."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -44,9 +44,9 @@ def levels_of(shaped: bool, repeats: int) -> tuple[Array, Array]:
 
 def compare(*, quick: bool = False, runs: int = RUNS) -> Sheet:
     """Identify many simulated runs."""
-    from scipy.stats import binom, chi2  # others need not wait for it
+    from scipy.stats import binom, chi2  # slow to import
     runs = QUICK_RUNS if quick else runs
-    # What one in ten thousand rows misses by chance.
+    # Bounds that one row in ten thousand misses by chance.
     ratio = LARGEST_RATIO * np.sqrt(chi2.ppf(1.0 - _CHANCE, runs) / runs)
     least = binom.ppf(_CHANCE, runs, LEAST_COVERAGE) / runs
     most = binom.ppf(1.0 - _CHANCE, runs, LARGEST_COVERAGE) / runs
@@ -89,7 +89,7 @@ def compare(*, quick: bool = False, runs: int = RUNS) -> Sheet:
 
 @dataclass(frozen=True, eq=False)
 class _Cell:
-    """What many runs of one kind gave: by parameter, and in time."""
+    """Results of many runs of one kind, by parameter and with durations."""
 
     ratios: Array
     coverage: Array
@@ -99,7 +99,7 @@ class _Cell:
 
 def _cell(
         levels: tuple[Array, Array], noise: float, rate: int, runs: int, place: int) -> _Cell:
-    """Identify runs of one kind; those of each place have noise of their own."""
+    """Identify runs of one kind; ``place`` seeds their noise."""
     times = np.arange(int(DURATION * rate)) / rate
     values = values_of(BLOCK)
     blank = Recording(times, np.linspace(1.0, 1.5, len(times)), *levels)
@@ -113,7 +113,7 @@ def _cell(
         stretch = exact.stretch + noise * random.standard_normal(len(times))
         start = _off(random)
         begin = process_time()
-        # The gain is exact, and given: intervals of one that nobody knows are to be wider.
+        # The gain is exact and given: an unknown gain widens intervals.
         found = identify(
             Recording(times, stretch, *levels), actuator=start, known={'stretch_gain': 1.0})
         durations.append(process_time() - begin)
@@ -132,7 +132,7 @@ def _cell(
 
 
 def _off(random: np.random.Generator, factor: float = np.exp(0.3)) -> ActuatorParameters:
-    """Return the block with parameters off by up to a factor; J_lim by 1.35."""
+    """Return the block with parameters off by up to a factor; J_lim and remanence by 1.35."""
     size = np.log(factor)
     return replace(
         BLOCK, shear_modulus=BLOCK.shear_modulus * np.exp(random.uniform(-size, size)),
@@ -142,11 +142,11 @@ def _off(random: np.random.Generator, factor: float = np.exp(0.3)) -> ActuatorPa
 
 
 def _spoilt(kind: str, clean: Array, random: np.random.Generator) -> Array:
-    """Return samples with noise of 1e-3 and what a sensor adds."""
+    """Return samples with noise of 1e-3 and the defects of a sensor."""
     n = len(clean)
     white = 1e-3 * random.standard_normal(n)
     if kind == _CORRELATED:
-        from scipy.signal import lfilter  # others need not wait for it
+        from scipy.signal import lfilter  # slow to import
         return clean + np.sqrt(1.0 - 0.9 ** 2) * lfilter([1.0], [1.0, -0.9], white)
     if kind == _PIXELS:
         pixel = 0.8 / 255.0
@@ -169,7 +169,7 @@ _ERRORS = {_JITTER: 5e-6, _LARGE_JITTER: 2e-5}
 
 
 def robustness(*, quick: bool = False, runs: int = ROBUST_RUNS) -> Sheet:
-    """Identify simulated runs whose samples or start values are bad."""
+    """Identify simulated runs with bad samples or bad start values."""
     runs = QUICK_RUNS if quick else runs
     levels = levels_of(False, 15)
     times = np.arange(int(1000 * DURATION)) * 1e-3

@@ -1,4 +1,4 @@
-"""How many joints one plant and planner serve at a rate, and how many pairs side by side."""
+"""Measure how many joints a plant and planner serve at a rate, and how many pairs in parallel."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,32 +21,32 @@ from hmsa_ros.nodes.capture import Capture, Taken
 from hmsa_ros.nodes.cdr import stamp_of
 from hmsa_ros.nodes.conversions import to_trajectory
 
-#: Joints of one plant and planner, by the rate of samples in Hz.
+#: Joints of one plant and planner, and rate of samples in Hz.
 _JOINTS = ((1, 1000.0), (16, 1000.0), (64, 1000.0), (128, 1000.0), (64, 4000.0))
 _SPACES = (1, 4, 8)
 _SECONDS = 6.0
-#: Behind the clock by no more than this, a plant keeps up, in s.
+#: Allowed lag of a plant behind the clock in s.
 _BEHIND = 0.02
-#: With nodes that start on a busy machine, in s.
+#: Allowed time for nodes to start on a busy machine, in s.
 _PATIENCE = 180.0
 _TICKS = os.sysconf('SC_CLK_TCK')
 
 
 def _used(child: Child) -> float:
-    """Return the processor time of a process so far in s."""
+    """Return the processor time used by a process so far, in s."""
     text = Path(f'/proc/{child.popen.pid}/stat').read_text(encoding='ascii')
     words = text.rpartition(')')[2].split()
     return (int(words[11]) + int(words[12])) / _TICKS
 
 
 class _Watch:
-    """Looks at the samples and verdicts of one pair: how many, how far behind, what was said."""
+    """Count samples and verdicts of one pair, with their delays and messages."""
 
     def __init__(self, rig: Rig, space: str) -> None:
         self.behind: list[float] = []
         self.late = 0
         self.refusal = ''
-        # Stamped as they arrive and not decoded: what this process does later does not count.
+        # Timestamped on arrival and not decoded, so that later work here does not count.
         self._capture = Capture(self._take)
         self._capture.add(None, endpoints.listen(rig.node, replace(
             topics.JOINT_STATES, name=f'{space}/{topics.JOINT_STATES.name}')))
@@ -54,7 +54,7 @@ class _Watch:
         endpoints.subscribe(rig.node, topics.STATUS, self._judge, f'{space}/{topics.PLANNER}')
 
     def close(self) -> None:
-        """End the thread that receives."""
+        """End the receiving thread."""
         self._capture.stop()
 
     def _take(self, taken: Sequence[tuple[None, list[Taken]]]) -> None:
@@ -126,7 +126,7 @@ def _sequence(names: Sequence[str], seconds: float):  # type: ignore[no-untyped-
 
 
 def compare(*, quick: bool) -> Sheet:
-    """Measure joints in one pair of nodes and pairs side by side; 64 at 1 kHz must keep up."""
+    """Measure joints in one pair of nodes, and pairs in parallel; 64 at 1 kHz must keep up."""
     cases = [(joints, rate, 1) for joints, rate in _JOINTS] + [
         (1, 1000.0, spaces) for spaces in _SPACES[1:]]
     if quick:

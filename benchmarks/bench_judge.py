@@ -1,13 +1,13 @@
 """
-Verdicts on runs drawn at random, with the truth beside them.
+Compare verdicts on random runs with the truth.
 
     python -m benchmarks judge [--runs N] [--quick]
 
-The stretch of a setpoint that is held is written down in closed form: an offset, a vibration that
-decays or does not, creep. Samples of it are noisy, rare, late or broken. A verdict is wrong if it
-is ``arrived`` where offset or vibration are beyond their tolerance, or ``off_target`` or
-``vibrating`` where neither is; where the sensor hides the truth, any other verdict is right. The
-seed of a run is its number, so that each can be drawn again.
+The held stretch of a setpoint is given in closed form: an offset, a vibration that decays or
+persists, and creep. Its samples are noisy, sparse, late or broken. A verdict is wrong if it is
+``arrived`` where offset or vibration exceed their tolerance, or ``off_target`` or ``vibrating``
+where neither does; where the sensor hides the truth, any other verdict is right. The seed of a
+run is its number, so each can be drawn again.
 """
 
 from collections import Counter
@@ -31,19 +31,19 @@ KINDS = {
     'nan': 'sensor not a number', 'out': 'sensor out of range',
     'unordered': 'in no order, repeated', 'edge': 'within 20 % of the tolerance',
     'transient': 'pushed once during the hold'}
-#: Kinds in which part of the samples, or all, show something else than the stretch.
+#: Kinds in which some or all samples do not show the stretch.
 BROKEN = ('frozen', 'nan', 'out')
 TOLERANCES = Tolerances(arrival=0.02, vibration=0.02, stretch=1e-3)
 ARRIVED, MISSED = ('arrived',), ('off_target', 'vibrating')
-# A verdict can be asked for where the truth is so many standard deviations of the best possible
-# estimate from the tolerance.
+# A verdict is required where the truth is at least this many standard deviations of the best
+# possible estimate away from the tolerance.
 _CLEAR = 15.0
-# Periods at the begin and at the end of a creeping setpoint over which its rest is averaged.
+# Periods at the start and at the end of a creeping setpoint over which its rest is averaged.
 _SLICE = 6
 _FINE = 400
-# How many times the tolerance a push counts as beyond it.
+# Multiple of the tolerance from which a push counts as beyond it.
 _BEYOND = 1.2
-# Noise from peak to peak in a period, in standard deviations, that is hardly ever exceeded.
+# Peak-to-peak noise in a period that is rarely exceeded, in standard deviations.
 _PEAKS = 7.0
 _ARRIVAL = 10**18
 
@@ -57,14 +57,14 @@ class Trial:
     setpoint: Setpoint
     time: np.ndarray  # (n,): stamps, with those of the move and of the setpoint before
     stretch: np.ndarray  # (n,)
-    within: bool | None  # None where neither answer is wrong
+    within: bool | None  # None where either answer is acceptable
     clarity: float  # distance of the truth from the tolerance, in standard deviations
-    words: str  # what was drawn
+    words: str  # description of the draw
 
 
 @dataclass(frozen=True)
 class Truth:
-    """How a setpoint is held; times in s from the planned arrival, stretches from the target."""
+    """How a setpoint is held; times in s from the planned arrival, stretches about the target."""
 
     offset: float
     amplitude: float
@@ -75,16 +75,16 @@ class Truth:
     slow: float
 
     def rests(self, time: np.ndarray) -> np.ndarray:
-        """Return what a mean over periods shows."""
+        """Return the mean over periods."""
         return np.asarray(self.offset + self.creep * np.exp(-time / self.slow))
 
     def vibrates(self, time: np.ndarray) -> np.ndarray:
-        """Return the vibration about it."""
+        """Return the vibration about the mean."""
         return np.asarray(
             self.amplitude * np.exp(-self.decay * time) * np.cos(self.omega * time + self.phase))
 
     def stretch(self, time: np.ndarray, step: float, move: float) -> np.ndarray:
-        """Return the stretch from a setpoint a step before on, from which a move lasts so long."""
+        """Return the stretch from ``step`` before the setpoint, in a move of duration ``move``."""
         share = np.clip(1.0 + time / move, 0.0, 1.0)
         smooth = 0.5 - 0.5 * np.cos(np.pi * share)
         after = np.maximum(time, 0.0)
@@ -131,14 +131,14 @@ def draw(seed: int, kind: str) -> Trial:
         stamps = time + interval * random.uniform(0.0, 0.2) * random.standard_normal(len(time))
     white, correlation, quantum = random.standard_normal(len(time)), 0.0, 0.0
     if kind == 'coloured':
-        from scipy.signal import lfilter  # others need not wait for it
+        from scipy.signal import lfilter  # slow to import
         correlation = random.uniform(0.3, 0.97)
         white[1:] *= math.sqrt(1.0 - correlation ** 2)
         white = lfilter([1.0], [1.0, -correlation], white)
     target = start + step
     push = 0.0
     if kind == 'transient':
-        # A push and no vibration, at times as fast as a tenth of a period.
+        # A push without vibration, at times as short as a tenth of a period.
         push = size * random.uniform(-0.15, 0.15)
         width, middle = period * spread(0.05, 1.5), random.uniform(0.0, hold)
         truth = replace(truth, amplitude=0.0, offset=0.1 * truth.offset)
@@ -149,7 +149,7 @@ def draw(seed: int, kind: str) -> Trial:
         quantum = size * spread(1e-3, 0.03)
         stretch = quantum * np.round(stretch / quantum)
     if kind == 'frozen':
-        # On the way, or in the middle of the hold.
+        # During the move or during the hold.
         begin = int(np.searchsorted(time, random.choice([
             random.uniform(-move, 0.0), random.uniform(0.0, hold)])))
         stretch[begin:] = stretch[min(begin, len(stretch) - 1)]
@@ -164,24 +164,24 @@ def draw(seed: int, kind: str) -> Trial:
         fine[fine <= _SLICE * period], fine[fine >= hold - _SLICE * period], fine)]
     vibration = float(np.ptp(truth.vibrates(fine)))
     if push:
-        # As far as there are samples of it.
+        # As far as samples cover it.
         after = time[time >= 0.0]
         vibration = float(np.ptp(_bump(after, push, width, middle))) if len(after) else 0.0
     error = math.sqrt(
         noise ** 2 * (1.0 + correlation) / (1.0 - correlation) + quantum ** 2 / 12.0)
     within: bool | None = vibration <= limit and max(map(abs, means)) <= limit
     if not within and vibration <= limit and min(map(abs, means)) <= limit:
-        # It creeps across the tolerance.
+        # Creep crosses the tolerance.
         within = None
     if push and limit < vibration < _BEYOND * limit + _PEAKS * noise:
-        # It is too near to the tolerance to be told from noise.
+        # Too close to the tolerance to distinguish from noise.
         within = None
     setpoint = Setpoint(
         target, start, _ARRIVAL - round(1e9 * move), _ARRIVAL, _ARRIVAL + round(1e9 * hold),
         model, decay, possible=(0.1, 3.0))
     return Trial(
         seed, kind, setpoint, _ARRIVAL + np.rint(1e9 * stamps).astype(np.int64), stretch, within,
-        # One push is not the vibration that is estimated.
+        # A single push is not the vibration that is estimated.
         0.0 if push else _clarity(
             np.unique(time[time >= 0.0]), truth, error, means, vibration, limit),
         f'step {step:.3g}, offset {100 * truth.offset / size:.3g} %, vibration '
@@ -196,14 +196,14 @@ def draw(seed: int, kind: str) -> Trial:
 
 
 def _bump(time: np.ndarray, size: float, width: float, middle: float) -> np.ndarray:
-    """Return a push that begins and ends at rest."""
+    """Return a push that starts and ends at rest."""
     return np.asarray(size * np.exp(-0.5 * np.square((time - middle) / (0.25 * width))))
 
 
 def _clarity(
         time: np.ndarray, truth: Truth, error: float, means: Sequence[float], vibration: float,
         limit: float) -> float:
-    """Return how far the truth is from the tolerance for one who has frequency and decay."""
+    """Return the distance of the truth from the tolerance, given frequency and decay."""
     if len(time) < 4:
         return 0.0
     fading, phase = np.exp(-truth.decay * time), truth.omega * time
@@ -220,13 +220,13 @@ def _clarity(
 
 
 def verdict_of(trial: Trial) -> str:
-    """Return what the judge says."""
+    """Return the judge's verdict."""
     found = judge(trial.time, trial.stretch, trial.setpoint, TOLERANCES)
     return str(found.verdict)
 
 
 def wrong(trial: Trial, verdict: str) -> str:
-    """Return what is wrong with a verdict; empty if nothing is."""
+    """Return what is wrong with a verdict; empty if it is right."""
     if trial.within is False and verdict in ARRIVED:
         return 'wrong arrived'
     if trial.within and verdict in MISSED:

@@ -1,14 +1,14 @@
 """
-Laboratories that nothing was tuned to: a serial board, and what no data sheet says.
+Tune laboratories unknown to the package: a serial board and deviations from the data sheet.
 
     python -m benchmarks laboratory [--runs N] [--page FILE] [--quick]
 
-The shipped driver class speaks to the firmware of the board over a line that takes its time. The
-board has a clock of its own; behind it, SciPy integrates coil, actuator and sensor. All is in
-simulated time. What ``hmsa tune`` does is done by the same functions: moves as they are, an
-excitation, an identification, the choice of a shaper, and the moves again; so is what ``hmsa
-calibrate coil --hysteresis`` does where there is an iron core. The true motion is judged, which
-nothing else reads.
+The shipped driver class communicates with the board's firmware over a line with delays. The board
+has its own clock; behind it, SciPy integrates coil, actuator and sensor. All of it runs in
+simulated time. The functions behind ``hmsa tune`` do the tuning: the initial moves, an excitation,
+an identification, the choice of a shaper, and the moves again. So do those behind ``hmsa calibrate
+coil --hysteresis`` where there is an iron core. The verdict is on the true motion, which nothing
+else reads.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,38 +46,38 @@ from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Options, Planner
 from hmsa_ros.recordings.levels import ROUNDED
 
-#: Laboratories of each kind, and the seed of the first without and with hysteresis; those before
-#: it are for development.
+#: Laboratories of each kind, and the first seed without and with hysteresis; earlier seeds are for
+#: development.
 RUNS, SEEDS = 20, {False: 31_000, True: 34_000}
-#: What the last two moves may leave, as a share of the step: without and with hysteresis.
+#: Allowed error of the last two moves, as a fraction of the step: without and with hysteresis.
 GOALS = {False: 0.005, True: 0.015}
-#: The share of laboratories that is to reach that, and what counts as worse than before.
+#: Fraction of laboratories that must reach that, and the increase that counts as worse.
 REACH, WORSE = 0.9, 0.005
-# Offset or vibration of a move, as a share of the step, from which on a verdict is to say so.
+# Offset or vibration of a move, as a fraction of the step, above which a verdict must report it.
 FAILED = 0.03
 _MS = 1_000_000
 _PERIOD = _MS  # of samples in ns
-_LEVEL = 0.14  # T, what the largest stretch needs
-_NONE = ROUNDED * _LEVEL  # what hysteresis leaves is no level, as hmsa learn has it
+_LEVEL = 0.14  # T, required for the largest stretch
+_NONE = ROUNDED * _LEVEL  # remanent field below which there is no level, as in hmsa learn
 _LIMIT, _LEAD = 0.5, 200 * _MS
-_TRIP = (150_000, 600_000)  # of a request and its answer in ns
+_TRIP = (150_000, 600_000)  # round trip of a request in ns
 _JOINT = 'actuator'
-# Of the calibration of a coil with a core: levels on a quarter, ns at each of them and between
-# signs of life, and the noise of the probe in T.
+# Calibration of a coil with a core: levels per quarter of the loop, ns at each level, ns between
+# heartbeats, and noise of the probe in T.
 _STEPS, _SETTLE, _BEAT, _PROBE = 6, 200 * _MS, 10 * _MS, 2e-5
-# Repeats that are learnt from, shares of the step that are enough by what is printed, and that
-# count as an arrival.
+# Repeats to learn from, fraction of the step that counts as small enough by the printed value,
+# and fraction that counts as an arrival.
 _REPEATS, _ENOUGH, _ARRIVED = 2, 0.005, 0.02
 
 
 @dataclass(frozen=True)
 class Laboratory:
-    """What a seed draws."""
+    """A laboratory as drawn from a seed."""
 
     bench: Bench
-    fast: float  # by how much the clock of the board is fast
-    constant: float  # of the coil, over that of its data sheet
-    hysteresis: float  # share of the range
+    fast: float  # rate error of the board's clock, positive if fast
+    constant: float  # of the coil, relative to its data sheet
+    hysteresis: float  # fraction of the range
 
     @property
     def period(self) -> float:
@@ -88,7 +88,7 @@ class Laboratory:
 
     @property
     def words(self) -> str:
-        """What is wrong, in words."""
+        """Deviations from the data sheet, in words."""
         bench = self.bench
         return (f'{bench.wrong}; lag {1e3 * bench.lag:.2f} ms, latency {1e3 * bench.late:.2f} ms, '
                 f'clock {1e6 * self.fast:.0f} ppm, T/A {100.0 * (self.constant - 1.0):+.1f} %, '
@@ -129,7 +129,7 @@ def drawn(seed: int, *, iron: bool) -> Laboratory:
 
 
 class Board(SimulatedBoard):
-    """The board of a laboratory in simulated time; ``motion`` is the truth, ns and stretch."""
+    """The board of a laboratory in simulated time; ``motion`` is the truth in ns and stretch."""
 
     def __init__(self, lab: Laboratory) -> None:
         self.lab, self.fast = lab, lab.fast
@@ -152,7 +152,7 @@ class Board(SimulatedBoard):
         return self._block.field
 
     def write(self, text: bytes) -> None:
-        """Take a request; half of its time passes before it is there, and half after it."""
+        """Send a request; half of the round trip passes before it arrives, half after."""
         trip = int(self._draw.uniform(*_TRIP))
         self.now += trip // 2
         super().write(text)
@@ -164,11 +164,11 @@ class Board(SimulatedBoard):
         return super().read(size)
 
     def _shown(self, stretch: float) -> float | None:
-        """Return what the sensor shows of a stretch; None where it shows nothing."""
+        """Return the sensor's reading of a stretch; None where there is none."""
         return stretch
 
     def _sample(self, time: int) -> None:
-        """Measure: the reading has the timestamp of now, and is of some time ago."""
+        """Measure: the reading has the present timestamp but belongs to an earlier time."""
         then = self._host(time) - round(1e9 * self.lab.bench.late)
         if then >= 0:
             stretch = self._block.advance(max(then, self._block.time))
@@ -181,12 +181,12 @@ class Board(SimulatedBoard):
 
 
 class Driver:
-    """The shipped driver before a board, as `Loop` wants it."""
+    """The shipped driver with a board, for `Loop`."""
 
     def __init__(self, board: Board, coil: CoilModel) -> None:
         self.board = board
         serial = type('Serial', (serial_board.Board,), {'simulate': lambda *_: board})
-        # It waits for answers in simulated time, too.
+        # It waits for answers in simulated time too.
         for module in (line, serial_board):
             module.monotonic = lambda: 1e-9 * board.now  # type: ignore[assignment]
         hardware = Assembly(
@@ -200,31 +200,31 @@ class Driver:
 
     @property
     def time(self) -> int:
-        """Time of the host in ns."""
+        """The host's time in ns."""
         return self.board.now
 
     @property
     def next_sample(self) -> int:
-        """When it is to be advanced next."""
+        """Time of the next call to `advance`."""
         return max(self.device.due or 0, self.board.now + _MS // 10)
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
-        """Take a level."""
+        """Receive a level."""
         self.device.receive(joint, stamp, level)
 
     def advance(self, time: int) -> None:
-        """Do what is due; that takes time, too."""
+        """Do what is due; this takes time too."""
         self.board.now = max(self.board.now, time)
         self.device.advance(self.board.now)
 
     def changes(self) -> Sequence[tuple[int, int, float]]:
-        """Return which levels took effect."""
+        """Return the levels that took effect."""
         found = [(x.joint, x.stamp, x.level) for x in self.device.changes()]
         self.changes_seen += [x[1:] for x in found]
         return found
 
     def samples(self) -> Sequence[tuple[int, Any, Any, Any]]:
-        """Return what was measured."""
+        """Return the measured samples."""
         found = [(x.time, x.stretch, x.rate, x.flux_density) for x in self.device.samples()]
         self.samples_seen += [(x[0], float(x[1][0])) for x in found]
         return found
@@ -232,7 +232,7 @@ class Driver:
 
 @dataclass(frozen=True)
 class Left:
-    """What a move left in truth, as shares of its step, and the verdict on it."""
+    """The true error after a move, as fractions of its step, and the verdict on it."""
 
     vibration: float
     offset: float
@@ -240,36 +240,36 @@ class Left:
 
     @property
     def size(self) -> float:
-        """The larger one."""
+        """The larger of both errors."""
         return max(self.vibration, self.offset)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What tuning a laboratory came to."""
+    """Result of tuning a laboratory."""
 
     lab: Laboratory
     verdict: str  # of the identification
     reason: str
     shaper: str
     before: list[Left]
-    after: list[Left]  # empty where nothing was written
-    learnt: list[Left]  # empty where there is nothing to learn
+    after: list[Left]  # empty if nothing was written
+    learnt: list[Left]  # empty if there is nothing to learn
 
     @property
     def last(self) -> float:
-        """The most that is left by the last two moves."""
+        """The largest error of the last two moves."""
         return _last(self.learnt or self.after or self.before)
 
     @property
     def worse(self) -> float:
-        """How much more than before a move leaves at most."""
+        """The largest increase of the error of a move over that before tuning."""
         return max((x.size - y.size for found in (self.after, self.learnt)
                     for x, y in zip(found, self.before, strict=False)), default=0.0)
 
     @property
     def silent(self) -> int:
-        """Moves that failed and were said to have arrived."""
+        """Moves that failed with the verdict ``arrived``."""
         return sum(x.size > FAILED and x.verdict == 'arrived' for x in (
             *self.before, *self.after, *self.learnt))
 
@@ -286,15 +286,15 @@ class Trial:
         self.loop = Loop(PlannerGroup({_JOINT: planner}), Settings(
             takeover_timeout=0, heartbeat_period=100 * _MS), self.driver)
         self.verdicts: dict[int, str] = {}
-        self.loop.deliver = self._hear
+        self.loop.deliver = self._record
         self.loop.run(self.loop.now + 500 * _MS)
 
-    def _hear(self, output: Output) -> None:
+    def _record(self, output: Output) -> None:
         if isinstance(output, StatusChanged):
             self.verdicts |= {x.setpoint.number: str(x.verdict) for x in output.findings.values()}
 
     def request(self, points: Sequence[tuple[float, float]], *, raw: bool) -> int:
-        """Carry out setpoints or levels with their times in s; return when it began, in ns."""
+        """Execute setpoints or levels with their times in s; return the start time in ns."""
         self.verdicts.clear()
         self.loop.runtime.request(Trajectory(
             (_JOINT,), [((x,), round(1e9 * y)) for x, y in points], len(points), raw=raw))
@@ -303,11 +303,11 @@ class Trial:
         return begin
 
     def moves(self, hold: float) -> list[Left]:
-        """Make the moves, and one back to rest; return what they left in truth."""
+        """Execute the moves and one back to rest; return their true errors."""
         targets = (*self.lab.bench.targets, 1.0)
         self.begin = self.request([(x, hold * (i + 1)) for i, x in enumerate(targets)], raw=False)
         segments = self.loop.runtime.group.planners[_JOINT].plan.segments[-len(targets):]
-        # What is planned anew begins later than the first level.
+        # Replanned segments start later than the first level.
         first = self._first()
         self.targets = [
             Target(x, hold * i, hold * (i + 1), 1e-9 * (y.arrival - first))
@@ -321,7 +321,7 @@ class Trial:
             x for x, y in self.driver.changes_seen if x >= self.begin and abs(y) > _NONE)
 
     def _left(self, rests: Sequence[float], verdicts: Sequence[str]) -> list[Left]:
-        """Return what moves that rest some s after the first level left in truth."""
+        """Return true errors of moves that come to rest at times in s after the first level."""
         time, stretch = np.array([x for x in self.driver.board.motion if x[0] >= self.begin]).T
         time = 1e-9 * (time - self._first())
         found, start, look = [], 1.0, self.lab.period
@@ -335,9 +335,9 @@ class Trial:
         return found[:-1]
 
     def learnt(self, actuator: ActuatorParameters) -> list[Left]:
-        """Repeat the moves as ``hmsa learn`` corrects them; return what the best repeat left."""
+        """Repeat the moves as corrected by ``hmsa learn``; return the best repeat's errors."""
         repeats: list[Repeat] = []
-        # Levels change until half a move after its end.
+        # Levels change until half the duration of a move after its end.
         rests = [x.begin + 1.5 * ((x.arrival or x.begin) - x.begin) for x in self.targets]
         true = []
         while True:
@@ -358,7 +358,7 @@ class Trial:
                 raw=True)
 
     def recorded(self, begin: int) -> Recording:
-        """Return what was recorded since then."""
+        """Return the recording since ``begin``."""
         samples, changes = self.driver.samples_seen, self.driver.changes_seen
         first = max((i for i, x in enumerate(changes) if x[0] <= begin), default=0)
         time, stretch = np.array([(x - begin, y) for x, y in samples if x >= begin]).T
@@ -367,7 +367,7 @@ class Trial:
 
 
 def calibrated(lab: Laboratory) -> CoilModel:
-    """Return the coil of a laboratory as ``hmsa calibrate coil --hysteresis`` finds it."""
+    """Return the coil of a laboratory as ``hmsa calibrate coil --hysteresis`` estimates it."""
     driver = Driver(Board(lab), CoilModel(TESLA_PER_AMPERE))
     random, rows = np.random.default_rng((31, lab.bench.seed)), []
     levels = loop(_LEVEL, _STEPS)
@@ -388,7 +388,7 @@ def calibrated(lab: Laboratory) -> CoilModel:
 
 
 def run(lab: Laboratory) -> Outcome:
-    """Tune a laboratory, and judge the moves before and after."""
+    """Tune a laboratory; judge the moves before and after."""
     sheet = CoilModel(TESLA_PER_AMPERE)
     hold = max(0.4, 12.0 * lab.period)
     entries = [(PLANNER, f'actuator.{x}', getattr(lab.bench.given, x)) for x in (
@@ -420,7 +420,7 @@ def run(lab: Laboratory) -> Outcome:
 
 
 def planner_of(actuator: Any, **options: Any) -> Planner:
-    """Return a planner for the amplifier of a laboratory."""
+    """Return a planner for a laboratory's amplifier."""
     return Planner(actuator, Options(
         flux_density_min=-_LIMIT, flux_density_max=_LIMIT, lead_time=_LEAD, **options))
 
@@ -439,7 +439,7 @@ def compare(*, quick: bool, runs: int = RUNS) -> Sheet:
 
 
 def sheet(outcomes: Mapping[bool, Sequence[Outcome]], *, quick: bool = False) -> Sheet:
-    """Return what came of laboratories without and with hysteresis."""
+    """Return the results of laboratories without and with hysteresis."""
     rows, figures, passed = [], {}, True
     for iron, found in outcomes.items():
         left, tuned, before = ([x.last for x in found], [

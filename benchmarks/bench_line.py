@@ -1,11 +1,11 @@
 """
-What goes wrong between a driver and its coil, many times each.
+Inject faults between a driver and its coil, many times each.
 
     python -m benchmarks line [--runs N] [--page FILE] [--quick]
 
-The shipped driver class and the firmware of the board are those of the laboratories, and so is the
-simulated time. The actuator is as the planner takes it to be, so that only the fault is judged: by
-the levels that really flowed, the true motion, and what driver and planner said. After the fault
+The shipped driver class, the board's firmware and the simulated time are those of the
+laboratories. The actuator matches the planner's model, so only the fault is judged: by the
+levels in the coil, the true motion, and the messages of driver and planner. After the fault
 comes another move; where the driver has ended, a new one is started on the same board.
 """
 
@@ -38,15 +38,15 @@ from hmsa_ros.errors import HmsaError
 from hmsa_ros.model.equations import elastic_force
 
 RUNS, SEED = 20, 33_000
-#: What the move after a fault may leave, as a share of the step.
+#: Allowed error of the move after a fault, as a fraction of the step.
 GOAL = 0.005
-#: Time in ns without a request after which the board switches off, and what comes on top: the
-#: requests in flight.
+#: Time in ns without a request after which the board switches off, and an allowance for requests
+#: in flight.
 WATCHDOG, _FLIGHT = 500_000_000, 10_000_000
 _MS = 1_000_000
-# For how long in ns a cable is out, and until when it is waited for.
+# Range of the time in ns that a cable is out, and the longest wait for it.
 _OUT, _PATIENCE = (600 * _MS, 2000 * _MS), 5000 * _MS
-# Shares of answers and requests with garbage before them, and of their bytes that are lost.
+# Fraction of answers and requests preceded by garbage, and fraction of their bytes lost.
 _GARBAGE, _LOST = 0.1, 1e-3
 
 FAULTS = {
@@ -56,17 +56,17 @@ FAULTS = {
 
 
 class _Amplifier(Plant):
-    """An actuator behind an amplifier that gives no more than a level in T."""
+    """An actuator behind an amplifier with a largest level in T."""
 
     largest = math.inf
 
     def command(self, stamp: int, level: float) -> None:
-        """Take a level from a stamp on, or what is possible of it."""
+        """Set a level from a timestamp on, limited to the amplifier's range."""
         super().command(stamp, max(-self.largest, min(level, self.largest)))
 
 
 class FaultyBoard(Board):
-    """A board on which something is wrong from a time of the host in ns until another."""
+    """A board with a fault between two times of the host in ns."""
 
     def __init__(self, lab: Laboratory, fault: str) -> None:
         self._fault, self._fate = fault, np.random.default_rng((33, lab.bench.seed))
@@ -81,7 +81,7 @@ class FaultyBoard(Board):
 
     @property
     def flowed(self) -> list[tuple[int, float]]:
-        """Times of the host in ns, and the levels in T from then on."""
+        """Times of the host in ns, and the level in T from each on."""
         found: list[tuple[int, float]] = self._block.applied
         return found
 
@@ -92,7 +92,7 @@ class FaultyBoard(Board):
         """Do what is due by now."""
         if self._wrong('reboot') and not self._restarted:
             self._restarted = True
-            # All of its levels go with it.
+            # All of its levels are lost.
             self._block.command(self.now, 0.0)
             self._level = 0
             self.restart()
@@ -113,13 +113,13 @@ class FaultyBoard(Board):
         return noise + bytes(x for x in text if self._fate.random() >= _LOST)
 
     def write(self, text: bytes) -> None:
-        """Take a request, if it is connected."""
+        """Send a request if connected."""
         self._connected()
         super().write(self._worn(text))
         self._answer = self._worn(self._answer)
 
     def read(self, size: int) -> bytes:
-        """Return bytes, if it is connected."""
+        """Return bytes if connected."""
         self._connected()
         return super().read(size)
 
@@ -140,18 +140,18 @@ class FaultyBoard(Board):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a fault."""
+    """Result of a fault."""
 
     lab: Laboratory
     off: float  # time in s from the fault until the coil was off; NaN where it need not be
     reported: bool
-    silent: int  # moves that failed and were said to have arrived
-    next: Left  # the move after it
-    words: str  # what was said
+    silent: int  # moves that failed with the verdict arrived
+    next: Left  # the move after the fault
+    words: str  # what was reported
 
 
 def run_one(seed: int, *, fault: str) -> Outcome:
-    """Have a fault come at a random time of four moves, and make another one after it."""
+    """Inject a fault at a random time during four moves, and make another move after it."""
     lab = drawn(seed, iron=False)
     lab = replace(lab, constant=1.0, bench=replace(
         lab.bench, given=lab.bench.block, lag=0.0, late=0.0, ratio=0.0))
@@ -189,9 +189,9 @@ def run_one(seed: int, *, fault: str) -> Outcome:
         trial = _trial(board)
     after = trial.moves(hold)
     return Outcome(
-        # What is done in time in spite of garbage need not be reported.
+        # A move completed in time in spite of garbage need not be reported.
         lab, off, bool(words or unseen) or fault == 'garbage' and not failed,
-        # What is lost after a verdict is reported by the driver.
+        # The driver reports a loss after the verdict.
         0 if words else sum(x.verdict == 'arrived' for x in failed),
         max(after, key=lambda x: x.size),
         words or ', '.join(x.verdict for x in moves))
@@ -202,7 +202,7 @@ def _trial(board: FaultyBoard) -> Trial:
 
 
 def compare(*, quick: bool, runs: int = RUNS) -> Sheet:
-    """Inject all faults; passed if the coil was always safe, all was said, and went on."""
+    """Inject all faults; passed if the coil was always safe and all was reported and recovered."""
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         found = {fault: list(pool.map(partial(run_one, fault=fault), range(
             SEED, SEED + (1 if quick else runs)))) for fault in FAULTS}

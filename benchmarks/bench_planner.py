@@ -1,10 +1,10 @@
 """
-The two-step command: this package against what else would compute it.
+Compare the two-step command of this package with other ways to compute it.
 
-All solve the same nine moves, the paper's steps up and down in stretch and what lies between.
+All solve the same nine moves: the paper's steps up and down in stretch, and steps between them.
 Errors are those of beta_p against solutions in 40-digit arithmetic (`benchmarks.reference`).
-Where a contender has a tolerance of its own, the loosest one is taken that keeps the error
-below a limit, so that times compare at equal accuracy.
+A contender with a tolerance of its own uses the loosest one that keeps the error below a limit,
+so times compare at equal accuracy.
 """
 
 from collections.abc import Callable
@@ -43,11 +43,11 @@ MOVES = [(1.0, 1.1), (1.1, 1.2), (1.2, 1.4), (1.0, 0.9), (0.9, 0.8), (0.8, 0.7),
          (0.85, 0.7), (0.7, 0.85)]
 ACTUATOR = Actuator(zeta=0.2, j_lim=5.0, c1=2.0)
 MATERIAL = NondimensionalParameters(zeta=0.2, j_lim=5.0, c1=2.0)
-#: Error that contenders have to keep.
+#: Error limit of the contenders.
 LIMIT = 1e-10
-#: The cheapest that keeps it.
+#: The cheapest setting that keeps it.
 POLYNOMIALS = contenders.Collocation(elements=2, degree=7)
-#: As in the package: first guess, a coarse first pass, and how the search ends.
+#: As in the package: initial guess, a coarse first iteration, and the end of the search.
 OURS = ['-DGUESS=2', '-DCOARSE=1e-7', '-DCUBICS']
 NOT_INSTALLED = 'not installed'
 ROOT = Path(__file__).resolve().parent.parent
@@ -56,7 +56,7 @@ Loads = Callable[[], list[float]]
 
 
 class Reference:
-    """The nine loads beta_p, to more digits than a double has."""
+    """The nine loads beta_p, to more digits than double precision."""
 
     def __init__(self) -> None:
         """Solve."""
@@ -100,7 +100,7 @@ def _ours(reference: Reference) -> list[Contender]:
 
 
 def _shaped(reference: Reference, setting: str, lag: float, creep: Creep) -> Contender:
-    """Time the shaper, to which a lag of the coil is one more unknown, and a branch a state."""
+    """Time the shaper; a lag of the coil adds an unknown, a branch adds a state."""
     material = replace(MATERIAL, creep=creep)
     requests = [
         Request(State(start), target, material, delivery=Delivery(lag=lag))
@@ -109,7 +109,7 @@ def _shaped(reference: Reference, setting: str, lag: float, creep: Creep) -> Con
     def loads() -> list[float]:
         return [shaper(x).levels[0].load for x in requests]
 
-    # The reference knows neither.
+    # The reference includes neither.
     error = reference.error(loads()) if lag == 0.0 and not creep else math.nan
     return Contender(
         'shaper two_step', setting, stopwatch(loads, len(MOVES)), error)
@@ -138,7 +138,7 @@ def _threads(count: int) -> str:
 def _external(
         name: str, program: contenders.External, reference: Reference, repeats: int,
         limit: float, *, start: float = 1e-8) -> Contender:
-    """Time a program at the loosest tolerance that keeps an error."""
+    """Time a program at the loosest tolerance that keeps an error limit."""
     errors: dict[float, float] = {}
 
     def error(tolerance: float) -> float:
@@ -169,7 +169,7 @@ def _c_programs(
 
 
 def compare(*, quick: bool = False) -> Report:
-    """Measure all that is there."""
+    """Measure all installed contenders."""
     rounds = 1 if quick else 15
     reference = Reference()
     rows: list[Row] = []
@@ -219,7 +219,7 @@ def compare(*, quick: bool = False) -> Report:
 
 
 def summary(report: Report) -> list[str]:
-    """Say what the table holds about the batch function."""
+    """Return the results of the batch function as sentences."""
     lines = []
     batches = [x for x in report.rows if x.name.startswith('plan_two_step_batch')]
     for one in (x for x in batches if x.name.endswith('1 thread')):
@@ -234,7 +234,7 @@ def summary(report: Report) -> list[str]:
     return lines
 
 
-# What each choice in the kernel is worth, shown in the C program, which has switches for them.
+# Effect of each choice in the kernel, shown in the C program, which has switches for them.
 _GUESSES = (('half way', '0'), ('undamped energy', '1'), ('energy and damping', '2'))
 CHOICES = [
     *((f'guess: {guess}', [f'-DGUESS={key}', *option], passes)
@@ -249,7 +249,7 @@ CHOICES = [
 
 
 def choices(*, quick: bool = False) -> Report:
-    """Measure what guess, derivatives and coarse passes do, in C, at equal error."""
+    """Measure the effect of guess, derivatives and coarse integrations, in C, at equal error."""
     title = 'What the choices are worth, in the C program; error below 1e-11'
     if contenders.compiler() is None:
         return Report('choices', title, 'time per plan', 'error in beta_p',
@@ -282,7 +282,7 @@ def _children() -> float:
 
 
 def _process(command: list[str]) -> list[float]:
-    """Return time from start to end and processor time of a command, and numbers it prints."""
+    """Return elapsed and processor time of a command, and the numbers it prints."""
     before = _children()
     begin = perf_counter()
     done = subprocess.run(
@@ -293,7 +293,7 @@ def _process(command: list[str]) -> list[float]:
 
 
 def start_up(*, quick: bool = False) -> Report:
-    """Measure the first plan of a new process, and of a new installation."""
+    """Measure the first plan of a new process and of a new installation."""
     _process([sys.executable, '-c', _FIRST])
     runs = [_process([sys.executable, '-c', _FIRST]) for _ in range(1 if quick else 9)]
     names = ('new process, first plan, from start to end', 'of that, processor time',
@@ -306,17 +306,17 @@ def start_up(*, quick: bool = False) -> Report:
 
 
 def _installed() -> list[Row]:
-    """Install the package alone into a new environment, and make the first plan there."""
+    """Install only the package into a new environment, and compute the first plan there."""
     with tempfile.TemporaryDirectory() as folder:
         venv.create(folder, with_pip=True)
         python = str(Path(folder) / 'bin' / 'python')
-        # A clone has nothing of an earlier build, which would be taken up.
+        # A clone has no files of an earlier build, which would be reused.
         clone = str(Path(folder) / 'clone')
         subprocess.run(['git', 'clone', '--quiet', str(ROOT), clone], check=True)
         install = _process([
             python, '-m', 'pip', 'install', '--no-deps', '--quiet',
             '--disable-pip-version-check', clone])
-        # The requirements, which take as long as the network does, are those of this Python.
+        # The requirements, whose download time depends on the network, are those of this Python.
         for site in Path(folder).glob('lib/python*/site-packages'):
             (site / 'requirements.pth').write_text(f'{sysconfig.get_path("purelib")}\n')
         first = _process([python, '-I', '-c', _FIRST])

@@ -1,10 +1,10 @@
 """
-The plant: time to simulate one unit of nondimensional time at an error of 1e-9.
+Time the simulation of one unit of nondimensional time by the plant at an error of 1e-9.
 
-The paper's sequence 1 to 1.1 to 1.2 to 1.4 with unshaped steps, ten units each, rings all the way;
-it is sampled ten times a unit, more often than a plant node at 1 kHz would. Errors are those of
-the samples against solutions in 40-digit arithmetic. Every method gets the loosest tolerance, or
-the longest step, that keeps the error.
+The paper's sequence 1 to 1.1 to 1.2 to 1.4 with unshaped steps, ten units each, vibrates
+throughout. It is sampled ten times a unit, more often than by a plant node at 1 kHz. Errors are
+those of the samples against solutions in 40-digit arithmetic. Every method uses the loosest
+tolerance, or the longest step, that keeps the error.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ Simulation = Callable[[float], np.ndarray]
 
 
 class Sequence:
-    """Steps of a length and the times to sample at."""
+    """Steps of equal duration, and the sampling times."""
 
     def __init__(self, span: float, rate: int) -> None:
         """Make the grid."""
@@ -45,7 +45,7 @@ class Sequence:
         return self.span * len(TARGETS)
 
     def pieces(self, follow: Callable[[np.ndarray, float, np.ndarray], np.ndarray]) -> np.ndarray:
-        """Simulate step by step; ``follow`` gets times from the beginning of the step."""
+        """Simulate step by step; ``follow`` gets times from the start of the step."""
         state = np.array([1.0, 0.0])
         stretch = []
         times = self.times[:self.each]
@@ -86,7 +86,7 @@ def _odeint(sequence: Sequence) -> Simulation:
 
 
 def _python(sequence: Sequence) -> Callable[[int], np.ndarray]:
-    """Return RK4 in plain Python by the number of steps between two samples."""
+    """Return RK4 in plain Python as a function of the number of steps between two samples."""
     def run(steps: int) -> np.ndarray:
         def follow(state: np.ndarray, load: float, times: np.ndarray) -> np.ndarray:
             l, v = (float(x) for x in state)  # noqa: E741

@@ -1,12 +1,12 @@
 """
-How exactly a bag is played.
+Measure the timing error of bag playback.
 
     python -m benchmarks player [--quick]
 
-A bag of equally spaced messages is played; for each speed the error of the sending times
-against the bag's own spacing is printed, by the source stamps that the middleware puts on each
-message. The first message is where time is counted from. Before and after, the same is measured
-of a loop that only sleeps: what the machine itself allows at that moment.
+A bag of equally spaced messages is played. For each speed, the error of the sending times against
+the bag's own spacing is printed, from the source timestamps that the middleware adds to each
+message. Time counts from the first message. Before and after, the same is measured for a loop
+that only sleeps, which shows the machine's own limit at that moment.
 """
 
 import json
@@ -39,7 +39,7 @@ def write(folder, rate, seconds):
 
 
 def receive():
-    """Take messages off a raw subscription; print their source stamps at the end."""
+    """Take messages from a raw subscription; print their source timestamps at the end."""
     import rclpy
     from rclpy.qos import HistoryPolicy, QoSProfile
     from std_msgs.msg import Float64
@@ -64,7 +64,7 @@ def receive():
 
 
 def sleep_only(rate, seconds):
-    """Sleep until each time of a grid; return how late each wake-up is."""
+    """Sleep until each time of a grid; return the delay of each wake-up."""
     late, begin = [], time.monotonic()
     for i in range(round(rate * seconds)):
         time.sleep(max(0.0, begin + i / rate - time.monotonic()))
@@ -79,7 +79,7 @@ def cells(errors):
 
 
 def play(folder, speed):
-    """Play a bag at a speed; return the stamps and numbers received."""
+    """Play a bag at a speed; return the timestamps and numbers received."""
     import struct
     environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
     receiver = subprocess.Popen(

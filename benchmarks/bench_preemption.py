@@ -1,11 +1,11 @@
 """
-Pre-emption: from a request that reaches the planner node to its first command.
+Measure pre-emption: from a request's arrival at the planner node to its first command.
 
-The actuator is moving all the time: each setpoint comes 3 ms after the last one, when half of
-the move is done, so every plan starts from a moving state. The node's own time is the
-processor's in its callback, which plans, publishes the first command, the plan and the verdict.
-The round trip is by the clock on the wall and adds DDS on this host, in both directions, and the
-executors of two processes.
+The actuator moves all the time: each setpoint comes 3 ms after the previous one, half way through
+its move, so every plan starts from a moving state. The node's own time is the processor time of
+its callback, which plans and publishes the first command, the plan and the verdict. The round
+trip is wall-clock time and adds DDS on this host in both directions and the executors of two
+processes.
 """
 
 import os
@@ -59,7 +59,7 @@ def own_time(name: str, parameters: dict[str, str], count: int) -> Row:
         channel = node._channels['actuator']
         spans = []
         for i in range(count):
-            # Simulated time, handed in as /clock would: requests lie 3 ms apart in it.
+            # Simulated time, set as by /clock; requests are 3 ms apart in it.
             source.clock_callback(Clock(clock=to_time(10**9 + i * _SPACING_NS)))
             message = Float64(data=float(_TARGETS[i % _TARGETS.size]))
             begin = thread_time()
@@ -73,7 +73,7 @@ def own_time(name: str, parameters: dict[str, str], count: int) -> Row:
 
 
 def round_trip(count: int) -> Row:
-    """Time a setpoint's way to the planner process and its command's way back."""
+    """Time the round trip of a setpoint to the planner process and its first command."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
     from std_msgs.msg import Float64

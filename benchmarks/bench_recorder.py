@@ -1,21 +1,21 @@
 """
-How fast can be recorded without loss.
+Measure how fast messages can be recorded without loss.
 
     python -m benchmarks recorder [--quick]
 
-First the highest rate is searched at which a bare raw subscription that does nothing, served
-by the EventsExecutor, gets every 120-byte message of another process: by some seconds at each
-rate, then by a whole minute at the one found and at lower ones until nothing is lost. At 80 % of
-that rate the bare subscription, the recorder of this package and a plain one (a raw subscription
-whose callback writes, served by the SingleThreadedExecutor) then run for a minute each. One
-table shows all of them.
+First, the benchmark searches the highest rate at which a bare raw subscription with an empty
+callback, served by the EventsExecutor, receives every 120-byte message of another process: for
+some seconds at each rate, then for a whole minute at the rate found and at lower ones until
+nothing is lost. At 80 % of that rate, the bare subscription, this package's recorder and a plain
+recorder (a raw subscription whose callback writes, served by the SingleThreadedExecutor) run for
+a minute each. One table shows all of them.
 
-Once a reliable reader of Fast DDS has fallen behind by more than the writer keeps, repairs take
-up the capacity and it does not catch up again as long as the stream lasts: on a machine that
-does other work at the same time any receiver, the bare one too, may lose half a run: here a
-receiver that is stopped for 0.06 s at four fifths of the highest rate loses a third of the next
-ten seconds, one that is stopped for 0.02 s nothing. So a rate counts as too high for some seconds
-only after several tries, and a run in which something was lost is repeated; all of them are shown.
+Once a reliable reader of Fast DDS has fallen behind by more than the writer keeps, repairs use up
+the capacity, and it does not catch up while the stream lasts. On a machine with other load, any
+receiver, even the bare one, may lose half a run: here, a receiver stopped for 0.06 s at four
+fifths of the highest rate loses a third of the next ten seconds; one stopped for 0.02 s loses
+nothing. A rate therefore counts as too high only after several tries of some seconds, and a run
+with a loss is repeated; all runs are shown.
 """
 
 import json
@@ -33,30 +33,30 @@ DEPTH = 10_000
 # Raw payload with header and length: 120 bytes.
 DATA_BYTES = 104
 SHARE = 0.8
-# The search begins here, doubles or halves, and then narrows down to this ratio.
+# The search starts here, doubles or halves, and then narrows down to this ratio.
 FIRST_RATE = 20_000.0
 RATIO = 1.1
 TRIES = 2
 SEARCH_SECONDS = 5.0
 SEARCH_LIMIT_SECONDS = 150.0
-# A queue hides for some seconds that a rate cannot be kept up, so that the highest rate is tried
-# for as long as is recorded, and lower ones by this factor each.
+# A queue can mask a rate that is too high for some seconds. The highest rate is therefore tried
+# for the full duration of a recording, then lower ones by this factor each.
 LOWER = 0.85
-# Runs of a receiver until one goes without loss, at most.
+# Maximum runs of a receiver until one loses nothing.
 RUNS = 3
-# What falls short of the rate asked for by more is no such rate.
+# A sender that falls short of the requested rate by more has not reached it.
 FAST_ENOUGH = 0.97
 
 
 def qos():
-    """Return the profile that all sides use."""
+    """Return the QoS profile that all sides use."""
     from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=DEPTH,
                       reliability=ReliabilityPolicy.RELIABLE)
 
 
 def source():
-    """For each line with a rate and seconds, send for so long and say how many."""
+    """For each input line with a rate and seconds, publish and print the number sent."""
     import rclpy
     from rclpy.serialization import serialize_message
     from std_msgs.msg import UInt8MultiArray
@@ -74,7 +74,7 @@ def source():
             due = min(total, int((time.perf_counter() - begin) * rate) + 1)
             if due <= sent:
                 time.sleep(0.0002)
-            # At most as many as the reader has room for, should this process have been held up.
+            # At most as many as the reader has room for, in case this process was delayed.
             due = min(due, sent + DEPTH // 4)
             for _ in range(due - sent):
                 publisher.publish(raw)
@@ -87,7 +87,7 @@ def source():
 
 
 def receive(kind, folder):
-    """Receive until told to end, and say how many whenever asked and then."""
+    """Receive until SIGINT or SIGTERM; print the count then and at each SIGUSR1."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.experimental.events_executor import EventsExecutor
@@ -119,7 +119,7 @@ def receive(kind, folder):
                 writer.flush()
                 flushed = time.monotonic()
         executor = SingleThreadedExecutor()
-    signal.signal(signal.SIGUSR1, lambda *_: tell(count))
+    signal.signal(signal.SIGUSR1, lambda *_: report(count))
     node.create_subscription(UInt8MultiArray, TOPIC, callback, qos(), raw=True)
     executor.add_node(node)
     never = Future()
@@ -127,22 +127,22 @@ def receive(kind, folder):
         executor.spin_until_future_complete(never, 0.1)
     if kind != 'bare':
         writer.close()
-    tell(count)
+    report(count)
     rclpy.try_shutdown()
 
 
-def tell(count):
+def report(count):
     """Print a count."""
     print(json.dumps({'received': count}), flush=True)
 
 
 def environment():
-    """Return the environment of the processes."""
+    """Return the environment variables of the processes."""
     return {**os.environ, 'PYTHONPATH': str(ROOT), 'PYTHONUNBUFFERED': '1'}
 
 
 def role(*words):
-    """Return the command of one side."""
+    """Return the command line of one side."""
     return [sys.executable, str(Path(__file__).resolve()), *map(str, words)]
 
 
@@ -155,13 +155,13 @@ class Source:
             text=True)
 
     def send(self, rate, seconds):
-        """Send; return what was sent and how fast."""
+        """Send; return the number sent and the rate."""
         self.process.stdin.write(f'{rate} {seconds}\n')
         self.process.stdin.flush()
         return json.loads(self.process.stdout.readline())
 
     def close(self):
-        """End it."""
+        """End the process."""
         self.process.communicate()
 
 
@@ -180,19 +180,19 @@ def measure(command, rate, seconds, count):
     return {
         'rate': figures['rate'], 'seconds': seconds, 'sent': figures['sent'],
         'received': received, 'lost': figures['sent'] - received,
-        # Start and end included: what is used for nothing else.
+        # Including start and end, when nothing else runs.
         'cores': (usage.ru_utime + usage.ru_stime) / seconds,
         'memory': usage.ru_maxrss / 1024,
     }
 
 
 def reported(output):
-    """Return what a receiver has counted."""
+    """Return the count printed by a receiver."""
     return json.loads(output.strip().splitlines()[-1])['received']
 
 
 def bare(rate, seconds):
-    """Measure a subscription that does nothing."""
+    """Measure a subscription with an empty callback."""
     return measure(role('receive', 'bare', ''), rate, seconds, reported)
 
 
@@ -211,7 +211,7 @@ def recorder(rate, seconds, folder):
 
 
 class Search:
-    """The search of the highest rate without loss, some seconds at each rate."""
+    """Search for the highest rate without loss, some seconds at each rate."""
 
     def __init__(self, seconds):
         self._seconds = seconds
@@ -222,7 +222,7 @@ class Search:
         self._before = 0
 
     def run(self):
-        """Return the highest rate and what was sent at it, None if there is none."""
+        """Return the result at the highest rate without loss, None if there is none."""
         try:
             return self._search()
         finally:
@@ -244,7 +244,7 @@ class Search:
         return best
 
     def _try(self, rate):
-        """Return what was sent if a rate goes without loss, None if it does not."""
+        """Return the result at a rate without loss, None if there was a loss."""
         for _ in range(TRIES):
             sent = self._source.send(rate, self._seconds)
             received = self._settled()
@@ -259,7 +259,7 @@ class Search:
         return None
 
     def _settled(self):
-        """Return the number of messages received when no more come."""
+        """Return the number of messages received once no more arrive."""
         count, same = -1, 0
         for _ in range(50):
             time.sleep(0.1)
@@ -273,7 +273,7 @@ class Search:
 
 
 def sustained(rate, seconds):
-    """Return the figures of the bare subscription at the highest rate that it keeps up."""
+    """Return the figures of the bare subscription at the highest rate it sustains."""
     while rate > 100.0:
         result = bare(rate, seconds)
         if not result['lost'] and result['rate'] > FAST_ENOUGH * rate:
@@ -285,7 +285,7 @@ def sustained(rate, seconds):
 
 
 def runs(name, run):
-    """Return the figures of a receiver's runs by name, until one goes without loss."""
+    """Return the figures of a receiver's runs by name, until one loses nothing."""
     found = {}
     for number in range(1, RUNS + 1):
         found[f'{name}, run {number}'] = figures = run(number)

@@ -1,18 +1,18 @@
 """
-Soak: hours of operation, compressed in time, with everything that goes wrong in them.
+Soak test: hours of operation, compressed in time, with every kind of fault.
 
-Two parts. Over DDS: plant, planner and recorder as real processes; the plant leads simulated time
-as fast as it can, at 1 kHz or another rate. Cycles of two kinds take turns, each with a bag of
-its own. In calm ones there are random setpoints, sequences, stops, garbage on the planner's
-inputs, and kills of planner or recorder; every sample and every command of them is in the bag,
-and integrating the commands anew must give the samples. In rough ones there is garbage on every
-topic and service, the plant is paused, reset and killed too; that nobody raises or ends, and that
-the recorder lost nothing, is what counts there. A second recorder, the witness, lives from the
-first cycle to the last, and the `mcap` package counts what it has written. In process: the
-planner's and the plant's cores with messages between them, for all hours, at 1 kHz.
+It has two parts. Over DDS: plant, planner and recorder run as real processes; the plant drives
+simulated time as fast as it can, at 1 kHz or another rate. Cycles of two kinds alternate, each
+with a bag of its own. Calm cycles contain random setpoints, sequences, stops, garbage on the
+planner's inputs, and kills of planner or recorder; the bag holds all their samples and commands,
+and integrating the commands again must give the samples. Rough cycles add garbage on every topic
+and service, and the plant is paused, reset and killed too; there, no node may raise or end, and
+the recorder may lose nothing. A second recorder, the witness, runs from the first cycle to the
+last, and the `mcap` package counts what it has written. In process: the cores of planner and
+plant with messages between them, for all hours, at 1 kHz.
 
-Memory of each process is sampled all the time; it must not grow. For that to be seen, plant and
-planner are killed in the first third only, and live through the rest.
+The memory of each process is sampled throughout; it must not grow. To make growth visible, plant
+and planner are killed in the first third only and run through the rest.
 """
 
 from collections.abc import Callable
@@ -42,29 +42,29 @@ _STEP_NS = 1_000_000
 #: Of the plant, in Hz.
 RATE = 1000.0
 _NANOSECONDS = 1_000_000_000
-#: On the wall; in simulated seconds as many times that as simulated time is faster.
+#: Wall-clock time; multiply by the factor of simulated time for simulated seconds.
 _LEAD_SECONDS = 1.0
 #: Of a file of the witness, in bytes.
 _FILE_SIZE = 100_000_000
-#: Part of a process's life, in simulated h, in which it may still grow: buffers fill.
+#: Initial part of a process's life, in simulated h, in which it may grow as buffers fill.
 _SETTLE_HOURS = 0.25
-#: Part of all hours in which plant and planner are killed; memory is watched in the rest.
+#: Fraction of all hours in which plant and planner are killed; memory is watched in the rest.
 _DEADLY_SHARE = 1.0 / 3.0
-#: Part of a process's life, in simulated h, that is not drawn: it is still being loaded.
+#: Initial part of a process's life, in simulated h, that is not drawn: it is still loading.
 _LOADED_HOURS = 0.005
 _LOOK_SECONDS = 2.0
-#: Simulated s that pass at most between two diagnostics of the plant, 1 s apart on the wall.
+#: Maximum simulated s between two diagnostics of the plant, which are 1 s of wall time apart.
 _LARGEST_ROUND = 90.0
-#: Samples a second, by `RATE`: what two cores manage with all processes, with some room.
-#: A recorder that does not get its turn for longer than a second loses samples then, since the
-#: plant keeps the last five thousand of them for those who have not taken them yet.
+#: Samples per second, over `RATE`: what two cores manage with all processes, with a margin.
+#: A recorder that is held up for more than a second then loses samples, since the plant keeps
+#: only the last five thousand for readers that lag.
 FACTOR = 5.0
 _TOPICS = (
     'joint_states', 'flux_density_command', 'flux_density_applied', 'planner/status',
     'planner/plan', 'planner/setpoint', 'planner/joint_trajectory', '/diagnostics')
 _NODES = ('plant', 'planner', 'recorder')
 _WITNESS = 'witness'
-#: Of stretch: a bag's samples against its commands, integrated anew.
+#: Tolerance of stretch between a bag's samples and its commands, integrated again.
 _SAME = 1e-9
 
 
@@ -75,32 +75,32 @@ class Cycle:
     kind: str  # 'calm' or 'rough'
     killed: str  # node that was killed in it; empty for none
     samples: int = 0  # of the plant in the bag
-    missing: int = 0  # samples between others that are not in the bag, in calm ones
-    odd: int = 0  # distances of two samples that are no whole number of ms, in calm ones
-    lost: int = 0  # as the recorder counts them; -1 if the bag does not tell
-    difference: float = math.nan  # of the stretch to the commands integrated anew
+    missing: int = 0  # samples between others that are not in the bag, in calm cycles
+    odd: int = 0  # intervals between samples that are not whole ms, in calm cycles
+    lost: int = 0  # by the recorder's count; -1 if the bag has none
+    difference: float = math.nan  # of the stretch from the commands integrated again
     late: int = 0  # commands that came after their time
     failure: str = ''  # why the bag could not be checked
 
 
 @dataclass
 class Witness:
-    """What the recorder that lived through all cycles has written."""
+    """The recording of the recorder that ran through all cycles."""
 
-    hours: float  # of simulated time that it lived
+    hours: float  # of simulated time that it ran
     files: int
     samples: int  # of the plant's stretch, as the mcap package reads them
     messages: int  # of all topics, by the same package
     told: int  # messages of all topics by the bag's metadata
-    lost: int  # by its own count
+    lost: int  # by the recorder's count
 
 
 @dataclass
 class Result:
-    """What the soak found over DDS."""
+    """Result of the soak over DDS."""
 
     hours: float = 0.0  # simulated
-    wall: float = 0.0  # hours that it took
+    wall: float = 0.0  # wall-clock hours
     requests: int = 0  # setpoints, sequences and stops
     garbage: int = 0  # messages
     calls: int = 0  # of services
@@ -110,12 +110,12 @@ class Result:
     witness: Witness | None = None
     trends: dict[str, Trend] = field(default_factory=dict)
     traces: list[str] = field(default_factory=list)  # unhandled exceptions
-    ended: list[str] = field(default_factory=list)  # nodes that ended without being told
+    ended: list[str] = field(default_factory=list)  # nodes that ended without a request
     broken: list[str] = field(default_factory=list)  # cycles that could not be finished, and why
-    statuses: list[int] = field(default_factory=list)  # of nodes that were told to end
+    statuses: list[int] = field(default_factory=list)  # of nodes that were asked to end
 
     def failures(self) -> list[str]:
-        """Say what is not as it has to be."""
+        """Return the requirements that are not met, as sentences."""
         found = [f'unhandled exception in the {x}' for x in self.traces]
         found += [f'{x} ended by itself' for x in self.ended]
         found += self.broken
@@ -142,7 +142,7 @@ class Result:
 
 
 def check_bag(folder: Path, kind: str, killed: str, step: int = _STEP_NS) -> Cycle:
-    """Look for gaps in a bag, integrate its commands anew, and remove it if all is well."""
+    """Check a bag for gaps, integrate its commands again, and remove it if it has no fault."""
     from hmsa_ros.bag.info import missing_messages
     from hmsa_ros.bag.reader import BagReader
     from hmsa_ros.bag.recover import recover
@@ -163,7 +163,7 @@ def check_bag(folder: Path, kind: str, killed: str, step: int = _STEP_NS) -> Cyc
         for message in reader.messages(('/joint_states',)):
             found.samples += 1
             if kind == 'rough':
-                # Time jumps, and there is garbage among them.
+                # Time jumps, and the samples include garbage.
                 continue
             now = stamp_of(message.data)
             if before:
@@ -176,7 +176,7 @@ def check_bag(folder: Path, kind: str, killed: str, step: int = _STEP_NS) -> Cyc
             found.late = verification.late_count
     except HmsaError as error:
         found.failure = str(error)
-    # A bag that tells of a fault is kept for as long as the folder is.
+    # A bag with a fault is kept as long as the folder.
     if not Result(cycles=[found]).failures():
         shutil.rmtree(folder, ignore_errors=True)
         shutil.rmtree(bag, ignore_errors=True)
@@ -184,7 +184,7 @@ def check_bag(folder: Path, kind: str, killed: str, step: int = _STEP_NS) -> Cyc
 
 
 def read_witness(folder: Path, hours: float) -> Witness:
-    """Count what a long recording holds, by a reader that is not this package's."""
+    """Count the messages of a long recording with a reader independent of this package."""
     from mcap.reader import make_reader
 
     from hmsa_ros.bag.info import summarize
@@ -203,27 +203,27 @@ def read_witness(folder: Path, hours: float) -> Witness:
 
 class Soak:
     """
-    Real processes, worn out; a context manager that ends them.
+    Real processes under stress; a context manager that ends them.
 
     Parameters
     ----------
     folder : Path
         For logs and bags.
-    domain : int
+        Folder for logs and bags.
         ROS domain for this alone.
     seed : int
-        Of all chance.
+        Seed of all random choices.
     factor : float
-        Simulated seconds per second that the plant is asked for; 0 for as fast as it can.
+        Requested ratio of simulated to real time of the plant; 0 for as fast as possible.
     rate : float
-        Of the plant, in Hz.
+        Rate of the plant in Hz.
 
     Attributes
     ----------
     result : Result
-        So far.
+        Result so far.
     seconds : float
-        Simulated so far.
+        Simulated seconds so far.
 
     """
 
@@ -248,8 +248,8 @@ class Soak:
         self._asked: list[tuple[Any, Any]] = []
         self._clients: dict[str, tuple[Any, type[Any]]] = {}
         self._bags = 0
-        # A child of its own, so that looking at a bag does not hold up the next cycle; after all
-        # others, so that it takes no time from the recorder.
+        # Bags are checked in a separate process, so that the next cycle does not wait, and at low
+        # priority, so that the recorder is not slowed down.
         self._pool = ProcessPoolExecutor(
             1, mp_context=multiprocessing.get_context('spawn'), initializer=os.nice,
             initargs=(19,))
@@ -307,18 +307,18 @@ class Soak:
             'storage.uri': self._witnessed, 'storage.max_bagfile_size': _FILE_SIZE})
 
     def _take_up_time(self) -> None:
-        """Wait for the time of a plant that has just been started."""
+        """Wait for the time of a plant that was just started."""
         self.rig.diagnostics.clear()
         self.rig.spin_until(
             lambda: not math.isnan(self.rig.value('plant', 'time')), 'the time of the plant')
         self._plant_time = self.rig.value('plant', 'time')
 
     def _look(self) -> None:
-        """Serve callbacks a moment, follow time, sample memory, find who has ended."""
+        """Serve callbacks briefly, update the time, sample memory, detect ended nodes."""
         self.rig.spin(0.01)
         time = self.rig.value('plant', 'time')
         passed = time - self._plant_time
-        # What is larger or negative is another plant's time.
+        # A larger or negative difference belongs to another plant's time.
         if 0.0 < passed < _LARGEST_ROUND:
             self.seconds += passed
         if not math.isnan(passed):
@@ -346,7 +346,7 @@ class Soak:
                 self._start(name)
 
     def _pass(self, seconds: float, act: Callable[[], None] | None = None) -> None:
-        """Let simulated time pass, acting about a hundred times a second."""
+        """Let simulated time pass, calling ``act`` about a hundred times a second."""
         end = self.seconds + seconds
         patience = monotonic() + 60.0 + seconds
         while self.seconds < end:
@@ -359,12 +359,12 @@ class Soak:
     # -- what is done to them ------------------------------------------------------------------
 
     def cycle(self, kind: str, seconds: float, victim: str) -> None:
-        """Run one cycle with a bag of its own; a victim is killed half way through."""
+        """Run one cycle with a bag of its own; kill the victim half way through."""
         bag = self.rig.folder / f'bag{self._bags}'
         self._bags += 1
         self._start('recorder', **{'storage.uri': bag})
         self.rig.spin_until(self._recording, 'the recorder to listen to all topics')
-        # What the plant was told before the bag began is over, or the bag would not hold it.
+        # Let commands from before the bag take effect, since the bag does not contain them.
         self._pass(2.0 * self._lead)
         act = self._act_calmly if kind == 'calm' else self._act_roughly
         self._pass(0.5 * seconds, act)
@@ -384,7 +384,7 @@ class Soak:
             check_bag, bag, kind, victim, round(_NANOSECONDS / self._rate)))
 
     def start_again(self, why: str) -> None:
-        """Start all nodes anew, after a cycle that could not be finished, which is a failure."""
+        """Restart all nodes after a cycle that could not be finished, which is a failure."""
         self.result.broken.append(why)
         self._publish_inputs()
         for child in self._children.values():
@@ -407,13 +407,13 @@ class Soak:
         if name == 'planner':
             self._start(name)
         elif name == 'plant':
-            # Every other one begins at the beginning: time jumps back.
+            # Every other plant starts at the initial time: time jumps back.
             ahead = self._plant_time + 100.0 if self._dice.random() < 0.5 else 1.0
             self._start(name, start_time=ahead)
             self._take_up_time()
 
     def _request(self) -> None:
-        """Ask for something that makes sense, often before the last move is over."""
+        """Send a valid request, often before the last move is complete."""
         from std_srvs.srv import Trigger
 
         from hmsa_ros.nodes.conversions import to_trajectory
@@ -434,7 +434,7 @@ class Soak:
             self._call(Trigger, '/planner/stop', Trigger.Request())
 
     def _rubbish(self, *, calm: bool) -> None:
-        """Send garbage; in calm cycles only where it cannot reach the plant or what is checked."""
+        """Send garbage; in calm cycles only where it cannot reach the plant or checked topics."""
         from benchmarks.faults import garbage
         from hmsa_ros.interfaces import topics
         from hmsa_ros.nodes.endpoints import interface_class
@@ -443,11 +443,11 @@ class Soak:
             x for x in self._topics
             if not calm or x[0] in (topics.SETPOINT, topics.JOINT_TRAJECTORY)]
         if not calm and self._dice.random() < 0.95:
-            # A little of it goes a long way: each message is a jump of time.
+            # Send little of it: each message is a jump of time.
             inputs = [x for x in inputs if x[0] != topics.CLOCK_TOPIC]
         topic, publisher = self._dice.choice(inputs)
         made = garbage.message if self._dice.random() < 0.5 else garbage.encoding
-        # What the middleware itself does not take never arrives.
+        # The middleware rejects some messages, which then never arrive.
         with suppress(Exception):
             publisher.publish(made(interface_class(topic.type), self._dice))
         self.result.garbage += 1
@@ -475,20 +475,20 @@ class Soak:
             owner = self._dice.choice(_NODES)
             try:
                 services = self.rig.node.get_service_names_and_types_by_node(owner, '/')
-            except Exception:  # rclpy has a class of its own for a node that is not there
+            except Exception:  # rclpy has a private class for a missing node
                 return
             if services:
                 name, types = self._dice.choice(services)
                 kind = interface_class(types[0])
                 self._call(kind, name, wild_request(kind, name, self._dice))
         else:
-            # One of the calls above may have paused or slowed it, and nothing would go on.
+            # An earlier call may have paused or slowed the plant, which would stop the soak.
             self._call(SetBool, '/plant/set_paused', SetBool.Request(data=False))
             self._call(SetParameters, '/plant/set_parameters', SetParameters.Request(parameters=[
                 Parameter('real_time_factor', value=self._factor).to_parameter_msg()]))
 
     def _call(self, kind: type[Any], name: str, request: Any) -> None:
-        """Call a service and do not wait for the answer."""
+        """Call a service without waiting for the response."""
         if name not in self._clients:
             self._clients[name] = self.rig.node.create_client(kind, name), kind
         client = self._clients[name][0]
@@ -497,7 +497,7 @@ class Soak:
             self.result.calls += 1
 
     def _publish_inputs(self) -> None:
-        """Create publishers for garbage; latched garbage of those before is gone with them."""
+        """Create publishers for garbage; this removes latched garbage of the previous ones."""
         from benchmarks.faults.inputs import input_topics
 
         for _, publisher in self._topics:
@@ -506,14 +506,14 @@ class Soak:
             (topic, self.rig.publisher(topic, owner)) for topic, owner in input_topics()]
 
     def _put_right(self) -> None:
-        """Undo what garbage may have set."""
+        """Undo settings that garbage may have changed."""
         from std_srvs.srv import SetBool
 
         from hmsa_ros.interfaces import topics
 
         self._publish_inputs()
         rig = self.rig
-        # Nobody is asked who is not there.
+        # Ask only nodes that are running.
         self._looked = 0.0
         self._look()
         rig.ready(*self._children)
@@ -533,14 +533,14 @@ class Soak:
 def run_over_dds(
         folder: Path, domain: int, *, hours: float, minutes: float, length: float,
         factor: float, rate: float = RATE, seed: int = 1) -> Result:
-    """Wear out real processes for hours of simulated time or minutes on the wall."""
+    """Stress real processes for hours of simulated time or minutes of wall time."""
     kinds = cycle((
         ('calm', 'planner'), ('rough', 'plant'), ('calm', 'recorder'), ('rough', ''),
         ('calm', ''), ('rough', 'planner'), ('calm', ''), ('calm', '')))
     from benchmarks.faults.rig import hushed
     from hmsa_ros.errors import HmsaError
 
-    with hushed(folder / 'hushed.log') as told, Soak(folder, domain, seed, factor, rate) as soak:
+    with hushed(folder / 'hushed.log') as stderr, Soak(folder, domain, seed, factor, rate) as soak:
         end = monotonic() + 60.0 * minutes
         while soak.seconds < hours * _HOUR and monotonic() < end:
             kind, victim = next(kinds)
@@ -553,27 +553,27 @@ def run_over_dds(
             trends = ', '.join(
                 f'{name} {x[-1].own / 2**20:.1f}' for name, x in soak.result.memory.items() if x)
             print(f'{soak.seconds / _HOUR:.2f} h, {kind} {victim}: MiB {trends}',
-                  file=told, flush=True)
+                  file=stderr, flush=True)
     return soak.result
 
 
 @dataclass
 class Core:
-    """What the soak in process found."""
+    """Result of the soak in process."""
 
     hours: float  # simulated
-    wall: float  # hours that it took
+    wall: float  # wall-clock hours
     steps: int  # of 1 ms
     requests: int
     refused: int  # requests that were garbage
     commands: int
     drift: int  # time at the end less the steps that were made, in ns
-    difference: float  # of the stretch to what the planner predicted
+    difference: float  # of the stretch from the planner's prediction
     memory: list[Sample]
     trend: Trend
 
     def failures(self) -> list[str]:
-        """Say what is not as it has to be."""
+        """Return the requirements that are not met, as sentences."""
         found = []
         if self.drift:
             found.append(f'in process: time drifted by {self.drift} ns')
@@ -590,21 +590,21 @@ def run_in_process(hours: float, seed: int = 2) -> Core:
     """
     Drive planner and plant without processes, for all hours, at 1 kHz.
 
-    Commands go from one to the other as serialised messages. Requests come at random, many
-    before the last move is over, some of them garbage; now and then a new planner takes the
-    place of the old one where the actuator is at rest.
+    Commands pass between them as serialised messages. Requests come at random, many before the
+    last move is complete, some of them garbage. Occasionally a new planner replaces the old one
+    while the actuator is at rest.
 
     Parameters
     ----------
     hours : float
-        Of simulated time.
+        Simulated hours.
     seed : int
-        Of all chance.
+        Seed of all random choices.
 
     Returns
     -------
     Core
-        What was found.
+        Result.
 
     """
     from rclpy.serialization import deserialize_message, serialize_message
@@ -661,7 +661,7 @@ def run_in_process(hours: float, seed: int = 2) -> Core:
             difference = max(
                 difference, abs(planner.state(now).stretch - plant.stretch))
         if step % 60_000 == 0:
-            # Python keeps up to 40,000 ended tuples to use again, some 2 MiB, until then.
+            # Until then, Python keeps up to 40,000 freed tuples for reuse, some 2 MiB.
             gc.collect()
             passed = step * _STEP_NS / _NANOSECONDS / _HOUR
             memory.append(Sample(passed, 1, passed, *used(os.getpid())))
@@ -694,7 +694,7 @@ def draw(result: Result, file: Path) -> None:
 
 
 def report(result: Result, core: Core, rate: float = RATE) -> list[str]:
-    """Say what both parts found, in sentences for the console and the page."""
+    """Return the results of both parts as sentences for the console and the page."""
     calm = [x for x in result.cycles if x.kind == 'calm']
     checked = [x.difference for x in calm if not x.late and not math.isnan(x.difference)]
     lines = [
@@ -740,7 +740,7 @@ def run(
         console: Console, *, hours: float = 8.0, minutes: float = math.inf,
         factor: float | None = None, rate: float = RATE, quick: bool = False,
         picture: Path | None = None) -> tuple[dict[str, Any], str, int]:
-    """Run both parts, print what was found, and return record, text and exit status."""
+    """Run both parts, print the results, and return record, text and exit status."""
     domain = ros_domain()
     length = 300.0
     if factor is None:

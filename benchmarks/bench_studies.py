@@ -1,15 +1,15 @@
 """
-What studies lose when workers are killed, and what a cluster leaves of the kernel's rate.
+Measure what studies lose when workers are killed, and their rate on a cluster.
 
     python -m benchmarks studies [--quick]
     python -m benchmarks rates [--minutes M] [--quick]
     python -m benchmarks lockstep [--quick]
 
-A study runs on two processes. Twenty times, once some chunks are done, one of its workers is
-killed with SIGKILL; the table is compared with that of a run that nobody disturbs. The rates are
-those of the batch kernel alone on one core, and of studies on two processes and on a Dask cluster
-of two. Lock-step compares that kernel with itself, one move after the other, and with the same
-method in C, on one core.
+A study runs on two processes. Twenty times, after some chunks are complete, one of its workers is
+killed with SIGKILL; the table is compared with that of an undisturbed run. The rates are those of
+the batch kernel alone on one core, and of studies on two processes and on a Dask cluster of two.
+Lock-step compares that kernel with itself, one move at a time, and with the same method in C, on
+one core.
 """
 
 from contextlib import suppress
@@ -35,12 +35,12 @@ from hmsa_studies.executors import dask, local_processes
 from hmsa_studies.sweep import parse_grid, Sweep
 
 WORKERS = 2
-# Chunks that are done between two kills, at most.
+# Maximum number of chunks completed between two kills.
 _BETWEEN = 6
 
 
 class Watched:
-    """A sweep that leaves a file for each chunk that is begun."""
+    """A sweep that creates a file for each chunk it starts."""
 
     def __init__(self, sweep, log):
         self._sweep, self._log = sweep, log
@@ -53,14 +53,14 @@ class Watched:
 
 
 def grid(points):
-    """Return a sweep of so many points, in steps of 1000."""
+    """Return a sweep over a number of points, in steps of 1000."""
     return Sweep({
         'zeta': parse_grid('0:1.5:1000', 'zeta'),
         'j_lim': parse_grid(f'4:9:{points // 1000}', 'j_lim')})
 
 
 class Killer(threading.Thread):
-    """Kills a worker at random, so many times, each once some chunks are done after the last."""
+    """Kill random workers a number of times, each some chunks after the last."""
 
     def __init__(self, kills, chunks):
         super().__init__(daemon=True)
@@ -68,7 +68,7 @@ class Killer(threading.Thread):
         self.killed = 0
 
     def run(self):
-        """Kill until enough are killed."""
+        """Kill until the count is reached."""
         dice = random.Random(1)
         while self._left:
             aim = len(self._chunks.found()) + dice.randint(1, _BETWEEN)
@@ -82,7 +82,7 @@ class Killer(threading.Thread):
 
 
 def compare(*, quick):
-    """Kill workers at random; passed if nothing of the table is lost."""
+    """Kill workers at random; passed if the table is complete."""
     kills = 2 if quick else 20
     # More chunks than the kills can wait for.
     sweep = grid(LEAST_ROWS * (kills + 1) * _BETWEEN)
@@ -113,23 +113,23 @@ def compare(*, quick):
 
 
 def rates(*, quick, minutes=math.inf):
-    """Compare plans a second: the kernel alone on all cores, processes, a Dask cluster."""
+    """Compare plans per second: the kernel alone on all cores, processes, a Dask cluster."""
     with dask('local', WORKERS):
-        # Whether it is installed shows now, and not after minutes.
+        # Fail now, not after minutes, if it is not installed.
         pass
     size = 20_000 if quick else 2_000_000
     found = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         found['kernel'] = _together(size)
-        # As many as take some five minutes, at most 1e8; all but the processes take 100 s.
+        # Points for about five minutes, at most 1e8; everything but the processes takes 100 s.
         seconds = min(280.0, max(60.0 * minutes - 100.0, 1.0))
         points = 400_000 if quick else min(100_000, int(found['kernel'] * seconds / 1000.0)) * 1000
         for words, start, rows in (
                 ('processes', lambda: local_processes(WORKERS), points),
                 ('Dask', lambda: dask('local', WORKERS), min(points, 20_000_000))):
             with start() as (executor, _):
-                # Each worker starts first.
+                # Each worker starts up first.
                 compute(grid(8 * LEAST_ROWS), folder / f'{words} first', executor)
                 begin, before = perf_counter(), _spent()
                 compute(grid(rows), folder / words, executor)
@@ -137,7 +137,7 @@ def rates(*, quick, minutes=math.inf):
             label = f'{rows:,} by {WORKERS} {words}'
             found[label] = rows / taken
             print(f'{label}: {taken:.0f} s, the parent {_spent() - before:.1f} s of a core')
-            # Other guests of a machine make cores slower and faster within minutes.
+            # Other guests of the host make cores slower and faster within minutes.
             found['kernel'] = max(found['kernel'], _together(size))
     load = os.getloadavg()[0]
     return Sheet(
@@ -149,14 +149,14 @@ def rates(*, quick, minutes=math.inf):
 
 
 def _together(size):
-    """Return the plans a second of the kernel by itself, in as many processes at once."""
+    """Return the plans per second of the kernel in as many processes at once."""
     with local_processes(WORKERS) as (executor, _):
         list(executor.map(_alone, [1000] * WORKERS))
         return sum(executor.map(_alone, [size] * WORKERS))
 
 
 def _alone(size):
-    """Return the plans a second of the kernel on one core."""
+    """Return the plans per second of the kernel on one core."""
     zeta, j_lim = (np.resize(parse_grid(x, x), size) for x in ('0:1.5:1000', '4:9:997'))
     begin = perf_counter()
     plan_two_step_batch(1.0, 1.1, Groups(zeta=zeta, j_lim=j_lim), workers=1)
@@ -170,7 +170,7 @@ def _spent():
 
 
 def lockstep(*, quick):
-    """Compare moves in lock-step with one after the other, by processor time."""
+    """Compare moves in lock-step with one at a time, by processor time."""
     size = 1000
     zeta, j_lim = (np.resize(parse_grid(x, x), size) for x in ('0:1.5:1000', '4:9:997'))
     repeats = 1 if quick else 20
@@ -195,7 +195,7 @@ def lockstep(*, quick):
 
 
 def _one_by_one(zeta, j_lim, repeats):
-    """Return what times the search for one move after the other, as `_batch` does."""
+    """Return a function that times the search for one move at a time, as `_batch` does."""
     materials = pack(zeta, j_lim, np.full(zeta.size, 2.0))
 
     def run():
@@ -209,7 +209,7 @@ def _one_by_one(zeta, j_lim, repeats):
 
 
 def _batch(zeta, j_lim, repeats, *, wide):
-    """Return what times a batch: seconds of a core for a plan, and beta_p."""
+    """Return a function that times a batch: core seconds per plan, and beta_p."""
     rows = np.ones(zeta.size), np.zeros(zeta.size), np.full(zeta.size, 1.1)
     material = pack(zeta, j_lim, np.full(zeta.size, 2.0))
     results = np.empty((3, zeta.size))

@@ -1,8 +1,9 @@
 """
-What the second move of a laboratory leaves at best, by the bound of Cramer and Rao with priors.
+Bound on the error of a laboratory's second move, by Cramer and Rao with priors.
 
-The first move is planned with what is given. Its samples, and what is drawn by `laboratory`, say
-how well parameters can be known; the second move is planned with the most probable ones.
+The first move is planned with the given parameters. Its samples and the distributions in
+`laboratory` determine how well parameters can be estimated; the second move is planned with the
+most probable ones.
 """
 
 from collections.abc import Sequence
@@ -19,8 +20,8 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.planner import Options, Planner
 
 Array = NDArray[np.float64]
-# Parameters of what can be wrong, and the width over which each is drawn: of the logarithm, or in
-# units of the damping coefficient, of time and of force.
+# Parameters that may deviate, and the width of each one's distribution: of the logarithm, or
+# relative to the damping coefficient, the time scale or the unit of force.
 _WIDTHS = {
     'modulus': {'shear_modulus': math.log(1.25 / 0.8), 'damping_coefficient': math.log(4.0)},
     'remanence': {'remanence': 0.16}, 'lag': {'coil_time_constant': 0.1},
@@ -28,17 +29,18 @@ _WIDTHS = {
     'creep': {'viscoelastic_ratio': 0.06, 'viscoelastic_time': math.log(20.0)},
     'force': {'constant_force': 0.03}}
 _BIAS = 6e-3
-# Units of time before the first move, after each, and of a look at what is left; times of that.
+# Duration before the first move, after each, and of a look at its error, in time scales; number
+# of points in a look.
 _BEFORE, _HOLD, _LOOK, _TIMES = 15.0, 22.0, 3.0, 30
 _DRAWS = 64
 
 
 def bound(bench: Bench, kinds: Sequence[str] = tuple(KINDS)) -> float:
     """
-    Return what the second move leaves in half of all cases, as a share of its step.
+    Return the median error of the second move, as a fraction of its step.
 
-    Uncertain is what can be wrong in these kinds, and the bias of the sensor. Vibration is by what
-    the first move has shown, the offset in the end by what the second one shows too.
+    The quantities of these kinds are uncertain, and so is the sensor's bias. Vibration follows
+    from the samples of the first move, the final offset also from those of the second.
     """
     free = (*(y for x in kinds for y in _WIDTHS[x]), 'stretch_bias')
     begin, arrivals, levels = _planned(bench)
@@ -57,7 +59,7 @@ def bound(bench: Bench, kinds: Sequence[str] = tuple(KINDS)) -> float:
 
 
 def _planned(bench: Bench) -> tuple[float, list[float], Levels]:
-    """Return when to begin, when two moves arrive, and their levels; times in s."""
+    """Return the start time, the arrivals of two moves, and their levels; times in s."""
     rows, arrivals, time = [(-100.0 * bench.unit, 0.0)], list[float](), 0.0
     for planner, target in zip((
             Planner(bench.given, Options(lead_time=0)),
@@ -74,7 +76,7 @@ def _planned(bench: Bench) -> tuple[float, list[float], Levels]:
 def _derivatives(
         bench: Bench, free: tuple[str, ...], levels: Levels, begin: float, times: Array,
         looks: Array) -> tuple[Array, Array]:
-    """Return those of what is shown at times, and of what is judged at looks, by deviations."""
+    """Return derivatives of readings at ``times`` and of the stretch at ``looks``, normalised."""
     values = complete(values_of(bench.block, {
         'coil_time_constant': bench.lag, 'stretch_gain': bench.gain,
         'constant_force': bench.force, 'viscoelastic_ratio': bench.ratio,
@@ -98,7 +100,7 @@ def _derivatives(
 
 
 def _deviations(given: ActuatorParameters, free: Sequence[str]) -> Array:
-    """Return the standard deviations of what is drawn uniformly, in SI."""
+    """Return the standard deviations of the uniform distributions, in SI."""
     units = {'damping_coefficient': given.damping_coefficient, 'sensor_latency': given.time_unit,
              'coil_time_constant': given.time_unit,
              'constant_force': 1.0 / given.load_per_newton}
@@ -107,7 +109,7 @@ def _deviations(given: ActuatorParameters, free: Sequence[str]) -> Array:
 
 
 def _drawn(shown: Array, bench: Bench, random: np.random.Generator) -> Array:
-    """Return deviations that samples leave possible, a column each."""
+    """Return random deviations consistent with the samples, one per column."""
     information = np.eye(shown.shape[1]) + (
         1.0 - bench.dropouts) * shown.T @ shown / bench.noise ** 2
     return np.linalg.solve(

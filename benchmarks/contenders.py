@@ -1,8 +1,8 @@
 """
 The two-step command (Eq. 13) by other means, each as its users would write it.
 
-Every maker returns a function of (start, target) that gives beta_p and tau_p, or something that
-stands for one; `None` where what it needs is not installed.
+Every factory returns a function of (start, target) that returns beta_p and tau_p, or an object
+that runs a program; `None` if a requirement is not installed.
 """
 
 from collections.abc import Callable, Sequence
@@ -79,7 +79,7 @@ class Collocation:
         """Return symbols of unknowns and of start and target, equations, and a first guess."""
         import casadi
 
-        # CasADi's own table of these points ends at degree 9 and at about ten digits.
+        # CasADi's own table of these points ends at degree 9 and has about ten digits.
         nodes = np.array([0.0, *(0.5 + 0.5 * np.polynomial.legendre.leggauss(self.degree)[0])])
         gaps = nodes[:, None] - nodes + np.eye(nodes.size)
         weights = 1.0 / np.prod(gaps, axis=1)
@@ -105,7 +105,7 @@ class Collocation:
             end = casadi.mtimes(states, ends)
             stretches += [(m + x) / self.elements for x in nodes[1:]]
             if m + 1 < self.elements:
-                # The ends of elements are unknowns too: it keeps the equations sparse.
+                # The ends of elements are unknowns too, which keeps the equations sparse.
                 node = casadi.SX.sym(f'node_{m}', 2)
                 unknowns.append(node)
                 equations += [node[0] - end[0], node[1] - end[1]]
@@ -115,7 +115,7 @@ class Collocation:
         shares = np.array(stretches)
 
         def guess(start: float, target: float):
-            # Half a swing of a linear oscillator.
+            # Half a period of a linear oscillator.
             middle = holding_load(0.5 * (start + target), actuator.j_lim)
             mass = (target ** -3 + actuator.c1) / 6.0
             step = 1e-6
@@ -161,21 +161,21 @@ def with_casadi(method: str, actuator: Actuator, collocation: Collocation) -> So
 
 class External:
     """
-    A program that reads moves, solves them again and again and times itself.
+    A program that reads moves, solves them repeatedly and times itself.
 
     Tolerance and number of repetitions follow the first arguments of ``command``.
     """
 
     def __init__(
             self, command: Sequence[str], actuator: Actuator, moves: Sequence[Move]) -> None:
-        """Keep what to run."""
+        """Store the command and the input."""
         self._command = command
         self._input = ''.join(
             f'{start!r} {target!r} {actuator.zeta!r} {actuator.j_lim!r} {actuator.c1!r}\n'
             for start, target in moves)
 
     def run(self, tolerance: float, repeats: int) -> tuple[list[float], float, float]:
-        """Solve the moves; return beta_p of each, and least and median seconds per plan."""
+        """Solve the moves; return beta_p of each, and minimum and median seconds per plan."""
         done = subprocess.run(
             [*self._command, repr(tolerance), str(repeats)], input=self._input, check=True,
             capture_output=True, text=True, timeout=_PATIENCE)
@@ -185,13 +185,13 @@ class External:
 
 
 def compiler() -> str | None:
-    """Return the C compiler that CC names, else cc; None without one."""
+    """Return the C compiler named by CC, else cc; None if there is none."""
     return shutil.which(os.environ.get('CC') or 'cc')
 
 
 def compile_c(
         directory: Path, name: str, options: Sequence[str], source: str = 'two_step.c') -> Path:
-    """Compile a C program with -O2, unless options say otherwise."""
+    """Compile a C program with -O2, unless options override it."""
     program = directory / name
     subprocess.run(
         [compiler() or 'cc', '-O2', *options, '-o', str(program), str(HERE / source),
@@ -200,5 +200,5 @@ def compile_c(
 
 
 def octave() -> str | None:
-    """Return GNU Octave's program without windows, None without one."""
+    """Return GNU Octave's program without windows, None if there is none."""
     return shutil.which('octave-cli') or shutil.which('octave')

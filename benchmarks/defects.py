@@ -1,8 +1,8 @@
 """
-Recordings of actuators that are not as the model has them, integrated by SciPy alone.
+Recordings of actuators that deviate from the model, integrated by SciPy alone.
 
-Many actuators of one kind are integrated at once, in units of their own time L sqrt(rho/G) and
-modulus. Nothing of the package takes part but the block's sizes and the record of samples.
+Many actuators of one kind are integrated at once, in units of their own time scale L sqrt(rho/G)
+and modulus. Of the package, only the block's parameters and the `Recording` class are used.
 """
 
 from collections.abc import Callable
@@ -23,37 +23,37 @@ Array = NDArray[np.float64]
 BLOCK = paper_actuator()
 _C1 = 2.0 * (BLOCK.half_thickness / BLOCK.half_length) ** 2
 _MASS = (1.0 + _C1) / 6.0
-#: Period at rest, in units of time.
+#: Period at rest, in time scales.
 PERIOD = 2.0 * math.pi * math.sqrt(_MASS / 3.0)
-_GRID = 0.01  # of the motion that samples are interpolated from
-# A rate this small still rubs in part, so that the integration goes on, and tolerances.
+_GRID = 0.01  # sampling interval of the motion that samples are interpolated from
+# Rate below which friction is smoothed, so that the integration continues; and tolerances.
 _SOFT, _RTOL, _ATOL = 2e-4, 1e-8, 1e-10
 _STEPS, _DWELL, _REPEATS = (1.1, 1.4, 1.0), 10.0, 9
 
 
 @dataclass(frozen=True, eq=False)
 class Plants:
-    """Actuators and what is wrong with them; arrays of shape (n,)."""
+    """Actuators and their defects; arrays of shape (n,)."""
 
-    damping: Array  # share of critical at rest
+    damping: Array  # fraction of critical damping at rest
     limit: Array  # J_lim
     modulus: Array  # G in Pa
     remanence: Array  # Br in T
     friction: Array  # force in G
-    drag: Array  # force by the square of the rate, in shares of the damping
-    second: Array  # of another mode, share of the motion that the sensor sees of it
-    higher: Array  # its frequency over the first
-    hysteresis: Array  # of the coil, share of the largest level
-    foreign: Array  # share of the elastic force with another law
+    drag: Array  # force by the square of the rate, relative to the damping
+    second: Array  # of another mode, fraction of its motion in the sensor's reading
+    higher: Array  # its frequency relative to the first
+    hysteresis: Array  # of the coil, fraction of the largest level
+    foreign: Array  # fraction of the elastic force by another hyperelastic model
     gain: Array  # of the sensor
-    latency: Array  # of the sensor in units of time
+    latency: Array  # of the sensor in time scales
 
     def block(self, i: int) -> ActuatorParameters:
-        """Return what of one actuator the model has."""
+        """Return the parameters of one actuator that the model includes."""
         block = replace(
             BLOCK, shear_modulus=float(self.modulus[i]), remanence=float(self.remanence[i]),
             chain_limit=float(self.limit[i]))
-        # A damping of 1 in units of G and the time, in N s/m.
+        # A damping of 1 in units of G and the time scale, in N s/m.
         unit = 8.0 * block.half_length ** 2 / block.half_thickness * block.shear_modulus * (
             block.time_unit)
         return replace(
@@ -62,7 +62,7 @@ class Plants:
 
 
 def plants(count: int, seed: int, **defects: tuple[float, float]) -> Plants:
-    """Draw actuators; of each defect the range of its size is given."""
+    """Draw actuators; ``defects`` gives the range of each defect's size."""
     random = np.random.default_rng(seed)
 
     def drawn(low: float, high: float) -> Array:
@@ -81,7 +81,7 @@ def plants(count: int, seed: int, **defects: tuple[float, float]) -> Plants:
 
 
 def _force(plants: Plants, stretch: Array) -> Array:
-    """Return the elastic force: Gent's, and a share of a law with a softer middle."""
+    """Return the elastic force: Gent's, and a fraction of a model with a softer middle range."""
     square = 2.0 / stretch + stretch ** 2 - 3.0
     base = stretch - stretch ** -2
     own = base / (1.0 - square / plants.limit)
@@ -93,10 +93,10 @@ def _force(plants: Plants, stretch: Array) -> Array:
 def motion(plants: Plants, switches: Array, levels: Array, end: float) -> Callable[
         [int, Array], Array]:
     """
-    Return what sensors see of plants at times, by the place of the plant.
+    Return a function of the index of a plant and times that returns the sensor's stretch.
 
-    Levels, shape (n, m), are loads in G in force from each of m switches on; all times are in
-    units of the plants' own.
+    ``levels``, shape (n, m), are loads in G in force from each of m switches on; all times are
+    in the plants' own time scales.
     """
     count = len(plants.damping)
     damped = plants.damping * 2.0 * math.sqrt(3.0 * _MASS)
@@ -106,7 +106,7 @@ def motion(plants: Plants, switches: Array, levels: Array, end: float) -> Callab
     field = np.empty_like(levels)
     played = levels[:, 0]
     for i in range(len(switches)):
-        # The play of an iron core: the field lags behind the current by half its width.
+        # Play model of an iron core: the field lags the current by half its width.
         played = np.clip(played, levels[:, i] - width, levels[:, i] + width)
         field[:, i] = played
     state = np.zeros((4, count))
@@ -150,7 +150,7 @@ def motion(plants: Plants, switches: Array, levels: Array, end: float) -> Callab
 
 def sequence(plants: Plants, targets: tuple[float, ...] = _STEPS, repeats: int = _REPEATS,
              dwell: float = _DWELL) -> tuple[Array, Array, float]:
-    """Return switches, loads and the end of unshaped steps to targets that the model holds."""
+    """Return switches, loads and the end of unshaped steps to targets as the model holds them."""
     held = [np.zeros(len(plants.damping))]
     for target in targets * repeats:
         square = 2.0 / target + target ** 2 - 3.0
@@ -161,7 +161,7 @@ def sequence(plants: Plants, targets: tuple[float, ...] = _STEPS, repeats: int =
 
 @dataclass(frozen=True)
 class Sensor:
-    """What a recording is made with."""
+    """Sensor and sampling of a recording."""
 
     per_period: float = 20.0  # samples
     noise: float = 1e-3
@@ -171,7 +171,7 @@ class Sensor:
 def measured(place: int, given: Plants, seen: Callable[[int, Array], Array], switches: Array,
              levels: Array, end: float, sensor: Sensor, seed: int, at: Array | None = None
              ) -> Recording:
-    """Return the recording of one plant in SI; samples are even, unless their times are given."""
+    """Return the recording of one plant in SI; evenly sampled unless times are given."""
     random = np.random.default_rng((seed, place))
     block = given.block(place)
     unit = block.time_unit
@@ -194,7 +194,7 @@ def measured(place: int, given: Plants, seen: Callable[[int, Array], Array], swi
 
 def away(block: ActuatorParameters, random: np.random.Generator, most: float = 0.3
          ) -> ActuatorParameters:
-    """Return a block as a data sheet might have it: off by up to the exponential of a share."""
+    """Return a block as in a data sheet: off by up to a factor of exp(``most``)."""
     factors: Any = np.exp(random.uniform(-most, most, 4))
     return replace(
         block, shear_modulus=block.shear_modulus * factors[0],

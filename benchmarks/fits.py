@@ -1,4 +1,4 @@
-"""The fits that others would make of a recording: SciPy's and CasADi's, to be timed."""
+"""Reference fits of a recording with SciPy and with CasADi, for timing."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import respond
 from hmsa_ros.model.equations import Array
 
-# Steps of Runge and Kutta from one sample to the next: errors far below the noise.
+# Runge-Kutta steps from one sample to the next: errors far below the noise.
 _SUBSTEPS = 4
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """Values by name in SI, and the seconds that the fit took without what it needs only once."""
+    """Values by name in SI, and the seconds of the fit without one-time setup."""
 
     values: dict[str, float]
     seconds: float
@@ -28,7 +28,7 @@ class Fitted:
 def with_scipy(
         recording: Recording, start: Mapping[str, float], free: Sequence[str], *,
         derivatives: bool) -> Fitted:
-    """Fit with SciPy's least squares on the simulation of this package, from start values."""
+    """Fit with SciPy's least squares and this package's simulation, from start values."""
     def respond_at(x: Array, names: Sequence[str] = ()):
         moved = dict(start) | {
             n: from_coordinate(n, y) for n, y in zip(free, x.tolist(), strict=True)}
@@ -53,24 +53,24 @@ def with_casadi(
         recording: Recording, start: Mapping[str, float], free: Sequence[str]
 ) -> Callable[[], Fitted] | None:
     """
-    Set up a fit by CasADi and IPOPT: multiple shooting with the Hessian of Gauss and Newton.
+    Set up a fit by CasADi and IPOPT: multiple shooting with the Gauss-Newton Hessian.
 
-    Every sample and every switch begins an interval, whose end four steps of Runge and Kutta
-    give; the states at the begins are unknowns too, and start from the samples.
+    An interval starts at every sample and every switch; four Runge-Kutta steps give its end. The
+    states at the starts are unknowns too, initialised from the samples.
 
     Parameters
     ----------
     recording : Recording
-        Samples from rest without field on, levels as steps.
+        Samples from rest without field, and levels as steps.
     start : mapping of str to float
         Start values of all quantities in SI.
     free : sequence of str
-        What is sought.
+        Quantities to estimate.
 
     Returns
     -------
     callable or None
-        The fit; None where CasADi is not installed.
+        The fit; None if CasADi is not installed.
 
     """
     try:
@@ -124,7 +124,7 @@ def with_casadi(
         {'x': unknowns, 'f': 0.5 * casadi.dot(miss, miss),
          'g': casadi.vec(states[:, 1:] - ends)},
         {'hess_lag': hessian, 'ipopt.print_level': 0, 'print_time': False, 'ipopt.sb': 'yes'})
-    # At rest without field; a field that lags is 0 there too.
+    # At rest without field; a lagging field is 0 there too.
     resting = np.array([1.0, 0.0] + [0.0] * (creeping + lagging))
     guess = np.zeros((state.numel(), count))
     guess[0] = np.interp(grid, recording.time, recording.stretch)
@@ -153,7 +153,7 @@ def with_casadi(
 
 
 _GEOMETRY = ('half_length', 'half_thickness', 'density')
-#: Of what the equations hold: sizes in SI of values that may be 0.
+#: Quantities of the equations: typical sizes in SI of values that may be 0.
 _SCALES = {
     'shear_modulus': 1e5, 'damping_coefficient': 1.0, 'chain_limit': 5.0, 'remanence': 0.1,
     'stretch_bias': 1e-2, 'coil_time_constant': 1e-3, 'constant_force': 1e-2,
@@ -161,7 +161,7 @@ _SCALES = {
 
 
 def _slope(casadi, state, values, level, unit, creeping, lagging):
-    """Return the derivatives of the state by the time in units of ``unit``."""
+    """Return the derivatives of the state with respect to time in units of ``unit``."""
     stretch, rate = state[0], state[1] / unit
     inertia = values['density'] * values['half_length'] ** 2
     c1 = 2.0 * (values['half_thickness'] / values['half_length']) ** 2

@@ -1,9 +1,9 @@
 """
-One-bit changes of bags: each is either harmless or said.
+One-bit changes of bags: each must be harmless or reported.
 
-Every bit of the headers of all records of a bag may be wrong: opcode, length, stamps, sizes,
-checksums, and the small records whole. A bag with one such bit is read as `hmsa bag info` and
-`hmsa bag recover` read it; what they find is held against the bag as it was written.
+The bits are those of the headers of all records of a bag: opcode, length, timestamps, sizes,
+checksums, and entire small records. A bag with one such bit flipped is read as `hmsa bag info`
+and `hmsa bag recover` read it; the result is compared with the bag as written.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,7 +23,7 @@ from hmsa_ros.bag.writer import BagWriter, Topic
 from hmsa_ros.errors import HmsaError
 
 _FLOAT = 'std_msgs/msg/Float64'
-# Of a chunk or a message index: what comes before the bulk of it.
+# Bytes of a chunk or a message index before its bulk.
 _HEADS = {Opcode.CHUNK: 48, Opcode.MESSAGE_INDEX: 22}
 # Until a file is closed, MCAP has no checksum for the texts of its metadata records.
 _HEADS_KILLED = {**_HEADS, Opcode.METADATA: 4}
@@ -33,13 +33,13 @@ _HEADS_KILLED = {**_HEADS, Opcode.METADATA: 4}
 class Count:
     """Result of the flips."""
 
-    said: int  # a problem was named, or the bag refused
-    harmless: int  # nothing was said, and everything was read as it was written
-    wrong: tuple[str, ...]  # something else was read without a word
+    said: int  # a problem was reported, or the bag refused
+    harmless: int  # nothing was reported, and everything was read as written
+    wrong: tuple[str, ...]  # something else was read without a report
 
 
 def make_bag(folder: Path, *, preset: str = 'none', killed: bool = False) -> Path:
-    """Write a bag of two topics in some chunks."""
+    """Write a bag of two topics in several chunks."""
     writer = BagWriter(folder, preset=preset, chunk_size=1000, custom_data={'actuator': 'A3'})
     numbers = [writer.add_topic(Topic(name, _FLOAT, 'float64 data\n')) for name in ('/a', '/b')]
     writer.write((
@@ -54,7 +54,7 @@ def make_bag(folder: Path, *, preset: str = 'none', killed: bool = False) -> Pat
 
 
 def header_bits(data: bytes, *, killed: bool = False) -> list[int]:
-    """Return the bits (eight times the byte's place, plus the bit) of all records' headers."""
+    """Return the bits (eight times the byte's offset, plus the bit) of all records' headers."""
     bits: list[int] = []
     heads = _HEADS_KILLED if killed else _HEADS
     offset = len(MAGIC)
@@ -69,7 +69,7 @@ def header_bits(data: bytes, *, killed: bool = False) -> list[int]:
 
 
 def flip(path: Path, bits: Sequence[int], work: Path) -> Count:
-    """Read a bag with one wrong bit after the other."""
+    """Read a bag with one flipped bit at a time."""
     original = path.read_bytes()
     truth = _read(path.parent)
     copy = work / path.parent.name
@@ -94,7 +94,7 @@ def flip(path: Path, bits: Sequence[int], work: Path) -> Count:
 
 
 def _read(folder: Path) -> tuple[Any, ...]:
-    """Read a bag as the commands do; last come the problems."""
+    """Read a bag as the commands do; the problems are the last element."""
     summary = summarize(folder)
     reader = BagReader(folder)
     in_time = list(reader.messages())

@@ -1,8 +1,8 @@
 """
-Random laboratories in virtual time: an actuator, a coil and a sensor that a planner does not know.
+Random laboratories in virtual time: actuator, coil and sensor differ from the planner's model.
 
-The motion is Eq. 10 with a coil that lags, a branch that creeps and a constant force, integrated
-by SciPy. Nothing of the package takes part but the record of a block's sizes.
+The motion follows Eq. 10 with a coil that lags, a viscoelastic branch and a constant force,
+integrated by SciPy. Of the package, only the class of a block's parameters is used.
 """
 
 from collections.abc import Sequence
@@ -17,60 +17,60 @@ from scipy.integrate import OdeSolution, solve_ivp
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 
 Array = NDArray[np.float64]
-#: What can be wrong, by name.
+#: Possible deviations, by name.
 KINDS = {
     'modulus': 'G and damping', 'remanence': 'remanence', 'lag': 'lag of the coil',
     'stamps': 'late timestamps', 'gain': 'gain of the sensor', 'creep': 'creep',
     'force': 'constant force'}
-#: All that are drawn, with nothing wrong and with several things wrong.
+#: All groups drawn: no deviation, one, or several.
 GROUPS = {'none': 'nothing', **KINDS, 'several': 'several of these'}
-# Units of time that are integrated at once, and samples in one.
+# Time scales that are integrated at once, and samples per time scale.
 _AHEAD, _SAMPLES = 3.0, (4.4, 25.0)
-# Looks at the stretch in one, for whoever judges moves: what samples happen to show of one that
-# ends late depends on when they are.
+# Points of the true stretch per time scale, for judging moves: what samples show of a move that
+# ends late depends on when they are taken.
 _LOOKS = 100.0
-# Every second bench has several things wrong, each with this probability.
+# Every second bench has several deviations, each with this probability.
 _LIKELY = 0.5
-_TARGETS = (1.08, 1.45)  # range of stretches, and the least step
+_TARGETS = (1.08, 1.45)  # range of stretches
 _LEAST_STEP = 0.1
 _PAPER = paper_actuator()
 
 
 @dataclass(frozen=True)
 class Bench:
-    """What one laboratory has; times in s, shares of the unit of time where named so."""
+    """One laboratory; times in s unless stated otherwise."""
 
     group: str  # of `GROUPS`
     seed: int
-    given: ActuatorParameters  # what the planner is given
-    block: ActuatorParameters  # what there is
+    given: ActuatorParameters  # the planner's parameters
+    block: ActuatorParameters  # the true parameters
     lag: float  # of the coil
-    late: float  # by how much timestamps are later than the motion they are of
-    delay: float  # of samples on their way
+    late: float  # delay of timestamps after the motion they belong to
+    delay: float  # transport delay of samples
     gain: float  # of the sensor about rest without field
     bias: float  # of the sensor
-    ratio: float  # of a branch that creeps
+    ratio: float  # of a viscoelastic branch
     relaxation: float
     force: float  # in N
     noise: float
     period: float  # of samples
-    dropouts: float  # share of samples that are lost, in bursts
+    dropouts: float  # fraction of samples that are lost, in bursts
     targets: tuple[float, ...]
-    kinds: tuple[str, ...] = ()  # of `KINDS`: what is wrong
+    kinds: tuple[str, ...] = ()  # of `KINDS`: the deviations
     iron: 'Iron | None' = None  # the core of the coil
 
     @property
     def unit(self) -> float:
-        """Unit of time of what is given."""
+        """Time scale of the planner's parameters."""
         return self.given.time_unit
 
     def shown(self, stretch: Array) -> Array:
-        """Return what the sensor would show without noise and bias."""
+        """Return the sensor's reading without noise and bias."""
         return 1.0 + self.gain * (stretch - 1.0)
 
     @property
     def wrong(self) -> str:
-        """What is wrong, in words."""
+        """The deviations in words."""
         unit, found = self.unit, []
         for name in ('shear_modulus', 'damping_coefficient', 'remanence'):
             ratio = getattr(self.block, name) / getattr(self.given, name)
@@ -83,7 +83,7 @@ class Bench:
 
 
 def drawn(seed: int, targets: int = 3) -> Bench:
-    """Return the laboratory of a seed; the groups come in turn."""
+    """Return the laboratory of a seed; groups alternate."""
     random = np.random.default_rng((27, seed))
     names = list(GROUPS)
     group = 'several' if seed % 2 else names[(seed // 2) % (len(names) - 1)]
@@ -98,7 +98,7 @@ def drawn(seed: int, targets: int = 3) -> Bench:
         half_thickness=size * _PAPER.half_thickness,
         damping_coefficient=size ** 2 * _PAPER.damping_coefficient)
     unit = given.time_unit
-    # All is drawn whether it is wrong or not, so that one seed is one sequence of numbers.
+    # Draw all quantities, used or not, so that one seed is one sequence of numbers.
     modulus, damping = random.uniform(0.8, 1.25), log(0.5, 2.0)
     remanence, lag, late, gain = (
         random.uniform(0.92, 1.08), random.uniform(0.0, 0.1), random.uniform(0.0, 0.1),
@@ -122,7 +122,7 @@ def drawn(seed: int, targets: int = 3) -> Bench:
     late = late * unit if 'stamps' in wrong else 0.0
     return Bench(
         group, seed, given, block, lag * unit if 'lag' in wrong else 0.0, late,
-        # A timestamp never lies ahead of the clock.
+        # A timestamp is never ahead of the clock.
         max(delay * unit, late), gain if 'gain' in wrong else 1.0, bias,
         ratio if 'creep' in wrong else 0.0, relaxation * unit,
         force / given.load_per_newton if 'force' in wrong else 0.0, noise, unit / per_unit,
@@ -134,7 +134,7 @@ class Iron:
     A core whose field lags behind the current, after Coleman and Hodgdon (1986).
 
     The field is the current's, in T, less a part that approaches ``half`` with a rising current
-    and its negative with a falling one; ``reach`` T change the rest by a factor of e.
+    and its negative with a falling one; over ``reach`` T its remainder falls by a factor of e.
     """
 
     def __init__(self, half: float, reach: float) -> None:
@@ -142,7 +142,7 @@ class Iron:
         self._from, self._before = 0.0, 0.0  # since the last reversal or level
 
     def field(self, current: float) -> float:
-        """Return the field at a current that is approached from where the last one began."""
+        """Return the field at a current approached from the start of the last change."""
         return current - self._part(current)
 
     def _part(self, current: float) -> float:
@@ -151,7 +151,7 @@ class Iron:
         return most + (self._before - most) * math.exp(-abs(way) / self._reach)
 
     def turn(self, current: float) -> None:
-        """Begin at a current that was reached."""
+        """Start a new change at the current reached."""
         self._from, self._before = current, self._part(current)
 
 
@@ -173,25 +173,25 @@ class Plant:
         self._ahead = round(1e9 * _AHEAD * bench.unit)
         self.time = self._begin = self._since = self._until = time
         self._levels: list[tuple[int, float]] = []
-        # The field without a core decays from the level before to the one in force.
+        # The field without a core decays from the previous level to the one in force.
         self._free = self._level = 0.0
         self._iron = bench.iron
         self._motion: OdeSolution | None = None  # from `_since` until `_until`
         self.applied: list[tuple[int, float]] = []
         state = 1.0
-        # Rest under the force, once branches have relaxed.
+        # Rest under the force, with branches relaxed.
         for _ in range(50):
             slope = (self._elastic(state + 1e-6) - self._elastic(state - 1e-6)) / 2e-6
             state -= (self._elastic(state) - self._force / self._stiffness) / slope
         self.state = np.array([state, 0.0, self._elastic(state)])  # at `_since`
 
     def command(self, stamp: int, level: float) -> None:
-        """Take a level from a stamp on; it takes the place of all at or after it."""
+        """Set a level from a timestamp on; it replaces all at or after that time."""
         stamp = max(stamp, self.time)
         self._levels = [*(x for x in self._levels if x[0] < stamp), (stamp, level)]
 
     def advance(self, time: int) -> float:
-        """Go on until a time; return the stretch then."""
+        """Simulate up to a time; return the stretch then."""
         while self._levels and self._levels[0][0] <= time:
             stamp, level = self._levels.pop(0)
             self._go_on(stamp)
@@ -224,7 +224,7 @@ class Plant:
         return free if self._iron is None else self._iron.field(free)
 
     def _elastic(self, stretch: float) -> float:
-        """Return psi' of the Gent law."""
+        """Return psi' of the Gent model."""
         return (stretch - stretch ** -2) / (
             1.0 - (2.0 / stretch + stretch ** 2 - 3.0) / self._limit)
 
@@ -237,7 +237,7 @@ class Plant:
         return rate, 6.0 * total / (cube + self._c1), (elastic - relaxed) / self._relaxation
 
     def _go_on(self, time: int) -> float:
-        """Go on under the level in force."""
+        """Simulate under the level in force; return the stretch."""
         while self._motion is None or time > self._until:
             if self._motion is not None:
                 self.state = self._motion(1e-9 * (self._until - self._since))
@@ -251,29 +251,29 @@ class Plant:
 
 
 class Device:
-    """Actuator and sensor of a bench, as `hmsa_ros.control.loop.Loop` wants them."""
+    """Actuator and sensor of a bench, for `hmsa_ros.control.loop.Loop`."""
 
     def __init__(self, bench: Bench, time: int) -> None:
         self.bench, self.time = bench, time
         self.plant = Plant(bench, time)
         self._random = np.random.default_rng((28, bench.seed))
-        self._measured = time  # when it measured last
+        self._measured = time  # of the last measurement
         self._period = round(1e9 * bench.period)
-        self._silent = 0  # samples that will still be lost
-        # When a sample arrives, its timestamp and value.
+        self._silent = 0  # number of samples still to be lost
+        # Arrival time, timestamp and value of each sample.
         self._wire: list[tuple[int, int, float]] = []
-        # The stretch, at times that do not depend on samples.
+        # The stretch at times that do not depend on samples.
         self.truth: list[tuple[int, float]] = []
         self._look = round(1e9 * bench.unit / _LOOKS)
 
     @property
     def next_sample(self) -> int:
-        """When something of the sensor happens next."""
+        """Time of the sensor's next event."""
         due = self._measured + self._period
         return min(due, self._wire[0][0]) if self._wire else due
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
-        """Take a level from a stamp on."""
+        """Set a level from a timestamp on."""
         self.plant.command(stamp, level)
 
     def advance(self, time: int) -> None:
@@ -284,7 +284,7 @@ class Device:
         self.time = time
 
     def _go_on(self, time: int) -> float:
-        """Go on until a time; return the stretch then."""
+        """Simulate up to a time; return the stretch then."""
         first = self.plant.time // self._look + 1
         self.truth += [(x, self.plant.advance(x)) for x in range(
             first * self._look, time + 1, self._look)]
@@ -307,13 +307,13 @@ class Device:
             1.0 + bench.gain * (stretch - 1.0) + bench.bias + noise))
 
     def changes(self) -> Sequence[tuple[int, int, float]]:
-        """Return which levels took effect."""
+        """Return the levels that took effect."""
         self._go_on(self.time)
         found, self.plant.applied = self.plant.applied, []
         return [(0, *x) for x in found]
 
     def samples(self) -> Sequence[tuple[int, Array, Array, Array]]:
-        """Return what has arrived: stamp, stretch, and neither rate nor field."""
+        """Return samples that have arrived: timestamp, stretch, and NaN for rate and field."""
         found = []
         nothing = np.array([math.nan])
         while self._wire and self._wire[0][0] <= self.time:

@@ -1,4 +1,4 @@
-"""Timing of several things side by side, and their table."""
+"""Timing of several contenders side by side, and their table."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -12,7 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-# Headings of columns that hold no numbers.
+# Headings of columns without numbers.
 _TEXT = ('', 'setting', 'remark')
 
 Clock = Callable[[], tuple[float, float]]
@@ -23,25 +23,25 @@ class Row:
     """One measured line of a table."""
 
     name: str
-    setting: str = ''  # its tolerance or what else was set
+    setting: str = ''  # its tolerance or other setting
     least: float | None = None  # seconds for one unit of work; None where it could not be measured
     median: float | None = None
-    error: float | None = None  # the largest one
+    error: float | None = None  # the largest
     note: str = ''
 
 
 @dataclass(frozen=True)
 class Contender:
-    """Something to be timed."""
+    """A function to be timed."""
 
     name: str
-    setting: str  # its tolerance or what else was set
-    clock: Clock  # runs a while; returns least and median seconds for one unit of work
-    error: float  # the largest one
+    setting: str  # its tolerance or other setting
+    clock: Clock  # runs for a while; returns minimum and median seconds for one unit of work
+    error: float  # the largest
 
 
 def stopwatch(work: Callable[[], object], units: float, *, least: float = 0.1) -> Clock:
-    """Make a clock of a function that does units of work, for at least so many seconds."""
+    """Return a clock of a function that does ``units`` of work, run for ``least`` s or more."""
     def clock() -> tuple[float, float]:
         spans = []
         end = perf_counter() + least
@@ -56,9 +56,9 @@ def stopwatch(work: Callable[[], object], units: float, *, least: float = 0.1) -
 
 def race(contenders: Sequence[Contender], rounds: int) -> list[Row]:
     """
-    Time contenders by turns, so that what disturbs the machine meets all of them.
+    Time contenders in turns, so that disturbances of the machine affect all of them.
 
-    A row holds the least of all turns and the median of their medians.
+    A row contains the minimum of all turns and the median of their medians.
     """
     turns: list[list[tuple[float, float]]] = [[] for _ in contenders]
     for _ in range(rounds):
@@ -74,16 +74,16 @@ def loosest(
         errors: Callable[[float], float], limit: float, *, start: float = 1e-6,
         end: float = 1e-14) -> float:
     """
-    Find the loosest tolerance that keeps an error.
+    Find the loosest tolerance that keeps an error limit.
 
     Parameters
     ----------
     errors : callable
-        Error by tolerance; NaN where it fails.
+        Error as a function of tolerance; NaN where it fails.
     limit : float
-        Error to keep.
+        Error limit.
     start, end : float
-        Tolerances to try between, three a decade.
+        Range of tolerances to try, three per decade.
 
     Returns
     -------
@@ -93,7 +93,7 @@ def loosest(
     Raises
     ------
     ArithmeticError
-        If none keeps the error.
+        If no tolerance keeps the limit.
 
     """
     tolerance = start
@@ -105,7 +105,7 @@ def loosest(
 
 
 def text_of_time(seconds: float | None) -> str:
-    """Return a time with a unit that suits it, in three digits."""
+    """Return a time in a suitable unit with three digits."""
     if seconds is None:
         return '-'
     for factor, unit in ((1.0, 's'), (1e3, 'ms'), (1e6, 'us')):
@@ -122,7 +122,7 @@ class Report:
     title: str
     unit: str  # heading of the times
     error: str  # heading of the errors
-    rows: list[Row]  # the first one is what the others are compared to
+    rows: list[Row]  # the others are compared with the first
 
     def _cells(self) -> tuple[list[str], list[list[str]]]:
         head = ['', 'setting', self.unit, 'median', 'ratio', self.error, 'remark']
@@ -138,7 +138,7 @@ class Report:
             body.append([
                 row.name, row.setting, text_of_time(row.least), text_of_time(row.median), ratio,
                 error, row.note])
-        # A column that says nothing is left out.
+        # An empty column is left out.
         used = [i for i in range(len(head))
                 if i == 0 or any(cells[i] not in ('', '-') for cells in body)]
         return [head[i] for i in used], [[cells[i] for i in used] for cells in body]
@@ -166,12 +166,12 @@ class Report:
 
 
 def ros_domain() -> int:
-    """Return the ROS domain to run in: the caller's, else one by the number of this process."""
+    """Return the caller's ROS domain, else one derived from the number of this process."""
     return int(os.environ.get('ROS_DOMAIN_ID') or 1 + os.getpid() % 101)
 
 
 def machine() -> dict[str, Any]:
-    """Return processor, cores, versions and the load average at this moment."""
+    """Return processor, cores, versions and the current load average."""
     import numpy
     import scipy
 

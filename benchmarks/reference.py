@@ -1,9 +1,9 @@
 """
-High-precision solutions to measure errors against, sharing nothing with the package.
+High-precision reference solutions, sharing no code with the package.
 
-Eq. 11 is integrated with its Taylor series in decimal arithmetic of 40 digits, which needs the
-standard library alone. Products and quotients of series follow from their recurrences, so each
-step costs the square of the order; at this precision few steps are needed.
+Eq. 11 is integrated by its Taylor series in decimal arithmetic of 40 digits, using only the
+standard library. Products and quotients of series follow from their recurrences, so the cost of a
+step is quadratic in the order; at this precision few steps are needed.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -21,7 +21,7 @@ Series = list[Decimal]
 
 @dataclass(frozen=True)
 class Actuator:
-    """Damping, J_lim and shape of Eq. 11, taken at their exact binary values."""
+    """Damping, J_lim and shape of Eq. 11; floats are taken at their exact binary values."""
 
     zeta: float = 0.2
     j_lim: float = 5.0
@@ -82,7 +82,7 @@ def _slope(series: Series, t: Decimal) -> Decimal:
 
 
 def _reach(stretch: Series, rate: Series) -> Decimal:
-    """Return for how long the last terms of both series stay below the precision."""
+    """Return the time for which the last terms of both series stay below the precision."""
     lengths = []
     for series in (stretch, rate):
         for n in (len(series) - 2, len(series) - 1):
@@ -109,7 +109,7 @@ def _turn(l0: Decimal, beta: Decimal, actuator: Actuator) -> tuple[Decimal, Deci
         raise ArithmeticError(f'no turning point under the load {beta}')
     low, high = Decimal(0), step
     if rate == 0:
-        # The first step spans the whole swing: stay clear of the rest it starts from.
+        # The first step spans the whole swing: avoid the rest it starts from.
         low = step / 4
     root = high
     for _ in range(200):
@@ -142,7 +142,7 @@ def two_step(start: float, target: float, actuator: Actuator) -> tuple[Decimal, 
     with _precise():
         l0, l1, j_lim = Decimal(start), Decimal(target), Decimal(actuator.j_lim)
         low, high = _holding_load(l0, j_lim), _holding_load(l1, j_lim)
-        # Without damping the work of the load is the change of elastic energy.
+        # Without damping, the work of the load equals the change of elastic energy.
         energy = [-j_lim / 2 * (1 - (2 / x + x * x - 3) / j_lim).ln() for x in (l0, l1)]
         old = (energy[1] - energy[0]) / (l1 - l0)
         new = old + (high - old) / 10

@@ -1,4 +1,4 @@
-"""A table of figures of any kind, to be printed, put on a page, or written as JSON."""
+"""A table of figures, to be printed, put on a page, or written as JSON."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -10,14 +10,14 @@ from rich.table import Table
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table with headings of its own."""
+    """A table with its own headings."""
 
     key: str  # name in the JSON file and in the marks of a page
     title: str
-    head: Sequence[str]  # of a first column of text and others of numbers
+    head: Sequence[str]  # of a first column of text and further columns of numbers
     rows: Sequence[Sequence[str]]
     figures: Mapping[str, Any] = field(default_factory=dict)  # the same in full, for JSON
-    passed: bool = True  # whether what was promised was seen
+    passed: bool = True  # whether the goals are met
 
     def show(self, console: Console) -> None:
         """Print the table."""

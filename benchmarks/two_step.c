@@ -9,15 +9,15 @@
  *
  * As it stands this is the program one would write: DOP853 (Hairer, Norsett, Wanner, "Solving
  * Ordinary Differential Equations I", sec. II.5), Newton on the load with the derivative from
- * the variational equations, every pass at the full tolerance, the first guess from the energy
+ * the variational equations, each iteration at full tolerance, the first guess from the energy
  * balance without damping. Choices, by -D:
  *
  *     SECANT    secant method instead of Newton, without variational equations
  *     GUESS=0   guess half way between the two holding loads
- *     GUESS=2   energy balance, shrunk by what damping takes from a linear oscillator
- *     COARSE=x  first pass at tolerance x, the next ones as fine as they can use
+ *     GUESS=2   energy balance, reduced by the damping loss of a linear oscillator
+ *     COARSE=x  first iteration at tolerance x, the next ones only as fine as useful
  *     CUBICS    land by a Taylor series of third order, and end by cubics through the last two
- *               turning points, without the pass that would confirm them
+ *               turning points, without the iteration that would confirm them
  */
 #define _POSIX_C_SOURCE 199309L
 #include <math.h>
@@ -222,8 +222,8 @@ static double first_guess(double l, double target, double beta_1)
 }
 
 #ifdef CUBICS
-/* What the cubic through two points, with a slope at each, adds to the line through the first at a
-   share of the way from it to the second. */
+/* What the cubic through two points, with a slope at each, adds to the line through the first, at
+   a fraction of the way from it to the second. */
 static double beyond_line(double share, double rise, double way, double slope, double other)
 {
     const double bend = way * (slope + other) - 2 * rise;
@@ -231,7 +231,7 @@ static double beyond_line(double share, double rise, double way, double slope, d
 }
 #endif
 
-/* Load and time of the two-step command. Returns the number of passes, 0 for failure. */
+/* Load and time of the two-step command. Returns the number of iterations, 0 on failure. */
 static int two_step(double l, double target, double rtol, double *beta_p, double *tau_p)
 {
     const int direction = target > l ? 1 : -1;

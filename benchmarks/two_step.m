@@ -4,7 +4,7 @@
 %     octave-cli two_step.m TOLERANCE REPEATS < moves
 %
 % with lines "start target zeta j_lim c1". Prints beta_p and tau_p of each move, and last the
-% least and the median time per plan in nanoseconds.
+% minimum and median time per plan in nanoseconds.
 1;
 
 function load = holding_load (l, j_lim)
@@ -30,9 +30,9 @@ function [miss, t] = turning_point (load, move, tolerance)
   slope = @(t, y) motion (y, load, move(3), move(4), move(5));
   options = odeset ('RelTol', tolerance, 'AbsTol', tolerance, 'Refine', 1);
   events = odeset (options, 'Events', @(t, y) turning (t, y, side));
-  % The event is not to catch the rest at the start.
+  % The event must not catch the rest at the start.
   [t, y] = ode45 (slope, [0 20], [move(1); side * 1e-300], events);
-  % Events are interpolated linearly: once more from the step before, and the rest by Newton.
+  % Events are interpolated linearly: repeat from the step before, then refine by Newton.
   [t, y] = ode45 (slope, t(end-1:end), y(end - 1, :)', options);
   dy = slope (t(end), y(end, :)');
   left = -dy(1) / dy(2);

@@ -1,1 +1,1 @@
-"""Fault injection: processes that disturb, a rig of real nodes, and the faults of the table."""
+"""Fault injection: processes that disturb, a rig of real nodes, and the table of faults."""

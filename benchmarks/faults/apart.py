@@ -1,4 +1,4 @@
-"""Faults of hosts that are apart: outages between planner and plant, a recorder that goes away."""
+"""Faults between hosts: outages between planner and plant, a recorder that disappears."""
 
 from collections.abc import Callable
 import os
@@ -18,7 +18,7 @@ _ONLOOKER = ROOT / 'test' / 'onlooker.py'
 
 
 class _Apart:
-    """Nodes on hosts of their own; the rig keeps their logs, and ends them."""
+    """Nodes on separate hosts; the rig keeps their logs and ends them."""
 
     def __init__(self, rig: Rig, made: Hosts) -> None:
         self._rig, self.hosts = rig, made
@@ -26,7 +26,7 @@ class _Apart:
         rig.environment |= {**ACROSS, 'FASTRTPS_DEFAULT_PROFILES_FILE': ''}
 
     def run(self, host: str, name: str, *words: str) -> Child:
-        """Start this Python with arguments on a host."""
+        """Start this Python interpreter with arguments on a host."""
         child = Child(
             self.hosts.on(host, sys.executable, *words), self._rig.folder / f'{name}.log',
             self._rig.environment)
@@ -38,20 +38,20 @@ class _Apart:
         return self.run(host, name, '-m', 'hmsa_ros', name, *words)
 
     def look_on(self, host: str, name: str = 'onlooker') -> Child:
-        """Have samples written down on a host."""
+        """Start an observer that writes down samples on a host."""
         child = self.run(
             host, name, str(_ONLOOKER), str(self._seen if name == 'onlooker' else os.devnull))
         wait(lambda: 'sees' in child.said, 'a sample')
         return child
 
     def seen(self, onlooker: Child) -> np.ndarray:
-        """Return rows of stamps and times of arrival in s, stretches and fields in T."""
+        """Return rows of timestamps and arrival times in s, stretches, and fields in T."""
         onlooker.end(15)
         found: np.ndarray = np.load(self._seen).T
         return found
 
     def send(self, host: str, *words: str) -> int:
-        """Send setpoints, and return the exit status."""
+        """Send setpoints; return the exit status."""
         return self.node(host, 'send', *words).popen.wait(PATIENCE)
 
 
@@ -79,7 +79,7 @@ def _outage(rig: Rig, seconds: float) -> Seen:
         begin = monotonic()
         wait(lambda: 'the field goes to zero' in plant.said, 'the watchdog')
         sleep(max(begin + seconds - monotonic(), 0.0))
-        told = 'no receipt' in planner.said
+        reported = 'no receipt' in planner.said
         made.join('desk')
         wait(lambda: 'was cut off by the plant or driver' in planner.said, 'the planner')
         sleep(1.0)
@@ -90,10 +90,10 @@ def _outage(rig: Rig, seconds: float) -> Seen:
         still = stretches[(back + off) // 2:off]
         peak = float(stretches[off:].max())
     return Seen(
-        f'{"reported" if told else "not reported"}; at rest at {still[-1]:.4f}, then at most '
+        f'{"reported" if reported else "not reported"}; at rest at {still[-1]:.4f}, then at most '
         f'{peak:.4f}, exit {status}',
         f'{float(np.ptp(still)):.1e}',
-        told and status == 0 and 1.199 < peak < 1.202 and float(np.ptp(still)) < 1e-3)
+        reported and status == 0 and 1.199 < peak < 1.202 and float(np.ptp(still)) < 1e-3)
 
 
 for _seconds in (2.0, 25.0):

@@ -15,29 +15,29 @@ class Board:
     """
     A thread on a pseudo-terminal that answers lines.
 
-    ``L level boots`` sets a level in T, unless it is for another boot (0 for any), which ``K level
+    A thread on a pseudo-terminal that answers requests, one per line.
     boots`` answers; ``R`` asks for ``S stretch rate boots``. Stretch is 1 + level here.
-
-    Parameters
+    ``L level boots`` sets a level in T unless ``boots`` is of another boot (0 for any); the answer
+    is ``K level boots``. ``R`` is answered by ``S stretch rate boots``. Stretch is 1 + level here.
     ----------
     port : Path
         Where the line is to be found; made new at each `plug`.
     watchdog : float
-        Time in s without a level after which the firmware switches off; 0 for never.
+        Path of the line; renewed by each `plug`.
 
     Attributes
     ----------
     record : list of (float, float)
         What really flows: time in s of `time.monotonic`, and level in T from then on.
     largest : float
-        Level in T at which the amplifier saturates.
+        The actual level: time in s of `time.monotonic`, and level in T from then on.
     answer : callable
-        Makes the answer out of what would be right; an empty one is not sent.
+        Makes the answer from the correct one; an empty answer is not sent.
 
     """
 
     def __init__(self, port: Path, watchdog: float = 0.0) -> None:
-        """Switch it on and plug it in."""
+        """Switch on and plug in."""
         self._port, self._watchdog = port, watchdog
         self.record: list[tuple[float, float]] = [(monotonic(), 0.0)]
         self.largest = 1.0
@@ -52,22 +52,22 @@ class Board:
 
     @property
     def level(self) -> float:
-        """Level in T that flows."""
+        """Present level in T."""
         return self.record[-1][1]
 
     def off_since(self, time: float) -> float:
-        """Return how long after a time it was off, in s; infinite if it is not."""
+        """Return how long after a time the coil was off, in s; infinite if it is not."""
         if self.level:
             return float('inf')
         return max(next((x for x, level in self.record if x > time and not level), time) - time,
                    0.0)
 
     def largest_since(self, time: float) -> float:
-        """Return the largest level that began after a time."""
+        """Return the largest level set after a time."""
         return max((abs(level) for x, level in self.record if x > time), default=0.0)
 
     def plug(self) -> None:
-        """Plug the cable in: a new line in the same place."""
+        """Plug the cable in: a new line at the same path."""
         with self._turn:
             self.unplug()
             controller, line = os.openpty()
@@ -77,7 +77,7 @@ class Board:
             self._port.symlink_to(os.ttyname(line))
 
     def unplug(self) -> None:
-        """Pull the cable out; what flows goes on flowing."""
+        """Pull the cable out; the level persists."""
         with self._turn:
             if self._fds is not None:
                 self._port.unlink(missing_ok=True)
@@ -86,12 +86,12 @@ class Board:
                 self._fds = None
 
     def reboot(self) -> None:
-        """Lose the level, and count."""
+        """Lose the level and count the boot."""
         self._set(0.0)
         self._boots += 1
 
     def end(self) -> None:
-        """Switch it off."""
+        """Switch off."""
         self._ended = True
         self.unplug()
 

@@ -3,7 +3,7 @@ Publish simulated time, with jumps.
 
     python -m benchmarks.faults.clock [--start S] [--jump AFTER:BY]
 
-Time runs with the clock on the wall, from S on; AFTER seconds later it jumps by BY seconds.
+Time runs with the wall clock, from S on; AFTER seconds later it jumps by BY seconds.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""What the faults share: a list to enter themselves in, and moves that are measured."""
+"""Code that faults share: a register, and moves that are measured."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -7,15 +7,15 @@ import numpy as np
 from benchmarks.faults.rig import Rig, settled
 from benchmarks.faults.table import Fault, Seen
 
-#: Largest residual, as a share of the step, of a move that is as planned.
+#: Maximum residual of a move as planned, as a fraction of the step.
 LIMIT = 1e-6
 #: Targets far enough apart, in both directions.
 TARGETS = (1.1, 1.3, 0.95, 1.2, 1.4)
-#: Ahead of its stamp, in s: the planner's default.
+#: Lead of a command over its timestamp in s: the planner's default.
 LEAD = 0.05
-#: Where lead_time is not what is looked at, in s.
+#: Lead where lead_time is not under test, in s.
 PATIENT_LEAD = 0.2
-# Levels in T that differ by less are one.
+# Levels in T that differ by less are equal.
 _SAME = 1e-9
 
 Inject = Callable[[Rig], Seen]
@@ -26,7 +26,7 @@ class Register(list[Fault]):
 
     def fault(
             self, key: str, name: str, how: str, expected: str) -> Callable[[Inject], Inject]:
-        """Return what enters a function as a fault."""
+        """Return a decorator that registers a function as a fault."""
         def enter(inject: Inject) -> Inject:
             self.append(Fault(key, name, how, expected, inject))
             return inject
@@ -38,9 +38,9 @@ def pair(
         rig: Rig, *, plant: Mapping[str, object] | None = None,
         planner: Mapping[str, object] | None = None,
         remap: Mapping[str, str] | None = None, slow: float = 0.0) -> None:
-    """Start a plant and a planner and wait for both; ``slow`` has the plant lead time."""
+    """Start a plant and a planner and wait for both; if ``slow``, the plant drives time."""
     led = {'publish_clock': True, 'real_time_factor': slow} if slow else {}
-    # By the wall, so far ahead that stalls of a busy machine are no faults of their own.
+    # On the wall clock, a large lead keeps stalls of a busy machine from counting as faults.
     follows: dict[str, object] = {'use_sim_time': True} if slow else {'lead_time': PATIENT_LEAD}
     rig.start('plant', {**led, **(plant or {})})
     rig.start('planner', {**follows, **(planner or {})}, remap)
@@ -50,12 +50,12 @@ def pair(
 def move(
         rig: Rig, target: float, *, start: float, pause: float = 0.3,
         patience: float = 60.0) -> tuple[float, float]:
-    """Ask for one stretch; return what `settled` says after a pause in s of the plant's time."""
+    """Request a stretch; return the result of `settled` after a pause in s of plant time."""
     mark = rig.count()
     rig.setpoint(target)
     await_change(rig, mark, patience)
     rig.let_pass(pause, patience)
-    # A report may come later than the samples that show its level.
+        # The report may come later than the samples with its level.
     rig.spin_until(
         lambda: abs(rig.applied[-1][1] - rig.samples(mark)[1][-1, 2]) < _SAME,
         'the report of the last level', patience)
@@ -63,14 +63,14 @@ def move(
 
 
 def await_change(rig: Rig, mark: int, patience: float = 60.0) -> None:
-    """Wait until the flux density in force changes, from a sample on."""
+    """Wait until the flux density in force changes after the mark."""
     rig.spin_until(lambda: jump(rig, mark) > 0.0, 'a command to take effect', patience)
 
 
 def moves(
         rig: Rig, targets: Sequence[float] = TARGETS, *, start: float = 1.0,
         pause: float = 0.3, patience: float = 60.0) -> float:
-    """Ask for several stretches, one after the other; return the worst residual or error."""
+    """Request several stretches in sequence; return the worst residual or error."""
     worst = 0.0
     for target in targets:
         worst = max(worst, *move(rig, target, start=start, pause=pause, patience=patience))
@@ -85,5 +85,5 @@ def jump(rig: Rig, first: int, last: int | None = None) -> float:
 
 
 def share(value: float) -> str:
-    """Return a residual, a share of the step, as text."""
+    """Return a residual, a fraction of the step, as text."""
     return f'{value:.1e}'

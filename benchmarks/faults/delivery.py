@@ -1,4 +1,4 @@
-"""Faults of delivery: load, delay, loss, doubling and reordering of commands."""
+"""Faults of delivery: load, delay, loss, duplication and reordering of commands."""
 
 import numpy as np
 
@@ -17,12 +17,12 @@ from benchmarks.faults.table import Seen
 
 FAULTS = Register()
 _SLOW = 0.05
-# In Hz: late commands take effect at the next sample of the plant.
+# In Hz; late commands take effect at the plant's next sample.
 _FINE = 1e4
-# What the relay's own jitter leaves of a move that is late as a whole: 0.008 alone, 0.08 on a busy
-# machine.
+# Allowed residual of a move that is late as a whole, caused by the relay's own jitter: 0.008 on an
+# idle machine, 0.08 on a busy one.
 _ALIKE = 0.1
-# Until when what was replanned has been carried out.
+# Time by which a replanned move has been executed.
 _AFTER_NS = round((LEAD + 0.03) * 1e9)
 
 
@@ -56,8 +56,8 @@ def _load_default(rig: Rig) -> Seen:
 
 
 def _delayed(rig: Rig, part: float) -> Seen:
-    # In slow motion a twentieth of lead_time is 50 ms on the wall, more than what the relay and
-    # DDS add.
+    # In slow motion, a twentieth of lead_time is 50 ms of wall time, more than the delay added by
+    # the relay and DDS.
     remap = rig.relay('--delay', str(part * LEAD / _SLOW))
     pair(rig, slow=_SLOW, remap=remap, planner={'lead_time': LEAD})
     worst = moves(rig, (1.2, 1.0), pause=0.15)
@@ -81,11 +81,11 @@ def _delay_beyond(rig: Rig) -> Seen:
     pair(rig, slow=_SLOW, remap=remap, planner={'lead_time': LEAD}, plant={'publish_rate': _FINE})
     residual, error = move(rig, 1.2, start=1.0, pause=0.6)
     rig.fresh('plant', 'planner')
-    late, told = rig.value('plant', 'late'), rig.value('planner', 'late')
+    late, known = rig.value('plant', 'late'), rig.value('planner', 'late')
     return Seen(
-        f'{late:g} late at the plant, {told:g} at the planner, '
+        f'{late:g} late at the plant, {known:g} at the planner, '
         f'{rig.value("planner", "replanned"):g} re-planned, error {error:.0e}', share(residual),
-        late > 0 and told > 0 and error < LIMIT and residual < _ALIKE)
+        late > 0 and known > 0 and error < LIMIT and residual < _ALIKE)
 
 
 @FAULTS.fault(
@@ -96,12 +96,12 @@ def _delay_always(rig: Rig) -> Seen:
     pair(rig, slow=_SLOW, remap=remap, planner={'lead_time': LEAD})
     residual, error = move(rig, 1.2, start=1.0, pause=0.6)
     rig.fresh('plant', 'planner')
-    late, told = rig.value('plant', 'late'), rig.value('planner', 'late')
+    late, known = rig.value('plant', 'late'), rig.value('planner', 'late')
     warned = min(rig.level('plant'), rig.level('planner'))
     return Seen(
-        f'{late:g} late at the plant, {told:g} at the planner, '
+        f'{late:g} late at the plant, {known:g} at the planner, '
         f'{rig.value("planner", "replanned"):g} re-planned, error {error:.0e}',
-        share(residual), late > 0 and told > 0 and warned >= 1 and error < 1e-3)
+        share(residual), late > 0 and known > 0 and warned >= 1 and error < 1e-3)
 
 
 @FAULTS.fault(
@@ -123,16 +123,16 @@ def _reorder(rig: Rig) -> Seen:
 
 
 def _learnt(rig: Rig) -> Seen:
-    mark, told = rig.count(), len(rig.applied)
+    mark, first = rig.count(), len(rig.applied)
     rig.setpoint(1.2)
     await_change(rig, mark)
     rig.let_pass(1.2)
     rig.fresh('planner')
     stamps, values = rig.samples(mark)
-    # What the plant reports, since a level may be in force for less than a sample. The second
-    # change is the level that the heartbeat brought. What is planned then takes effect lead_time
-    # later; left to itself, vibration would be a hundredth by that time.
-    changes = [stamp for stamp, _ in rig.applied[told:]]
+    # Use the plant's reports, since a level may be in force for less than a sample. The second
+    # change is the level from the heartbeat. The replanned levels take effect lead_time later;
+    # without them, vibration would fall to a hundredth by then.
+    changes = [stamp for stamp, _ in rig.applied[first:]]
     if len(changes) < 2:
         return Seen(f'{len(changes)} changes in force: expected at least 2', '-', False)
     rest = values[stamps > max(changes[1] + _AFTER_NS, changes[-1]), 0]

@@ -28,7 +28,7 @@ _LENGTHS = (0, 0, 1, 1, 1, 2, 3, 50)
 
 
 def message(kind: type[Any], dice: random.Random) -> Any:
-    """Return a message, or a request of a service, of wild values."""
+    """Return a message, or a service request, with random extreme values."""
     made = kind()
     for name, slot in zip(kind.get_fields_and_field_types(), kind.SLOT_TYPES, strict=True):
         setattr(made, name, _value(slot, dice))
@@ -36,7 +36,7 @@ def message(kind: type[Any], dice: random.Random) -> Any:
 
 
 def encoding(kind: type[Any], dice: random.Random) -> bytes:
-    """Return bytes that are no message, or not one that was meant."""
+    """Return bytes that are not a valid message, or not the intended one."""
     whole = bytearray(serialize_message(message(kind, dice)))
     choice = dice.randrange(4)
     if choice == 0:
@@ -51,7 +51,7 @@ def encoding(kind: type[Any], dice: random.Random) -> bytes:
 
 
 def _value(slot: Any, dice: random.Random) -> Any:
-    """Return a wild value of one field."""
+    """Return an extreme value of one field."""
     if isinstance(slot, NamespacedType):
         module = import_module('.'.join(slot.namespaces))
         return message(getattr(module, slot.name), dice)
@@ -72,6 +72,6 @@ def _value(slot: Any, dice: random.Random) -> Any:
     if slot.typename == 'boolean':
         return dice.random() < 0.5
     low, high = _WIDTHS[slot.typename]
-    # Nanoseconds beyond a second are garbage that a message carries; the class takes them.
+    # Nanoseconds above one second are garbage that a message can carry; the class accepts them.
     number = dice.choice((low, high, 0, 1, dice.randint(low, high)))
     return bytes([number]) if slot.typename == 'octet' else number

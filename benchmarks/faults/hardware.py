@@ -1,4 +1,4 @@
-"""Faults of drivers, told from the board's own record of what flowed."""
+"""Faults of drivers, judged by the board's own record of its level."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,19 +22,19 @@ from hmsa_ros.nodes.conversions import CUT_OFF, to_command
 FAULTS = Register()
 _LEVEL = 0.02
 _BEAT = 0.05
-# As a planner's, in ns: what is stamped before a cut-off is refused.
+# As a planner's, in ns: commands with timestamps before a cut-off are refused.
 _LEAD = 200_000_000
-# Parameters: the watchdog of the driver, the limit of a call, and that of the firmware, in s.
+# Timeouts in s: the driver's watchdog, a call, and the firmware's watchdog.
 _TIMEOUT, _CALL, _FIRMWARE = 0.5, 0.5, 0.4
-# What a driver may take that is told to end, and one whose call hangs, in s.
+# Allowed time in s for a driver to end on request, and for one whose call hangs.
 _PROMPT, _SOON = 3.0, 5.0
-# What stands around what a driver says, in its log and its last words.
+# Text around a driver's message, in its log and in its last line.
 _AROUND = re.compile(
     r'^(hmsa: error: |\[\w+\] \[[\d.]+\] \[\w+\]: )|; correct it, then start the driver again$')
 
 
 class _Bench:
-    """A board, its driver, and commands that are repeated while somebody waits."""
+    """A board, its driver, and commands that are repeated during waits."""
 
     def __init__(self, rig: Rig, board: Board, **parameters: object) -> None:
         self.rig, self.board = rig, board
@@ -50,19 +50,19 @@ class _Bench:
         self._cut_off = message.header.frame_id == CUT_OFF
 
     def ready(self) -> None:
-        """Wait until the driver takes commands."""
+        """Wait until the driver accepts commands."""
         self.rig.spin_until(
             lambda: self.rig.applied and self._command.get_subscription_count(), 'the driver')
 
     def switch_on(self) -> None:
-        """Have a level flow."""
+        """Set a level in the coil."""
         self.ready()
         self.beat_until(lambda: self.board.level == _LEVEL, 'the level')
 
     def beat_until(
             self, condition: Callable[[], Any], what: str, level: float = _LEVEL, *,
             yields: bool = True) -> None:
-        """Repeat a level until a condition holds; it ``yields`` to a cut-off by 0 first."""
+        """Repeat a level until a condition holds; if ``yields``, answer a cut-off by 0 first."""
         due = 0.0
 
         def look() -> Any:
@@ -84,7 +84,7 @@ class _Bench:
 
     @property
     def last(self) -> str:
-        """What the driver said last."""
+        """The last message of the driver."""
         last = self.driver.said.strip().rpartition('\n')[2]
         return _AROUND.sub('', last)
 
@@ -99,7 +99,7 @@ def _bench(rig: Rig, watchdog: float = 0.0, **parameters: object) -> Iterator[_B
 
 
 def _failed(rig: Rig, words: str, reply: str, *texts: str) -> Seen:
-    """Have the next call of a kind answered by something wrong."""
+    """Inject a wrong answer to the next call of a kind."""
     with _bench(rig) as bench:
         bench.switch_on()
         board = bench.board
@@ -169,7 +169,7 @@ def _cable_ended(rig: Rig) -> Seen:
 
 
 def _terminated(bench: _Bench, text: str) -> Seen:
-    """Have the driver end by SIGTERM and judge how it does."""
+    """End the driver by SIGTERM and judge how it ends."""
     begin = monotonic()
     bench.driver.send(signal.SIGTERM)
     status = bench.ends()
@@ -214,7 +214,7 @@ def _saturated(rig: Rig) -> Seen:
 
 
 def _blocked(bench: _Bench, word: str) -> float:
-    """Have answers to a kind of call cease, and wait for a call without one; return since when."""
+    """Stop answers to a kind of call; wait for an unanswered call; return the start time."""
     bench.switch_on()
     unanswered = Event()
 

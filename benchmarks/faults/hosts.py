@@ -1,8 +1,8 @@
 """
-Hosts of their own on one machine: network namespaces that a bridge joins, which can be cut off.
+Separate hosts on one machine: network namespaces joined by a bridge, which can be cut off.
 
-Traffic stays inside the namespaces made here. Each has its own shared memory, so that nothing but
-the network joins them. They end with the processes that hold them.
+Traffic stays inside the namespaces created here. Each has its own shared memory, so only the
+network connects them. They end with the processes that hold them.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,16 +11,16 @@ import os
 import shutil
 import subprocess
 
-#: Environment of processes that are to find each other across hosts.
+#: Environment of processes that must discover each other across hosts.
 ACROSS = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}
 _TOOLS = ('ip', 'nsenter', 'unshare')
-# An address of Ethernet that no host has.
+# An Ethernet address that no host has.
 _NOBODY = '02:00:00:00:00:99'
 _HOLD = 'mount -t tmpfs shm /dev/shm && ip link set lo up && echo ready && exec sleep infinity'
 
 
 def unavailable() -> str:
-    """Return why there can be no hosts here; empty where there can be."""
+    """Return why hosts are unavailable here; empty if they are available."""
     if missing := [x for x in _TOOLS if shutil.which(x) is None]:
         return f'{missing[0]} is not installed (iproute2, util-linux)'
     if os.geteuid() != 0:
@@ -34,9 +34,9 @@ def unavailable() -> str:
 
 class Hosts:
     """
-    Hosts with names, joined by a switch.
+    Named hosts, joined by a switch.
 
-    Each is found by the others at `address`, and can be cut off from them and joined again.
+    Each has its `address` and can be cut off from the others and joined again.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -58,7 +58,7 @@ class Hosts:
             self._ip('switch', f'link set {name} up')
             self._ip(name, f'addr add {self.address(name)}/24 dev eth0')
             self._ip(name, 'link set eth0 up')
-            # Multicast finds its way by it.
+            # Multicast is routed by it.
             self._ip(name, 'route add default dev eth0')
 
     def address(self, name: str) -> str:
@@ -66,7 +66,7 @@ class Hosts:
         return f'10.99.0.{1 + self._names.index(name)}'
 
     def on(self, name: str, *command: str) -> list[str]:
-        """Return a command that runs another one on a host."""
+        """Return a command that runs another command on a host."""
         return ['nsenter', '-t', str(self._holders[name].pid), '-n', '-m',
                 f'--wd={os.getcwd()}', *command]
 
@@ -74,7 +74,7 @@ class Hosts:
         subprocess.run(self.on(name, 'ip', *words.split()), check=True, capture_output=True)
 
     def cut(self, name: str) -> None:
-        """Cut a host off from all others, who forget where it was, as after some minutes."""
+        """Cut a host off; the others lose its link-layer address, as after some minutes."""
         self._ip('switch', f'link set {name} down')
         for other in self._names:
             if other != name:
@@ -85,12 +85,12 @@ class Hosts:
         self._ip('switch', f'link set {name} up')
 
     def lose(self, sender: str, receiver: str) -> None:
-        """Lose what a host sends to another one alone; what comes back arrives."""
+        """Lose packets from one host to another; the opposite direction works."""
         self._ip(sender, f'neigh replace {self.address(receiver)} lladdr {_NOBODY} nud permanent '
                  'dev eth0')
 
     def find(self, sender: str, receiver: str) -> None:
-        """Have what a host sends to another one arrive again."""
+        """Restore packets from one host to another."""
         self._ip(sender, f'neigh del {self.address(receiver)} dev eth0')
 
     def close(self) -> None:
@@ -104,7 +104,7 @@ class Hosts:
 
 @contextmanager
 def hosts(*names: str) -> Iterator[Hosts]:
-    """Make hosts, and end them in the end."""
+    """Create hosts; end them on exit."""
     made = Hosts(names)
     try:
         yield made
@@ -113,5 +113,5 @@ def hosts(*names: str) -> Iterator[Hosts]:
 
 
 def environment(given: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment of a process that others on other hosts are to find."""
+    """Return the environment of a process that processes on other hosts must discover."""
     return {**given, **ACROSS}

@@ -1,4 +1,4 @@
-"""Faults of input: garbage on topics and services, strangers, changed parameters."""
+"""Faults of input: garbage on topics and services, foreign publishers, changed parameters."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -21,7 +21,7 @@ _CALLS = 60
 
 
 def input_topics() -> Iterator[tuple[topics.Topic, str]]:
-    """Yield every topic that nodes of the package take messages from, and whose private it is."""
+    """Yield each topic that nodes of the package subscribe to, and the node that owns it."""
     for topic in vars(topics).values():
         if isinstance(topic, topics.Topic) and topic.subscribers:
             yield topic, next(
@@ -47,7 +47,7 @@ def _topics(rig: Rig) -> Seen:
         for _ in range(_COUNT):
             for topic, publisher in publishers:
                 made = garbage.message if dice.random() < 0.5 else garbage.encoding
-                # What the middleware itself does not take never arrives.
+                # The middleware rejects some messages, which then never arrive.
                 with suppress(Exception):
                     publisher.publish(made(interface_class(topic.type), dice))
             rig.spin(0.005)
@@ -64,7 +64,7 @@ def _topics(rig: Rig) -> Seen:
 
 
 def _recovered(rig: Rig) -> float:
-    """Put plant and planner back to work and measure moves."""
+    """Return plant and planner to normal operation and measure moves."""
     rig.spin(1.0)
     rig.setpoint(1.0)
     rig.let_pass(1.0)
@@ -104,7 +104,7 @@ def _services(rig: Rig) -> Seen:
 
 
 def wild_request(kind: type[Any], name: str, dice: random.Random) -> Any:
-    """Return a request that nobody means; of transitions only such as do not exist."""
+    """Return a random request; transitions are only ones that do not exist."""
     request = garbage.message(kind.Request, dice)
     if name.endswith('/change_state'):
         request.transition.id = dice.randrange(100, 256)
@@ -151,7 +151,7 @@ def _taken(rig: Rig) -> Seen:
 
 
 def atomically(rig: Rig, owner: str, **values: object) -> str:
-    """Set parameters all together or not at all; return the reason of a refusal."""
+    """Set parameters all together or not at all; return the reason of a rejection."""
     from rcl_interfaces.srv import SetParametersAtomically
     from rclpy.parameter import Parameter
 
@@ -163,7 +163,7 @@ def atomically(rig: Rig, owner: str, **values: object) -> str:
 
 
 def _stranger(rig: Rig, source: str) -> tuple[float, int, float, float]:
-    """Have a stranger command the plant while the planner holds 1.2."""
+    """Let a foreign publisher command the plant while the planner holds 1.2."""
     pair(rig, plant={'command_source': source})
     moves(rig, (1.2,))
     stranger = rig.publisher(topics.FLUX_DENSITY_COMMAND)

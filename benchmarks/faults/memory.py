@@ -5,11 +5,11 @@ import math
 
 import numpy as np
 
-#: Growth over the second half of a life, in bytes, that counts as none.
+#: Growth in bytes over the second half of a life that counts as none.
 SMALL = 2**20
-#: In the first minutes of a life, when buffers fill.
+#: The same in the first minutes of a life, when buffers fill.
 SMALL_AT_FIRST = 16 * 2**20
-#: Length, in h of simulated time, from which on a life tells of leaks.
+#: Length of a life, in h of simulated time, from which leaks show.
 LONG = 0.1
 
 
@@ -29,24 +29,24 @@ def used(pid: int) -> tuple[int, int, int]:
 
 @dataclass(frozen=True)
 class Sample:
-    """Memory of a process at a moment, in bytes; leaks show in what is its own."""
+    """Memory of a process at a moment, in bytes; leaks show in its own memory."""
 
     time: float  # in h of simulated time, all lives of the run together
-    life: int  # counts the processes that have carried the name
+    life: int  # number of the process among those of the same name
     age: float  # since this process was started, in h of simulated time
-    own: int  # anonymous memory; the others change with who shares the libraries
+    own: int  # anonymous memory; the others depend on how many processes share libraries
     pss: int
     rss: int
 
 
 @dataclass(frozen=True)
 class Trend:
-    """How memory changes."""
+    """Change of memory over time."""
 
-    slope: float  # bytes per simulated hour, from all lives, each with a level of its own
+    slope: float  # bytes per simulated hour, common to all lives; each life has its own level
     error: float  # standard error of the slope; infinite for too few samples
-    span: float  # longest part of a life that counts, in h
-    samples: int  # that were used
+    span: float  # longest part of a life that was used, in h
+    samples: int  # number used
 
     @property
     def flat(self) -> bool:
@@ -59,15 +59,15 @@ def trend(samples: list[Sample], settle: float) -> Trend:
     """
     Fit one slope through the second halves of all lives of a process.
 
-    A leak goes on for ever and shows there as well. The heap's holes fill ever more slowly: by as
-    much from the first hour to the second as from the second to the fourth.
+    A leak persists and shows there too. Holes in the heap fill ever more slowly: by as much from
+    the first hour to the second as from the second to the fourth.
 
     Parameters
     ----------
     samples : list of Sample
-        In order.
+        In order of time.
     settle : float
-        Part of each life that is left out at least, in h: memory that is taken once.
+        Minimum initial part of each life left out, in h: memory that is allocated once.
 
     Returns
     -------
@@ -100,8 +100,8 @@ def trend(samples: list[Sample], settle: float) -> Trend:
     slope = float(x @ y) / square
     rest = y - slope * x
     free = max(x.size - used_lives - 1, 1)
-    # Samples follow each other closely, and memory comes in steps: neighbours are no two
-    # observations. An autoregressive noise of first order widens the error by this.
+    # Successive samples are close in time, and memory grows in steps, so neighbours are not
+    # independent observations. First-order autoregressive noise widens the error by this factor.
     spread = float(rest @ rest)
     near = float(rest[1:] @ rest[:-1]) / spread if spread > 0.0 else 0.0
     near = min(max(near, 0.0), 0.99)

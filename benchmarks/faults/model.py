@@ -1,4 +1,4 @@
-"""Faults of the model: parameters, noise, lag and forces that the planner does not know of."""
+"""Faults of the model: parameters, noise, lag and forces unknown to the planner."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from hmsa_ros.model.simulation import ActuatorSimulation
 
 FAULTS = Register()
 _SHARES = (0.01, 0.05, 0.1, 0.2)
-#: Of the stretch: two integrations of the same thing.
+#: Tolerance of stretch between two integrations of the same motion.
 _SAME = 1e-9
 
 
@@ -50,7 +50,7 @@ def _mismatch(rig: Rig, name: str) -> Seen:
 def _difference(
         truth: ActuatorParameters, stamps: np.ndarray, values: np.ndarray,
         commands: list[tuple[int, float]], **coil: float) -> float:
-    """Return the largest difference to the same commands, integrated here."""
+    """Return the maximum difference from the same commands, integrated here."""
     simulation = ActuatorSimulation(truth, time=int(stamps[0]), **coil)
     simulation.set_state(*map(float, values[0]))
     for stamp, flux_density in commands:
@@ -83,7 +83,7 @@ def _lag(rig: Rig) -> Seen:
     stamps, values = rig.samples(mark)
     worst = _difference(
         paper_actuator(), stamps, values, rig.commands[sent:], coil_time_constant=lag)
-    # From the change on that is as good as the last: the rest follows within microteslas.
+    # From the last substantial change on: the rest follows within microteslas.
     late = np.flatnonzero(np.abs(values[:, 2] - values[-1, 2]) > 1e-6)[-1]
     residual = float(np.ptp(values[late + 1:, 0])) / 0.2
     return Seen(

@@ -34,7 +34,7 @@ _RAMP = 0.05
     'slow motion, between the two commands of 1 -> 1.2; a new planner, request of 1.1',
     'the field changes only after the request; the move starts from the actual state')
 def _planner_killed(rig: Rig) -> Seen:
-    # 2 ms ahead, 0.4 s on the wall; the move takes 6 ms, 1.2 s on the wall.
+    # 2 ms ahead is 0.4 s of wall time; the move takes 6 ms, 1.2 s of wall time.
     follows = {'use_sim_time': True, 'lead_time': 0.002}
     rig.start('plant', {
         'publish_clock': True, 'real_time_factor': 0.005, 'publish_rate': 10_000.0})
@@ -142,7 +142,7 @@ def _watchdog(rig: Rig, safe: str) -> Seen:
     mark, killed = rig.count(), rig.time
     rig.let_pass(_TIMEOUT + held / _RAMP + 1.0, 60.0)
     rig.fresh('plant')
-    told = rig.level('plant')
+    during = rig.level('plant')
     stamps, values = rig.samples(mark)
     flux = values[:, 2]
     ends = {'hold': held, 'zero': 0.0, 'ramp': 0.0}
@@ -152,7 +152,7 @@ def _watchdog(rig: Rig, safe: str) -> Seen:
     if safe != 'hold':
         changed = np.flatnonzero(flux != held)
         after = (stamps[changed[0]] - killed) * 1e-9 if changed.size else float('nan')
-        # The last heartbeat may have been 0.2 s old, and is stamped lead_time ahead.
+        # The last heartbeat may have been 0.2 s old, and its timestamp is lead_time ahead.
         good = good and _TIMEOUT - 0.3 < after < _TIMEOUT + 0.5
         loss = f'{after:.3f} s'
     if safe == 'ramp':
@@ -169,9 +169,9 @@ def _watchdog(rig: Rig, safe: str) -> Seen:
     rig.fresh('plant')
     again = rig.level('plant')
     return Seen(
-        f'{text}; diagnostics {quiet} before, {told} then, {again} after a move of a new '
+        f'{text}; diagnostics {quiet} before, {during} then, {again} after a move of a new '
         f'planner with residual {residual:.1e}', f'safe after {loss}' if loss != '-' else '-',
-        good and quiet == 0 and told >= 1 and again < told and residual < LIMIT)
+        good and quiet == 0 and during >= 1 and again < during and residual < LIMIT)
 
 
 for _safe, _what in (
@@ -223,18 +223,18 @@ def _disk_full(rig: Rig) -> Seen:
         rig.spin_until(
             lambda: rig.level('recorder') >= 2 or not recorder.alive, 'the disk to be full')
         worst = moves(rig)
-        told = rig.level('recorder')
+        level = rig.level('recorder')
         times, gaps = _samples(disk / 'bag')
         status = recorder.end()
     finally:
         subprocess.run(['umount', '--lazy', str(disk)], check=False)
     return Seen(
-        f'diagnostics {told}, {len(times)} samples with {gaps} gaps, exit {status}',
-        share(worst), told == 2 and gaps == 0 and len(times) > 1000 and worst < LIMIT)
+        f'diagnostics {level}, {len(times)} samples with {gaps} gaps, exit {status}',
+        share(worst), level == 2 and gaps == 0 and len(times) > 1000 and worst < LIMIT)
 
 
 def _samples(bag: Path) -> tuple[np.ndarray, int]:
-    """Return the times of the samples in a bag in ns, and how many are missing between them."""
+    """Return the times of a bag's samples in ns, and the number of irregular intervals."""
     reader = BagReader(bag)
     topic = '/' + topics.JOINT_STATES.name
     decode = reader.decoder(topic)
@@ -277,7 +277,7 @@ def _deactivated(rig: Rig) -> Seen:
 
 
 def _transit(rig: Rig, transition: int) -> bool:
-    """Ask the planner for a transition."""
+    """Request a transition of the planner."""
     from lifecycle_msgs.msg import Transition
     from lifecycle_msgs.srv import ChangeState
 

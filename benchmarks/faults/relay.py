@@ -1,11 +1,11 @@
 """
-Stand between planner and plant: delay, drop, duplicate or reorder commands.
+Relay commands from planner to plant: delay, drop, duplicate or reorder them.
 
     python -m benchmarks.faults.relay IN OUT [--delay S] [--first N] [--drop I,...] [--twice]
                                       [--swap]
 
-Takes commands from topic IN and sends them to topic OUT. Delays count by steady time, whatever
-the clock of the nodes does. Says "joined" once both are known, and a node that looks on.
+Takes commands from topic IN and sends them to topic OUT. Delays are in steady time, independent
+of the nodes' clock. Prints "joined" once planner, plant and an observing node are connected.
 """
 
 import argparse
@@ -27,21 +27,21 @@ from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.runner import spin
 
 _TICK_SECONDS = 0.0005
-# The plant, and a node that looks on.
+# The plant and an observing node.
 _LISTENERS = 2
 
 
 class Relay(Node):
-    """Passes commands on, with a fault."""
+    """Relay commands, with a fault."""
 
     def __init__(self, options: argparse.Namespace) -> None:
-        """Listen and pass on."""
+        """Subscribe and relay."""
         super().__init__('relay', enable_rosout=False)
         self._options = options
         self._drop = {int(x) for x in options.drop.split(',') if x}
         self._count, self._joined = 0, False
         self._held: MagneticField | None = None
-        # Stamps of commands that are lost; a heartbeat may repeat one before it applies.
+        # Timestamps of lost commands; a heartbeat may repeat one before it applies.
         self._lost: list[Time] = []
         self._waiting: deque[tuple[float, MagneticField]] = deque()
         topic = topics.FLUX_DENSITY_COMMAND
@@ -62,7 +62,7 @@ class Relay(Node):
                 self._held = message
                 return
             self._publisher.publish(message)
-            # The one sent after it is to supersede it for good.
+            # The later command must supersede it for good.
             self._lost.append(message.header.stamp)
             message, self._held = self._held, None
         delay = self._options.delay
@@ -77,7 +77,7 @@ class Relay(Node):
                                  and self._publisher.get_subscription_count() >= _LISTENERS):
             self._joined = True
             print('joined')
-        # In the order in which they came, unless asked to reorder them.
+        # In order of arrival, unless asked to reorder them.
         while self._waiting and self._waiting[0][0] <= monotonic():
             self._publisher.publish(self._waiting.popleft()[1])
 

@@ -1,4 +1,4 @@
-"""A rig of real node processes in a ROS domain of its own, and a node that looks on."""
+"""A rig of real node processes in a ROS domain of its own, and an observing node."""
 
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,14 +29,14 @@ from hmsa_ros.nodes.conversions import from_time, to_trajectory
 from hmsa_ros.nodes.endpoints import interface_class
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-#: Patience with a process that starts, or with a condition, in s.
+#: Maximum wait for a process to start, or for a condition, in s.
 PATIENCE = 40.0
 _SLICE = 0.02
-# What a server needs to find a new client, in s.
+# Time a server needs to discover a new client, in s.
 _ACQUAINTANCE = 0.2
 _PR_SET_PDEATHSIG = 1
 _TRACE = 'Traceback (most recent call last)'
-# Lines of a log that a failure is told with.
+# Number of log lines quoted for a failure.
 _LAST = 4
 
 
@@ -45,7 +45,7 @@ class Child:
 
     def __init__(
             self, command: Sequence[str], log: Path, environment: Mapping[str, str]) -> None:
-        """Start it."""
+        """Start the process."""
         self.log = log
         with open(log, 'ab') as file:
             self.popen = subprocess.Popen(
@@ -55,12 +55,12 @@ class Child:
 
     @property
     def alive(self) -> bool:
-        """Whether it runs."""
+        """Whether the process is running."""
         return self.popen.poll() is None
 
     @property
     def said(self) -> str:
-        """What it has written so far."""
+        """Its output so far."""
         return self.log.read_text(errors='replace')
 
     def send(self, number: int) -> None:
@@ -68,7 +68,7 @@ class Child:
         self.popen.send_signal(number)
 
     def end(self, number: int = signal.SIGINT, patience: float = PATIENCE) -> int:
-        """Send a signal, wait for the end and return the status; kill what does not answer."""
+        """Send a signal, wait for the end and return the status; kill an unresponsive process."""
         if self.alive:
             self.popen.send_signal(number)
         try:
@@ -79,14 +79,14 @@ class Child:
 
 
 def _die_with_parent() -> None:
-    """Have the kernel end this process with its parent, and answer SIGINT."""
+    """Make the kernel end this process with its parent, and respond to SIGINT."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 class Rig:
     """
-    Starts nodes, looks on, asks and measures; a context manager that ends them.
+    Start nodes, observe, send requests and measure; a context manager that ends them.
 
     Parameters
     ----------
@@ -95,24 +95,24 @@ class Rig:
     domain : int
         ROS domain for this rig alone.
     watch : bool
-        Whether to take samples, commands and what became of them, all of which are kept.
+        Whether to keep samples, commands and the changes they cause.
 
     Attributes
     ----------
     folder : Path
         As given.
     node : rclpy.node.Node
-        Ours.
+        The rig's own node.
     children : list of Child
-        All that were started.
+        All processes that were started.
     commands, applied : list of (int, float)
-        Stamp in ns and flux density in T, as received.
+        Timestamp in ns and flux density in T, as received.
     verdicts : list of dict
         Of ``planner/status``, with ``level`` and ``message``.
     diagnostics : dict of dict
         Newest of each name on ``/diagnostics``, with ``level`` and ``message``.
     deaf : bool
-        Whether to pass over what comes, while garbage is sent to topics that are watched.
+        Whether to ignore messages, while garbage is sent to watched topics.
 
     """
 
@@ -163,7 +163,7 @@ class Rig:
         """End the processes and leave the domain."""
         for child in self.children:
             if child.alive:
-                # A stopped process answers nothing but this.
+                # A stopped process responds to this signal only.
                 child.send(signal.SIGCONT)
                 child.send(signal.SIGINT)
         for child in self.children:
@@ -187,7 +187,7 @@ class Rig:
         return self.run(name, '-m', 'hmsa_ros', name, '--ros-args', *words)
 
     def run(self, name: str, *words: str) -> Child:
-        """Start this Python with arguments."""
+        """Start this Python interpreter with arguments."""
         child = Child(
             [sys.executable, *words], self.folder / f'{name}.log', self.environment)
         self.children.append(child)
@@ -207,16 +207,16 @@ class Rig:
         return [self.run('load', '-c', 'while True: pass') for _ in range(count)]
 
     def ready(self, *names: str) -> None:
-        """Wait until nodes are there and have found each other."""
+        """Wait until nodes are running and have discovered each other."""
         if topics.PLANT in names and self._watch:
             self.spin_until(lambda: len(self._stamps) > 0, 'the first sample')
         if topics.PLANNER in names:
             self.spin_until(
                 lambda: self.verdicts and self._setpoint.get_subscription_count() > 0,
                 'the planner')
-        # What is sent before two nodes have found each other is lost. They found us, and a
-        # second round of diagnostics later, at least a second, each other; a relay that starts
-        # on a busy machine finds them later.
+        # Messages sent before two nodes have discovered each other are lost. They have discovered
+        # this node; two rounds of diagnostics later, at least a second, also each other. A relay
+        # that starts on a busy machine discovers them later.
         for child in self.children:
             if child.log.stem == 'relay':
                 self.spin_until(
@@ -231,13 +231,13 @@ class Rig:
             if log.stem.split('_')[0] not in topics.NODES:
                 continue
             for part in log.read_text(errors='replace').split(_TRACE)[1:]:
-                # Frames are indented; the first line that is not names the exception.
+                # Frames are indented; the first unindented line names the exception.
                 last = next((x for x in part.splitlines()[1:] if x[:1].strip()), '')
                 found.append(f'{log.stem}: {last.strip()}')
         return found
 
     def last_words(self) -> str:
-        """Return the last lines of each node of the package, for a failure."""
+        """Return the last log lines of each node of the package, for a failure."""
         logs = {x.log: x for x in self.children if x.log.stem.split('_')[0] in topics.NODES}
         return ''.join(
             f'; {log.stem} said last: {" / ".join(child.said.split(chr(10))[-_LAST - 1:-1])}'
@@ -251,7 +251,7 @@ class Rig:
             self.node, topic, lambda x: None if self.deaf else callback(x), owner)
 
     def publisher(self, topic: topics.Topic, owner: str = '') -> Any:
-        """Return a publisher of ours."""
+        """Return a publisher of the rig's node."""
         return endpoints.publisher(self.node, topic, owner)
 
     def _on_sample(self, message: JointState) -> None:
@@ -278,7 +278,7 @@ class Rig:
         return len(self._stamps)
 
     def samples(self, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Return stamps in ns and stretch, rate in 1/s, flux density in T from a mark on."""
+        """Return timestamps in ns; stretch, rate in 1/s, flux density in T; from a mark on."""
         return (np.array(self._stamps[first:], np.int64),
                 np.array(self._values[3 * first:]).reshape(-1, 3))
 
@@ -295,16 +295,16 @@ class Rig:
         return float('nan')
 
     def level(self, node: str) -> int:
-        """Return the worst level in a node's newest diagnostics; -1 if it says nothing."""
+        """Return the worst level in a node's newest diagnostics; -1 if there are none."""
         return max((int(x['level']) for name, x in self.diagnostics.items()
                     if name.startswith(node)), default=-1)
 
     def fresh(self, *nodes: str) -> None:
-        """Wait for diagnostics that are newer than now."""
+        """Wait for diagnostics newer than now."""
         self._await_diagnostics(nodes)
 
     def _await_diagnostics(self, nodes: Sequence[str]) -> None:
-        """Wait for two rounds of diagnostics: the first may have been on its way already."""
+        """Wait for two rounds of diagnostics: the first may already have been on its way."""
         ends = {x: self._rounds(x) + 2 for x in nodes}
         for node, end in ends.items():
             self.spin_until(
@@ -323,29 +323,29 @@ class Rig:
             self._executor.spin_once(timeout_sec=_SLICE)
 
     def spin(self, seconds: float) -> None:
-        """Serve callbacks for a time by the clock on the wall."""
+        """Serve callbacks for a period of wall time."""
         end = monotonic() + seconds
         self.spin_until(lambda: monotonic() >= end, 'the time to pass', seconds + 1.0)
 
     def let_pass(self, seconds: float, patience: float = PATIENCE) -> None:
-        """Serve callbacks until the plant's samples are so much older."""
+        """Serve callbacks until the plant's samples have advanced by ``seconds``."""
         end = self.time + round(seconds * NANOSECONDS)
         self.spin_until(lambda: self.time >= end, f'{seconds:g} s of the plant', patience)
 
     def setpoint(self, stretch: float) -> dict[str, str]:
-        """Ask for a stretch and wait for the verdict."""
+        """Request a stretch and wait for the verdict."""
         return self.ask(lambda: self.publish_setpoint(stretch))
 
     def publish_setpoint(self, stretch: float) -> None:
-        """Ask for a stretch and do not wait."""
+        """Request a stretch without waiting."""
         self._setpoint.publish(Float64(data=float(stretch)))
 
     def publish_trajectory(self, message: Any) -> None:
-        """Send a sequence and do not wait."""
+        """Send a sequence without waiting."""
         self._trajectory.publish(message)
 
     def sequence(self, setpoints: Sequence[tuple[float, float]]) -> dict[str, str]:
-        """Send a sequence that begins now and wait for the verdict."""
+        """Send a sequence that starts now and wait for the verdict."""
         ends = np.cumsum([x for _, x in setpoints])
         message = to_trajectory(
             [(x, round(end * NANOSECONDS))
@@ -371,7 +371,7 @@ class Rig:
         if client is None:
             client = self._clients[name] = self.node.create_client(kind, name)
             self.spin_until(client.service_is_ready, f'service {name}')
-            # The server may answer before it knows where to: to be ready is to know of it.
+            # A ready client may be unknown to the server, whose response would then be lost.
             self.spin(_ACQUAINTANCE)
         self.spin_until(client.service_is_ready, f'service {name}')
         future = client.call_async(kind.Request() if request is None else request)
@@ -379,7 +379,7 @@ class Rig:
         return future.result()
 
     def set_parameters(self, owner: str, **values: object) -> list[str]:
-        """Set parameters each by itself, ``__`` for a dot; return the reasons of refusals."""
+        """Set parameters individually, ``__`` for a dot; return the reasons of rejections."""
         from rcl_interfaces.srv import SetParameters
 
         response = self.call_by_name(SetParameters, f'{owner}/set_parameters', (
@@ -398,9 +398,9 @@ def _plain(status: DiagnosticStatus) -> dict[str, str]:
 @contextmanager
 def hushed(log: Path) -> Iterator[TextIO]:
     """
-    Have what the middleware writes to standard error go to a file.
+    Redirect the middleware's standard error to a file; yield the original stream.
 
-    It complains there of every broken message that this process sends or receives.
+    The middleware complains there of every broken message that this process sends or receives.
     """
     sys.stderr.flush()
     with open(os.dup(2), 'w', encoding='utf-8') as before, open(log, 'ab') as file:
@@ -417,31 +417,31 @@ def settled(
         stamps: np.ndarray, values: np.ndarray, applied: Sequence[tuple[int, float]],
         target: float, step: float) -> tuple[float, float]:
     """
-    Measure what is left of a move after the last change of the flux density in force.
+    Measure the residual of a move after the last change of the flux density in force.
 
     Parameters
     ----------
     stamps, values : ndarray, shape (n,) and (n, 3)
-        Samples from before the move until long after it, stamped in ns.
+        Samples from before the move until long after it, timestamped in ns.
     applied : sequence of (int, float)
-        Changes that the plant reported: stamp in ns and level. Samples do not show one
+        Changes reported by the plant: timestamp in ns and level. Samples do not show a level
         that is superseded within a sample.
     target : float
-        Stretch that was asked for.
+        Requested stretch.
     step : float
-        Difference of stretch that was asked for.
+        Requested difference of stretch.
 
     Returns
     -------
     residual : float
-        Peak-to-peak stretch since the last change, as a share of the step.
+        Peak-to-peak stretch since the last change, as a fraction of the step.
     error : float
-        Distance of the last sample from the target, as a share of the step.
+        Distance of the last sample from the target, as a fraction of the step.
 
     Raises
     ------
     HmsaError
-        If too few samples have come since.
+        If there are too few samples since.
 
     """
     last = max((stamp for stamp, _ in applied if stamp <= stamps[-1]), default=0)

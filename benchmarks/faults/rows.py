@@ -1,4 +1,4 @@
-"""All faults of the table, in its order."""
+"""All faults of the table, in order."""
 
 from benchmarks.faults import (
     apart,
@@ -16,7 +16,7 @@ FAULTS = (
     *delivery.FAULTS, *processes.FAULTS, *timing.FAULTS, *inputs.FAULTS, *model.FAULTS,
     *samples.FAULTS, *hardware.FAULTS, *bags.FAULTS, *apart.FAULTS)
 
-#: What the tests inject: one of each kind.
+#: Faults injected by the tests: one of each kind.
 QUICK = (
     'none', 'twice', 'planner_restarted', 'planner_stopped', 'stranger_first',
     'parameter_refused')

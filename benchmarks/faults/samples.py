@@ -1,4 +1,4 @@
-"""Faults of the sensor while feedback adapts: they are named, and never move the field."""
+"""Faults of the sensor while feedback adapts: they are reported, and never move the field."""
 
 import signal
 
@@ -10,15 +10,15 @@ from hmsa_ros.nodes import endpoints
 
 FAULTS = Register()
 _TARGET = 1.2
-# What noise of 1e-3 may leave, as a share of the step.
+# Allowed error due to noise of 1e-3, as a fraction of the step.
 _LEFT = 0.02
 
 
 def _failing(rig: Rig, fault: str, word: str, counter: str) -> Seen:
-    """Learn with a sensor that works, have it fail at rest, and move again."""
-    told: list[tuple[str, dict[str, str]]] = []
+    """Adapt with a working sensor, let it fail at rest, and move again."""
+    estimates: list[tuple[str, dict[str, str]]] = []
     endpoints.subscribe(
-        rig.node, topics.ESTIMATE, lambda x: told.extend(
+        rig.node, topics.ESTIMATE, lambda x: estimates.extend(
             (y.message, {z.key: z.value for z in y.values}) for y in x.status), topics.PLANNER)
     name = topics.JOINT_STATES.name
     sensor = rig.run('sensor', '-m', 'benchmarks.faults.sensor', name, f'{name}_seen', fault)
@@ -27,23 +27,23 @@ def _failing(rig: Rig, fault: str, word: str, counter: str) -> Seen:
     mark = rig.count()
     rig.setpoint(_TARGET)
     await_change(rig, mark)
-    rig.spin_until(lambda: told and 'plans use it' in told[-1][0], 'what is learnt')
-    # Until nothing is left to be corrected.
+    rig.spin_until(lambda: estimates and 'plans use it' in estimates[-1][0], 'what is learnt')
+    # Until no correction is pending.
     rig.let_pass(2.0)
     first = rig.count()
     sensor.send(signal.SIGUSR1)
     rig.let_pass(1.5)
     moved = jump(rig, first)
-    seen = len(told)
+    seen = len(estimates)
     residual, error = move(rig, 1.1, start=_TARGET, pause=1.0)
-    said = any(word in message for message, _ in told[seen - 1:]) if word else True
-    count = int(told[-1][1].get(counter, 0)) if counter else 1
-    silent = fault == 'silence' and len(told) - seen < 2
-    trusted = all(x['trusted'] == 'True' for _, x in told[seen:])
+    said = any(word in message for message, _ in estimates[seen - 1:]) if word else True
+    count = int(estimates[-1][1].get(counter, 0)) if counter else 1
+    silent = fault == 'silence' and len(estimates) - seen < 2
+    trusted = all(x['trusted'] == 'True' for _, x in estimates[seen:])
     harmless = fault in ('swap', 'twice')
     return Seen(
         f'field changed by {moved:.2g} T; '
-        + ('no estimate' if silent else f'"{told[-1][0].split(";")[0]}"')
+        + ('no estimate' if silent else f'"{estimates[-1][0].split(";")[0]}"')
         + (f'; {count} {counter}' if counter else '') + f'; error {error:.1%}', share(residual),
         said and count > 0 and max(residual, error) < _LEFT
         and (harmless and trusted or moved == 0.0))

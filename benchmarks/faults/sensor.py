@@ -1,5 +1,5 @@
 """
-Stand between plant and planner as a sensor with noise, which fails when it gets SIGUSR1.
+Relay samples from plant to planner as a noisy sensor that fails on SIGUSR1.
 
     python -m benchmarks.faults.sensor IN OUT FAULT
 
@@ -24,16 +24,16 @@ from hmsa_ros.interfaces import topics
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.runner import spin
 
-#: What can happen to a sensor.
+#: Faults of the sensor.
 FAULTS = ('nan', 'freeze', 'jump', 'swap', 'twice', 'silence')
 _NOISE, _JUMP = 1e-3, 0.05
 
 
 class Sensor(Node):
-    """Passes samples on, with a fault once it has been asked for."""
+    """Relay samples, with a fault once requested."""
 
     def __init__(self, options: argparse.Namespace) -> None:
-        """Listen and pass on."""
+        """Subscribe and relay."""
         super().__init__('sensor', enable_rosout=False)
         self._fault = options.fault
         self.failed = False
@@ -46,7 +46,7 @@ class Sensor(Node):
 
     def _on_sample(self, message: JointState) -> None:
         stretch = message.position[0] + self._random.gauss(0.0, _NOISE)
-        # A camera has neither of them.
+        # A camera measures neither of them.
         message.velocity, message.effort = [], []
         if not self.failed:
             self._last = stretch
@@ -72,7 +72,7 @@ class Sensor(Node):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Pass on until interrupted."""
+    """Relay samples until interrupted."""
     parser = argparse.ArgumentParser(description='Pass samples on, with a fault.')
     parser.add_argument('source')
     parser.add_argument('target')

@@ -1,4 +1,4 @@
-"""What a laboratory would write for `benchmarks.faults.board`: the hardware of a driver."""
+"""Example of a laboratory's hardware class for `benchmarks.faults.board`."""
 
 import builtins
 import ctypes
@@ -14,7 +14,7 @@ class SerialCoil:
     resolution = 1e-6
 
     def __init__(self, joint: str, port: str, sleep: float = 0.0) -> None:
-        """Open the port, which some boards take their time for."""
+        """Open the port, which takes a while on some boards."""
         time.sleep(sleep)
         self._port = port
         self._line = -1
@@ -51,7 +51,7 @@ class SerialCoil:
         return values
 
     def write(self, level: float, now: int) -> tuple[int, float]:
-        """Set a level in T; return when and what was set."""
+        """Set a level in T; return the time and the actual level."""
         (really,) = self._ask(f'L {level!r} {self._boots or 0}')
         return time.time_ns(), float(really)
 

@@ -1,4 +1,4 @@
-"""The table of faults: one row a fault, what was expected of it and what was seen."""
+"""The table of faults: one row per fault, with the expected and the actual response."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,22 +11,22 @@ from hmsa_ros.errors import HmsaError
 
 @dataclass(frozen=True)
 class Seen:
-    """What was seen of a fault."""
+    """The response to a fault."""
 
     text: str
-    figure: str  # residual as a share of the step, or loss with its unit
-    met: bool  # whether it is what was expected
+    figure: str  # residual as a fraction of the step, or loss with its unit
+    met: bool  # whether the response is as expected
 
 
 @dataclass(frozen=True)
 class Fault:
     """A fault to inject."""
 
-    key: str  # to ask for it on the command line
-    name: str  # what goes wrong
-    how: str  # how it is made
-    expected: str  # what has to be seen
-    inject: Callable[[Rig], Seen]  # does it in a rig of its own
+    key: str  # name on the command line
+    name: str  # description of the fault
+    how: str  # how it is injected
+    expected: str  # required response
+    inject: Callable[[Rig], Seen]  # injects it in a rig of its own
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def inject(fault: Fault, domain: int) -> Outcome:
     Inject one fault into real processes of a ROS domain.
 
     A fault that stops the rig counts as a failure, and the reason is reported. An unhandled
-    exception in the output of any process is never what was expected.
+    exception in the output of any process is always a failure.
     """
     with tempfile.TemporaryDirectory(prefix='hmsa_faults_') as folder:
         rig = Rig(Path(folder), domain)
@@ -60,7 +60,7 @@ def inject(fault: Fault, domain: int) -> Outcome:
 
 
 def markdown(outcomes: Sequence[Outcome]) -> str:
-    """Return the table for a page of the documentation: what was seen only if not expected."""
+    """Return the table for a documentation page; the response is shown only if unexpected."""
     head = ('fault', 'how', 'expected', 'residual or loss')
     lines = ['| ' + ' | '.join(head) + ' |', '|' + ' --- |' * len(head)]
     for row in outcomes:

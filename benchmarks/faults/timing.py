@@ -27,7 +27,7 @@ def _none(rig: Rig) -> Seen:
 
 
 def _jumping(rig: Rig, by: float) -> None:
-    """Have plant and planner follow a clock that will jump."""
+    """Start plant and planner with a clock that will jump."""
     rig.run('clock', '-m', 'benchmarks.faults.clock', '--jump', f'{_JUMP_AFTER}:{by}')
     rig.start('recorder', {**_FOLLOWS, 'storage.uri': rig.folder / 'bag'})
     pair(rig, plant=_FOLLOWS, planner=_FOLLOWS)
