@@ -71,12 +71,12 @@ def run(bench: Bench, way: str) -> list[Left]:
         PlannerGroup({'a': Planner(bench.given, Options(
             flux_density_min=-_LIMIT, flux_density_max=_LIMIT, lead_time=lead))}),
         Settings(takeover_timeout=0, heartbeat_period=0, **WAYS[way]), device)
-    outputs: list[Output] = []
-    loop.deliver = outputs.append
+    sent: list[Output] = []
+    loop.deliver = sent.append
     loop.run(device.time + round(_BEFORE * unit))
     found, start, words = [], 1.0, ''
     for target in bench.targets:
-        outputs.clear()
+        sent.clear()
         begin = loop.now
         loop.runtime.request(Target('a', target))
         loop.serve()
@@ -86,13 +86,12 @@ def run(bench: Bench, way: str) -> list[Left]:
         seen, look = bench.shown(stretch), _LOOK * unit
         early, late = (time >= arrival) & (time < arrival + look), time >= loop.now - look
         step = abs(target - start)
-        words = next(
-            (x.message for x in reversed(outputs) if isinstance(x, EstimateChanged)), words)
+        words = next((x.message for x in reversed(sent) if isinstance(x, EstimateChanged)), words)
         found.append(Left(
             max(float(np.ptp(seen[early])), float(np.ptp(seen[late]))) / step,
             abs(float(np.mean(seen[late])) - target) / step,
             tuple(dict.fromkeys(
-                str(code) for x in outputs if isinstance(x, StatusChanged)
+                str(code) for x in sent if isinstance(x, StatusChanged)
                 for code in (x.verdict.code, *(y.verdict for y in x.findings.values())))),
             words))
         start = target
