@@ -356,7 +356,7 @@ class Soak:
                 act()
             self._look()
 
-    # -- what is done to them ------------------------------------------------------------------
+    # -- disturbances ------------------------------------------------------------------------
 
     def cycle(self, kind: str, seconds: float, victim: str) -> None:
         """Run one cycle with a bag of its own; kill the victim half way through."""

@@ -1,4 +1,4 @@
-"""Faults of recordings that need no nodes: what is damaged is said."""
+"""Faults of recordings, without nodes: all damage must be reported."""
 
 from benchmarks.faults.common import Register
 from benchmarks.faults.rig import Rig

@@ -13,24 +13,24 @@ _POLL = 0.005
 
 class Board:
     """
-    A thread on a pseudo-terminal that answers lines.
-
     A thread on a pseudo-terminal that answers requests, one per line.
-    boots`` answers; ``R`` asks for ``S stretch rate boots``. Stretch is 1 + level here.
+
     ``L level boots`` sets a level in T unless ``boots`` is of another boot (0 for any); the answer
     is ``K level boots``. ``R`` is answered by ``S stretch rate boots``. Stretch is 1 + level here.
+
+    Parameters
     ----------
     port : Path
-        Where the line is to be found; made new at each `plug`.
-    watchdog : float
         Path of the line; renewed by each `plug`.
+    watchdog : float
+        Time in s without a level after which the firmware switches off; 0 for never.
 
     Attributes
     ----------
     record : list of (float, float)
-        What really flows: time in s of `time.monotonic`, and level in T from then on.
-    largest : float
         The actual level: time in s of `time.monotonic`, and level in T from then on.
+    largest : float
+        Level in T at which the amplifier saturates.
     answer : callable
         Makes the answer from the correct one; an empty answer is not sent.
 

@@ -243,7 +243,7 @@ class Rig:
             f'; {log.stem} said last: {" / ".join(child.said.split(chr(10))[-_LAST - 1:-1])}'
             for log, child in logs.items())
 
-    # -- what is seen --------------------------------------------------------------------------
+    # -- observations --------------------------------------------------------------------------
 
     def _subscribe(
             self, topic: topics.Topic, owner: str, callback: Callable[[Any], None]) -> None:
@@ -311,7 +311,7 @@ class Rig:
                 lambda node=node, end=end: self._rounds(node) >= end,  # type: ignore[misc]
                 f'diagnostics of {node}')
 
-    # -- what is done --------------------------------------------------------------------------
+    # -- requests ------------------------------------------------------------------------------
 
     def spin_until(
             self, condition: Callable[[], Any], what: str, patience: float = PATIENCE) -> None:
