@@ -208,8 +208,8 @@ class Soak:
     Parameters
     ----------
     folder : Path
-        For logs and bags.
         Folder for logs and bags.
+    domain : int
         ROS domain for this alone.
     seed : int
         Seed of all random choices.
@@ -356,7 +356,7 @@ class Soak:
                 act()
             self._look()
 
-    # -- disturbances ------------------------------------------------------------------------
+    # -- disturbances --------------------------------------------------------------------------
 
     def cycle(self, kind: str, seconds: float, victim: str) -> None:
         """Run one cycle with a bag of its own; kill the victim half way through."""
