@@ -37,11 +37,11 @@ struct Tail {
     static constexpr double pair_share = 0.05;
     // Maximum duration of a level of a pair, in half periods, and the phase limit for a grid.
     static constexpr double longest = 0.5, last_phase = 2.6;
-    // Vibration about a single level relative to the drift during it: the drift, the ringing after
+    // Vibration about a single level relative to the drift during it: drift, the vibration after
     // a step of that height to both sides, and a margin.
     static constexpr double single = 3.5;
     static constexpr double forever = 1e15;  // maximum half periods of a single level
-    // Half periods for which a branch with an endless decay is followed.
+    // Half periods for which a branch with an endless decay is simulated.
     static constexpr double endless = 1e6;
     // Phase after which a decayed term counts as zero.
     static constexpr double faded_phase = 50;
