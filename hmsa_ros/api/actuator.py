@@ -350,7 +350,7 @@ class Actuator:
         Returns
         -------
         Actuator
-            All else is as it was.
+            A copy in which all other parameters are unchanged.
 
         Raises
         ------
@@ -391,7 +391,7 @@ class Actuator:
         Returns
         -------
         Actuator
-            All else is as it was.
+            A copy in which all other parameters are unchanged.
 
         Raises
         ------
