@@ -2,7 +2,7 @@
 Moving horizon estimation: the most probable motion through the newest samples, by Gauss-Newton.
 
 The unknowns are the coordinates of the free parameters, then stretch and rate at the start of the
-window. Earlier data are a Gaussian prior of them: when the window moves on, the samples that leave
+window. Earlier data form a Gaussian prior: when the window moves on, the samples that leave
 it are added to the prior at the present estimate, and the prior is propagated along the motion
 (C. V. Rao, J. B. Rawlings and D. Q. Mayne, IEEE Trans. Autom. Control 48 (2003) 246).
 """
