@@ -115,7 +115,7 @@ def static(
     for begin, end, when, level in segments(recording, 1):
         tail = recording.stretch[begin + (end - begin) * 2 // 3:end]
         rests.append((when, level, median(tail.tolist())))
-    # Take the median of each level: short ones do not come to rest, but ring about it.
+    # Take the median of each level: during short ones, the motion vibrates about it.
     fields = np.unique([x[1] for x in rests])
     if len(fields) < 2:
         return Static(math.nan, usual, tuple(rests))
