@@ -17,8 +17,8 @@ constexpr int friction_of = 400, square_of = 401, constant_of = 500, switch_of =
 constexpr double soft_rate = 3e-3;
 
 // Maximum phase of a step: the dense output is then accurate to about 1e-8, as are derivatives,
-// which continue to vibrate after the motion, whose error alone is controlled. Also the maximum step
-// in times of the fastest branch: beyond about six the derivatives would grow without bound.
+// which vibrate longer than the motion, whose error alone is controlled. Also the maximum step in
+// times of the fastest branch: beyond about six the derivatives would grow without bound.
 constexpr double longest_phase = 1, relaxed_share = 4;
 // Work limits, beyond the needs of any recording, for start values with large errors.
 constexpr int most_response_steps = 20000, most_steps_a_sample = 20;
