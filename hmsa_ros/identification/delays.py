@@ -118,7 +118,7 @@ def field_delays(
     values, since_ms = found.x, 1e3 * since
     begin, end = values[0], values[0] + 3.0 * values[1]
     if np.count_nonzero((since_ms > begin) & (since_ms < end)) < _RISE:
-        # All that is known is the readings between which the field rises, for three lags.
+        # The data only show the two readings between which the field rises, for three lags.
         before = float(np.max(since_ms, where=since_ms <= begin, initial=0.0))
         after = float(np.min(since_ms, where=since_ms >= end, initial=1e3 * _LONGEST))
         half = (after - before) / np.array([2.0, 6.0])
