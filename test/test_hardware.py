@@ -814,6 +814,8 @@ def test_a_worker_that_is_to_reconnect_goes_on_from_zero_once_the_cable_is_in_ag
         for level in (0.15, 0.0, 0.12):
             worker.receive(0, 0, level)
         wait_until(lambda: cable.levels[-1] == 0.12, 'a new level')
+        assert '0.15 T, and an open interlock or a failure switched' in ''.join(
+            x.text for x in worker.device.notices() if x.kind is Kind.REFUSED)
         assert 0.15 not in cable.levels
     assert other.levels[-1] == 0.0
     worker.close()

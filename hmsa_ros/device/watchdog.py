@@ -192,8 +192,8 @@ class GuardedJoint:
         if self._since is not None:
             why, ago = '', (now - self._since) / NANOSECONDS
             if self._zero_first and (level or current):
-                why = (f'{level:g} T, and the interlock was opened {ago:.3f} s ago: expected 0 T '
-                       'first, with the coil off')
+                why = (f'{level:g} T, and an open interlock or a failure switched the coil off '
+                       f'{ago:.3f} s ago: expected 0 T first, with the coil off')
             elif stamp and stamp < max(now, self._since):
                 self._remember(level)
                 why = (f'{level:g} T applied {(now - stamp) / NANOSECONDS:.3f} s ago, and the '
