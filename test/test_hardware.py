@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from hmsa_ros.device import StateLostError
+from hmsa_ros.device.clock_map import ClockMap
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.hardware import Calls, load
 from hmsa_ros.device.health import judge_hardware
@@ -467,6 +468,20 @@ def test_samples_of_a_device_with_a_clock_are_stamped_in_the_time_of_the_host():
     assert np.abs(errors[100:]).max() < 10_000
     assert device.coils[0].instrument.clock_map.drift == pytest.approx(80e-6, abs=15e-6)
     assert device.coils[0].instrument.clock_map.error < 50e-6
+
+
+def test_a_clock_that_answers_at_once_is_known_by_later_answers_that_take_longer():
+    known, dice, now = ClockMap(), np.random.default_rng(1), TODAY
+
+    def clock(host):
+        return round((host - START) * (1.0 + 50e-6))
+    # First several within microseconds, then each for itself.
+    for duration in [200] * 8 + [20_000] * 50:
+        now += 250 * MS if duration > 200 else 500
+        assert known.add(now, clock(now + int(dice.integers(duration))), now + duration)
+        off = abs(known.to_device(now) - clock(now)) * 1e-9
+        assert off < min(2e-5, known.error)
+    assert known.drift == pytest.approx(50e-6, abs=2e-6)
 
 
 def test_a_board_whose_clock_begins_anew_has_lost_its_state():

@@ -18,8 +18,9 @@ from hmsa_ros.model.units import NANOSECONDS
 _KEPT, ENOUGH = 64, 8
 # Standard deviation of the rate of an unknown clock: 100 ppm.
 _RATE_STD = 1e-4
-# Answers that took longer than this multiple of the shortest are ignored.
-_SLOW = 3.0
+# Answers that took longer than this multiple of the shortest are ignored; half durations in ns up
+# to the second count alike, since the host takes as long to make a call that it has not just made.
+_SLOW, _LEAST = 3.0, 20_000
 # Number of successive answers inconsistent with the known clock until a new one is assumed.
 _STRANGE = 3
 
@@ -68,7 +69,7 @@ class ClockMap:
             self._origin = before, device
         host, clock = self._origin
         answer = _Answer(
-            (before + after) // 2 - host, device - clock, max((after - before) // 2, 1))
+            (before + after) // 2 - host, device - clock, max((after - before) // 2, _LEAST))
         off = answer.device - answer.host - self._offset - self.drift * (
             answer.host - self._centre)
         if len(self._answers) >= ENOUGH and abs(off) > answer.half + self._error(answer.host):
