@@ -183,7 +183,8 @@ def test_slow_ramps_and_a_lagging_field_leave_less_than_the_chain_too(delivery, 
     Delivery(period=0.05), Delivery(period=0.3), Delivery(slew=50.0), Delivery(slew=1.0),
     Delivery(slew=0.3), Delivery(lag=0.05), Delivery(lag=0.2),
     Delivery(period=0.05, slew=10.0, lag=0.1)], ids=str)
-@pytest.mark.parametrize('state', [State(1.0), State(1.2, -0.5)], ids=['rest', 'moving'])
+@pytest.mark.parametrize(
+    'state', [State(1.0), State(1.2, -0.5), State(1.4, -0.5)], ids=['rest', 'moving', 'through'])
 def test_it_is_never_worse_than_the_chain_on_any_hardware(delivery, state):
     request = Request(state, 1.4, PAPER, WIDE, delivery)
     chain, move = (get_shaper(x)(request) for x in ('robust', 'minimax'))

@@ -29,7 +29,7 @@ from hmsa_ros.model.simulation import flow_rates, followed_by, with_followed
 from hmsa_ros.model.status import Code
 from hmsa_ros.planning.shapers.creeping import arrival
 from hmsa_ros.planning.shapers.modes import oscillation
-from hmsa_ros.planning.shapers.request import as_errors, LARGEST_ERROR, Request
+from hmsa_ros.planning.shapers.request import as_errors, AT_REST, LARGEST_ERROR, Request
 from hmsa_ros.planning.shapers.robust import robust
 
 #: Minimum number of levels besides the holding level, with steps and with ramps, and number of
@@ -148,7 +148,8 @@ def _case(request: Request, holding: float, errors: Errors) -> _Case | None:
     if found is None:
         return None
     root, mode, tail = found
-    peaks = (1.0 + math.exp(math.pi * root.real / root.imag)) / abs(request.target - state.stretch)
+    move = max(abs(request.target - state.stretch), AT_REST)
+    peaks = (1.0 + math.exp(math.pi * root.real / root.imag)) / move
     return _Case(
         packed, stiffer, faster, stretch, state.rate / faster, with_followed(
             material, np.array(followed_by(state, request.material)) / stiffer),
