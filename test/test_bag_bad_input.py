@@ -379,16 +379,20 @@ def test_messages_that_never_saw_a_clock_are_read(tmp_path):
     assert (reader.start_time, reader.end_time, reader.counts()) == (0, 0, {'/a': 1})
 
 
-def test_a_missing_schema_leaves_the_messages_raw(tmp_path):
+@pytest.mark.parametrize('encoding', ['cdr', 'json'])
+def test_a_missing_schema_leaves_the_messages_raw(tmp_path, encoding):
     path = tmp_path / 'raw.mcap'
     with path.open('wb') as file:
         writer = Writer(file)
         writer.start('ros2', 'test')
-        channel = writer.register_channel('/a', 'cdr', 0, {})
+        channel = writer.register_channel('/a', encoding, 0, {})
         writer.add_message(channel, 1, payload(1), 1)
         writer.finish()
     reader, got = stamps(path)
     assert got == [1]
+    recover(path, tmp_path / 'whole')
+    # What is sent again or decoded goes by it.
+    assert BagReader(tmp_path / 'whole').topics['/a'].encoding == encoding
     assert any('has no message definition' in problem for problem in reader.problems)
     with pytest.raises(BagError, match='cannot be decoded'):
         list(read_messages(path, ['/a']))

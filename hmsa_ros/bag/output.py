@@ -208,8 +208,8 @@ class OutputFile:
                     encoding=topic.definition_encoding, data=topic.definition.encode())
                 self._declared.append(self._schemas[topic.type])
             self._channels.append(Channel(
-                id=len(self._channels) + 1, topic=topic.name,
-                schema_id=self._schemas[topic.type].id, message_encoding='cdr', metadata={
+                id=len(self._channels) + 1, topic=topic.name, message_encoding=topic.encoding,
+                schema_id=self._schemas[topic.type].id, metadata={
                     'offered_qos_profiles': qos.to_yaml(topic.profiles),
                     'topic_type_hash': topic.type_hash}))
             self._declared.append(self._channels[-1])

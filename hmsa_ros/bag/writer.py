@@ -335,7 +335,7 @@ class BagWriter:
         end = max((file.start_ns + file.duration_ns for file in filled), default=start)
         return metadata.BagMetadata(
             start, end - start, sum(file.message_count for file in files),
-            tuple(replace(topic, encoding='cdr', message_count=counts.get(number, 0))
+            tuple(replace(topic, message_count=counts.get(number, 0))
                   for number, topic in enumerate(self._topics)),
             tuple(files), custom_data, self._ros_distro)
 
