@@ -545,6 +545,17 @@ def test_a_recorder_on_another_clock_leaves_lead_and_delay_open(tmp_path):
     assert 'clock of the recorder differs' in ' '.join(Page(page([part])).words)
 
 
+def test_commands_on_another_clock_than_the_samples_hold_up_no_report(tmp_path):
+    ahead = 1_700_000_000 * NANOSECONDS
+    messages = [
+        x if x[1] != '/joint_states' else (*x[:3], joint_state(
+            x[0] + ahead, x[3].position, x[3].velocity, x[3].effort)) for x in simulated()]
+    part = one(tmp_path / 'bag', messages, **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert not np.isfinite(part.evaluation.plain.stretch).any()
+    assert not np.isfinite(part.evaluation.planned.stretch).any()
+    page([part])
+
+
 def applied(messages, late=0, space=''):
     """Return a plant's reports on commands: the initial level and each change."""
     topic, kind = f'{space}/{APPLIED}', TYPES[APPLIED]

@@ -37,6 +37,8 @@ from hmsa_ros.report.outcome import findings_of
 FEW_SAMPLES = 10
 # Fraction of the step; a block that covers less did not move.
 _MOVED = 0.1
+# Longer takes minutes to simulate. It is a pause, or a stamp of another clock than the samples'.
+_MOST_PERIODS = 1e6
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,8 @@ class Evaluation:
     moves: tuple[Move, ...]  #: setpoints
     results: tuple[MoveResult, ...]  #: one per move
     recorded: Curve  #: through the samples
-    #: simulated for unshaped steps; NaN without a move, and for steps too large to simulate
+    #: simulated for unshaped steps; NaN without a move, and for steps too large or too long to
+    #: simulate
     plain: Curve
     plan: tuple[Level, ...]  #: planned changes of level that were not replanned, by timestamp
     #: predicted by the plan, at the samples and between them; NaN before and without a plan
@@ -190,9 +193,9 @@ def _plain(
         run: Run, time: Array, moves: Sequence[Move], zero: int, start: float) -> Curve:
     """Simulate unshaped steps, at the samples and between them."""
     nothing = Curve(time, np.full_like(time, np.nan), np.full_like(time, np.nan))
-    if not moves:
-        return nothing
     begins = np.array([(x.begin - zero) / NANOSECONDS for x in moves])
+    if not moves or time[-1] - begins[0] > _MOST_PERIODS * run.plant.period:
+        return nothing
     before = time[time < begins[0]]
     grid = fine(np.union1d(begins[:1], time[len(before):]), run.plant.period)
     lower, upper = stretch_limits(run.plant.nondimensional)
@@ -259,6 +262,8 @@ def _predict(run: Run, plan: Sequence[Level], stamps: Times) -> tuple[Array, Arr
     state = State(plan[0].stretch, load=float(elastic_force(plan[0].stretch, material)))
     for i, point in enumerate(plan):
         until = plan[i + 1].stamp if i + 1 < len(plan) else max(int(run.time[-1]), point.stamp)
+        if until - point.stamp > _MOST_PERIODS * actuator.period * NANOSECONDS:
+            continue
         level = PlannedLoad(0.0, actuator.units.of_level(point.flux_density))
         state = replace(state, stretch=point.stretch, rate=point.rate * unit)
         part = slice(
