@@ -46,6 +46,31 @@ def test_an_error_in_the_thread_is_kept(ros, start, wait_until):
     assert isinstance(capture.error, ValueError)
 
 
+class _Held:
+    """A subscription that holds some numbers, one a round; ``meanwhile`` happens at the first."""
+
+    def __init__(self, *numbers, meanwhile=lambda: None):
+        self._numbers = list(numbers)
+        self._meanwhile = [meanwhile]
+
+    def take(self, limit):
+        if self._meanwhile:
+            self._meanwhile.pop()()
+        return [self._numbers.pop(0)] if self._numbers else []
+
+    def destroy(self):
+        pass
+
+
+def test_what_a_subscription_holds_that_is_replaced_meanwhile_comes_first():
+    got = []
+    capture = Capture(lambda taken: got.extend(x for _, numbers in taken for x in numbers))
+    capture.add('a', _Held(1, 2, meanwhile=lambda: capture.replace('a', _Held(3))))
+    capture.start()
+    capture.stop()
+    assert got == [1, 2, 3]
+
+
 def test_simulated_time_is_that_of_the_last_tick_before():
     clock = SimulatedTime()
     assert not clock.started

@@ -185,8 +185,8 @@ class Capture:
         """Read another subscription under a known key; messages of the old one are delivered."""
         for i, (known, old) in enumerate(self._subscriptions):
             if known is key:
-                self._subscriptions[i] = key, subscription
                 self._leaving.append((key, old))
+                self._subscriptions[i] = key, subscription
 
     def matched(self) -> list[Any]:
         """Return the keys of the subscriptions with a matched publisher."""
@@ -227,12 +227,14 @@ class Capture:
         The first one is read last: if /clock was added first, every tick received before a message
         of this round is known when the message gets its timestamp.
         """
-        taken = [(key, x.take(limit)) for key, x in reversed([*self._subscriptions])]
+        # In this order: one that is replaced meanwhile is read to its end before the new one.
+        known, leaving = [*self._subscriptions], []
         while self._leaving:
-            key, old = self._leaving.pop()
-            taken.append((key, old.take(sys.maxsize)))
+            key, old = self._leaving.pop(0)
+            leaving.append((key, old.take(sys.maxsize)))
             old.destroy()
-        return [x for x in reversed(taken) if x[1]]
+        taken = [(key, x.take(limit)) for key, x in reversed(known)]
+        return [x for x in (*leaving, *reversed(taken)) if x[1]]
 
 
 class SimulatedTime:
