@@ -156,7 +156,8 @@ def _places(
         if match is None:
             continue
         name = '_'.join(match[1].lower().split())
-        unit = (match[2] or '').strip().lower()
+        # A keyboard gives the micro sign, or the Greek letter.
+        unit = (match[2] or '').strip().lower().replace('\u03bc', 'µ')
         for suffix in ('ms', 'us', 'mt', 'mm', 's', 't'):
             stem = name.removesuffix(f'_{suffix}')
             if not unit and stem != name and _ALIASES.get(stem, stem) in names:

@@ -226,10 +226,11 @@ def test_points_in_any_order_are_sorted_and_that_is_said(folder, capsys):
     assert any('not in the order of time' in x for x in found['warnings'])
 
 
-@pytest.mark.parametrize('encoding', ['utf-16', 'utf-8-sig', 'cp1252'])
-def test_files_of_spreadsheets_are_read(folder, capsys, encoding):
+@pytest.mark.parametrize(('encoding', 'micro'), [
+    ('utf-16', 'µ'), ('utf-8-sig', '\N{GREEK SMALL LETTER MU}'), ('cp1252', 'µ')])
+def test_files_of_spreadsheets_are_read(folder, capsys, encoding, micro):
     rows = (f'{1e6 * t:.9g},{y:.12g}' for t, y in zip(TIMES, STRETCH, strict=True))
-    text = '\n'.join(['time [µs],stretch', *rows])
+    text = '\n'.join([f'time [{micro}s],stretch', *rows])
     (folder / 'camera.csv').write_text(text, encoding=encoding)
     status, out, _ = identify(capsys, 'camera.csv', '--commands', 'levels.csv', '--json')
     assert status == 0

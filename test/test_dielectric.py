@@ -186,7 +186,7 @@ def test_the_parameters_of_an_actuator_give_it_again_and_scale_it():
 
 def test_init_writes_a_file_with_which_plan_shows_volts(tmp_path, capsys):
     path = tmp_path / 'stack.yaml'
-    sizes = ['--half-length', '5mm', '--half-thickness', '2mm', '--layer-thickness', '50um']
+    sizes = ['--half-length', '5mm', '--half-thickness', '2mm', '--layer-thickness', '50\u03bcm']
     assert main([
         'init', '--dielectric', *sizes, '--permittivity', '3', '--shear-modulus', '100kPa',
         '--j-lim', '50', '--voltage-max', '5kV', '--yes', '--out', str(path)]) == 0

@@ -54,7 +54,7 @@ def number_of(text: str, unit: str, words: str) -> float:
     if found is None:
         example = f' with or without a unit ({", ".join(units)})' if units else ''
         raise BadInputError(f'{words} is {text!r}: expected a number{example}')
-    number, own = found.groups()
+    number, own = found[1], found[2].replace('\u03bc', 'µ')
     if own and own not in units:
         raise BadInputError(
             f'{words} has the unit {own!r}: expected '
