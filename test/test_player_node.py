@@ -425,6 +425,8 @@ def test_an_empty_bag_ends_at_once(play, tmp_path):
     ((), 'parameter storage.uri is empty'),
     (('storage.uri:=/none',), 'does not exist: expected the folder of a bag'),
     (('storage.uri:={bag}', 'play.rate:=0.0'), 'play.rate'),
+    (('storage.uri:={bag}', 'play.start_offset.sec:=5'),
+     'play.start_offset is 5 s: expected at most 0 s'),
     (('storage.uri:={bag}', 'play.regex_to_filter:="("'), 'expected a regular expression'),
     (('storage.uri:={bag}', 'play.wait_for_subscribers:=[/b]'), 'expected topics that are sent'),
 ])

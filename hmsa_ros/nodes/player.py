@@ -215,6 +215,10 @@ class Player(ManagedNode):
         first, last = self._reader.start_time or 0, self._reader.end_time
         start = first + duration_from(self._values, 'play.start_offset')
         length = duration_from(self._values, 'play.playback_duration')
+        if last is not None and start > last:
+            raise BadInputError(
+                f'parameter play.start_offset is {(start - first) * 1e-9:g} s: expected at most '
+                f'{(last - first) * 1e-9:g} s, where {self._reader.path} ends')
         end = (first if last is None else last) if length < 0 else start + length
         return Excerpt(first, start, end, self._values['play.loop'],
                        self._values['play.read_ahead_queue_size'])
