@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 from hmsa_ros.bag.definitions import message_definition, type_hash
 from hmsa_ros.bag.info import summarize
 from hmsa_ros.bag.qos import Qos
+from hmsa_ros.bag.transport import Transport
 from hmsa_ros.bag.writer import BagWriter, Topic
 from hmsa_ros.cli import main
 from hmsa_ros.interfaces import topics
@@ -175,6 +176,12 @@ def test_pause_next_resume_and_stop(ros, play, tmp_path):
     assert ros.call(Trigger, 'player/stop').success
     assert process.wait() == 0, process.output
     assert [message.data for message in got] == list(range(len(got)))
+
+
+def test_a_step_that_was_not_possible_is_not_made_later():
+    transport = Transport(7, 1.0)
+    assert not transport.step(0.01)
+    assert transport.wait(8, message=True, timeout=0.01) == 7
 
 
 def test_latched_messages_before_the_offset_are_sent_first(ros, play, tmp_path):

@@ -63,6 +63,11 @@ class Transport:
             self._answers.append(answer)
             self.change.notify_all()
         answer.wait(timeout)
+        with self.change:
+            if self._steps and not answer.is_set():
+                # Nobody is to be surprised by it later.
+                self._steps -= 1
+                self._answers.remove(answer)
         return answer.is_set() and not self.stopped
 
     def stop(self) -> None:

@@ -355,7 +355,7 @@ class Player(ManagedNode):
         if not self.active or not self._transport.paused or self._transport.stopped:
             return False, 'not paused: expected a paused player; call pause first'
         sent = self._transport.step(1.0)
-        return sent, 'sent' if sent else 'there is no next message'
+        return sent, 'sent' if sent else 'none was due: playing has not begun, or has ended'
 
     def _on_stop(self) -> tuple[bool, str]:
         """Stop playing, and end the process."""
