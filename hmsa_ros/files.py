@@ -57,6 +57,8 @@ def check_targets(*targets: Path | None, sources: Iterable[Path | None] = ()) ->
                f'{target.parent} is no folder; expected one that exists'
                if not target.resolve().parent.is_dir() else
                'the command reads it; expected another name' if target.resolve() in read else
+               'it may be part of a bag; expected another name'
+               if target.suffix == '.mcap' or target.name == 'metadata.yaml' else
                'two outputs name the same file; expected different files'
                if target.resolve() in [x.resolve() for x in named[:i]] else '')
         if why:

@@ -15,7 +15,6 @@ from typing import Any, TYPE_CHECKING
 from hmsa_ros.cli.options import add_command, bags, show
 from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
-from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import write_text
 
 if TYPE_CHECKING:
@@ -46,9 +45,6 @@ def run(arguments: argparse.Namespace) -> int:
     paper = paper_of(arguments, out, sources=arguments.bags)
     targets = [out, *pictures, *(
         dict.fromkeys(x.with_suffix('.csv') for x in pictures) if paper.data else ())]
-    if part := next((x for x in targets if x.suffix in ('.mcap', '.yaml')), None):
-        raise BadInputError(
-            f'cannot write {part}: it may be part of a bag; expected a name such as report.html')
 
     from hmsa_ros.recordings.bags import read_runs
     from hmsa_ros.recordings.parameters import read_parameter_file
