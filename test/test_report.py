@@ -36,7 +36,7 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.drafting import finish
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Options, Planner
-from hmsa_ros.recordings.bags import read_runs
+from hmsa_ros.recordings.bags import read_run, read_runs
 from hmsa_ros.recordings.levels import in_force, Level, without_repeats
 from hmsa_ros.recordings.topics import (
     APPLIED,
@@ -762,6 +762,9 @@ def test_each_namespace_of_a_bag_is_a_run(tmp_path):
     assert [x.run.label for x in runs] == ['bag /left', 'bag /right']
     assert [[y.stretch for y in x.evaluation.results] for x in runs] == [
         [1.1, 1.2, 1.4], [1.3]]
+    # Both are called actuator.
+    with pytest.raises(BadInputError, match='expected one; record the topics of one namespace'):
+        read_run(tmp_path / 'bag', joint='actuator')
 
 
 def test_the_actuator_is_found_among_other_joints(tmp_path):

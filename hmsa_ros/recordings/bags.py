@@ -105,8 +105,9 @@ def read_run(
     runs = read_runs(path, joints=[joint] if joint else [], progress=progress)
     if len(runs) > 1:
         raise BadInputError(
-            f'{path} has the runs {", ".join(x.label for x in runs)}: expected one; name its '
-            'actuator (--joint)')
+            f'{path} has the runs {", ".join(x.label for x in runs)}: expected one; ' + (
+                'name its actuator (--joint)' if len({x.joint for x in runs}) == len(runs)
+                else 'record the topics of one namespace in a bag'))
     return runs[0]
 
 
