@@ -738,6 +738,9 @@ def test_a_bag_without_parameters_is_verified_and_exported_with_a_parameter_file
         assert (actuator['largest_difference'] < SAME) is (status == 0)
     assert main(['bag', 'verify', str(folder)]) == 2
     assert '--params-file' in capsys.readouterr().err
+    write_with_rosbags(tmp_path / 'samples', without(simulated(((1.1, 10.0),)), 'command'))
+    assert main(['bag', 'verify', str(tmp_path / 'samples'), '--params-file', str(file)]) == 1
+    assert 'samples, 0 commands (0 late), largest' in capsys.readouterr().out
     assert main(['export', str(folder), '--out', str(tmp_path / 'run.csv')]) == 0
     samples, levels = (
         np.genfromtxt(tmp_path / x, delimiter=',', names=True)

@@ -110,8 +110,9 @@ def _verify(arguments: argparse.Namespace) -> int:
             'passed': passed, 'tolerance': arguments.tolerance, 'problems': problems,
             'actuators': [asdict(x) for x in results]},
         *(printable(
-            f'{x.states}: {x.sample_count} samples, {x.command_count} commands of {x.commands} '
-            f'({x.late_count} late), largest difference of the {run.plant.coordinate.name} '
+            f'{x.states}: {x.sample_count} samples, {x.command_count} commands'
+            + f' of {x.commands}' * bool(x.commands)
+            + f' ({x.late_count} late), largest difference of the {run.plant.coordinate.name} '
             f'{x.largest_difference:.3g} at {x.where:.6f} s' + (f'; {x.note}' if x.note else ''))
           for run, x in zip(runs, results, strict=True)))
     return 0 if passed else 1
