@@ -65,7 +65,8 @@ class SampleReader:
         joint, or none of its samples can be used; ``where`` names the source.
         """
         if not self._columns:
-            raise BadInputError(f'{where} holds no message: expected samples of the actuator')
+            raise BadInputError(
+                f'{where} holds no message that can be used: expected samples of the actuator')
         joint = self._joint(where, joint, required)
         parts = []
         total = 0
