@@ -365,7 +365,7 @@ class Recorder(ManagedNode):
                   before.values()), flush=True)
         for sentence, counts in (
                 ('lost {} of {}', lost),
-                ('{} of {} were sent before the recorder was matched', before)):
+                ('{} of {} sent before the recorder was matched', before)):
             for name, count in sorted(counts.items()):
                 if count:
                     print('hmsa recorder:', sentence.format(count, name), flush=True)
