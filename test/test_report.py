@@ -899,6 +899,10 @@ def test_a_run_without_commands_shows_the_response_alone(tmp_path):
     assert 'holds no command' in ' '.join(report.words)
     assert 'arrivals' not in report.ids
     assert len(report.trace('response', 'recorded')['y']) > 100
+    # No scale without a field, no entry without a curve.
+    figure = draw(tmp_path / 'run.svg', [part])
+    assert not len(figure.axes[0].get_yticks())
+    assert [x.get_text() for y in figure.legends for x in y.get_texts()] == ['recorded']
 
 
 def test_a_move_that_the_recording_cut_off_is_left_out(tmp_path):

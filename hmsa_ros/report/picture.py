@@ -69,6 +69,9 @@ def draw(
         style.finish(axes['command'], time, level, 'a')
         axes['command'].tick_params(labelbottom=False)
         axes['command'].xaxis.label.set_visible(False)
+        if not any(x.evaluation.levels for x in parts):
+            # Ticks from 0 to 1 would look like a field.
+            axes['command'].set_yticks([])
         position = style.axis(what.name, what.tex)
         style.finish(axes['response'], time, position, 'b')
         style.finish(axes['phase'], position, style.axis(
@@ -140,7 +143,7 @@ def _draw_run(
             found.plain, found.recorded, Curve(found.time, run.stretch, run.rate)))
     dense: dict[str, Any] = {} if times[1] - times[0] <= _DASHED * run.plant.period else {
         'linestyle': '-', 'linewidth': _THIN}
-    if alone:
+    if alone and np.isfinite(plain.stretch).any():
         # Of several runs only the recorded curves are compared.
         for panel, x, y, more in (
                 ('response', *decimate(unit.of(plain.time), plain.stretch), dense),
