@@ -352,8 +352,8 @@ class _Collected:
         notes = [*self.notes, *summary.problems]
         if roles.COMMAND not in topics:
             notes.append(
-                f'The recording has no {roles.COMMAND}: setpoints, unshaped steps and lateness '
-                'are unknown.')
+                f'The recording has no {roles.COMMAND}: unshaped steps and lateness are unknown, '
+                'and so are setpoints that were not requested.')
         elif not self.commands[key]:
             notes.append(
                 f'{topics[roles.COMMAND]} holds no command: there is no setpoint to evaluate.')

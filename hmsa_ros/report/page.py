@@ -171,7 +171,8 @@ def _notes_of(part: Part) -> Iterable[str]:
                f'requested {part.run.plant.coordinate.name} or lasts a period of the actuator.')
     if part.evaluation.results and not np.isfinite(
             part.evaluation.plain.stretch).any():
-        yield 'Unshaped steps cannot be simulated: the levels are too large to follow.'
+        yield ('Unshaped steps cannot be simulated: the levels are too large to follow, or too '
+               'long before the last sample.')
     samples = part.run.plant.period / np.median(part.timing.interval) \
         if len(part.timing.interval) else math.inf
     if samples < FEW_SAMPLES:
