@@ -67,7 +67,7 @@ def write_run(path: Path, run: Run) -> list[Path]:
 
 
 def levels_beside(path: Path) -> Path:
-    """Return where the levels go whose samples go to a file."""
+    """Return the path of the table of levels that belongs to a file of samples."""
     return path.with_name(f'{path.stem}_levels{path.suffix}')
 
 
