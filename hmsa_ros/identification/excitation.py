@@ -212,7 +212,7 @@ class Designer:
         matrix = response.jacobian.T @ response.jacobian / self._noise ** 2
         sign, size = np.linalg.slogdet(matrix)
         variances = np.diag(np.linalg.inv(matrix)) if sign > 0.0 else np.zeros(len(matrix))
-        # Those of a matrix that is singular but for rounding may be below 0.
+        # Variances of a matrix that is singular except for rounding may be negative.
         deviations = np.sqrt(np.where(variances > 0.0, variances, math.inf))
         std = {}
         for name, deviation in zip(self._free, deviations.tolist(), strict=True):

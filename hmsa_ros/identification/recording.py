@@ -157,7 +157,7 @@ class Recording:
         least, most = what.at_rest if seen else what.possible
         if least <= rest <= most and what.possible[0] <= low and high <= what.possible[1]:
             return
-        # A length in m is small too, but never near to 0 beside its own rest.
+        # A length in m is small too, but never near 0 compared with its rest value.
         strain = abs(rest) < 0.4 and not 0.0 < rest < 3.0 * low if seen else (
             low < what.possible[0])
         looks = what.looks or (
