@@ -186,7 +186,7 @@ def _follow(request: Request, move: Move, span: float) -> State:
             material, delivery)
     parts, last = ramps(move.levels, request.load, end, delivery.slew)
     ramped = max(parts[-1][0], 0.0)
-    # A move that is held without an end also swings after the last level.
+    # A move held without an end also vibrates after the last level.
     _check_known(request, move.levels, (ramped, max(end, span)))
     if not material.creep:
         end = min(end, ramped + longest_motion(last, material) + delivery.settling(0.0))
@@ -203,7 +203,7 @@ def _check_known(request: Request, levels: Sequence[Level], ends: tuple[float, f
     elastic, limits = material.law, stretch_limits(material)
     if elastic is None or limits == ENDLESS:
         return
-    # Where the force decreases, unless that is where the range of the model ends.
+    # Stretches from which the elastic force decreases, unless the range of the model ends there.
     falls = [x if x != y else z for x, y, z in zip(
         limits, elastic.limits, (-math.inf, math.inf), strict=True)]
     where = f'{material.coordinate.name} {request.state.stretch:.6g}'
