@@ -35,7 +35,7 @@ template <class C> struct PowerLaw {
         const S size = x * inverse(s);
         return x * power(S(size * size + nothing), C(0.5 * (m - 1.0)));
     }
-    // What remains of x after a span of constant force; before it, at most twice as much.
+    // Remainder of x after a span of constant force; at most twice x for a negative span.
     double relaxed(double x, double speed, double span) const
     {
         const double p = value(m) - 1, way = x != 0 ? speed * (*this)(x) / x * span : 0;
