@@ -18,6 +18,7 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces.topics import FLUX_DENSITY_COMMAND
 from hmsa_ros.model.residual import percent
 from hmsa_ros.report import style
+from hmsa_ros.report.bands import draw_bands
 from hmsa_ros.report.charts import commanded
 from hmsa_ros.report.curves import Curve, decimate, through
 from hmsa_ros.report.looks import case, CASES, Look, SHAPERS
@@ -146,10 +147,14 @@ def test_between_six_samples_a_period_the_curve_is_the_motion_and_no_polygon() -
     assert np.count_nonzero(np.isnan(shown)) == 1
 
 
-def test_runs_that_agree_are_all_seen(tmp_path: Path) -> None:
+@pytest.mark.parametrize('repeated', [False, True])
+def test_runs_that_agree_are_all_seen(tmp_path: Path, repeated: bool) -> None:
     run = one(tmp_path / 'one', simulated(), **parameters(planner=ACTUATOR, plant=ACTUATOR))
-    path = tmp_path / 'both.png'
-    draw(path, [run, run], Paper(width=85.0, dpi=200.0))
+    path, paper = tmp_path / 'both.png', Paper(width=85.0, dpi=200.0)
+    if repeated:
+        draw_bands([path], {'first': [run], 'second': [run]}, paper)
+    else:
+        draw(path, [run, run], paper)
     shades = np.rint(255.0 * imread(path)[..., :3])
     for look in CASES[:2]:
         colour = [int(look.colour[i:i + 2], 16) for i in (1, 3, 5)]

@@ -60,8 +60,9 @@ SHAPERS = {
     'ei': Look(BLACK, 1.0, (6.0, 1.0, 1.0, 1.0, 1.0, 1.0), '>', 3),
     'umzv': Look(PURPLE, 1.2, (1.0, 2.5), 'p', 3),
 }
-#: Styles of unnamed curves, such as those of several runs, in order.
-CASES = tuple(SHAPERS[x] for x in (
+#: Styles of unnamed curves, such as those of several runs, in order. The first is solid: dashed
+#: curves on top of it remain distinguishable.
+CASES = tuple(replace(SHAPERS[x], order=RECORDED.order) for x in (
     'two_step', 'step', 'robust', 'minimum_time', 'umzv', 'ei', 'minimax', 'zvd'))
 RUNS = tuple(x.colour for x in CASES)
 

@@ -1,7 +1,6 @@
 """Draw runs: command, response, phase plane, and the arrivals with the largest residuals."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,9 +53,7 @@ def draw(
         axes: dict[str, Axes] = figure.subplot_mosaic(
             rows, height_ratios=heights)  # type: ignore[arg-type]
         for number, part in enumerate(parts):
-            # The first run is solid: dashed curves on top of it remain distinguishable.
-            look = looks.RECORDED if len(parts) == 1 else replace(
-                looks.case(number), order=looks.RECORDED.order)
+            look = looks.RECORDED if len(parts) == 1 else looks.case(number)
             _draw_run(axes, part, unit, look, times, alone=len(parts) == 1)
             for i in shown:
                 if i < len(part.evaluation.results):
