@@ -165,7 +165,10 @@ def _map(
         levels = [z for z in levels if values[known].min() < z < values[known].max()]
         if levels:
             lines = panel.contour(x, y, values, levels=levels, colors='white', linewidths=0.7)
-            for drawn in (lines, *panel.clabel(lines, fontsize='small', fmt='%.3g')):
+            numbers = panel.clabel(lines, fontsize='small', fmt='%.3g')
+            for number in numbers:
+                number.set_clip_on(False)  # cut off at the edge, it would be another number
+            for drawn in (lines, *numbers):
                 drawn.set(path_effects=[withStroke(linewidth=1.6, foreground='#404040')])
     figure.remember(panel, label_of(name), x, y, values)
     style.finish(panel, label_of(axes[0].name), label_of(axes[1].name))

@@ -4,6 +4,7 @@ import csv
 import json
 import math
 
+from matplotlib.axes import Axes
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -323,6 +324,15 @@ def test_a_folder_gets_the_map_of_its_table_and_other_pictures_are_named(run, tm
     assert (status, 'no picture' in err) == (0, True)
     assert sorted(x.name for x in (tmp_path / 'study').iterdir()) == [
         'chunks', 'study.json', 'table.parquet']
+
+
+def test_no_number_of_a_contour_is_cut_off_at_the_edge_of_a_map(run, monkeypatch):
+    drawn, label = [], Axes.clabel
+    monkeypatch.setattr(Axes, 'clabel', lambda *x, **y: drawn.extend(label(*x, **y)) or drawn)
+    assert run('sweep', '--zeta', '0:3:7', '--j-lim', 'log:0.1:100:6', '--out', 'map',
+               '--show', 'beta_p', '--format', 'png')[0] == 0
+    assert drawn
+    assert not any(x.get_clip_on() for x in drawn)
 
 
 def test_a_view_puts_each_row_of_a_sweep_where_its_axes_say():
