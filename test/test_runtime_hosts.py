@@ -91,6 +91,13 @@ def test_a_device_that_is_not_heard_any_more_is_sent_nothing_and_named():
     assert (rig.status.unheard, rig.runtime.report()[0]) == ('', Severity.OK)
     assert len(rig.sent) > sent
     assert rig.residual(1.2) < 1e-6
+    rig.runtime.request(Target('a', 1.3))
+    rig.linked = False
+    rig.run(START + 6000 * MS)
+    assert rig.runtime.request(Target('a', 1.1)).code == 'waiting'
+    rig.run(START + 17_000 * MS)
+    assert rig.status.verdict.code == 'unheard'
+    assert 'for 10 s, and no receipts either: start the plant' in rig.status.verdict.message
 
 
 def test_a_device_that_comes_late_is_not_put_on_a_level_in_one_step():

@@ -93,10 +93,10 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'the planner predicts.',
         'Repair the sensor, or stop its publisher; without samples moves start as predicted.'),
     Code.UNHEARD: (
-        'The plant or driver sends receipts, but commands do not arrive, as when a link works in '
-        'one direction only.',
-        'Repair the network from the host of the planner to that of the plant or driver; then '
-        'send the request again.'),
+        'Commands do not arrive: the plant or driver has ended, or a link works in one direction '
+        'only.',
+        'Start the plant or driver, or repair the network from the host of the planner to its '
+        'host; then send the request again.'),
     Code.CUT_OFF: (
         'The watchdog of plant or driver switched the coil off, or the hardware lost its state. '
         'The rest of the sequence was dropped.',

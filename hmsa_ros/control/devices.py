@@ -221,7 +221,7 @@ class Devices:
         Raises
         ------
         RefusedError
-            If commands have not arrived for a long time at a device that sends receipts.
+            If commands have not arrived for a long time.
 
         """
         names = self._following.astray
@@ -239,11 +239,15 @@ class Devices:
             return passed <= settings.takeover_timeout
         if passed > _PATIENCE:
             self.since = None
+            how = (
+                'and no receipts either: start the plant or driver, or check the network'
+                if lost[0] in self.receipts.silent else
+                'though its receipts arrive: check the network in the direction from the planner '
+                'to the plant or driver')
             raise RefusedError(
                 Code.UNHEARD,
                 f'commands of joint {lost[0]} have not arrived for {passed / NANOSECONDS:.0f} s, '
-                'though its receipts arrive: check the network in the direction from the planner '
-                'to the plant or driver, and send the request again')
+                f'{how}, and send the request again')
         return True
 
     @property
