@@ -214,6 +214,19 @@ def test_after_a_cut_off_the_planner_waits_and_then_starts_from_where_the_actuat
     assert rig.residual(1.4) < 1e-6
 
 
+def test_a_planner_that_is_asked_for_nothing_leaves_a_device_cut_off():
+    rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS))
+    rig.cut_off()
+    rig.come_back()
+    # Its watchdog would have been silenced for a moment only, again and again.
+    rig.run(START + 3000 * MS)
+    assert (rig.cut, rig.sent) == (True, [])
+    rig.runtime.request(Target('a', 1.2))
+    rig.run(START + 4000 * MS)
+    assert rig.refused == []
+    assert rig.residual(1.2) < 1e-6
+
+
 @pytest.mark.parametrize('deaf', [3000, 15_000])
 def test_after_a_cut_off_a_request_waits_until_the_device_hears(deaf):
     rig = Bench()

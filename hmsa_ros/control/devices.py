@@ -225,6 +225,8 @@ class Devices:
 
         """
         names = self._following.astray
+        for joint in self.cut:
+            self.acknowledge(joint)
         lost = [x for x in self._planners
                 if self.receipts.lost(x, *((0,) if x in self.cut else ()))]
         if not lost and not self.cut and all(

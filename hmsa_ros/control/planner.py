@@ -170,7 +170,8 @@ class PlannerRuntime:
             self.planning.clear()
         self._drop(self.devices.cut_off(
             joint, self.settings, in_force=in_force, locked=locked))
-        if in_force and self.active:
+        if in_force and self.active and self._takeover.engaged:
+            # Whoever gives no signs of life afterwards would have it cut off again.
             self.devices.acknowledge(joint)
 
     def _drop(self, verdict: Verdict | None) -> None:
