@@ -298,6 +298,21 @@ def test_a_move_does_not_start_from_a_state_that_samples_contradict():
     assert max(x.flux_density for t, x in rig.sent if t > START + 800 * MS) < 0.06
 
 
+def test_a_model_that_cannot_be_followed_is_no_longer_in_the_way_once_it_is_replaced():
+    rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS))
+    rig.runtime.request(Target('a', 1.2))
+    rig.run(START + 800 * MS)
+    model = rig.planner.model
+    stiff = replace(model, actuator=replace(model.actuator, damping_coefficient=1e12))
+    rig.runtime.change(rig.runtime.settings, {'a': stiff}, simultaneous=False)
+    rig.runtime.request(Stop())
+    rig.run(START + 1600 * MS)
+    rig.runtime.change(rig.runtime.settings, {'a': model}, simultaneous=False)
+    rig.runtime.request(Target('a', 1.3))
+    rig.run(START + 2600 * MS)
+    assert rig.residual(1.3) < 1e-6
+
+
 @pytest.mark.parametrize('level', [-1e12, 1e300, 1.7e308])
 def test_a_report_or_a_sample_that_cannot_be_is_ignored(level):
     rig = Rig(settings=replace(QUIET, takeover_timeout=500 * MS))

@@ -6,7 +6,7 @@ import math
 from hmsa_ros.control.receipts import Receipts
 from hmsa_ros.control.records import Settings
 from hmsa_ros.control.surroundings import Seen, Surroundings
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.planner import Planner
@@ -229,8 +229,13 @@ class Takeover:
         self._check_age(name, seen, settings)
         self._check_ahead(name, seen)
         planner = self._planners[name]
-        predicted = planner.state(seen.stamp).stretch
-        contradicts = abs(seen.stretch - predicted) > _tolerance(planner, seen.stamp, predicted)
+        try:
+            predicted = planner.state(seen.stamp).stretch
+        except HmsaError:
+            # The model of the plan cannot be followed, and may have been set by mistake.
+            predicted = math.nan
+        contradicts = not (
+            abs(seen.stretch - predicted) <= _tolerance(planner, seen.stamp, predicted))
         if not contradicts and name not in self._doubted:
             return
         if self._take(name, seen, keep=keep) and contradicts:
