@@ -356,6 +356,19 @@ def test_a_move_does_not_start_where_samples_have_ceased():
     assert rig.runtime.request(Target('a', 1.1)).code == 'accepted'
 
 
+def test_a_request_is_taken_while_simulated_time_stands_still():
+    rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS))
+    rig.runtime.surroundings.one_clock = lambda: True
+    rig.runtime.request(Target('a', 1.2))
+    rig.run(START + 1000 * MS)
+    rig.runtime.request(Target('a', 1.3))
+    # No more samples come.
+    rig.samples = False
+    rig.run(START + 1300 * MS)
+    rig.steady += 10_000 * MS
+    assert rig.runtime.request(Target('a', 1.2)).code == 'accepted'
+
+
 def test_samples_that_cease_are_named_when_they_do_and_when_they_come_again():
     rig = Bench()
     rig.runtime.request(Target('a', 1.2))

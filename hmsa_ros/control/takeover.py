@@ -191,7 +191,7 @@ class Takeover:
                 continue
             new = self._look_until is not None and (
                 seen.came > self._look_until - settings.takeover_timeout)
-            if self._around.steady() - seen.came > _RECENT or (
+            if not self._is_current(seen, settings) or (
                     name in self._doubted and not new):
                 if not settings.takeover_timeout:
                     continue
@@ -201,6 +201,11 @@ class Takeover:
         self._settle()
         return True
 
+    def _is_current(self, seen: Seen, settings: Settings) -> bool:
+        """Return whether a sample has come lately, or time has stood still since."""
+        return self._around.steady() - seen.came <= _RECENT or self._around.one_clock() and (
+            abs(self._around.clock() - seen.stamp) <= settings.takeover_max_age)
+
     def _is_over(self, name: str, seen: Seen, settings: Settings) -> bool:
         """Wait for a new sample; return True after a vain wait, or refuse to continue without."""
         steady = self._around.steady()
@@ -208,13 +213,13 @@ class Takeover:
             self._look_until = steady + settings.takeover_timeout
         if steady <= self._look_until:
             return False
-        silence = steady - seen.came
         self._settle(keep=name)
-        if silence <= _RECENT:
+        if self._is_current(seen, settings):
             return True
+        silence = (steady - seen.came) / NANOSECONDS
         raise RefusedError(
             Code.UNSEEN,
-            f'no sample of joint {name} for {silence / NANOSECONDS:.1f} s, though there were '
+            f'no sample of joint {name} for {silence:.1f} s, though there were '
             'some and joint_states has a publisher: expected one before the actuator is moved; '
             'repair the sensor, or end its publisher')
 
