@@ -56,7 +56,7 @@ def state(ros):
     return ros.call(GetState, 'example/get_state').current_state.id
 
 
-def test_a_node_starts_by_itself_and_goes_through_all_states(ros, serve):
+def test_a_node_starts_by_itself_and_goes_through_all_states(ros, serve, capfd):
     served = serve(Example)
     node = served.nodes[0]
     assert node.done == ['configure', 'activate']
@@ -75,6 +75,9 @@ def test_a_node_starts_by_itself_and_goes_through_all_states(ros, serve):
     assert node.active
     assert node.done == [
         'configure', 'activate', 'deactivate', 'cleanup', 'configure', 'activate']
+    node.refuse.add('deactivate')
+    assert not change(ros, Transition.TRANSITION_DEACTIVATE)
+    assert 'cannot deactivate: deactivate is not wanted' in capfd.readouterr().err
 
 
 class Asked(Example):

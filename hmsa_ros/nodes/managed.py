@@ -189,6 +189,8 @@ class ManagedNode(LifecycleNode):
             transition()
             if self._refusal is not None:
                 raise self._refusal
+        # Why a later one is refused is in the log alone.
+        self._autostart = False
 
     # -- transitions ---------------------------------------------------------------------------
 
