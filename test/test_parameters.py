@@ -255,10 +255,13 @@ def test_small_number_as_ros2_param_load_reads_it_is_taken(ros, serve):
 
 
 @pytest.mark.ros
-def test_former_name_is_refused_with_the_present_one(ros, serve):
+def test_former_or_misspelt_name_is_refused_with_the_present_one(ros, serve):
     node, = serve(PlannerNode).nodes
     result, = ros.set_parameters('planner', [Parameter('law', value='yeoh')])
     assert result.reason == 'parameter law has been renamed: expected law.name'
+    result, = ros.set_parameters('planner', [Parameter('lead_tine', value=0.1)])
+    assert result.reason == (
+        'parameter lead_tine does not exist: expected one of the planner, such as lead_time')
 
 
 @pytest.mark.ros

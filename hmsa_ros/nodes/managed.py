@@ -26,7 +26,13 @@ from hmsa_ros.interfaces.parameters import ParameterSpec
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import to_diagnostics
 from hmsa_ros.nodes.outlet import Outlet
-from hmsa_ros.nodes.parameters import check_former_names, check_names, checked, declare
+from hmsa_ros.nodes.parameters import (
+    check_former_names,
+    check_names,
+    checked,
+    declare,
+    unknown,
+)
 
 AUTOSTART = ParameterSpec(
     'autostart', True,
@@ -309,6 +315,10 @@ class _CarefulParameterService(ParameterService):
     def _set_parameters_atomically_callback(self, request: Any, response: Any) -> Any:
         try:
             check_former_names(x.name for x in request.parameters)
+            for x in request.parameters:
+                if not self._get_node().has_parameter(x.name):
+                    # rclpy does not say which one.
+                    raise unknown(self._get_node(), x.name)
             return super()._set_parameters_atomically_callback(request, response)
         except Exception as error:  # rclpy raises errors of several unrelated classes here
             response.result = SetParametersResult(

@@ -189,24 +189,29 @@ def check_names(node: Node) -> None:
 
     """
     # Files may have sections for several nodes: names of other nodes of the package pass.
-    unknown = [x for x in node._parameter_overrides
+    strange = [x for x in node._parameter_overrides
                if not node.has_parameter(x) and not x.startswith('qos_overrides.')
                # Parameters of the driver's hardware class.
                and 'hardware' not in x.split('.')[:2]]
-    if not unknown:
+    if not strange:
         return
     others = {spec.name for name in topics.NODES
               for spec in import_module(f'hmsa_ros.nodes.{name}').PARAMETERS} | _ONCE
     joints = node.get_parameter('joints').value or () if node.has_parameter('joints') else None
-    for name in unknown:
+    for name in strange:
         joint, _, rest = name.partition('.')
         # A recorder has no parameter that lists the joints.
         if name in others or rest in others and (joints is None or joint in joints):
             continue
-        near = difflib.get_close_matches(name, [*node._parameters, *others], 1, 0.0)
-        raise BadInputError(
-            f'parameter {name} does not exist: expected one of the {node.get_name()}, such as '
-            f'{near[0]}')
+        raise unknown(node, name, others)
+
+
+def unknown(node: Node, name: str, others: Iterable[str] = ()) -> BadInputError:
+    """Return why a parameter is none of a node, with the nearest that it or others have."""
+    near = difflib.get_close_matches(name, [*node._parameters, *others], 1, 0.0)
+    return BadInputError(
+        f'parameter {name} does not exist: expected one of the {node.get_name()}, such as '
+        f'{near[0]}')
 
 
 JOINTS = ParameterSpec(
