@@ -251,7 +251,10 @@ def test_it_plays_while_it_is_active(ros, play, tmp_path):
 
     assert change(Transition.TRANSITION_CONFIGURE)
     ros.spin_until(lambda: ros.node.count_publishers('/a'), 'the publisher')
-    assert not ros.call(Trigger, 'player/resume').success
+    for name in ('resume', 'play_next'):
+        answer = ros.call(Trigger, f'player/{name}')
+        assert not answer.success
+        assert answer.message == 'the player is inactive: expected an active one'
     assert not got
     assert change(Transition.TRANSITION_ACTIVATE)
     ros.spin_until(lambda: len(got) > 10, 'messages')

@@ -345,14 +345,20 @@ class Player(ManagedNode):
         self.offer(topics.STOP, self._on_stop)
         self.diagnose(self._report)
 
+    @property
+    def _inactive(self) -> str:
+        return f'the player is {self.state}: expected an active one'
+
     def _set_paused(self, paused: bool) -> tuple[bool, str]:
         if not self.active:
-            return False, f'the player is {self.state}: expected an active one'
+            return False, self._inactive
         self._transport.set_paused(paused)
         return True, 'paused' if paused else 'playing'
 
     def _on_play_next(self) -> tuple[bool, str]:
-        if not self.active or not self._transport.paused or self._transport.stopped:
+        if not self.active:
+            return False, self._inactive
+        if not self._transport.paused or self._transport.stopped:
             return False, 'not paused: expected a paused player; call pause first'
         sent = self._transport.step(1.0)
         return sent, 'sent' if sent else 'none was due: playing has not begun, or has ended'
