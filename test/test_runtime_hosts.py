@@ -398,7 +398,7 @@ def test_samples_that_cease_are_named_when_they_do_and_when_they_come_again():
 
 @pytest.mark.parametrize(('lag', 'text'), [
     (600, 'come 0.600 s after their timestamps'), (-600, 'come 0.600 s before their timestamps'),
-    (-100, 'stamped 0.100 s ahead of the clock of the planner'),
+    (-100, 'are 0.100 s ahead of the clock of the planner'),
     (1_700_000_000_000, 'simulated time, or time since a start')])
 def test_samples_of_another_clock_are_refused_and_the_clocks_are_named(lag, text):
     rig = Rig(settings=PATIENT)
