@@ -50,8 +50,10 @@ def find(path: Path, problem: _Problem) -> tuple[list[Path], metadata.BagMetadat
                 f'{path} holds an SQLite bag ({others[0]}): expected MCAP; convert it with '
                 '"ros2 bag convert"')
         inside = sorted(x.parent for x in path.glob('*/*.mcap'))
+        links = [x for x in entries if x.suffix == '.mcap' and x.is_file()]
         raise BadInputError(f'{path} holds no .mcap file: expected a bag' + (
-            f', such as {inside[0]}' if inside else ''))
+            f', such as {inside[0]}' if inside else
+            f'; name {links[0]}, a link out of the folder, to read it' if links else ''))
     stems = dict.fromkeys(_order(x)[0] for x in present)
     if len(stems) > 1:
         raise BadInputError(
