@@ -31,7 +31,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 .DELETE_ON_ERROR:
 
 .PHONY: help
-help: ## say what there is (default)
+help: ## list the targets (default)
 	@sed -n 's/^\([a-z]*\):.*## /\1	/p' $(MAKEFILE_LIST) | expand -t 14
 	@echo "Variables: PYTHON=$(PYTHON) VENV=$(VENV) ARGS='$(ARGS)'"
 
@@ -50,7 +50,7 @@ full: tools ## run the gate with the slow tests too and random examples, as befo
 	$(PYTEST) --hypothesis-profile full $(ARGS)
 
 .PHONY: check
-check: tools ## run what needs no nodes of the gate: ruff, mypy, tests of the rest
+check: tools ## run the part of the gate that needs no nodes: ruff, mypy, pytest
 	$(BIN)/python -m ruff check .
 	$(PYTEST) -m 'not slow and not ros' $(ARGS)
 
@@ -68,11 +68,11 @@ docs: tools ## build the documentation into docs/_build/html, warnings as errors
 	@echo "docs/_build/html/index.html"
 
 .PHONY: graph
-graph: tools ## draw docs/images/graph.svg anew, when a topic has changed
+graph: tools ## redraw docs/images/graph.svg, when a topic has changed
 	$(BIN)/python scripts/draw_graph.py
 
 .PHONY: pictures
-pictures: tools ## draw the pictures of the documentation anew
+pictures: tools ## redraw the pictures of the documentation
 	$(BIN)/python scripts/draw_docs.py $(ARGS)
 
 .PHONY: release
@@ -82,7 +82,7 @@ release: env ## build sdist and wheels into dist/, and test them in empty enviro
 	$(BIN)/python scripts/make_release.py $(ARGS)
 
 .PHONY: constraints
-constraints: ## write constraints.txt anew, with each of $(PYTHONS)
+constraints: ## rewrite constraints.txt, with each of $(PYTHONS)
 	$(PYTHON) scripts/make_constraints.py $(PYTHONS)
 
 .PHONY: clean
