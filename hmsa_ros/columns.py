@@ -178,6 +178,6 @@ def _places(
                    if name == 'stretch' else ', '.join(known)))
         factor = known[unit]
         if factor != 1.0:
-            notes.append(f'{name} was converted from {unit} according to the header')
+            notes.append(f'column {cell} was converted to SI units')
         places[name] = place, factor
     return places, notes

@@ -159,7 +159,7 @@ def test_levels_sampled_beside_the_stretch_serve_with_semicolons_and_units(folde
     found = json.loads(out)
     x = found['parameters']['shear_modulus']
     assert abs(x['value'] - BLOCK.shear_modulus) < 4.0 * x['std']
-    for word in ('from ms', 'from mt', 'is estimated too'):
+    for word in ('column time [ms] was', 'column flux_density [mT] was', 'is estimated too'):
         assert any(word in note for note in found['warnings'])
 
 
@@ -234,7 +234,7 @@ def test_files_of_spreadsheets_are_read(folder, capsys, encoding, micro):
     (folder / 'camera.csv').write_text(text, encoding=encoding)
     status, out, _ = identify(capsys, 'camera.csv', '--commands', 'levels.csv', '--json')
     assert status == 0
-    assert 'from µs' in json.loads(out)['warnings'][0]
+    assert f'column time [{micro}s] was converted' in json.loads(out)['warnings'][0]
 
 
 def test_a_few_samples_of_nothing_are_no_other_unit(folder, capsys):

@@ -95,7 +95,7 @@ def read_csv(
     # Subtract the first time: seconds since an epoch leave few digits for differences.
     return Recording(
         time - time[:1], stretch, times - time[:1], levels, slew_limit, earlier, str(path),
-        tuple(notes), coordinate)
+        tuple(dict.fromkeys(notes)), coordinate)
 
 
 def _kept(path: Path, table: Table, notes: list[str]) -> NDArray[np.int64]:
