@@ -9,9 +9,9 @@ import numpy as np
 from scipy.constants import mu_0
 from scipy.integrate import solve_ivp
 
+from hmsa_ros.control.environment import Environment
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import EstimateChanged, Send, Settings, StatusChanged, Target
-from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Options, Planner
@@ -106,7 +106,7 @@ class Bench:
                 flux_density_min=-limit, flux_density_max=limit, lead_time=lead))}),
             Settings(**{'takeover_timeout': 0, 'heartbeat_period': 0, 'feedback': 'adapt',
                         **settings}),
-            Surroundings(clock=lambda: self.now, steady=lambda: self.now))
+            Environment(clock=lambda: self.now, steady=lambda: self.now))
         self.runtime.active = True
 
     @property

@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
+from hmsa_ros.control.environment import Environment
 from hmsa_ros.control.goals import ErrorCode, Goals
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import Send, Settings, StatusChanged, Stop, Target, Trajectory
-from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.model.actuators import Setup
 from hmsa_ros.model.parameters import paper_actuator
@@ -33,7 +33,7 @@ class Bench:
         options = Options(flux_density_min=-0.5, flux_density_max=0.5)
         self.runtime = PlannerRuntime(
             PlannerGroup({x: Planner(block, options) for x in joints}),
-            Settings(takeover_timeout=0), Surroundings(
+            Settings(takeover_timeout=0), Environment(
                 clock=lambda: self.now, steady=lambda: self.now,
                 observable=lambda: self.measured))
         self.runtime.active = True

@@ -8,9 +8,9 @@ from core_oracle import follow
 import numpy as np
 import pytest
 
+from hmsa_ros.control.environment import Environment
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import Note, Send, Settings, Severity, StatusChanged, Trajectory
-from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.control.weighing import worthwhile
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.planning.group import PlannerGroup
@@ -39,7 +39,7 @@ class Bench:
         self.group = PlannerGroup({'a': Planner(self.block, Options(
             shaper, flux_density_min=-LIMIT, flux_density_max=LIMIT, lead_time=lead))})
         self.runtime = PlannerRuntime(
-            self.group, settings, Surroundings(clock=lambda: self.now, steady=lambda: 0))
+            self.group, settings, Environment(clock=lambda: self.now, steady=lambda: 0))
         self.runtime.active = True
         self.ahead, self.applied, self.outputs, self.sent = [], [(0, 0.0)], [], []
         self.number = 0

@@ -10,6 +10,7 @@ import random
 import numpy as np
 import pytest
 
+from hmsa_ros.control.environment import Environment
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import (
     EstimateChanged,
@@ -19,7 +20,6 @@ from hmsa_ros.control.records import (
     StatusChanged,
     Trajectory,
 )
-from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.judge.records import Sensor
@@ -62,7 +62,7 @@ class Drawn:
             PlannerGroup({'a': Planner(block, Options(
                 flux_density_min=-0.5, flux_density_max=0.5, lead_time=50 * MS))}),
             Settings(takeover_timeout=0, feedback=more.choice(['off', 'off', 'adapt'])),
-            Surroundings(clock=lambda: self.now, steady=lambda: self.now))
+            Environment(clock=lambda: self.now, steady=lambda: self.now))
         self.runtime.active = True
         hold = draw.choice([20, 60, 100, 200]) * MS
         self.late_for = draw.choice([20, 100, 400]) * MS

@@ -11,9 +11,9 @@ from scipy.interpolate import CubicHermiteSpline
 
 from hmsa_ros import Actuator
 from hmsa_ros.cli import main
+from hmsa_ros.control.environment import Environment
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import Settings, Severity, Trajectory
-from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.model.status import Code, RefusedError
@@ -240,7 +240,7 @@ def test_a_planner_follows_velocities_only_in_mode_path():
         group = PlannerGroup({'a': Planner(paper_actuator(), Options(
             flux_density_min=-0.5, flux_density_max=0.5))})
         runtime = PlannerRuntime(
-            group, Settings(trajectory_mode=mode, takeover_timeout=0), Surroundings(
+            group, Settings(trajectory_mode=mode, takeover_timeout=0), Environment(
                 clock=lambda: SECOND, steady=lambda: 0))
         runtime.active = True
         assert runtime.request(request).severity in (severity, Severity.OK)
@@ -260,7 +260,7 @@ def test_a_path_begins_soon_though_planning_takes_time():
     group = PlannerGroup({'a': Planner(paper_actuator(), Options(
         flux_density_min=-0.5, flux_density_max=0.5, lead_time=5_000_000))})
     runtime = PlannerRuntime(
-        group, Settings(trajectory_mode='path', takeover_timeout=0), Surroundings(
+        group, Settings(trajectory_mode='path', takeover_timeout=0), Environment(
             clock=clock, steady=lambda: 0))
     runtime.active = True
     runtime.request(Trajectory(

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 from test_runtime_planner import HOLD, LEAD, MS, PATIENT, QUIET, Rig, SEQUENCE, START, trajectory
 
+from hmsa_ros.control.environment import Seen
 from hmsa_ros.control.records import Severity, Stop, Target
-from hmsa_ros.control.surroundings import Seen
 
 BEATING = replace(QUIET, heartbeat_period=200 * MS)
 
@@ -16,7 +16,7 @@ class Bench(Rig):
 
     def __init__(self, *, settings=BEATING, **options):
         super().__init__(settings=settings, **options)
-        self.runtime.surroundings.glance = self.glance
+        self.runtime.environment.glance = self.glance
         self.ahead = 0  # lead of the device's clock
         self.linked = True
         self.cut = False
@@ -102,7 +102,7 @@ def test_a_device_that_is_not_heard_any_more_is_sent_nothing_and_named():
 
 def test_a_device_that_comes_late_is_not_put_on_a_level_in_one_step():
     rig = Rig(settings=BEATING)
-    rig.runtime.surroundings.glance = lambda: [('a', Seen(
+    rig.runtime.environment.glance = lambda: [('a', Seen(
         rig.now, rig.plant.stretch, rig.plant.rate, rig.plant.flux_density, 0))]
     rig.found = False
     rig.runtime.request(trajectory((1.1, HOLD)))
@@ -145,7 +145,7 @@ def test_a_device_that_begins_anew_is_not_put_on_a_level_in_one_step(outage, beg
 
 def test_a_device_in_slow_motion_is_heard_again_after_a_silence():
     rig = Bench()
-    rig.runtime.surroundings.one_clock = lambda: True
+    rig.runtime.environment.one_clock = lambda: True
     rig.runtime.request(trajectory((1.2, HOLD)))
 
     def pass_slowly(seconds):
@@ -254,7 +254,7 @@ def test_after_a_cut_off_a_request_waits_until_the_device_hears(deaf):
 
 def test_a_device_that_dds_has_lost_and_found_is_not_a_new_one():
     rig = Bench()
-    rig.runtime.surroundings.reporters = lambda joint: frozenset({b'one'} if rig.found else ())
+    rig.runtime.environment.reporters = lambda joint: frozenset({b'one'} if rig.found else ())
     rig.runtime.request(trajectory((1.2, 400 * MS), (1.4, 60_000 * MS)))
     rig.run(START + 1500 * MS)
     rig.cut_off()
@@ -358,7 +358,7 @@ def test_a_move_does_not_start_where_samples_have_ceased():
 
 def test_a_request_is_taken_while_simulated_time_stands_still():
     rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS))
-    rig.runtime.surroundings.one_clock = lambda: True
+    rig.runtime.environment.one_clock = lambda: True
     rig.runtime.request(Target('a', 1.2))
     rig.run(START + 1000 * MS)
     rig.runtime.request(Target('a', 1.3))

@@ -5,6 +5,7 @@ import math
 
 import pytest
 
+from hmsa_ros.control.environment import Environment
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import (
     Note,
@@ -17,7 +18,6 @@ from hmsa_ros.control.records import (
     Target,
     Trajectory,
 )
-from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.model.equations import natural_frequency
 from hmsa_ros.model.parameters import paper_actuator
@@ -61,7 +61,7 @@ class Rig:
         self.group = PlannerGroup({
             x: Planner(block, self.options) for x, block in self.blocks.items()})
         self.runtime = PlannerRuntime(
-            self.group, settings, Surroundings(
+            self.group, settings, Environment(
                 clock=self.clock, steady=self.look, observable=lambda: self.observable,
                 unheard=lambda: self.unheard, found=lambda joint: self.found))
         self.runtime.active = True
@@ -654,7 +654,7 @@ def test_a_device_that_takes_over_from_another_is_sent_no_level_of_before(receip
     if receipts:
         rig.runtime.received('a', rig.now, 0, cut_off=False)
     reporters = {b'old'}
-    rig.runtime.surroundings.reporters = lambda joint: frozenset(reporters)
+    rig.runtime.environment.reporters = lambda joint: frozenset(reporters)
     rig.runtime.request(trajectory(*SEQUENCE))
     rig.run(START + LEAD + 20 * MS)
     assert rig.status.progress.state != 'idle'

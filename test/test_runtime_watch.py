@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from hmsa_ros.control import holds
+from hmsa_ros.control.environment import Environment
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import Note, Send, Settings, StatusChanged, Trajectory
-from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.judge import judging
@@ -44,7 +44,7 @@ class Loop:
         self.unheard = ''
         self.runtime = PlannerRuntime(
             PlannerGroup({'a': Planner(block, options)}),
-            Settings(takeover_timeout=0, **changes), Surroundings(
+            Settings(takeover_timeout=0, **changes), Environment(
                 clock=lambda: self.now, steady=lambda: self.now,
                 observable=lambda: rate > 1, unheard=lambda: self.unheard))
         self.runtime.active = True
@@ -349,7 +349,7 @@ def test_judging_several_joints_does_not_keep_commands_waiting(monkeypatch):
     runtime = PlannerRuntime(
         PlannerGroup({x: Planner(block, Options(
             flux_density_min=-0.5, flux_density_max=0.5)) for x in names}),
-        Settings(takeover_timeout=0), Surroundings(
+        Settings(takeover_timeout=0), Environment(
             clock=lambda: now, steady=lambda: now + cost, observable=lambda: True,
             unheard=lambda: ''))
     runtime.active = True

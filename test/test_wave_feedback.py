@@ -9,9 +9,9 @@ from test_path import C1, force, LOAD, TIME, ZETA
 
 from hmsa_ros import Actuator
 from hmsa_ros.api.paths import smooth_points, wave_of, wave_path, wave_points
+from hmsa_ros.control.environment import Environment
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import Send, Settings, StatusChanged, Stop, Trajectory
-from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Options, Planner
@@ -67,8 +67,8 @@ class Run:
         self.runtime = PlannerRuntime(
             PlannerGroup({'a': self.planner}),
             Settings(takeover_timeout=0, heartbeat_period=0, feedback=feedback),
-            Surroundings(clock=lambda: self.now, steady=lambda: self.now))
-        self.runtime.active, self.runtime.surroundings.one_clock = True, lambda: True
+            Environment(clock=lambda: self.now, steady=lambda: self.now))
+        self.runtime.active, self.runtime.environment.one_clock = True, lambda: True
         self.sent, self.codes, self.truth = [], [], []
         self._random = np.random.default_rng(1)
         path = [((tuple(x),), round(t * SECOND)) for t, *x in rows.tolist()]

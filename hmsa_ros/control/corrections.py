@@ -8,11 +8,11 @@ import math
 import numpy as np
 
 from hmsa_ros.control.feedback import Feedback
+from hmsa_ros.control.joint import Joint
 from hmsa_ros.control.learnt import alike, as_of_path, believed, learnt_model
 from hmsa_ros.control.ledger import Moves
 from hmsa_ros.control.records import Severity, Verdict
 from hmsa_ros.control.slices import Clock, replanning, Work
-from hmsa_ros.control.tracked import Joint
 from hmsa_ros.control.weighing import LEAST_STEP, step_of
 from hmsa_ros.estimation import Estimate
 from hmsa_ros.estimation.correction import (

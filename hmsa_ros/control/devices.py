@@ -3,10 +3,10 @@
 from collections.abc import Callable, Iterable, Mapping
 import math
 
+from hmsa_ros.control.environment import Environment
 from hmsa_ros.control.following import Following
 from hmsa_ros.control.receipts import Receipts
 from hmsa_ros.control.records import Output, Send, Settings, Severity, Verdict
-from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.control.takeover import Takeover
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
@@ -37,9 +37,9 @@ class Devices:
 
     def __init__(
             self, planners: Mapping[str, Planner], receipts: Receipts, following: Following,
-            takeover: Takeover, surroundings: Surroundings, outputs: list[Output]) -> None:
+            takeover: Takeover, environment: Environment, outputs: list[Output]) -> None:
         self._planners, self._following, self._takeover = planners, following, takeover
-        self.receipts, self._around = receipts, surroundings
+        self.receipts, self._around = receipts, environment
         #: Delivers a command immediately, before any other work.
         self.deliver: Callable[[Send], None] = outputs.append
         self.sent = self.heartbeats = 0

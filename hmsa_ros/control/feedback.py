@@ -4,12 +4,12 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
-from hmsa_ros.control.aside import ANSWER, Awaited, Doing, goes_on, here
 from hmsa_ros.control.holds import Hold
+from hmsa_ros.control.joint import as_held, Joint, RESTING
 from hmsa_ros.control.learnt import alike, save
+from hmsa_ros.control.offload import ANSWER, Awaited, Doing, goes_on, here
 from hmsa_ros.control.records import EstimateChanged, Output, Settings, Severity
 from hmsa_ros.control.slices import Clock
-from hmsa_ros.control.tracked import as_held, Joint, RESTING
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation.words import differences
 from hmsa_ros.judge.records import Sensor

@@ -10,8 +10,8 @@ import numpy as np
 from hmsa_ros.control.lateness import Lateness
 from hmsa_ros.control.receipts import Receipts
 from hmsa_ros.control.records import Settings, Severity, Verdict
-from hmsa_ros.control.seldom import Seldom
 from hmsa_ros.control.slices import Clock, replanning, Work
+from hmsa_ros.control.throttle import Throttle
 from hmsa_ros.control.weighing import (
     aims,
     compared,
@@ -61,7 +61,7 @@ class Following:
         self._looked = 0, 0
         self._ages: dict[str, int] = {}
         self._found: dict[str, Resumption] = {}
-        self._late_due, self._foreign_due, self.replanned_due = Seldom(), Seldom(), Seldom()
+        self._late_due, self._foreign_due, self.replanned_due = Throttle(), Throttle(), Throttle()
 
     def restart(self) -> None:
         """Discard the state of plans that are dropped."""

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from hmsa_ros.control.aside import ANSWER, Awaited, Doing, here
+from hmsa_ros.control.offload import ANSWER, Awaited, Doing, here
 from hmsa_ros.judge.judging import ENOUGH, judge
 from hmsa_ros.judge.records import (
     Finding,

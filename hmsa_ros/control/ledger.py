@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field, replace
 import math
 
-from hmsa_ros.control.aside import Awaited
 from hmsa_ros.control.holds import Hold
+from hmsa_ros.control.offload import Awaited
 from hmsa_ros.judge.records import Finding, Sensor, Setpoint
 from hmsa_ros.model.equations import equilibrium_stretch
 from hmsa_ros.planning.timeline import Model, Plan

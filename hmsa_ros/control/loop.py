@@ -8,9 +8,9 @@ the time, the applied levels and the samples.
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from hmsa_ros.control.environment import Environment
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import Output, Send, Settings
-from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import PlannerGroup
@@ -63,7 +63,7 @@ class Loop:
         self.now = device.time  #: in ns
         self.device = device
         self.runtime = PlannerRuntime(
-            group, settings, Surroundings(
+            group, settings, Environment(
                 clock=lambda: self.now, steady=lambda: self.now, one_clock=lambda: True))
         self.runtime.active = True
         #: Called with each output of the controller.

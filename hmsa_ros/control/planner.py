@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 import math
 
-from hmsa_ros.control.bulletin import Bulletin, LOOK
 from hmsa_ros.control.checks import check_joints, check_ready
 from hmsa_ros.control.corrections import Corrections
 from hmsa_ros.control.devices import Devices
+from hmsa_ros.control.environment import Environment, Seen
 from hmsa_ros.control.feedback import Feedback
 from hmsa_ros.control.following import Following
 from hmsa_ros.control.planning import Planning
@@ -28,11 +28,11 @@ from hmsa_ros.control.records import (
     Trajectory,
     Verdict,
 )
-from hmsa_ros.control.seldom import Seldom
+from hmsa_ros.control.reporting import LOOK, Reporting
 from hmsa_ros.control.silence import Silence
 from hmsa_ros.control.slices import SLICE
-from hmsa_ros.control.surroundings import Seen, Surroundings
 from hmsa_ros.control.takeover import Takeover
+from hmsa_ros.control.throttle import Throttle
 from hmsa_ros.control.watching import Watch
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
@@ -51,7 +51,7 @@ class PlannerRuntime:
     """Plan requests in slices, send commands in time and track their effects."""
 
     def __init__(
-            self, group: PlannerGroup, settings: Settings, surroundings: Surroundings) -> None:
+            self, group: PlannerGroup, settings: Settings, environment: Environment) -> None:
         self.group = group
         self.settings = settings
         self._prepare()
@@ -64,8 +64,8 @@ class PlannerRuntime:
 
         def clock() -> int:
             # A clock that is set continues unchanged until that is processed.
-            return surroundings.clock() - self._stepped
-        around = self.surroundings = replace(surroundings, clock=clock)
+            return environment.clock() - self._stepped
+        around = self.environment = replace(environment, clock=clock)
         self._clock, self._steady = clock, around.steady
         self._outputs: list[Output] = []
         receipts = Receipts(around.steady)
@@ -78,17 +78,17 @@ class PlannerRuntime:
         self._watch = Watch(group, around, self.feedback)
         self.devices = Devices(
             group.planners, receipts, self.following, self._takeover, around, self._outputs)
-        self._bulletin = Bulletin(
+        self._reporting = Reporting(
             group, self.following, self._watch, around, self._outputs, self._note,
             lambda: around.unheard() or receipts.words, self._unseen)
         self.planning = Planning(
-            group, self.following, Corrections(self.feedback, clock), self._bulletin,
+            group, self.following, Corrections(self.feedback, clock), self._reporting,
             around, lambda: self.devices.send(clock()))
         self._next_beat = 0  # time in ns of the next heartbeat
         self._last_jump: int | None = None
         self._set_back = 0
         self._differ = False  # whether a clock offset was reported
-        self._impossible_due = Seldom()
+        self._impossible_due = Throttle()
 
     def _note(self, words: str) -> None:
         self._outputs.append(Note(Severity.WARN, words))
@@ -128,7 +128,7 @@ class PlannerRuntime:
         if self._set_back:
             # The clock was set back during planning, so the planned times are invalid.
             return self.request(request)
-        return _WAITING if work in self.planning else self._bulletin.verdict
+        return _WAITING if work in self.planning else self._reporting.verdict
 
     def _check(self, request: Request) -> None:
         """Have joints that are to move now checked; a stop does not wait."""
@@ -142,7 +142,7 @@ class PlannerRuntime:
             x for x in request.joints if not (later and self.group.planners[x].moves(now)))
 
     def _look_at_samples(self) -> None:
-        for joint, seen in self.surroundings.glance():
+        for joint, seen in self.environment.glance():
             self._takeover.observe(joint, seen)
             self._silence.record(joint, seen.stamp)
 
@@ -177,8 +177,8 @@ class PlannerRuntime:
     def _drop(self, verdict: Verdict | None) -> None:
         """Report that a plan was dropped, if there is a verdict."""
         if verdict is not None:
-            self._bulletin.show()
-            self._bulletin.go_on(verdict, log=True)
+            self._reporting.show()
+            self._reporting.go_on(verdict, log=True)
 
     def applied(self, joint: str, stamp: int, flux_density: float) -> None:
         """Record that a joint's level in T was in force from a timestamp in ns on."""
@@ -215,7 +215,7 @@ class PlannerRuntime:
         if self._takeover.waiting or not self._takeover.engaged:
             self._takeover.observe(joint, Seen(
                 stamp, stretch, rate, flux_density,
-                None if self.surroundings.one_clock() else came - stamp))
+                None if self.environment.one_clock() else came - stamp))
         self._watch.add(joint, stamp, stretch)
         if joint in self.feedback.joints:
             self.feedback.joints[joint].add(stamp, stretch, flux_density, came)
@@ -261,11 +261,11 @@ class PlannerRuntime:
             for request in requests:
                 # It was being planned for times that are now invalid.
                 self.planning.add(request, engaged=self._takeover.engaged)
-            self._bulletin.show()
+            self._reporting.show()
         last, self._last_jump = self._last_jump, self._steady()
         if last is not None and self._last_jump - last < _STORM:
             return
-        self._bulletin.go_on(Verdict(
+        self._reporting.go_on(Verdict(
             Severity.WARN, Code.CLOCK_JUMPED,
             f'the clock jumped back by {back / NANOSECONDS:.3f} s: the plan is dropped, and the '
             'actuator is assumed where it began, at initial_stretch, unless joint_states shows '
@@ -287,7 +287,7 @@ class PlannerRuntime:
             self.planning.clear()
             self.devices.send(now, everything=True)
             self._watch.restart()
-            self._bulletin.give(Verdict(Severity.OK, Code.STOPPED, 'deactivated: coming to rest'))
+            self._reporting.give(Verdict(Severity.OK, Code.STOPPED, 'deactivated: coming to rest'))
         self._takeover.engaged = False
 
     def change(
@@ -331,7 +331,7 @@ class PlannerRuntime:
         now = self._clock()
         times = [
             None if self.devices.all_silent else self.group.next_command(),
-            self._bulletin.next_change, self._bulletin.preview_again, self._watch.wake(now),
+            self._reporting.next_change, self._reporting.preview_again, self._watch.wake(now),
             self.feedback.wake]
         if self.settings.heartbeat_period:
             times.append(self._next_beat)
@@ -354,13 +354,13 @@ class PlannerRuntime:
         estimated = self._send(now) and self.feedback.update(now)
         if not estimated:
             self._work_on()
-        if self._bulletin.preview_again is not None and now >= self._bulletin.preview_again:
-            self._bulletin.show()
-        self._bulletin.report_progress(now)
+        if self._reporting.preview_again is not None and now >= self._reporting.preview_again:
+            self._reporting.show()
+        self._reporting.report_progress(now)
         if self.active and (
-                self._watch.open or self._bulletin.unheard or self._bulletin.unseen
-                or self.devices.receipts or self._bulletin.next_change is not None):
-            self._bulletin.look_for_listeners()
+                self._watch.open or self._reporting.unheard or self._reporting.unseen
+                or self.devices.receipts or self._reporting.next_change is not None):
+            self._reporting.look_for_listeners()
             if not estimated:
                 self._judge(now)
         self._process_clock()
@@ -437,18 +437,18 @@ class PlannerRuntime:
         """Judge arrivals from samples."""
         if not self._watch.open:
             return
-        end, observable = self._steady() + SLICE, self.surroundings.observable()
+        end, observable = self._steady() + SLICE, self.environment.observable()
         while self._steady() < end:
             finding = self._watch.judge(
                 now, self.settings.tolerances, end, observable=observable)
             if finding is not None or not self._watch.open:
-                self._bulletin.found(finding)
+                self._reporting.found(finding)
             if finding is None:
                 break
 
     def _report_ended(self, words: str) -> None:
         """Report why feedback of a joint has ended."""
-        self._bulletin.go_on(Verdict(Severity.WARN, Code.FEEDBACK_ENDED, words), log=True)
+        self._reporting.go_on(Verdict(Severity.WARN, Code.FEEDBACK_ENDED, words), log=True)
 
     def report(self) -> tuple[Severity, str, dict[str, object]]:
         """Return the state of the commands: severity, message and counters."""
@@ -460,9 +460,9 @@ class PlannerRuntime:
         elif clocks:
             severity, message = Severity.WARN, clocks
         if self.active:
-            self._bulletin.look_for_listeners()
-        if self._bulletin.unseen:
-            severity, message = Severity.WARN, self._bulletin.unseen
+            self._reporting.look_for_listeners()
+        if self._reporting.unseen:
+            severity, message = Severity.WARN, self._reporting.unseen
         if receipts.words:
             severity, message = Severity.ERROR, receipts.words
         if clocks and not self._differ:

@@ -3,12 +3,12 @@
 from collections import deque
 from collections.abc import Callable, Mapping
 
-from hmsa_ros.control.bulletin import Bulletin
 from hmsa_ros.control.corrections import Corrections
+from hmsa_ros.control.environment import Environment
 from hmsa_ros.control.following import Following
 from hmsa_ros.control.records import Note, Request, Severity, Verdict
+from hmsa_ros.control.reporting import Reporting
 from hmsa_ros.control.slices import SLICE, Work, work_on
-from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.group import PlannerGroup
@@ -23,10 +23,10 @@ class Planning:
 
     def __init__(
             self, group: PlannerGroup, following: Following, corrections: Corrections,
-            bulletin: Bulletin, surroundings: Surroundings, send: Callable[[], None]) -> None:
-        self._group, self._following, self._bulletin = group, following, bulletin
+            reporting: Reporting, environment: Environment, send: Callable[[], None]) -> None:
+        self._group, self._following, self._reporting = group, following, reporting
         self._corrections = corrections
-        self._around, self._send = surroundings, send
+        self._around, self._send = environment, send
         self._queue: deque[Work] = deque()
         # Parts of replaced plans: freeing all at once takes tens of ms.
         self._leftovers: list[object] = []
@@ -70,7 +70,7 @@ class Planning:
             if old.number < work.number and old.joints <= work.joints and not work.postponed:
                 self._queue.remove(old)
                 if old.request is not None:
-                    self._bulletin.give(Verdict(
+                    self._reporting.give(Verdict(
                         Severity.WARN, Code.SUPERSEDED, 'another request came before this one was '
                         'planned', old.request.name))
 
@@ -88,7 +88,7 @@ class Planning:
             if self.advance(work) and work in self._queue:
                 self._queue.remove(work)
         while self._following.verdicts:
-            self._bulletin.go_on(self._following.verdicts.pop(0))
+            self._reporting.go_on(self._following.verdicts.pop(0))
 
     def advance(self, work: Work) -> bool:
         """Continue one piece of work; return whether it is done."""
@@ -100,9 +100,9 @@ class Planning:
             found = end.value
         except HmsaError as error:
             if work.corrects:
-                self._bulletin.note(f'plan not corrected: {error}')
+                self._reporting.note(f'plan not corrected: {error}')
             elif work.request is None:
-                self._bulletin.go_on(self._following.abandon(work, error), log=True)
+                self._reporting.go_on(self._following.abandon(work, error), log=True)
             else:
                 self.refuse(error, work.request)
             return True
@@ -126,19 +126,19 @@ class Planning:
         """Start to carry out a request."""
         self._following.dropped(drafts)
         changed = self._group.take(drafts, now)
-        self._bulletin.take_goals(request)
+        self._reporting.take_goals(request)
         # Commands are sent first, since reporting takes time.
         self._send()
         warnings = [x.warning for x in drafts.values() if x.warning is not None]
         if changed:
-            self._bulletin.show()
-        self._bulletin.look_for_listeners()
+            self._reporting.show()
+        self._reporting.look_for_listeners()
         severity, code, words = Severity.OK, Code.ACCEPTED, _accepted(drafts)
         if warnings:
             severity, code, words = Severity.WARN, warnings[0].code, warnings[0].reason
         elif not changed:
             code, words = Code.UNCHANGED, 'already on the way there: the plan is unchanged'
-        self._bulletin.give(Verdict(severity, code, words, request.name), log=bool(warnings))
+        self._reporting.give(Verdict(severity, code, words, request.name), log=bool(warnings))
 
     def refuse(self, error: HmsaError, request: Request) -> Verdict:
         """Report a request that cannot be read or carried out."""
@@ -146,9 +146,9 @@ class Planning:
         if isinstance(error, RefusedError):
             code = error.code
         self.refused += 1
-        self._bulletin.give(Verdict(Severity.ERROR, code, str(error), request.name))
-        self._bulletin.outputs.append(Note(Severity.ERROR, f'request refused ({code}): {error}'))
-        return self._bulletin.verdict
+        self._reporting.give(Verdict(Severity.ERROR, code, str(error), request.name))
+        self._reporting.outputs.append(Note(Severity.ERROR, f'request refused ({code}): {error}'))
+        return self._reporting.verdict
 
     def _go_on(self, work: Work, drafts: Mapping[str, Draft], now: int) -> None:
         """Adopt a plan that was replanned, or corrected from samples."""
@@ -158,10 +158,10 @@ class Planning:
         if verdict is None:
             return
         if work.corrects:
-            self._bulletin.corrected(drafts, now)
+            self._reporting.corrected(drafts, now)
         else:
-            self._bulletin.show()
-        self._bulletin.go_on(
+            self._reporting.show()
+        self._reporting.go_on(
             verdict, log=not work.corrects and self._following.replanned_due())
 
 

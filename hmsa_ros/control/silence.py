@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from hmsa_ros.control.surroundings import Surroundings
+from hmsa_ros.control.environment import Environment
 from hmsa_ros.model.units import NANOSECONDS
 
 # Longest gap between samples: in ns by the steady clock, and in sampling intervals.
@@ -27,8 +27,8 @@ class Silence:
     A publisher that ends normally disappears at once.
     """
 
-    def __init__(self, surroundings: Surroundings) -> None:
-        self._around = surroundings
+    def __init__(self, environment: Environment) -> None:
+        self._around = environment
         self._joints: dict[str, _Joint] = {}
 
     def restart(self) -> None:

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Iterable, Mapping
 import math
 
+from hmsa_ros.control.environment import Environment, Seen
 from hmsa_ros.control.receipts import Receipts
 from hmsa_ros.control.records import Settings
-from hmsa_ros.control.surroundings import Seen, Surroundings
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
@@ -29,7 +29,7 @@ class Takeover:
     """Wait for samples of the joints before the first request, and start from them."""
 
     def __init__(
-            self, planners: Mapping[str, Planner], surroundings: Surroundings, receipts: Receipts,
+            self, planners: Mapping[str, Planner], environment: Environment, receipts: Receipts,
             newest: Mapping[str, tuple[int, float]], followed: Callable[[str], bool],
             note: Callable[[str], None]) -> None:
         """
@@ -38,7 +38,7 @@ class Takeover:
         ``newest`` contains timestamp in ns and level in T of the newest change of each joint. A
         joint that feedback has ``followed`` is left to feedback.
         """
-        self._planners, self._around, self._receipts = planners, surroundings, receipts
+        self._planners, self._around, self._receipts = planners, environment, receipts
         self._newest, self._followed, self._note = newest, followed, note
         self._until: int | None = None
         # Whether the positions of the joints are known, or assumed at rest.

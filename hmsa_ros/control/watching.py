@@ -4,10 +4,10 @@ from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from hmsa_ros.control.aside import Doing
+from hmsa_ros.control.environment import Environment
 from hmsa_ros.control.feedback import Feedback
 from hmsa_ros.control.holds import AHEAD, Hold
-from hmsa_ros.control.surroundings import Surroundings
+from hmsa_ros.control.offload import Doing
 from hmsa_ros.judge.records import (
     Finding,
     GoalTolerances,
@@ -184,8 +184,8 @@ class Watch:
     """Gather samples of each setpoint as requested, and judge them."""
 
     def __init__(
-            self, group: PlannerGroup, surroundings: Surroundings, feedback: Feedback) -> None:
-        self._group, self._around, self._feedback = group, surroundings, feedback
+            self, group: PlannerGroup, environment: Environment, feedback: Feedback) -> None:
+        self._group, self._around, self._feedback = group, environment, feedback
         #: Goal tolerances of the newest request, by joint.
         self.goals: Mapping[str, GoalTolerances] = {}
         self._joints: dict[str, _Joint] = {}

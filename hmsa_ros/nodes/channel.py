@@ -8,7 +8,7 @@ from std_msgs.msg import Float64
 
 from hmsa_ros.control.planner import PlannerRuntime
 from hmsa_ros.control.records import Send, Target
-from hmsa_ros.control.seldom import Seldom
+from hmsa_ros.control.throttle import Throttle
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.nodes import conversions, endpoints
@@ -22,7 +22,7 @@ class JointChannel:
             serve: Callable[[], None], *, linked: bool = False) -> None:
         """Create them; a linked device passes its reports on directly."""
         self._node, self._joint, self._runtime, self._serve = node, joint, runtime, serve
-        self._ignored_due = Seldom()
+        self._ignored_due = Throttle()
         self._command = endpoints.publisher(
             node, topics.of_joint(topics.FLUX_DENSITY_COMMAND, joint, joints))
         endpoints.subscribe(

@@ -14,8 +14,8 @@ import gc
 from rclpy.node import Node
 
 from hmsa_ros.control.cycles import Cycles
+from hmsa_ros.control.environment import Seen
 from hmsa_ros.control.records import Output, Send
-from hmsa_ros.control.surroundings import Seen
 from hmsa_ros.device.protocol import Change, Sample
 from hmsa_ros.interfaces import topics
 from hmsa_ros.nodes import conversions, endpoints

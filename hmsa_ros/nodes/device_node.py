@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState, MagneticField
 
-from hmsa_ros.control.seldom import Seldom
+from hmsa_ros.control.throttle import Throttle
 from hmsa_ros.device.health import judge_commands
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.device.watchdog import Fallback, SAFE_FLUX
@@ -85,7 +85,7 @@ class DeviceJoint:
         self._commanded = node.commanded
         self._of_me = '' if len(names) == 1 else f'joint {self.name}: '
         self._crowded = False
-        self._refused_due, self._late_due = Seldom(), Seldom()
+        self._refused_due, self._late_due = Throttle(), Throttle()
         self.received = self.refused = self.refused_source = 0
         self.late = self.latest = self.failed = 0
         self._applied, self._received = (

@@ -13,9 +13,9 @@ from rclpy.duration import Duration
 from rosgraph_msgs.msg import Clock
 
 from hmsa_ros.control import records
-from hmsa_ros.control.aside import Aside
+from hmsa_ros.control.environment import Environment, Seen
+from hmsa_ros.control.offload import Offload
 from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.surroundings import Seen, Surroundings
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.actuator import actuator_from
@@ -63,7 +63,7 @@ class PlannerNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__(topics.PLANNER)
         self._settings = declare_joints(self, PARAMETERS, OWN)
-        self._aside = Aside(self.get_logger().warning)
+        self._offload = Offload(self.get_logger().warning)
         # The executor would store an event for each message on /clock, without limit if the node
         # cannot keep up. This subscription, read by `now`, only keeps the newest. It is unsuitable
         # for a node that must process commands before the time published after them.
@@ -86,14 +86,14 @@ class PlannerNode(ManagedNode):
 
     def _new_runtime(self) -> PlannerRuntime:
         runtime = PlannerRuntime(
-            group_from(self._settings), settings_from(self._settings), Surroundings(
+            group_from(self._settings), settings_from(self._settings), Environment(
                 self.now, one_clock=self._one_clock, observable=self._observable,
                 unheard=self._unheard, found=lambda joint: self._channels[joint].found,
                 reporters=lambda joint: self._channels[joint].reporters, glance=self._glance))
         runtime.devices.deliver = lambda command: self._take((command,))
-        runtime.feedback.doing = self._aside
+        runtime.feedback.doing = self._offload
         if runtime.feedback.on:
-            self._aside.start()
+            self._offload.start()
         return runtime
 
     # -- states --------------------------------------------------------------------------------
@@ -159,7 +159,7 @@ class PlannerNode(ManagedNode):
 
     def cleanup(self) -> None:
         """Drop the plans."""
-        self._aside.close()
+        self._offload.close()
         self._jump.unregister()
         self._presence.close()
         self._poll.cancel()
@@ -171,7 +171,7 @@ class PlannerNode(ManagedNode):
 
     def close(self) -> None:
         """End the estimation process."""
-        self._aside.close()
+        self._offload.close()
 
     # -- in ------------------------------------------------------------------------------------
 

@@ -20,7 +20,7 @@ class Seen(NamedTuple):
 
 
 @dataclass
-class Surroundings:
+class Environment:
     """
     Queries to the caller of a planner; times in ns.
 

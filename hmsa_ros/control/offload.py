@@ -20,7 +20,7 @@ ANSWER = 5_000_000
 # All modules that the work uses are imported before the first work.
 _WORKER = (
     'import sys; sys.path[:] = {!r}; import hmsa_ros.control.feedback; '
-    'from hmsa_ros.control.aside import serve; serve({})')
+    'from hmsa_ros.control.offload import serve; serve({})')
 # Longest wait for a result in ns: the first takes seconds on a busy machine.
 _PATIENCE = 20_000_000_000
 # Niceness, relative to the processes that send and apply commands.
@@ -38,7 +38,7 @@ def goes_on(work: Iterator[None]) -> bool:
     return next(work, work) is not work
 
 
-class Aside:
+class Offload:
     """
     Execute work in a separate process, one piece after another.
 

@@ -11,7 +11,7 @@ from bench_oracle import Bench, Plant
 import numpy as np
 import pytest
 
-from hmsa_ros.control.aside import Aside, goes_on, here
+from hmsa_ros.control.offload import goes_on, here, Offload
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.planning.drafting import finish
 
@@ -33,19 +33,19 @@ def ends(parent):
 
 
 @pytest.fixture
-def aside():
+def offload():
     told = []
-    found = Aside(told.append)
+    found = Offload(told.append)
     found.told = told
     yield found
     found.close()
 
 
-def test_each_gets_the_answer_to_what_it_asked_in_whatever_order_they_look(aside, tmp_path):
+def test_each_gets_the_answer_to_what_it_asked_in_whatever_order_they_look(offload, tmp_path):
     gate = tmp_path / 'gate'
     os.mkfifo(gate)
-    finish(aside(whose, 'ready'))
-    first, second = aside(whose, 1, gate), aside(whose, 2)
+    finish(offload(whose, 'ready'))
+    first, second = offload(whose, 1, gate), offload(whose, 2)
     assert goes_on(first)
     assert goes_on(second)
     gate.write_text('')
@@ -53,38 +53,38 @@ def test_each_gets_the_answer_to_what_it_asked_in_whatever_order_they_look(aside
     (two, there), (one, _) = finish(second), finish(first)
     assert (one, two) == (1, 2)
     assert there != os.getpid()
-    left = aside(whose, 'left', gate)
+    left = offload(whose, 'left', gate)
     assert goes_on(left)
     left.close()
     gate.write_text('')
-    assert finish(aside(whose, 3)) == (3, there)
-    assert not aside.told
+    assert finish(offload(whose, 3)) == (3, there)
+    assert not offload.told
 
 
-def test_a_process_that_ends_is_done_without_and_said_once(aside):
-    assert finish(aside(ends, os.getpid())) == 'here'
-    assert finish(aside(whose, 3)) == (3, os.getpid())
-    words, = aside.told
+def test_a_process_that_ends_is_done_without_and_said_once(offload):
+    assert finish(offload(ends, os.getpid())) == 'here'
+    assert finish(offload(whose, 3)) == (3, os.getpid())
+    words, = offload.told
     assert 'the planner estimates itself' in words
 
 
-def test_a_process_that_does_not_answer_is_done_without(aside, monkeypatch):
-    _, process = finish(aside(whose, 1))
+def test_a_process_that_does_not_answer_is_done_without(offload, monkeypatch):
+    _, process = finish(offload(whose, 1))
     os.kill(process, signal.SIGSTOP)
-    monkeypatch.setattr('hmsa_ros.control.aside._PATIENCE', 0)
-    assert finish(aside(whose, 2)) == (2, os.getpid())
-    assert 'does not answer' in aside.told[0]
+    monkeypatch.setattr('hmsa_ros.control.offload._PATIENCE', 0)
+    assert finish(offload(whose, 2)) == (2, os.getpid())
+    assert 'does not answer' in offload.told[0]
 
 
 def test_it_ends_with_the_planner_however_that_ends_and_not_by_ctrl_c(tmp_path):
     script = tmp_path / 'planner.py'
     script.write_text(
         'import time\n'
-        'from hmsa_ros.control.aside import Aside\n'
+        'from hmsa_ros.control.offload import Offload\n'
         'from hmsa_ros.planning.drafting import finish\n'
-        'from test_aside import whose\n'
-        'aside = Aside(print)\n'
-        'print(finish(aside(whose, 1))[1], flush=True)\n'
+        'from test_offload import whose\n'
+        'offload = Offload(print)\n'
+        'print(finish(offload(whose, 1))[1], flush=True)\n'
         'time.sleep(600)\n')
     with subprocess.Popen(
             [sys.executable, script], stdout=subprocess.PIPE, text=True,
@@ -98,9 +98,9 @@ def test_it_ends_with_the_planner_however_that_ends_and_not_by_ctrl_c(tmp_path):
     assert end.poll(60_000)
 
 
-def test_what_is_learnt_is_the_same_in_either_process(aside):
+def test_what_is_learnt_is_the_same_in_either_process(offload):
     sent = {}
-    for name, doing in (('here', here), ('aside', aside)):
+    for name, doing in (('here', here), ('offload', offload)):
         def at_once(work, *arguments, doing=doing):
             return finish(doing(work, *arguments))
             yield
@@ -113,4 +113,4 @@ def test_what_is_learnt_is_the_same_in_either_process(aside):
             bench.move(target, 200 * MS)
         assert 'plans use it' in bench.message
         sent[name] = np.array(bench.sent)
-    assert np.array_equal(sent['here'], sent['aside'])
+    assert np.array_equal(sent['here'], sent['offload'])

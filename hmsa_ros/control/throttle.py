@@ -3,7 +3,7 @@
 from time import monotonic
 
 
-class Seldom:
+class Throttle:
     """
     Permit a report at most once a second.
 

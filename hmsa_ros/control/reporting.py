@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 
+from hmsa_ros.control.environment import Environment
 from hmsa_ros.control.following import Following
 from hmsa_ros.control.records import (
     Output,
@@ -13,7 +14,6 @@ from hmsa_ros.control.records import (
     Trajectory,
     Verdict,
 )
-from hmsa_ros.control.surroundings import Surroundings
 from hmsa_ros.control.watching import Watch
 from hmsa_ros.judge.records import Finding, VERDICTS
 from hmsa_ros.model.status import Code
@@ -27,16 +27,16 @@ _PREVIEW, _SOON = 500, 50_000_000
 LOOK = 200_000_000
 
 
-class Bulletin:
+class Reporting:
     """Verdicts, progress, previews and notes that wait to be published."""
 
     def __init__(
             self, group: PlannerGroup, following: Following, watch: Watch,
-            surroundings: Surroundings, outputs: list[Output], note: Callable[[str], None],
+            environment: Environment, outputs: list[Output], note: Callable[[str], None],
             *looks: Callable[[], str]) -> None:
         """Begin without a verdict; ``looks`` return the values of `unheard` and `unseen`."""
         self._group, self._following, self._watch = group, following, watch
-        self._around, self._looks = surroundings, looks
+        self._around, self._looks = environment, looks
         self.outputs, self.note = outputs, note
         self._look_again = 0
         self.unheard = ''  # why commands are not carried out; empty if they are

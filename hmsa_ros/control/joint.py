@@ -5,11 +5,11 @@ from dataclasses import dataclass, field, InitVar, replace
 from functools import partial
 import math
 
-from hmsa_ros.control.aside import Awaited, Doing
 from hmsa_ros.control.choice import clearly_better
 from hmsa_ros.control.holds import Hold
 from hmsa_ros.control.learnt import as_of_path, believed, differs, learnt_model, sensor_of
 from hmsa_ros.control.ledger import Ledger, Moves
+from hmsa_ros.control.offload import Awaited, Doing
 from hmsa_ros.control.records import Settings
 from hmsa_ros.control.trust import Trust
 from hmsa_ros.errors import HmsaError
