@@ -85,8 +85,12 @@ template <class C> struct AnyFlow {
         power_law_flow.read(from + 1);
     }
     void seed(int constant, int j) { power_law_flow.seed(constant, j); }
-    // Exponentials of a nonlinear rule.
+    // The rate of a nonlinear rule, and what remains under constant force.
     template <class S> HMSA_APART S other(const S &x) const { return power_law_flow(x); }
+    double relaxed(double x, double speed, double span) const
+    {
+        return power_law_flow.relaxed(x, speed, span);
+    }
     Fading fading(double x, double speed, double until) const
     {
         if (kind != maxwell)

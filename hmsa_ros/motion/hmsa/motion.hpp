@@ -195,7 +195,7 @@ inline bool trail(const Trail &of)
                 const double faded = expm1(-branches.speed[b] * span);
                 x += faded * (x - slope / branches.speed[b]);
             } else if (slope == 0)
-                x = branches.flow[b].power_law_flow.relaxed(x, branches.speed[b], span);
+                x = branches.flow[b].relaxed(x, branches.speed[b], span);
             else {
                 double left = span;
                 for (int n = 0; left > 0; n++) {
