@@ -33,7 +33,8 @@ _SETTLED = 40.0
 _MOST_PERIODS = 2000.0
 # Stress that counts as zero, and tolerance of the relaxation without inertia.
 _NOTHING, _SLOWLY = 1e-12, 1e-12
-_STUCK = 'the integration ran out of steps: the load is too large to follow'
+#: The message if an integration does not end.
+STUCK = 'the integration ran out of steps: the load is too large to follow'
 
 
 def simulate(
@@ -175,7 +176,7 @@ def _sampled(
     if not motion.sample(
             state.stretch, state.rate, loads[0] if math.isnan(state.load) else state.load,
             switches, loads, slopes, lag, times, material.packed, branches, rtol, out):
-        raise HmsaError(_STUCK)
+        raise HmsaError(STUCK)
     return out
 
 

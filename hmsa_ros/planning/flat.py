@@ -8,9 +8,10 @@ P. Martin, P. Rouchon, Int. J. Control 61, 1327 (1995)).
 import numpy as np
 
 from hmsa_ros import motion
+from hmsa_ros.errors import HmsaError
 from hmsa_ros.model.equations import acceleration, Array, elastic_force
 from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.simulation import with_followed
+from hmsa_ros.model.simulation import STUCK, with_followed
 
 
 def fade(share: Array) -> tuple[Array, Array, Array]:
@@ -30,8 +31,13 @@ def loads_for(
 def held_along(
         times: Array, stretch: Array, followed: tuple[float, ...],
         material: NondimensionalParameters) -> tuple[Array, Array]:
-    """Return the overstress (n,) of branches along a path, and the branch states (n, k)."""
+    """
+    Return the overstress (n,) of branches along a path, and the branch states (n, k).
+
+    Raises `HmsaError` if a branch is too fast to integrate.
+    """
     forces = elastic_force(stretch, material)
     behind = np.empty((len(times), len(followed)))
-    motion.trail(times, forces, with_followed(material, followed), behind)
+    if not motion.trail(times, forces, with_followed(material, followed), behind):
+        raise HmsaError(STUCK)
     return (forces[:, np.newaxis] - behind) @ material.branches[:, motion.RATIO], behind
