@@ -21,8 +21,9 @@ ANSWER = 5_000_000
 _WORKER = (
     'import sys; sys.path[:] = {!r}; import hmsa_ros.control.feedback; '
     'from hmsa_ros.control.offload import serve; serve({})')
-# Longest wait for a result in ns: the first takes seconds on a busy machine.
-_PATIENCE = 20_000_000_000
+# Longest wait in ns for the process to start, which on a busy machine takes many times as long as
+# on an idle one, and for a result.
+_START, _PATIENCE = 60_000_000_000, 20_000_000_000
 # Niceness, relative to the processes that send and apply commands.
 _NICE = 5
 
@@ -108,6 +109,7 @@ class _Worker:
         self._look.register(self._line, select.POLLIN)
         # List that receives the pending result; the first result signals that the worker is ready.
         self._owed: list[Any] | None = []
+        self._patience = _START
 
     def result(self, work: object, arguments: object) -> Awaited[Any]:
         """
@@ -115,15 +117,15 @@ class _Worker:
 
         Raises `OSError` or `EOFError` if no result will come, or none came in time.
         """
-        end = monotonic_ns() + _PATIENCE
+        begun = monotonic_ns()
         answer: list[Any] = []
         while not answer:
             if self._owes():
-                if monotonic_ns() > end:
+                if monotonic_ns() - begun > self._patience:
                     raise TimeoutError
                 yield
             elif not answer:
-                self._owed = answer
+                self._owed, begun = answer, monotonic_ns()
                 self._line.send((work, arguments))
         return answer[0]
 
@@ -131,7 +133,7 @@ class _Worker:
         """Receive a pending result if there is one; return whether one is still pending."""
         if self._owed is not None and self._look.poll(0):
             self._owed.append(self._line.recv())
-            self._owed = None
+            self._owed, self._patience = None, _PATIENCE
         return self._owed is not None
 
     def end(self) -> None:
