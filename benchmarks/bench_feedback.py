@@ -88,7 +88,7 @@ def run(
         'stretch_noise': scenario.noise, 'stretch_bias': _BIAS}
     planner: dict[str, object] = {
         **parameters_of(scenario.block), 'flux_density_min': -_LIMIT, 'flux_density_max': _LIMIT,
-        'lead_time': graph.lead, 'feedback': 'adapt', 'feedback_cautious': graph.cautious,
+        'lead_time': graph.lead, 'feedback': 'cautious' if graph.cautious else 'adapt',
         'feedback_tolerance': _TOLERANCE}
     follows: dict[str, object] = {}
     if graph.factor != 1.0:

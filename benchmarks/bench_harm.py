@@ -44,7 +44,7 @@ _BEFORE, _HOLD, _LOOK = 15.0, 22.0, 3.0
 #: Control modes: open loop, feedback, and cautious feedback.
 WAYS: dict[str, dict[str, Any]] = {
     'open loop': {'feedback': 'off'}, 'adapt': {'feedback': 'adapt'},
-    'cautious': {'feedback': 'adapt', 'feedback_cautious': True}}
+    'cautious': {'feedback': 'cautious'}}
 
 
 @dataclass(frozen=True)

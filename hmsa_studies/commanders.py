@@ -92,9 +92,8 @@ class _Running(Commander):
             self, scenario: Scenario, strategy: Strategy, error: float, seed: int) -> None:
         super().__init__(scenario, strategy, error, seed)
         self._loop = Loop(PlannerGroup({_JOINT: self.planner}), Settings(
-            takeover_timeout=0, feedback='adapt' if strategy.kind == 'adapt' else 'off',
-            feedback_parameters=scenario.free, feedback_cautious=True,
-            feedback_tolerance=_TOLERANCE), self.device)
+            takeover_timeout=0, feedback='cautious' if strategy.kind == 'adapt' else 'off',
+            feedback_parameters=scenario.free, feedback_tolerance=_TOLERANCE), self.device)
 
     @property
     def now(self) -> int:

@@ -177,7 +177,8 @@ def test_an_actuator_that_was_identified_is_not_moved_with_caution():
 
 
 @pytest.mark.parametrize(('mode', 'cautious', 'predicted'), [
-    ('observe', True, False), ('adapt', False, False), ('adapt', True, True)])
+    ('observe', True, False), ('adapt', False, False), ('adapt', True, True),
+    ('cautious', False, True)])
 def test_only_a_cautious_first_request_waits_for_what_it_may_leave(
         monkeypatch, mode, cautious, predicted):
     predict, calls = Estimator.predict, []

@@ -49,9 +49,9 @@ def add_parser(subparsers: Any) -> None:
          'parameter file; with --simulate, used for the nodes started; otherwise the running '
          'nodes are checked against it'),
         ('--feedback', 'MODE', str,
-         'feedback mode: off, observe or adapt. With a running planner, fails unless the planner '
-         'is in this mode (default: do not check; off with --simulate)',
-         {'choices': ('off', 'observe', 'adapt')}),
+         'feedback mode: off, observe, adapt or cautious. With a running planner, fails unless '
+         'the planner is in this mode (default: do not check; off with --simulate)',
+         {'choices': ('off', 'observe', 'adapt', 'cautious')}),
         ('--tolerance', 'X', float,
          'steady-state error and residual vibration that count as arrived, as a fraction of the '
          "step (default: the planner's arrival_tolerance, vibration_tolerance and "

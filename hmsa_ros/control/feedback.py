@@ -18,7 +18,7 @@ from hmsa_ros.planning.planner import Believed
 from hmsa_ros.planning.timeline import Model
 
 #: Values of the parameter `feedback`.
-MODES = ('off', 'observe', 'adapt')
+MODES = ('off', 'observe', 'adapt', 'cautious')
 # Interval in ns at which the estimate is published.
 _REPORT = 200_000_000
 # Minimum delay of the next update, as a multiple of the time that an update or a correction took,

@@ -99,7 +99,7 @@ class Joint:
         self.estimator = Estimator(
             prior.informed(settings.known.get(self.name, Known())),
             Options(slew_limit=given.options.slew_limit, learn=not settings.feedback_frozen))
-        self.trust = Trust(begun, at_once=settings.feedback_cautious)
+        self.trust = Trust(begun, at_once=settings.cautious)
         self.start = given.actuator.rest
 
     @property
@@ -110,13 +110,12 @@ class Joint:
     @property
     def adapts(self) -> bool:
         """Whether plans use the estimate."""
-        return self.settings.feedback == 'adapt'
+        return self.settings.adapts
 
     @property
     def tolerance(self) -> float:
         """Predicted error, as a fraction of the step, up to which a move is not slowed down."""
-        cautious = self.adapts and self.settings.feedback_cautious
-        return self.settings.feedback_tolerance if cautious else math.inf
+        return self.settings.feedback_tolerance if self.settings.cautious else math.inf
 
     @property
     def acting(self) -> Estimate | None:

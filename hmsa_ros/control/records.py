@@ -35,10 +35,11 @@ class Settings:
     trajectory_mode: str = 'rest'  # one of `TRAJECTORY_MODES`
     allow_partial_joints: bool = False  # whether a trajectory may omit joints
     tolerances: Tolerances = field(default_factory=Tolerances)
-    # ``off``; ``observe`` to estimate from samples; ``adapt`` to correct plans as well.
+    # ``off``; ``observe`` to estimate from samples; ``adapt`` to correct plans as well;
+    # ``cautious`` to slow down moves with a large predicted error, too.
     feedback: str = 'off'
     feedback_parameters: tuple[str, ...] = TRACKED  # estimated in addition to the state
-    feedback_cautious: bool = False  # slow down moves with a large predicted error
+    feedback_cautious: bool = False  # whether ``adapt`` is ``cautious``
     feedback_tolerance: float = TOLERANCE  # fraction of the step from which it is large
     feedback_trim: float = 0.0  # limit in T for trimming against a force; 0: off
     feedback_frozen: bool = False  # estimate only the state, keep the parameters
@@ -51,6 +52,16 @@ class Settings:
                      'takeover_max_age', 'max_points'):
             if getattr(self, name) < 0:
                 raise BadInputError(f'{name} is {getattr(self, name)}: expected at least 0')
+
+    @property
+    def adapts(self) -> bool:
+        """Whether plans use the estimate."""
+        return self.feedback in ('adapt', 'cautious')
+
+    @property
+    def cautious(self) -> bool:
+        """Whether moves with a large predicted error are slowed down."""
+        return self.feedback == 'cautious' or self.adapts and self.feedback_cautious
 
 
 # -- in -----------------------------------------------------------------------------------------

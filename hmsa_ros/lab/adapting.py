@@ -52,7 +52,7 @@ def _carry_out(
         [SimulatedJoint(Setup(true), errors=_ERRORS)], period=_PERIOD, measurement_delay=_DELAY)
     loop = Loop(
         PlannerGroup({_JOINT: planner}),
-        Settings(takeover_timeout=0, feedback=feedback, feedback_cautious=True), device)
+        Settings(takeover_timeout=0, feedback=feedback), device)
     loop.run(_MS)
     seen, results, before = [], [], 1.0
     for target in _TARGETS:
@@ -85,7 +85,7 @@ def second_act(picture: Path) -> tuple[AdaptingResult, ...]:
     with style.picture(picture, 2.8, SCREEN) as figure:
         axes = figure.add_subplot()
         for feedback, label, kind in (
-                ('off', 'open loop', style.UNSHAPED), ('adapt', 'adapting', style.SHAPED)):
+                ('off', 'open loop', style.UNSHAPED), ('cautious', 'adapting', style.SHAPED)):
             track, found = _carry_out(block, feedback)
             results += found
             axes.plot(1e3 * track[:, 0], track[:, 1], label=label, **kind)

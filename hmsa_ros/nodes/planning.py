@@ -137,7 +137,10 @@ SPECS = (
     _changeable(
         'feedback', _SETTINGS.feedback,
         'Use of the samples on joint_states: off; observe estimates the parameters and publishes '
-        'them on ~/estimate; adapt also corrects plans, and plans with the estimate.',
+        'them on ~/estimate; adapt also corrects plans, and plans with the estimate; cautious '
+        'also extends moves whose predicted error exceeds feedback_tolerance, to correct them on '
+        'the way: three times (five times for six estimated parameters, and up to twice that for '
+        'large noise).',
         choices=MODES),
     ParameterSpec(
         'feedback_parameters', list(_SETTINGS.feedback_parameters),
@@ -145,13 +148,11 @@ SPECS = (
         'stretch_bias, remanence, chain_limit, coil_time_constant and others of hmsa identify.'),
     _changeable(
         'feedback_cautious', _SETTINGS.feedback_cautious,
-        'Whether feedback adapt extends moves whose predicted error exceeds feedback_tolerance, '
-        'to correct them on the way: three times (five times for six estimated parameters, and up '
-        'to twice that for large noise).'),
+        'Whether feedback adapt is the same as feedback cautious.'),
     _changeable(
         'feedback_tolerance', _SETTINGS.feedback_tolerance,
         'Predicted error (vibration amplitude plus steady-state error, as a fraction of the step) '
-        'above which feedback_cautious extends a move.', '', 0.0, 1.0),
+        'above which feedback cautious extends a move.', '', 0.0, 1.0),
     _changeable(
         'feedback_trim', _SETTINGS.feedback_trim,
         'Maximum change of a holding level by which feedback adapt compensates a constant force, '
