@@ -161,7 +161,7 @@ def test_what_was_sent_before_it_was_matched_is_counted_apart(record, ros):
     assert 'nothing was received of /b' in recorder.process.stdout
     summary = summarize(recorder.folder)
     assert (summary.sent_before, summary.topics[0].sent_before) == (20, 20)
-    assert 'complete  yes, but for 20 messages' in to_text(summary)
+    assert 'complete  yes, except 20 messages' in to_text(summary)
 
 
 def test_a_topic_of_which_nothing_came_is_named_by_the_recorder_and_by_its_bag(record, ros):

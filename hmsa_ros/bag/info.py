@@ -140,7 +140,7 @@ def _lines(
     yield f'bag       {summary.path}'
     for name, size in summary.files:
         yield f'file      {name}  {size / 1024:.1f} KiB'
-    late = (f', but without {summary.sent_before} sent before the recorder was matched'
+    late = (f', except {_messages(summary.sent_before)} sent before the recorder was matched'
             if summary.sent_before else '')
     yield f'complete  {"yes" + late if summary.complete else "no, see hmsa bag recover"}'
     if summary.start_ns is not None:
@@ -175,11 +175,15 @@ def _lines(
                 yield f'  {key} = {value if len(value) <= 200 else value[:200] + " ..."}'
     for topic in summary.topics:
         if topic.sent_before:
-            yield (f'note: {topic.sent_before} of {topic.name} sent before the recorder was '
-                   'matched')
+            yield (f'note: {_messages(topic.sent_before)} of {topic.name} sent before the '
+                   'recorder was matched')
     if silent := [x.name for x in summary.topics if not x.count]:
         yield f'note: nothing was received of {", ".join(silent)}'
     yield from (f'note: {x}' for x in (*summary.problems, *notes))
+
+
+def _messages(count: int) -> str:
+    return f'{count} message{"s" * (count != 1)}'
 
 
 def _time(nanoseconds: int) -> str:
