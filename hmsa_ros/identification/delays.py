@@ -1,5 +1,6 @@
 """Delays of a field after its command, and of a sensor after the motion."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 import math
 
@@ -95,9 +96,9 @@ def field_delays(
     def off(values: Array) -> Array:
         return weight * (response(since, 1e-3 * values[0], 1e-3 * values[1]) - share)
 
-    def search(transports: Array, lags: Array) -> tuple[float, float]:
-        return min((float(np.sum(off(np.array((x, y)))**2)), x, y)
-                   for x in 1e3 * transports for y in 1e3 * lags)[1:]
+    def search(transports: Iterable[float], lags: Iterable[float]) -> tuple[float, float]:
+        return min((float(np.sum(off(np.array((1e3 * x, 1e3 * y)))**2)), 1e3 * x, 1e3 * y)
+                   for x in transports for y in lags)[1:]
 
     coarse = 1e-3 * search(_TRANSPORTS, _LAGS)[0]
     # The cost of a short lag is constant between two readings.
