@@ -24,7 +24,7 @@ _LONGEST = 0.05
 _TRANSPORTS = np.linspace(-2e-3, 2e-2, 45)
 _LAGS = np.geomspace(5e-5, 2e-2, 9)
 _LEAST_LAG = 1e-6
-# Readings within the first three lags of a step that determine its shape.
+# Minimum number of readings within the first three lags of a step to determine its shape.
 _RISE = 3
 # Minimum change of the field, in standard deviations of its readings, to determine its time.
 _SEEN = 10.0
@@ -119,7 +119,7 @@ def field_delays(
     values, since_ms = found.x, 1e3 * since
     begin, end = values[0], values[0] + 3.0 * values[1]
     if np.count_nonzero((since_ms > begin) & (since_ms < end)) < _RISE:
-        # The data only show the two readings between which the field rises, for three lags.
+        # The readings only show an interval in which the field starts and rises for three lags.
         before = float(np.max(since_ms, where=since_ms <= begin, initial=0.0))
         after = float(np.min(since_ms, where=since_ms >= end, initial=1e3 * _LONGEST))
         half = (after - before) / np.array([2.0, 6.0])
@@ -163,7 +163,7 @@ class Delays:
     """Components of the time between a command and a sample of its effect; in s."""
 
     transport: Interval  #: from the timestamp of a level to the start of its field
-    jitter: float  #: standard deviation of the reported part
+    jitter: float  #: standard deviation of the part that the device reports
     lag: Interval  #: time constant of the field
     latency: Interval  #: delay of the timestamps of samples after the motion
     #: correction of these timestamps: the latency, and the transport that is not reported

@@ -34,7 +34,7 @@ _HINT = 2.0
 # biased.
 _MEDIAN = 0.455
 GAIN = 'stretch_gain'
-#: Standard deviation of an unknown gain, and size above which it would not be detected.
+#: Standard deviation of an unknown gain, and that of its estimate above which it is undetectable.
 USUAL_GAIN, _HIDDEN_GAIN = 0.02, 0.006
 # Relative tolerance of the integration, sufficient for directions.
 _RTOL = 1e-6
@@ -95,9 +95,9 @@ class Departures:
 
     signatures: tuple[Signature, ...]  # the largest first
     hint: Array  # variance of the coordinates due to likely departures, shape (p,)
-    # Change of the coordinates by a standard deviation of undetectable departures, by name.
+    # Change of the coordinates by one standard deviation of each undetectable error, by name.
     considered: dict[str, Array]
-    # Unknown latency of the sensor in s that would not be detected, and its effect.
+    # Largest unknown latency of the sensor in s that is not detected, and its effect; or None.
     late: tuple[float, Array] | None
 
 

@@ -60,7 +60,7 @@ def allowed(fit: Fit) -> Array:
 
 
 def _of_law(fit: Fit, name: str) -> float:
-    """Return the same for a constant of the hyperelastic model or a logarithmic coordinate."""
+    """Return the maximum for a constant of the hyperelastic model or a logarithmic coordinate."""
     quantity, value = quantities.quantity_of(name), float(fit.values[name])
     if quantity.scale == 'log':
         return _RELATIVE
@@ -74,8 +74,8 @@ def weakness(fit: Fit, deviation: float, factors: Array) -> tuple[set[str], str]
     """
     Return undetermined parameters, the reason and what to record; empty if all are determined.
 
-    ``deviation`` is that of a sample; ``factors`` on those of the parameters are due to
-    correlation.
+    ``deviation`` is that of a sample; ``factors``, due to correlation, multiply those of the
+    parameters.
     """
     limits = allowed(fit)
     scaled = limits / np.maximum(factors, 1.0) / deviation
@@ -348,7 +348,7 @@ def undetected(late: tuple[float, Array], std: Array, fit: Fit) -> list[str]:
 
 
 def resting(fit: Fit, names: Collection[str]) -> str:
-    """Return the message that samples only show rest, which does not determine some parameters."""
+    """Return the message that samples show only rest, so that ``names`` are undetermined."""
     return (
         f'{_listed([x for x in fit.free if x in names])} cannot be identified from this '
         f'recording: rest at each level explains the samples, {fit.recording.gap:.3g} s apart, as '

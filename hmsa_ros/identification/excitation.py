@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _PATTERN = 5  # number of levels in the repeated pattern
 # Attempts to scale a pattern to the limits, target of the scaling, and sufficient scale.
 _SCALINGS, _AIM, _ALMOST = 5, 0.99, 0.97
-# Number of random patterns, number and steps of improved ones, and steps for the best one.
+# Number of random patterns, number of the best to improve, steps for each, and for the winner.
 _FIRST, _KEPT, _FEW, _STEPS = 150, 5, 60, 300
 _LEAST_DWELL, _MOST_DWELL = 0.2, 6.0  # range of the time on a level, in periods
 _BEGIN = 0.2  # rest before the first level, in periods
@@ -45,7 +45,7 @@ _MARGIN = 0.95  # fraction of the range to the limits of the chains
 #: The sequence of the paper, and one of unshaped steps; from rest.
 PAPER = (0.1, 0.2, 0.4)
 PLAIN = (0.1, 0.4, 0.0)
-_WEIGHT = 4.0  # of the worst parameter relative to the volume
+_WEIGHT = 4.0  # weight of the worst parameter relative to the volume
 _WINDOW = 30.0  # periods over which patterns are compared
 _REST = 1e-3  # maximum deviation from rest at the end, stretch
 
@@ -100,7 +100,7 @@ class Program:
 
     level_times: Array  # in s
     levels: Array  # flux density in T from each time on
-    std: dict[str, float]  # expected standard deviations, relative except for signed values
+    std: dict[str, float]  # expected standard deviations, relative unless the value is 0
     information: float  # logarithm of the determinant of the information matrix
     reach: tuple[float, float]  # minimum and maximum stretch
     ends_at_rest: bool  # whether the motion ends at rest
@@ -384,11 +384,12 @@ def excite(
         duration: float | None = None, rate: float = 1000.0, noise: float = 1e-3,
         free: Sequence[str] = quantities.DEFAULT_FREE) -> Excitation:
     """
-    Design the sequence to record for identification; compare it with unshaped steps and the paper.
+    Design the sequence to record for identification, and two others to compare it with.
 
-    The actuator contains prior values, the duration is in s (default 180 periods of the block),
-    the rate in samples per second, and ``noise`` the standard deviation of a sample. Raise
-    `BadInputError` if bounds or numbers allow no sequence.
+    The others are unshaped steps and the sequence of the paper. The actuator contains prior
+    values, the duration is in s (default 180 periods of the block), the rate in samples per
+    second, and ``noise`` is the standard deviation of a sample. Raise `BadInputError` if bounds or
+    numbers allow no sequence.
     """
     designer = Designer(actuator, bounds or Bounds(), duration, rate=rate, noise=noise, free=free)
     best = designer.search()

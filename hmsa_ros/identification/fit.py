@@ -2,7 +2,7 @@
 Maximum likelihood by Levenberg-Marquardt, robust against outliers.
 
 Residuals have full weight up to three standard deviations, then a decreasing one, and none
-beyond six (Hampel, "Robust Statistics", Wiley 1986, sec. 2.6), where the deviation is estimated
+beyond six (Hampel, "Robust Statistics", Wiley 1986, sec. 2.6). The standard deviation is estimated
 from the residuals themselves. Under normal noise that costs 0.1 % of the accuracy.
 """
 
@@ -80,7 +80,7 @@ def robust_scale(residual: Array, fitted: int = 0) -> float:
     """
     Return the standard deviation of residuals that may include outliers.
 
-    As many of them as there are fitted parameters may be zero, whatever the noise is.
+    As many residuals as there are fitted parameters may be zero for any noise; they do not count.
     """
     last = len(residual) - 1
     rest = max(last - fitted, 0)
@@ -122,7 +122,7 @@ def fit(
         recording: Recording, values: Mapping[str, float], free: Sequence[str], *,
         most: int = _MAX_PASSES, spread: Array | None = None) -> Fit | None:
     """
-    Search a minimum from start values of all quantities; None if they cannot be simulated.
+    Search for a minimum from start values of all quantities; None if they cannot be simulated.
 
     ``spread`` is the standard deviation of each sample relative to one at rest; default 1.
     """
@@ -245,7 +245,7 @@ class _Search:
 
 
 def _stride(values: Mapping[str, float], free: Sequence[str], step: Array) -> float:
-    """Return the fraction of a step that limits the change of logarithms and J_lim."""
+    """Return the largest fraction of a step that keeps its changes within their limits."""
     share = 1.0
     for name, change in zip(free, step.tolist(), strict=True):
         quantity, limit = quantities.quantity_of(name), _STRIDE
@@ -264,6 +264,6 @@ def _stride(values: Mapping[str, float], free: Sequence[str], step: Array) -> fl
 
 
 def _at_bottom(matrix: Array, gradient: Array, count: int, scale: float) -> bool:
-    """Return whether the next full step is within the standard deviations or numerical errors."""
+    """Return whether the next full step is small in standard deviations or numerical errors."""
     step = np.linalg.solve(matrix + 1e-12 * np.eye(len(gradient)), gradient)
     return float(gradient @ step) <= (_SMALL * scale) ** 2 + count * _NUMERICAL ** 2

@@ -23,9 +23,9 @@ from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 
 # Maximum number of iterations for the timestamp errors.
 _MOST_SPREADS = 3
-# Probability of white residuals below which they are certainly not white.
+# P-value of the test for whiteness below which residuals are certainly not white.
 _CERTAIN = 1e-4
-# Maximum relative overshoot of a shaped run.
+# Maximum overshoot of the moves of a shaped run, as a fraction of the step.
 _SHAPED = 0.15
 
 
@@ -179,7 +179,7 @@ def _conclude(
         reason = (
             f'{len(best.free)} parameters from {len(best.recording.time)} samples with a noise of '
             f'{known.deviation:.3g}')
-        # The modulus of a beam is reported as Young's modulus.
+    # The modulus of a beam is reported as Young's modulus.
     reason = reason.replace('shear_modulus', quantities.modulus_of(best.values.get('law'))[0])
     parameters, matrix = estimates_of(best, known, lost)
     outliers = int(np.count_nonzero(best.weights == 0.0))

@@ -21,7 +21,7 @@ class Known:
     """Values of parameters and their covariance, in SI units; empty if none were identified."""
 
     names: tuple[str, ...] = ()
-    values: tuple[float, ...] = ()  # empty if given elsewhere
+    values: tuple[float, ...] = ()  # in the order of the names; empty if given elsewhere
     # Of shape (p, p).
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
 

@@ -210,7 +210,7 @@ class _Sequence:
 
 
 def _ringing(time: Array, frequencies: Sequence[float]) -> Array:
-    """Return columns of a constant, and of cosine and sine of frequencies in rad/s."""
+    """Return a constant, and cosine and sine of frequencies in rad/s, shape (n, 1 + 2 f)."""
     since = time - time[0]
     return np.column_stack([np.ones(len(time)), *(
         f(x * since) for x in frequencies for f in (np.cos, np.sin))])
@@ -225,7 +225,7 @@ class _Mode:
     gain: float = 1.0
 
     def driven(self, times: Array, levels: Array, time: Array) -> Array:
-        """Return its response at some times to levels from others on."""
+        """Return its response at ``time``, from ``times[0]`` on, to levels set at ``times``."""
         power = self.frequency * complex(-self.damping, math.sqrt(1.0 - self.damping**2))
         states, state = [], 0j
         for change, fade in zip(
@@ -306,7 +306,7 @@ def learn(
     Raises
     ------
     BadInputError
-        If there are no repeats or targets.
+        If there are no repeats or targets, or the repeats do not fit the targets.
 
     """
     if not trials or not targets:

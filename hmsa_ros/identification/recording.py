@@ -22,7 +22,7 @@ _TIMES_SCATTER = 6.0
 # this fraction of the range.
 _CLIPPED_SLOPE = 0.01
 _CLIPPED_SAMPLES = 3
-# Number of repeated values in motion, more than half of all, that show quantisation in time.
+# Number of repeated values in motion, if more than half of all, above which samples were held.
 _STAIRS = 4
 # Fraction of samples on either side that may be invalid, and the maximum flux density of a coil
 # in T.
@@ -188,7 +188,7 @@ class Recording:
         """
         Return the number of crests that are clipped at the end of the sensor's range.
 
-        Also return how often values in motion repeat, 0 unless most of them do.
+        Also return the number of samples for which a value in motion is held, 0 unless most are.
         """
         y = self.stretch
         edges = np.flatnonzero(np.diff(y) != 0.0) + 1

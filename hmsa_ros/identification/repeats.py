@@ -16,7 +16,7 @@ from hmsa_ros.identification.fit import Fit
 from hmsa_ros.identification.start import segments
 from hmsa_ros.model.equations import Array
 
-# Numbers of random draws: first, and if the result is not clear.
+# Numbers of random draws: first, and if the p-value is not clearly above a limit.
 _DRAWS, _CLEAR = (199, 3999), 0.04
 _MOST = 48  # maximum number of repeats of one change; beyond it several share a sign
 _FEWEST = 4  # samples on a level
@@ -102,7 +102,7 @@ def _chance(grams: list[list[Array]]) -> float:
 def _folded(
         time: Array, residual: Array, group: list[tuple[int, int, float]], width: float
 ) -> tuple[Array, Array]:
-    """Return residuals and their numbers by repeat and time bin; 0 in empty bins."""
+    """Return sums and counts of residuals by repeat and time bin; 0 in empty bins."""
     places = [((time[begin:end] - when) / width).astype(np.int64) for begin, end, when in group]
     size = min(int(x[-1]) for x in places) + 1
     rows = min(len(group), _MOST)

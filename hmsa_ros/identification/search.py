@@ -112,7 +112,7 @@ def _settled(found: Sequence[Fit]) -> bool:
 
 
 def _miss(recording: Recording, candidate: Mapping[str, float]) -> float:
-    """Return the mean deviation of the simulated from the recorded motion."""
+    """Return the mean absolute deviation of the simulated from the recorded motion."""
     response = respond(recording, candidate, (), rtol=1e-4)
     return math.inf if response is None else float(
         np.mean(np.abs(recording.stretch - response.stretch)))
@@ -121,7 +121,7 @@ def _miss(recording: Recording, candidate: Mapping[str, float]) -> float:
 def _descended(
         found: list[Fit], recording: Recording, start: Mapping[str, float], free: Sequence[str]
 ) -> bool:
-    """Add the fit from a start, if any, in full if it may become the best; return whether."""
+    """Add the fit from a start, in full if it may become the best; return whether there is one."""
     few = any(x.converged for x in found)
     one = fit(recording, start, free, most=_FEW_PASSES if few else _FIRST_PASSES)
     if few and one is not None and not one.converged and _promising(found, one):
@@ -135,8 +135,8 @@ def rivals(best: Fit) -> tuple[Fit, list[Fit]]:
     """
     Return the best fit, and those of other frequencies that are nearly as good.
 
-    They are only searched if there are few samples, or fewer than two per period, from frequencies
-    over the whole possible range.
+    The search covers the whole possible range of frequencies. It is only made if there are few
+    samples, or fewer than two per period.
     """
     recording = best.recording
     gap = recording.gap
@@ -169,7 +169,7 @@ def unmoved(best: Fit) -> set[str]:
     """
     Return undetermined parameters, if rest at each level explains the samples as well as motion.
 
-    The test is Fisher's, corrected for the number of frequencies tried.
+    The test is Fisher's F-test, corrected for the number of frequencies tried.
     """
     # Slow to import, and not needed by a planner that estimates.
     from scipy.special import fdtrc

@@ -104,7 +104,7 @@ def levels_in(path: Path) -> list[tuple[float, float]]:
     Raises
     ------
     BadInputError
-        If the file contains none.
+        If the file cannot be read, or is no learnt sequence.
 
     """
     import yaml

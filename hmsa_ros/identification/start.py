@@ -46,7 +46,7 @@ _SHORTEST = 0.02  # minimum time unit, in sampling intervals
 class Static:
     """Properties of the levels at rest."""
 
-    per_tesla: float  # load psi' held by 1 T, Br/(mu0 G); NaN without rest
+    per_tesla: float  # load psi' of 1 T, Br/(mu0 G); NaN without rest at two or more levels
     chain_limit: float  # best of several values
     # Start of the level in s, flux density in T, mean stretch at its end.
     rests: tuple[tuple[float, float, float], ...]
@@ -54,7 +54,7 @@ class Static:
 
 def segments(
         recording: Recording, fewest: int = _FEWEST) -> list[tuple[int, int, float, float]]:
-    """Return first and last index, start in s and flux density of each level with samples."""
+    """Return begin and end index, start in s and flux density of each level with samples."""
     times, levels = recording.level_times, recording.levels
     changed = np.flatnonzero(np.append(True, np.diff(levels) != 0.0))
     edges = np.searchsorted(recording.time, np.append(times[changed], math.inf))
@@ -68,7 +68,7 @@ def segments(
 
 
 def deviations(values: Array, parts: NDArray[np.int64]) -> Array:
-    """Return the standard deviations of parts of values, given by first and last indices."""
+    """Return the standard deviations of parts of values, given by begin and end indices (n, 2)."""
     apart = values - np.mean(values)
     begins, ends = parts.T
     sums = np.append(0.0, np.cumsum(apart)), np.append(0.0, np.cumsum(apart ** 2))
@@ -115,7 +115,7 @@ def static(
     for begin, end, when, level in segments(recording, 1):
         tail = recording.stretch[begin + (end - begin) * 2 // 3:end]
         rests.append((when, level, median(tail.tolist())))
-    # Take the median of each level: during short ones, the motion vibrates about it.
+    # Take the median of each level: at the end of short ones, the motion still vibrates.
     fields = np.unique([x[1] for x in rests])
     if len(fields) < 2:
         return Static(math.nan, usual, tuple(rests))
@@ -123,7 +123,7 @@ def static(
     low, high = float(np.min(recording.stretch)), float(np.max(recording.stretch))
     best = (math.inf, math.nan, usual)
     group = quantities.group_of(values)
-    # Motion may exceed the range that can be held, but not that of the force.
+    # Motion may exceed the range that can be held, but not that in which the force is defined.
     ends = group.rest + 1.002 * (np.array([low, high]) - group.rest)
     shape = np.full(len(limits), group.c1)
     for limit, material in zip(

@@ -14,12 +14,12 @@ from hmsa_ros.model.laws.coordinate import Coordinate, STRETCH
 
 # Maximum fraction of rows to leave out.
 _MOST_LEFT_OUT = 0.2
-# Interval, in median ones, above which a gap is noted; and ratio of levels to samples above which
-# the column is a measured field.
+# Interval, in median ones, above which a gap is noted.
 _GAP = 20.0
 # A clock was set back if this many rows are in order on either side of a jump back by this many
 # intervals.
 _RUN, _OVERTAKEN = 10, 3.0
+# Number of levels, relative to samples and at least, above which the column is a measured field.
 _MEASURED_FIELD = 0.3
 _FEW_LEVELS = 8
 # Maximum number of unknown switching times, for speed.
@@ -99,7 +99,7 @@ def read_csv(
 
 
 def _kept(path: Path, table: Table, notes: list[str]) -> NDArray[np.int64]:
-    """Return the usable rows by time, and note the others; raise an error if too many are lost."""
+    """Return the usable rows by time, and note the others; raise `BadInputError` for too many."""
     time, stretch = table.columns['time'], table.columns['stretch']
     places: NDArray[np.int64] = np.flatnonzero(np.isfinite(time) & np.isfinite(stretch))
     lost = len(time) - len(places)
