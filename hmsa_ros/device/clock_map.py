@@ -18,8 +18,8 @@ from hmsa_ros.model.units import NANOSECONDS
 _KEPT, ENOUGH = 64, 8
 # Standard deviation of the rate of an unknown clock: 100 ppm.
 _RATE_STD = 1e-4
-# Answers that took longer than this multiple of the shortest are ignored; half durations in ns up
-# to the second count alike, since the host takes as long to make a call that it has not just made.
+# Answers that took longer than this multiple of the shortest are ignored; half durations below the
+# second value, in ns, count alike, since a call after a pause takes the host that long.
 _SLOW, _LEAST = 3.0, 20_000
 # Number of successive answers inconsistent with the known clock until a new one is assumed.
 _STRANGE = 3
@@ -44,7 +44,7 @@ class ClockMap:
         self._answers: deque[_Answer] = deque(maxlen=_KEPT)
         self._origin = 0, 0
         self._strange = 0
-        # Device time minus host time is offset + drift (host - centre), all in ns.
+        # Device time minus host time is offset + drift (host - centre), with times in ns.
         self._centre = self._offset = self.drift = 0.0
         self._offset_std = self._rate_std = math.inf
 

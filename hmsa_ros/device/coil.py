@@ -406,7 +406,7 @@ class Coil(GuardedJoint):
             self.instrument.disarm()
 
     def switch_off(self, now: int) -> str:
-        """Switch off and refuse what was commanded; return the reason of a failure in words."""
+        """Switch off, and reject levels commanded before; return any failure in words."""
         self.stand_by()
         self.cut_off(now)
         try:

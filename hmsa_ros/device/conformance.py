@@ -255,7 +255,7 @@ class Trial:
         moving = timed.stretch
         changed = int(np.count_nonzero(np.diff(moving)))
         repeated = 1.0 - changed / (len(moving) - 1) if len(moving) > 1 else 0.0
-        # A sensor of few steps returns to each of them.
+        # The values of a sensor with few steps recur; changes of a slow one bring new values.
         if repeated > _REPEATED and 2 * len(np.unique(moving)) < changed:
             self._untried.append(
                 f'samples_new: +-{self._level:g} T are a few steps of the sensor; a larger '

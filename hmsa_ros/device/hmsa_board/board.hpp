@@ -6,21 +6,18 @@ in us since the board started; levels and readings are integers in units of 1e-6
 the sensor's unit).
 
 A request is a line `NUMBER SESSION VERB VALUES*CRC`, and so is its answer, with the same NUMBER.
-CRC
-is CRC-16/CCITT-FALSE of the text before the star, as four hexadecimal digits. A damaged line is
-not
-answered; a newline before a request separates it from noise. Each request may be repeated with the
-same effect and answer.
+CRC is CRC-16/CCITT-FALSE of the text before the star, as four hexadecimal digits. A damaged line
+is not answered; a newline before a request separates it from noise. Each request may be repeated
+with the same effect and answer.
 
-    H SESSION WATCHDOG    begin a session; the coil is switched off after WATCHDOG us without
-    request
+    H SESSION WATCHDOG    begin a session; the coil is switched off WATCHDOG us after the last
+                          request
                           -> H VERSION CAPACITY LIMIT RESOLUTION EVENTS SAMPLES, and the previous
                              session, 0 after a start or a silence
     T                     -> T TIME
     W LEVEL               output a level now, and drop all scheduled ones -> W TIME LEVEL EVENTS
     S TIME LEVEL          schedule a level; drop scheduled levels from that time on -> S, F if full
-    A NUMBER              -> A FIRST TIME LEVEL ...: levels that took effect, numbered from FIRST
-    on
+    A NUMBER              -> A FIRST TIME LEVEL ...: levels that took effect, from number FIRST on
     M NUMBER              -> M FIRST TIME READING ...: samples, in the same form
     K                     -> K: heartbeat
     C                     -> C TEMPERATURE of the coil in 1e-6 degrees Celsius; only C if it is not
