@@ -37,7 +37,7 @@ _HEADER = re.compile(r'\s*([A-Za-z_µ ]+?)\s*(?:[\[(/]\s*([^\])]*?)\s*[\])]?)?\s
 class Table:
     """Columns of a CSV file by name."""
 
-    columns: dict[str, Array]  # in SI; NaN for an empty cell
+    columns: dict[str, Array]  # in SI; NaN for a missing value
     lines: Array  # line number of each row
     notes: tuple[str, ...]  # conversions
 
@@ -136,7 +136,7 @@ def _split(text: str, separator: str | None) -> list[str]:
 
 
 def _number(text: str, separator: str | None) -> float | None:
-    """Return the number in a cell, NaN for an empty one, None for other text."""
+    """Return the number in a cell, NaN for a missing value, None for other text."""
     if text.lower() in ('', 'nan', 'na', 'n/a', 'null', 'none'):
         return math.nan
     try:
@@ -156,7 +156,7 @@ def _places(
         if match is None:
             continue
         name = '_'.join(match[1].lower().split())
-        # A keyboard gives the micro sign, or the Greek letter.
+        # The prefix is the micro sign or the Greek letter.
         unit = (match[2] or '').strip().lower().replace('\u03bc', 'µ')
         for suffix in ('ms', 'us', 'mt', 'mm', 's', 't'):
             stem = name.removesuffix(f'_{suffix}')

@@ -20,8 +20,8 @@ def prepare_middleware() -> None:
     cannot command a coil. Set ``ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET`` to use several machines.
 
     Unless other Fast DDS profiles are set, lost messages are sent again within 0.03 s, and new
-    participants are discovered within 0.5 s. By default, either may take 3 s, long after a command
-    was to apply. If other hosts take part, a send never waits for one of them.
+    participants are discovered within 0.5 s. With the defaults of Fast DDS, either may take 3 s,
+    long after a command was to apply. If other hosts take part, a send never waits for one.
     """
     if not any(os.environ.get(name) for name in _DECIDED):
         os.environ[RANGE] = 'LOCALHOST'

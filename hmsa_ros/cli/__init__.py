@@ -82,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == 'strict':
-        # A character that the locale lacks, in a table or the name of a file, ends no command.
+        # A character that the locale lacks, in a table or a file name, must not end a command.
         sys.stdout.reconfigure(errors='replace')
     # A command is started without importing the modules of the others.
     name = 'node' if words and words[0] in NODES else ''.join(words[:1]).replace('-', '_')

@@ -208,7 +208,7 @@ def _readings(arguments: argparse.Namespace) -> 'tuple[Array, Array]':
 
 def _typed(current: float) -> float:
     """Ask until a reading is valid; raise `HmsaError` at the end of the input."""
-    with redirect_stdout(sys.stderr):  # what is asked is no result
+    with redirect_stdout(sys.stderr):  # the question is not a result
         while True:
             try:
                 return number_of(

@@ -73,7 +73,7 @@ def _carry_out(
 
 
 def second_act(picture: Path) -> tuple[AdaptingResult, ...]:
-    """Run the moves with feedback off and adapt, and plot both."""
+    """Run the moves with feedback off and cautious, and plot both."""
     from hmsa_ros.report import style
     from hmsa_ros.report.paper import SCREEN
 

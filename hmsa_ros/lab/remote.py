@@ -131,7 +131,7 @@ class RemoteNode(Visitor):
 
 
 def _value(text: str, before: Any) -> Any:
-    """Return a value of the previous type, also for numbers that YAML reads otherwise."""
+    """Return a value of the previous type; 1 and 5e3, no floats in YAML, serve as floats."""
     value = get_parameter_value(text)
     if isinstance(before, str):
         value.type, value.string_value = ParameterType.PARAMETER_STRING, text

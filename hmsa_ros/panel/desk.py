@@ -31,8 +31,7 @@ from hmsa_ros.watch.listener import Listener
 from hmsa_ros.watch.scene import History, LEVELS, Scene, SLOTS
 from hmsa_ros.watch.screen import as_json
 
-# Frame interval in s; number of chart slots in a frame, and time in s for which a new page gets
-# all.
+# Frame interval in s; number of chart slots in a frame; time in s for which a new page gets all.
 _PERIOD, _TAIL, _NEW_SECONDS = 0.02, 24, 1.0
 # Time in s for a page to be reloaded, and after which a planner counts as gone.
 _RELOAD_SECONDS, _GONE_SECONDS = 1.0, 10.0

@@ -134,7 +134,7 @@ class Server:
 
 
 class _Guarded(RequestHandler):
-    """Refuse requests without valid token, host and origin; serves no content itself."""
+    """Refuse requests without valid token, host and origin; serve no content itself."""
 
     origin_needed = False
 

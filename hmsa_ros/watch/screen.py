@@ -104,8 +104,8 @@ _WIDE = 10
 # Smallest range of a chart's axis.
 _LEAST_RANGE = 1e-3
 _MOST_REPORTS = 4
-# Maximum height of a warning as a fraction of the rows, and of other messages in rows; indent by
-# the name and the level.
+# Divisor of the rows for the maximum height of a warning, and that of other messages in rows;
+# indent by the name and the level.
 _SHARE, _WORDS, _INDENT = 6, 2, 15
 # Time in s without a report, normally one a second, after which a node is silent.
 SILENT_AFTER = 3.5
