@@ -48,7 +48,7 @@ def limits_of(target: float, material: NondimensionalParameters, number: int) ->
 
 def settling_time(
         move: Move, start: float, target: float, material: NondimensionalParameters) -> float:
-    """Return the time after which the stretch stays within 1 % of the step, or `HmsaError`."""
+    """Return when the stretch stays within 1 % of the step for good, or raise `HmsaError`."""
     _, decay = ringing(target, material)
     times = np.linspace(0.0, move.levels[-1].time + _DECADES / decay, _SAMPLES)
     away = np.abs(Actual.off(material).response(move, start, times) - target)

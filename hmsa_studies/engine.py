@@ -69,7 +69,7 @@ def compute(
     resume : bool
         Keep chunks that exist and are intact.
     say : callable
-        Called with a message after an error that can be recovered.
+        Called with a message after an error from which the engine recovers.
     advance : callable, optional
         Called with the number of rows completed since the last call.
 

@@ -70,7 +70,7 @@ def local_processes(workers: int) -> Iterator[tuple[Executor, int]]:
 
 def local(workers: int) -> Start:
     """
-    Return a function that creates an executor of some processes; of this process for one.
+    Return a function that creates an executor with several processes, or with this one for 1.
 
     Raises
     ------

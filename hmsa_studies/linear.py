@@ -42,8 +42,8 @@ class Weights:
 class Linearised:
     """A block linearised about an equilibrium and discretised: x(k + 1) = a x(k) + b u(k)."""
 
-    #: state: stretch from the target, rate in time scales, and the delayed levels, the
-    #: newest first, shape (n, n)
+    #: effect of the state: stretch from the target, rate per time scale, and the delayed levels,
+    #: the newest first; shape (n, n)
     a: Array
     b: Array  #: effect of a level, as a load above the holding one, shape (n,)
 

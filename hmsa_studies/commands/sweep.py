@@ -98,10 +98,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class _Picture:
-    """What is drawn of a sweep, and where."""
+    """The figures of a sweep: columns to draw, and files."""
 
     def __init__(self, sweep: 'Sweep', arguments: argparse.Namespace) -> None:
-        """Find out what, before anything is computed."""
+        """Check the options before anything is computed."""
         import numpy as np
 
         self._sweep = sweep
@@ -156,7 +156,7 @@ class _Picture:
 
 
 def _sweep(arguments: argparse.Namespace) -> 'Sweep':
-    """Return what the arguments ask for."""
+    """Return the sweep of the arguments."""
     from hmsa_studies.axes import draw, NOTHING, parse_values, read_cases, Spread
     from hmsa_studies.settings import ACTUAL, BLOCK_OF, InSI, Nondimensional, System
     from hmsa_studies.sweep import Sweep
