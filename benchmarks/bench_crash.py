@@ -75,7 +75,7 @@ class Recorder:
         with Reader(recovered) as reader:
             stamps = [stamp for _, stamp, _ in reader.messages()]
         sequences = [message.sequence for message in BagReader(recovered).messages()]
-        # The middleware dropped these while the processor was busy; the kill did not.
+        # Dropped by the middleware while the processor was busy, not lost by the kill.
         gaps = sequences[-1] - sequences[0] + 1 - len(sequences)
         return (self.killed - stamps[-1]) * 1e-9, len(stamps), gaps
 

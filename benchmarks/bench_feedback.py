@@ -1,5 +1,5 @@
 """
-Measure the errors of moves with feedback when G is off, with real nodes, from a bag.
+Measure the errors of moves with feedback and an error of G, with real nodes, from a bag.
 
 In real time, the actuator moves from 1 to 1.4, to 1.1 and back, several times with feedback, which
 is reset in between, and then in open loop. rosbags reads the recording, and NumPy judges the
@@ -31,8 +31,8 @@ SIZES = ((0.0, (0.0,)), (0.1, (-0.1, 0.1)), (0.2, (-0.2, 0.2)))
 _SEEDS, _BIAS, _LIMIT = 3, 1e-3, 0.25
 # Allowed vibration and offset of the next move with feedback.
 _LARGEST = 0.02
-# From the start of a move to its arrival, in tau_p of open loop: first move, and next move by
-# cautious, longer where G turns out lower. A cycle is in time scales.
+# Time from the start of a move until its vibration is judged, in tau_p of open loop: first move,
+# and next move by whether feedback is cautious, with room for a lower G; a cycle in time scales.
 _FIRST, _NEXT, _CYCLE = 3.0, {True: 3.4, False: 1.25}, 1.45
 # Allowed residual that a cautious move is predicted to leave.
 _TOLERANCE = 3e-4

@@ -132,7 +132,7 @@ def _cell(
 
 
 def _off(random: np.random.Generator, factor: float = np.exp(0.3)) -> ActuatorParameters:
-    """Return the block with parameters off by up to a factor; J_lim and remanence by 1.35."""
+    """Return the block with parameters changed by up to a factor; J_lim and remanence by 1.35."""
     size = np.log(factor)
     return replace(
         BLOCK, shear_modulus=BLOCK.shear_modulus * np.exp(random.uniform(-size, size)),

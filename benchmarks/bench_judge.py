@@ -55,7 +55,7 @@ class Trial:
     seed: int
     kind: str
     setpoint: Setpoint
-    time: np.ndarray  # (n,): stamps, with those of the move and of the setpoint before
+    time: np.ndarray  # (n,): timestamps, with those of the move and of the setpoint before
     stretch: np.ndarray  # (n,)
     within: bool | None  # None where either answer is acceptable
     clarity: float  # distance of the truth from the tolerance, in standard deviations

@@ -194,7 +194,7 @@ def measured(place: int, given: Plants, seen: Callable[[int, Array], Array], swi
 
 def away(block: ActuatorParameters, random: np.random.Generator, most: float = 0.3
          ) -> ActuatorParameters:
-    """Return a block as in a data sheet: off by up to a factor of exp(``most``)."""
+    """Return a block as in a data sheet, changed by up to a factor of exp(``most``)."""
     factors: Any = np.exp(random.uniform(-most, most, 4))
     return replace(
         block, shear_modulus=block.shear_modulus * factors[0],

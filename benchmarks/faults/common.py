@@ -55,7 +55,7 @@ def move(
     rig.setpoint(target)
     await_change(rig, mark, patience)
     rig.let_pass(pause, patience)
-        # The report may come later than the samples with its level.
+    # The report may come later than the samples with its level.
     rig.spin_until(
         lambda: abs(rig.applied[-1][1] - rig.samples(mark)[1][-1, 2]) < _SAME,
         'the report of the last level', patience)

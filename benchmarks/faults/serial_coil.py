@@ -41,7 +41,7 @@ class SerialCoil:
                 raise OSError('the line is closed')
             answer += part
         word, *values, boots = answer.decode().split()
-        if word == 'RAISE':  # what the software of a vendor may do
+        if word == 'RAISE':  # as the software of a vendor may
             raise getattr(builtins, boots)
         if word == 'HANG':  # holding the GIL, as a badly made extension does
             ctypes.PyDLL(None).sleep(60)
