@@ -78,7 +78,7 @@ def pytest_xdist_auto_num_workers() -> int:
 def pytest_make_collect_report(
         collector: pytest.Collector
 ) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
-    """Let each worker begin with other modules, so that each kernel is compiled only once."""
+    """Let each worker begin with other modules, so that each is compiled only once."""
     report = yield
     worker = os.environ.get('PYTEST_XDIST_WORKER', 'gw0')
     if isinstance(collector, pytest.Directory):

@@ -5,7 +5,7 @@ Publishes numbered std_msgs/Float64 messages from a separate process.
               [--wait SUBSCRIBERS]
 
 It waits for its subscribers, publishes, prints "done" and stays until it is asked to end. It keeps
-the last N messages for late subscribers.
+the last N messages, by default all, for subscribers that missed some.
 """
 
 import argparse
