@@ -262,6 +262,9 @@ def test_former_or_misspelt_name_is_refused_with_the_present_one(ros, serve):
     result, = ros.set_parameters('planner', [Parameter('lead_tine', value=0.1)])
     assert result.reason == (
         'parameter lead_tine does not exist: expected one of the planner, such as lead_time')
+    result, = ros.set_parameters('planner', [Parameter('lead_tine' * 10**5, value=0.1)])
+    assert not result.successful
+    assert len(result.reason) < 500
 
 
 @pytest.mark.ros

@@ -26,6 +26,8 @@ from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.actuator import completed
 from hmsa_ros.interfaces.parameters import FIXED, JOINT, LAW, ParameterSpec, present_name
 
+# Characters of an unknown name that are compared and reported.
+_LONGEST_NAME = 200
 # Names written by earlier versions of hmsa identify.
 _ONCE = {'identification.verdict', 'identification.noise_std'}
 # Numbers that PyYAML reads as text.
@@ -207,7 +209,9 @@ def check_names(node: Node) -> None:
 
 
 def unknown(node: Node, name: str, others: Iterable[str] = ()) -> BadInputError:
-    """Return why a parameter is none of a node, with the nearest that it or others have."""
+    """Return the error of an unknown name, with the closest one of the node or ``others``."""
+    # The name may come from any participant, and comparing a long one would take seconds.
+    name = name[:_LONGEST_NAME]
     near = difflib.get_close_matches(name, [*node._parameters, *others], 1, 0.0)
     return BadInputError(
         f'parameter {name} does not exist: expected one of the {node.get_name()}, such as '
