@@ -100,7 +100,7 @@ class Audience:
             for x in endpoints.subscribers_of(self._node, sender.topic_name).values())
 
     def found(self, also: Any) -> bool:
-        """Return whether all known subscribers match; ``also`` is one more publisher or None."""
+        """Return whether all known subscribers are matched; ``also`` is one more publisher."""
         senders = [*self._senders.values(), *([] if also is None else [also])]
         if any(x.get_subscription_count() < self._node.count_subscribers(x.topic_name)
                for x in senders):

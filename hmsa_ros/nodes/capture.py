@@ -227,7 +227,8 @@ class Capture:
         The first one is read last: if /clock was added first, every tick received before a message
         of this round is known when the message gets its timestamp.
         """
-        # In this order: one that is replaced meanwhile is read to its end before the new one.
+        # In this order, a subscription that is replaced meanwhile is read to its end before the
+        # new one.
         known, leaving = [*self._subscriptions], []
         while self._leaving:
             key, old = self._leaving.pop(0)
@@ -278,5 +279,5 @@ class SimulatedTime:
         return None
 
     def at(self, received_ns: int) -> int:
-        """Return simulated time at a system time, in ns; the first tick before there is one."""
+        """Return the simulated time at a system time, in ns; the first one for earlier times."""
         return self._times[max(0, bisect_right(self._received, received_ns) - 1)]

@@ -1,9 +1,9 @@
 """
 Read messages field by field from their serialized form, without ROS message objects.
 
-rclpy creates objects for all points of a trajectory at once. For 5 million points this takes
-seconds and gigabytes. Here the header is read first, so that rejecting an overlong trajectory
-costs nothing, and the points are read on demand.
+rclpy creates objects for all points of a trajectory at once. For a million points this takes
+seconds and half a gigabyte. Here the header is read first, so that rejecting an overlong
+trajectory costs nothing, and the points are read on demand.
 """
 
 from collections.abc import Iterator, Sequence

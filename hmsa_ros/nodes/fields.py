@@ -30,7 +30,7 @@ _STEP = re.compile(r'([a-z]\w*)((?:\[\d+\])*)$')
 
 def located(type_name: str, message: Any, path: str) -> tuple[str, list[str | int], Any]:
     """
-    Return a path, its steps, and the value at its end; an empty path is the default one.
+    Return a path, or the default for an empty one, its steps, and the value at its end.
 
     The value is that of an empty message of the type, or the array before an index.
 

@@ -184,7 +184,7 @@ class ManagedNode(LifecycleNode):
         Raises
         ------
         HmsaError
-            If the node refuses, which refuses the start.
+            If a transition is refused, which refuses the start.
 
         """
         check_names(self)
@@ -195,7 +195,7 @@ class ManagedNode(LifecycleNode):
             transition()
             if self._refusal is not None:
                 raise self._refusal
-        # Why a later one is refused is in the log alone.
+        # Errors of later transitions are not raised, so they must be logged.
         self._autostart = False
 
     # -- transitions ---------------------------------------------------------------------------
@@ -317,7 +317,7 @@ class _CarefulParameterService(ParameterService):
             check_former_names(x.name for x in request.parameters)
             for x in request.parameters:
                 if not self._get_node().has_parameter(x.name):
-                    # rclpy does not say which one.
+                    # The error of rclpy does not name the parameter.
                     raise unknown(self._get_node(), x.name)
             return super()._set_parameters_atomically_callback(request, response)
         except Exception as error:  # rclpy raises errors of several unrelated classes here

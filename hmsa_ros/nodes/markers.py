@@ -11,8 +11,8 @@ material, so that the remanence of the deformed block is Br times the stretch. R
 applied field are arrows of the same scale: length H for a flux density of Br, upwards if positive.
 
 A beam lies along x, is clamped at the end of smaller x, and bends towards z. The arrow of its
-magnetisation lies along its middle, with half its length. The arrow of the field is as long as the
-deflection of a beam without stiffening.
+magnetisation lies along its middle and is half as long as the beam. The arrow of the field is as
+long as the deflection of a beam without stiffening.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -1,5 +1,5 @@
 """
-Publish without holding Python's global lock.
+Publish without holding the global interpreter lock.
 
 rclpy holds the lock while the middleware sends. A send that blocks, for example to a host that has
 disappeared, would block all threads, including the one that serves a coil.
@@ -17,7 +17,7 @@ from hmsa_ros.nodes.capture import Buffer
 
 @cache
 def _function() -> Any:
-    """Return rcl's function; calls through `ctypes.CDLL` release Python's global lock."""
+    """Return rcl's function; calls through `ctypes.CDLL` release the global interpreter lock."""
     found = ctypes.CDLL('librcl.so').rcl_publish_serialized_message
     found.argtypes = [ctypes.c_void_p] * 3
     found.restype = ctypes.c_int

@@ -249,7 +249,7 @@ class PlannerNode(ManagedNode):
     # -- time ----------------------------------------------------------------------------------
 
     def now(self) -> int:
-        """Return the node's time in ns; report if the clock was set."""
+        """Return the node's time in ns; pass a step of the clock on to the runtime."""
         if self.simulated:
             for taken in [] if self._ticks is None else self._ticks.take()[-1:]:
                 try:

@@ -33,11 +33,11 @@ def start_ros(
     Raises
     ------
     BadInputError
-        If the log cannot be written, or there is no such domain.
+        If the log cannot be written, or ROS_DOMAIN_ID is out of range.
 
     """
     domain = os.environ.get('ROS_DOMAIN_ID', '').strip()
-    # DDS has no ports for others, and ends the process.
+    # Other domains have no ports in DDS, which would end the process.
     if domain and not (domain.isdecimal() and int(domain) <= _LAST_DOMAIN):
         raise BadInputError(
             f'ROS_DOMAIN_ID is {domain!r}: expected a whole number of 0 to {_LAST_DOMAIN}')
