@@ -61,7 +61,7 @@ class Cycles:
                 for key, x in (('p50', 0.5), ('p99', 0.99), ('largest', 1.0))}
 
     def report(self) -> tuple[Severity, str, dict[str, object]]:
-        """Return severity since the last call, message and counters."""
+        """Return severity and message for the cycles since the last call, and counters."""
         count, late = self.count - self._reported[0], self.late - self._reported[1]
         self._reported = self.count, self.late
         message = f'{late} of {count} cycles late' if late else 'cycles in time'

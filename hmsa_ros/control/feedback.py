@@ -76,7 +76,7 @@ class Feedback:
     def _begin(self, models: Mapping[str, Model]) -> None:
         """Begin without samples, with models as given."""
         for joint in self.joints.values():
-            # This cancels a choice or an audit that is under way.
+            # Without an estimate, corrections that are being drafted have no result.
             joint.latest = None
         self.joints = {
             name: Joint(name, self._group.planners[name], model, self._settings, self._clock())
@@ -164,7 +164,7 @@ class Feedback:
         Return whether this took long.
         """
         busy = False
-        # An update under way ends before the next one, which is that of the longest wait.
+        # An update under way ends before another begins, first for the joint that waited longest.
         for joint in sorted(
                 self.joints.values(), key=lambda x: (x.looking is None, x.next_look)):
             if joint.choosing is not None:

@@ -62,7 +62,7 @@ class Outcome:
 @dataclass
 class _Goal:
     request: Trajectory
-    path: Mapping[str, Point]  # maximum errors during the motion, by joint
+    path: Mapping[str, Point]  # tolerances during the motion, by joint
     plan: int | None = None  # number of the plan that carries it out; None until it is made
     canceled: bool = False
     begin: int = 0  # in ns, relative to the begin of the last setpoint: a clock step shifts both

@@ -420,7 +420,8 @@ def as_held(planner: Planner, time: int) -> Believed | None:
     Return the predicted state at a time in ns, in the stretches of the planner's model.
 
     The last level may be planned with other parameters. With those of the model it holds another
-    stretch, and a move from the planned one would leave vibration. None if it needs no change.
+    stretch, and a move from the planned one would leave vibration. None if both have the same
+    parameters, or if the model cannot be at that stretch.
     """
     last, model = planner.plan.levels[-1], planner.model
     if last.model.actuator == model.actuator and last.model.others == model.others:

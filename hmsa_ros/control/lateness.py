@@ -16,7 +16,8 @@ _ENOUGH = 3
 _APART, _MOST = 5.0, 0.6
 # Number of commands per joint whose sending time is stored.
 _REMEMBERED = 64
-# A driver's delay is constant if its spread is below this fraction of that of the send times.
+# The driver causes the delay if the spread of the lateness is below this fraction of that of the
+# time from sending to effect; the transport causes it in the opposite case.
 _CONSTANT = 0.5
 # Vibration, as a fraction of the step, that is negligible.
 _NOTHING = 1e-3
@@ -113,7 +114,8 @@ class Lateness:
         if most == 1 or not exception and usual[0] == usual[-1]:
             return np.full((1, count), self.expected)
         if exception:
-            # The exception persists or is over; the latter is more probable the more were in time.
+            # The exception persists or is over; the more usual commands there were, the more
+            # scenarios assume that it is over.
             ways = [*exception, *usual[::-(-len(usual) // (min(most, _RARE) - 1))]]
             return np.repeat(np.array(ways)[:, None], count, axis=1)
         alike = np.array([usual[int(x * len(usual))] for x in _SHARES])[:most, None]

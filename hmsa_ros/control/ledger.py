@@ -9,10 +9,11 @@ from hmsa_ros.judge.records import Finding, Sensor, Setpoint
 from hmsa_ros.model.equations import equilibrium_stretch
 from hmsa_ros.planning.timeline import Model, Plan
 
-# A move is worse if its error exceeds the open-loop error by this fraction of the step and by this
-# many standard deviations.
+# A move is worse if its error exceeds the open-loop error by more than this fraction of the step
+# plus this many standard deviations.
 _WORSE, _SURE = 0.005, 3.0
-# Largest usual vibration, peak to peak, over the predicted amplitude: twice three deviations.
+# Largest usual vibration, peak to peak, over the predicted amplitude: twice three standard
+# deviations.
 _EXPECTED = 6.0
 # Smaller steps are not informative.
 _STEP = 0.02
@@ -33,7 +34,7 @@ class Ledger:
 
     A move planned with the given parameters shows the open-loop vibration. If a learnt level
     holds the actuator, the open-loop steady-state error is known too, because the given parameters
-    predict the shift between the two levels accurately enough.
+    predict the shift of the equilibrium between the two levels accurately enough.
     """
 
     def __init__(self) -> None:

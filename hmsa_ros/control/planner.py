@@ -171,7 +171,8 @@ class PlannerRuntime:
         self._drop(self.devices.cut_off(
             joint, self.settings, in_force=in_force, locked=locked))
         if in_force and self.active and self._takeover.engaged:
-            # Whoever gives no signs of life afterwards would have it cut off again.
+            # Before the first request there are no heartbeats: released, the device would be cut
+            # off again.
             self.devices.acknowledge(joint)
 
     def _drop(self, verdict: Verdict | None) -> None:

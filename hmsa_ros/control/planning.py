@@ -56,7 +56,7 @@ class Planning:
         self._leftovers.clear()
 
     def add(self, request: Request, *, engaged: bool) -> Work:
-        """Add a checked request, first in the queue if it replaces all others."""
+        """Add a checked request; once ``engaged``, one that replaces all others comes first."""
         work = work_on(request, self._group, self._around.clock, self._corrections.cautious)
         if engaged and work.replaces(self._queue):
             self._queue.appendleft(work)

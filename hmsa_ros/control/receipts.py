@@ -84,9 +84,10 @@ class Receipts:
         """
         Process a receipt with the device's time; return whether the device restarted.
 
-        ``now`` is the time of the planner's clock. The two times are ``comparable`` if each side
-        has its own clock: a shared clock may be slowed down or paused. A device has restarted if
-        it reports no command after it reported one.
+        ``command`` is the timestamp of the newest command that the device has received, 0 for
+        none. ``now`` is the time of the planner's clock. The two times are ``comparable`` if each
+        side has its own clock: a shared clock may be slowed down or paused. A device has restarted
+        if it reports no command after it reported one.
         """
         steady = self._steady()
         known = self._joints.get(joint)

@@ -31,7 +31,7 @@ class Settings:
     takeover_timeout: int = NANOSECONDS // 2  # initial wait for plant and sample; 0: no wait
     takeover_max_age: int = NANOSECONDS // 2  # maximum age of such a sample
     after_cut_off: str = 'wait'  # one of `AFTER_CUT_OFF`
-    max_points: int = 100_000  # limit for one request, summed over its joints
+    max_points: int = 100_000  # maximum number of setpoints in a request, summed over joints
     trajectory_mode: str = 'rest'  # one of `TRAJECTORY_MODES`
     allow_partial_joints: bool = False  # whether a trajectory may omit joints
     tolerances: Tolerances = field(default_factory=Tolerances)
@@ -40,7 +40,7 @@ class Settings:
     feedback: str = 'off'
     feedback_parameters: tuple[str, ...] = TRACKED  # estimated in addition to the state
     feedback_cautious: bool = False  # whether ``adapt`` is ``cautious``
-    feedback_tolerance: float = TOLERANCE  # fraction of the step from which it is large
+    feedback_tolerance: float = TOLERANCE  # large predicted error, as a fraction of the step
     feedback_trim: float = 0.0  # limit in T for trimming against a force; 0: off
     feedback_frozen: bool = False  # estimate only the state, keep the parameters
     feedback_file: str = ''  # file for learnt parameters; empty: none

@@ -37,7 +37,7 @@ class Work:
     request: Request | None = None  # None for a replanning
     number: int = field(default_factory=count().__next__)  # increases with each work
     corrects: bool = False  # whether it is a correction from samples
-    spent: int = 0  # CPU time in ns
+    spent: int = 0  # time spent on a correction, in ns
 
     @property
     def postponed(self) -> bool:
@@ -101,7 +101,7 @@ def in_time(
     Return drafts and the time in ns they are for, which has not passed when they are ready.
 
     Planning restarts if the plans of the joints change meanwhile. ``size`` is the approximate
-    number of pauses. The work includes the function ``then`` of the drafts.
+    number of pauses. The drafts are passed through ``then``, as part of the work.
     """
     lead = planners[0].options.lead_time
     later = 0

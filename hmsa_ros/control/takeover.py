@@ -202,7 +202,7 @@ class Takeover:
         return True
 
     def _is_current(self, seen: Seen, settings: Settings) -> bool:
-        """Return whether a sample has come lately, or time has stood still since."""
+        """Return whether a sample is recent in steady time, or by a shared clock, as if paused."""
         return self._around.steady() - seen.came <= _RECENT or self._around.one_clock() and (
             abs(self._around.clock() - seen.stamp) <= settings.takeover_max_age)
 

@@ -44,15 +44,15 @@ class Trust:
             return False
         self._failures += self.acts
         if self._failures > 1:
-            # Each restart requires more fitting moves.
             self.confirmed = None
         self.beginnings += 1
         self.acts, self._begin, self._doubts = False, now, 0
+        # From the second failure on, each one doubles the number of moves that must fit.
         self._moves = 2 ** max(self._failures - 1, 0)
         return True
 
     def fits(self, plan: Plan, unit: float, estimator: Estimator, now: int) -> bool:
-        """Record that samples fit at a time in ns; return whether to restart, if too few fit."""
+        """Record that samples fit at a time in ns; return whether to restart as too few did."""
         # The time scale is in s.
         self._doubts = 0
         if self.ended:
