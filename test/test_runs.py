@@ -92,7 +92,7 @@ def test_a_creeping_plant_recorded_from_the_middle_of_a_motion_on_is_said_to_be(
         'time', 'logged', 'stretch', 'rate', 'flux_density')})
     found = verify_run(late)
     assert found.largest_difference > 1e-4
-    assert 'the first sample is not one of rest' in found.note
+    assert 'the first sample is not at rest' in found.note
     with pytest.raises(BadInputError, match='ratio has 1 values and viscoelastic.time 2'):
         verify_run(moved(told={**TOLD, 'plant.viscoelastic.ratio': 0.1}))
 

@@ -45,8 +45,9 @@ def plans_of(verdicts: Sequence[Verdict], plans: Sequence[int]) -> dict[int, int
     """
     Return the plans that were published right before a verdict, if only recording times are known.
 
-    Both are ordered by time. Plans are given by their recording time, in ns, as are the returned
-    verdicts. The first verdict may belong to a plan from before the recording.
+    The result maps the recording time of each such plan to that of its verdict, in ns. Both
+    arguments are ordered by time; plans are given by their recording times. The first verdict may
+    belong to a plan from before the recording.
     """
     found: dict[int, int] = {}
     for verdict in beginning(verdicts, verdicts[0].plan if verdicts else 0):
@@ -105,7 +106,7 @@ def _answers(verdicts: Sequence[Verdict], new: Collection[int]) -> Iterator[Verd
 def _nearest(
         times: Sequence[int], time: int, before: int, after: int, without: Container[int],
         ) -> int | None:
-    """Return the time nearest to another within a range, without some; None if there is none."""
+    """Return the time nearest to another in a range, except ``without``; None if there is none."""
     begin, end = bisect_left(times, time - before), bisect_left(times, time + after)
     return min((x for x in times[begin:end] if x not in without),
                key=lambda x: abs(x - time), default=None)

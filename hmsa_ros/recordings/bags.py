@@ -301,7 +301,7 @@ class _Collected:
             self.requests[i] = replace(request, sent=sent, taken=taken)
 
     def _plans(self, joint: str) -> Iterator[tuple[Level, ...]]:
-        """Return the plans of a joint, or those without joint names."""
+        """Yield the plans of a joint, and those without joint names."""
         for plan in self.plans:
             place = _place(plan.joints, joint)
             if place is None:
@@ -320,7 +320,7 @@ class _Collected:
             yield tuple(levels)
 
     def _requests(self, joint: str) -> Iterator[RecordedRequest]:
-        """Return the requests for a joint, by time."""
+        """Yield the requests for a joint, by time."""
         for asked in sorted(self.requests, key=lambda x: x.sent):
             place = _place(asked.joints, joint)
             if place is not None:

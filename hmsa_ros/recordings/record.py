@@ -33,7 +33,7 @@ class RecordedRequest:
     # Stretch, and end time in ns from the start; None for a setpoint that is held until the
     # next.
     points: tuple[tuple[float, int | None], ...]
-    # End of a path in ns from the start, whose one point is its end; None for setpoints.
+    # End time of a path in ns from the start; its one point is where it ends. None for setpoints.
     path: int | None = None
     name: str = ''  # if any
     taken: bool = True  # False if the planner is known to have refused it

@@ -111,10 +111,10 @@ def _begin(run: Run, request: RecordedRequest, levels: Sequence[Level]) -> int:
 
 def _under_way(run: Run, place: int, levels: Sequence[Level]) -> int | None:
     """
-    Return the first timestamp of a plan that starts with a level already sent for it.
+    Return the time of the first level sent for a plan, if the plan starts with one already sent.
 
-    Such a plan contains the rest of the running motion. ``levels`` are those sent since the
-    request.
+    Such a plan contains only what remains of its motion; None for other plans. ``levels`` are
+    those sent since the request.
     """
     plan = run.plans[place]
     old = {(x.stamp, x.flux_density) for x in (run.plans[place - 1] if place else ())}

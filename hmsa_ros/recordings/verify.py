@@ -47,7 +47,7 @@ class Verification:
     states: str  # the topics compared
     commands: str
     sample_count: int  # messages compared
-    command_count: int
+    command_count: int  # commands applied in the simulation
     # Commands received after their timestamp, so that the time of their effect is unknown; 0 if
     # the plant reported it.
     late_count: int
@@ -67,8 +67,8 @@ def verify_run(run: Run) -> Verification:
     """
     Simulate the levels of one actuator and compare the result with its samples.
 
-    Raise `BadInputError` if there are no levels, the actuator is unknown, or there are several
-    runs, `HmsaError` if the integration fails.
+    Raise `BadInputError` if there are no commands and no field, the parameters of the actuator are
+    unknown, or there are several runs; `HmsaError` if the simulation fails.
     """
     if run.summary is not None and len(run.summary.files) > 1 and (
             jumps := run.summary.custom_data.get('time_jumps', '0')) != '0':
@@ -90,8 +90,8 @@ def verify_run(run: Run) -> Verification:
     simulation = _start(run, window.start, creep)
     if creep and not _rests(simulation):
         notes.append(
-            'the first sample is not one of rest: what the branches of viscoelastic.* hold by '
-            'then is not known and taken as nothing, expected differences that fade')
+            'the first sample is not at rest: the overstress of the viscoelastic branches is '
+            'unknown there and taken as 0, expected differences that fade')
     samples = zip(
         np.maximum.accumulate(run.logged[window]).tolist(), itertools.repeat(_SAMPLE),
         run.time[window].tolist(), run.stretch[window].tolist(), strict=False)
