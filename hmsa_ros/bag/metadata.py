@@ -28,7 +28,7 @@ class Topic:
     type: str  #: for example ``'sensor_msgs/msg/JointState'``; empty if unknown
     definition: str = ''  #: with its dependencies; empty if unknown
     definition_encoding: str = 'ros2msg'  #: or ``'ros2idl'``, empty
-    profiles: tuple[qos.Qos, ...] = ()  #: what the publishers offer
+    profiles: tuple[qos.Qos, ...] = ()  #: offered by the publishers
     type_hash: str = ''  #: RIHS01 hash; empty if unknown
     encoding: str = 'cdr'  #: of the messages
     message_count: int = 0  #: as the metadata say

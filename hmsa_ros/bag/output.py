@@ -61,9 +61,9 @@ class OutputFile:
     One file of a bag; methods that write raise `OSError` if the disk does not accept all of it.
 
     ``topics`` is the list of the bag's topics, which may grow. ``counts`` contains the number of
-    messages by topic, ``start`` and ``end`` the first and last log time, ``size`` the size of the
-    file in bytes, ``message_size`` that of the messages, and ``notes_size`` that of the metadata
-    records of the experiment.
+    messages by topic, ``start`` and ``end`` the lowest and highest log time, ``size`` the bytes
+    written (until `finish`, the file on disk is larger), ``message_size`` that of the
+    messages, and ``notes_size`` that of the metadata records of the experiment.
     """
 
     def __init__(self, path: Path, preset: str, topics: Sequence[Topic]) -> None:

@@ -37,7 +37,7 @@ FILE_SECONDS = 1.0
 class Limits:
     """Limits on flushing, splitting, and memory."""
 
-    flush_period: float = 0.5  #: s until a message has been passed to the operating system
+    flush_period: float = 0.5  #: maximum time in s until the operating system has a message
     max_size: int = 0  #: bytes at which a file is split; 0 for never, else at least 1024
     max_duration_ns: int = 0  #: time span at which a file is split; 0 for never
     #: bytes of queued messages at which new ones are counted as lost
@@ -240,7 +240,7 @@ class Recording:
             raise BagError(str(error)) from error
 
     def _keep(self, batch: _Batch) -> None:
-        """Keep messages in memory for a snapshot, discarding the oldest; count those too large."""
+        """Keep messages for a snapshot and discard the oldest; count a batch too large as lost."""
         self._queued += batch.size
         self._kept.append(batch)
         oldest = batch.messages[-1][1] - self._limits.snapshot_ns

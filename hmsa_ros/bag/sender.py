@@ -19,7 +19,7 @@ READ_AHEAD_BYTES = 64 * 2**20
 
 
 class ReadAhead:
-    """Read messages ahead in a thread; ``read`` takes the argument ``cancelled``."""
+    """Read ``size`` messages ahead in a thread; ``read`` takes the argument ``cancelled``."""
 
     def __init__(self, read: Callable[..., Iterator[Message]], size: int) -> None:
         self._ended = False

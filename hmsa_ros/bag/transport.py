@@ -65,7 +65,7 @@ class Transport:
         answer.wait(timeout)
         with self.change:
             if self._steps and not answer.is_set():
-                # Nobody is to be surprised by it later.
+                # Withdraw the step, so that it does not send a message later.
                 self._steps -= 1
                 self._answers.remove(answer)
         return answer.is_set() and not self.stopped
@@ -115,10 +115,12 @@ class Transport:
         self.position = when
         if self._answers:
             with self.change:
-                self._answers.popleft().set()
+                # A step may have been withdrawn in between.
+                if self._answers:
+                    self._answers.popleft().set()
 
     def rest(self, seconds: float) -> bool:
-        """Wait; return whether playing was stopped meanwhile."""
+        """Wait for a time in s; return whether playback was stopped meanwhile."""
         with self.change:
             return self.change.wait_for(lambda: self.stopped, max(0.0, seconds))
 
