@@ -37,7 +37,7 @@ from hmsa_ros.report.outcome import findings_of
 FEW_SAMPLES = 10
 # Fraction of the step; a block that covers less did not move.
 _MOVED = 0.1
-# Longer takes minutes to simulate. It is a pause, or a stamp of another clock than the samples'.
+# Maximum natural periods to simulate: more take minutes, and indicate a pause or another clock.
 _MOST_PERIODS = 1e6
 
 
@@ -126,7 +126,7 @@ def verdicts(evaluations: Sequence[Evaluation], number: int) -> str:
 
 
 def _verdict(finding: Finding) -> str:
-    """Return a verdict in words, with the time of arrival if that is after the move."""
+    """Return a verdict in words, with the time of rest for a target that is only approached."""
     words = str(finding.verdict).replace('_', ' ')
     late = finding.setpoint.arrival is None and finding.arrived
     return f'{words} after {1e3 * judged_from(finding):.3g} ms' if late else words
