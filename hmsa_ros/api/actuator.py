@@ -555,9 +555,9 @@ class Actuator:
         Parameters
         ----------
         shape : {'sine', 'triangle', 'square'} or pairs, array of shape (n, 2), mapping, DataFrame
-            Shape of the stretch (not of the field), or one period of times and stretches, which is
-            shifted and scaled to offset and amplitude. A square wave is a sequence of two-step
-            moves.
+            Shape of the stretch (not of the field), or one period of times and stretches, shifted
+            and scaled so that the mean is the offset, and the peak the amplitude. A square wave is
+            a sequence of two-step moves.
         frequency : float
             In Hz.
         amplitude : float

@@ -67,7 +67,11 @@ class Identified:
         return {x: (found[x].low, found[x].high) for x in self.result.names}
 
     def report(self, path: str | Path | None = None) -> Table:
-        """Return the table of ``hmsa identify``; with a path, also write the HTML page there."""
+        """
+        Return the table of ``hmsa identify``.
+
+        With a path, also write the HTML page there; raise `BadInputError` if it cannot be written.
+        """
         if path is not None:
             from hmsa_ros.report.identified import page
 
