@@ -27,7 +27,7 @@ _DENSE = 0.4
 _NEAR, _MIDDLE, _WIDE = (0.75, 1.3), (0.6, 1.6), (0.3, 2.5)
 # Periods above which a frequency far from the model's, and a drift at all, can be identified.
 _FAR, _DRIFTS = 3.0, 3.0
-# Frequencies per period in the span, and around the best one, and number of refinements.
+# Frequencies to try per 1/span of the range, and around the best one, and number of refinements.
 _TRIED, _REFINED, _ROUNDS = 3, 7, 3
 # Decays to try, relative to the largest one, which is a multiple of the model's, within limits
 # given as a ratio to the frequency.
@@ -67,7 +67,7 @@ class Fit:
     frequency: float  #: in rad/s
     noise: float  #: standard deviation of a sample
     usual: float  #: robust standard deviation, insensitive to single events
-    independent: float  #: fraction of independent samples with coloured noise
+    independent: float  #: effective fraction of independent samples; below 1 for coloured noise
 
 
 def fit(

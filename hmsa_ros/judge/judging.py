@@ -232,7 +232,7 @@ def _thinned(
 
 
 def _looks(stamps: Stamps, begin: int, setpoint: Setpoint) -> Iterator[slice]:
-    """Yield the samples of each window: a few periods at first, then ever longer intervals."""
+    """Yield the samples of each window: adjacent at first, then ever farther apart."""
     length = setpoint.look
     if len(stamps) > 1:
         length = max(length, ENOUGH * round(float(np.median(np.diff(stamps)))))

@@ -25,7 +25,8 @@ class Setpoint:
     """
     A setpoint as it was requested; times in ns.
 
-    Frequency and decay of vibration about the target are those of a model, as initial values.
+    Frequency and decay of vibration about the target are those of a model; they guide the
+    search.
     """
 
     target: float  #: stretch to rest at
@@ -123,8 +124,8 @@ class Sensor:
     """
     Properties of the sensor: it reports bias plus gain times stretch, with a latency.
 
-    Each has a standard deviation, which widens the bounds; ``together`` is the correlation of bias
-    and gain.
+    Each has a standard deviation; those of bias and gain widen the bounds. ``together`` is the
+    correlation of bias and gain.
     """
 
     bias: float = 0.0
@@ -136,7 +137,7 @@ class Sensor:
     together: float = 0.0
 
     def to_dict(self) -> dict[str, str]:
-        """Return the properties as they are part of a planner's estimate."""
+        """Return the properties as they appear in a planner's estimate."""
         return {f'{_SENSOR}{key}': f'{x:.9g}' for key, x in asdict(self).items()}
 
     @classmethod
