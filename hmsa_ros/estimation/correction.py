@@ -167,8 +167,8 @@ def worthwhile(
     Return whether another course has a sufficiently smaller error, and gains at least ``least``.
 
     Both are compared along the direction in which their errors differ, since common errors do not
-    matter. The error has to decrease to at most ``share``. A change of less than ``little``, in
-    units of stretch, can do little harm, and only has to be a small improvement.
+    matter. The error has to decrease to less than ``share`` of the former one; for a change of
+    less than ``little``, in units of stretch, `SHARE` suffices, since it can do little harm.
     """
     if not math.isfinite(before.size + after.size):
         return after.size < before.size

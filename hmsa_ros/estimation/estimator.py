@@ -470,7 +470,7 @@ class Estimator:
             x[1] == y[1] or not before < y[0] <= end for x, y in itertools.pairwise(self._levels))
 
     def _move_begins(self, until: float) -> int:
-        """Return the time in ns of the last change, until a time in s, after a long rest."""
+        """Return the time in ns, until one in s, of the last change after a long calm."""
         calm = round(_CALM * self.prior.values['time_unit'] * NANOSECONDS)
         most = max((abs(x) for _, x in self._levels), default=0.0)
         changes = [y[0] for x, y in itertools.pairwise(self._levels)

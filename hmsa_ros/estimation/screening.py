@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import Coordinate
 
-# Rejected samples in a row that are no outliers: sensor or actuator has changed.
+# Number of rejected samples in a row that are no outliers: sensor or actuator has changed.
 _LOST = 6
-# Samples that fit in a row after which that is over.
+# Number of fitting samples in a row after which samples are used again.
 _FOUND = 12
 # Equal values in a row that show a frozen sensor, if more motion than this, in standard
 # deviations, is expected.
@@ -24,8 +24,8 @@ class Screening:
     """
     Rejection of samples beyond some standard deviations of the innovation, with a reason.
 
-    Attributes count values that were no number, repeated, too late, had a future timestamp, did
-    not fit, or did not change while the actuator moved.
+    Attributes count values that were no number, had the timestamp of another one, were too late,
+    had a future timestamp, did not fit, or did not change while the actuator moved.
     """
 
     def __init__(self, gate: float, coordinate: Coordinate) -> None:

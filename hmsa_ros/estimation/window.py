@@ -23,7 +23,7 @@ from hmsa_ros.identification.response import sensed
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import coordinate_of
 
-# Maximum Gauss-Newton iterations, bisections of each step, and small step in standard deviations.
+# Maximum Gauss-Newton iterations, halvings of each step, and small step in standard deviations.
 _PASSES, _HALVINGS, _SMALL = 4, 4, 0.1
 # Growth of the number of samples after which the suspects are examined again.
 _MORE = 1.3
@@ -125,7 +125,7 @@ class Window:
     weighed: int = 0  # number of samples when these were chosen
     others: Others = Others(1.0, *(np.zeros(()),) * 3)  # effect of other sets
     rest: Rest | None = None  # equilibrium at the begin
-    information: Array = field(init=False)  # inverse of the covariance
+    information: Array = field(init=False)  # inverse of the covariance, set by `settle`
 
     def values_at(self, z: Array) -> dict[str, Any]:
         """Return the values of all quantities for coordinates."""
