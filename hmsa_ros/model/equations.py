@@ -102,9 +102,9 @@ def equilibrium_stretch(load: ArrayLike, material: Material) -> Array:
 
 def stretch_limits(material: Material) -> tuple[float, float]:
     """
-    Return the limiting stretches at full extension of the chains, both excluded.
+    Return the limiting stretches between which the force increases, both excluded.
 
-    They are 0 and infinity for models without limits.
+    For Gent, they are those at full extension of the chains; for neo-Hookean, 0 and infinity.
     """
     made = packed(material)
     return float(made[law.LOWER]), float(made[law.UPPER])

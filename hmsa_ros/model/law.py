@@ -46,7 +46,7 @@ __all__ = [
 KIND = 0  # family of the model
 ZETA = 1  # damping
 C1 = 2  # shape of the block, 2 H^2/L^2
-DAMPING = 3  # d; of a beam at rest
+DAMPING = 3  # d; for a beam, its value at rest
 LOWER = 4  # limiting stretches; 0 and infinity without limits
 UPPER = 5
 

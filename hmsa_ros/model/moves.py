@@ -18,7 +18,7 @@ class State:
     load: float = math.nan
     #: Load that a lagging field approaches; None if equal to the load.
     amplifier: float | None = None
-    #: Elastic force that each Maxwell branch has followed; empty if relaxed.
+    #: Elastic force that each branch has followed; empty if relaxed.
     followed: tuple[float, ...] = ()
 
     @property

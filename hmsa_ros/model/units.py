@@ -21,7 +21,7 @@ class Drive:
     unit: str
     shown: str  #: unit in tables and figures
     per: float  #: number of shown units in one unit
-    squared: bool = False  #: whether the load is the square of the level
+    squared: bool = False  #: whether the load increases as the square of the level
 
     def text(self, level: float, form: str = '.3g') -> str:
         """Format a level in the shown unit."""

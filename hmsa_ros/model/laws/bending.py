@@ -80,7 +80,7 @@ def angle_of(deflections: ArrayLike) -> Array:
     """Return the angle of the tip in rad at deflections, each within that of `fold`."""
     wanted = np.asarray(deflections, dtype=np.float64)
     most = float(deflection(fold()))
-    # Near the fold the missing deflection is about the square of the missing angle.
+    # Near the fold the missing deflection is about as the square of the missing angle.
     angle: Array = np.sign(wanted) * fold() * (
         1.0 - np.sqrt(np.maximum(1.0 - np.abs(wanted) / most, 0.0)))
     for _ in range(_NEWTON):

@@ -152,7 +152,7 @@ def fitted(stretch: tuple[float, ...], flux: tuple[float, ...]) -> Curve:
         raise BadInputError(
             f'law table has a scatter of {scatter * height:.3g} T about a smooth curve: expected '
             f'at most {_MOST_SCATTER * height:.3g} T, {_MOST_SCATTER:.0%} of its range')
-    # Use the least smooth curve that increases everywhere; if none does, even parabolas misfit.
+    # Use the roughest curve that increases everywhere; if there is none, 0, which fits no points.
     slopes = basis.derivative()(_points(knots, np.linspace(0.0, 1.0, _LOOK)))
     chosen = next((x for x in coefficients[best if scatter > _EXACT else 0:]
                    if np.min(slopes @ x) > _LEAST_SLOPE), np.zeros(len(basis.c)))
