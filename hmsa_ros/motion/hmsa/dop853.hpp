@@ -84,8 +84,8 @@ template <class S> constexpr int size_of = sizeof(S) / sizeof(real<S>);
 // f(i, y, k): derivative k of state y at node i of the step. Returns the error in units of rtol.
 template <class S, int W, int stages = 12> struct Step {
     using R = real<S>;
-    // For states of more than three values with one derivative each, loop over the stages and over
-    // the values in use, so that they share one code.
+    // States of more than three values, or with more than one derivative each, share one code: it
+    // loops over the stages and over the values in use.
     static constexpr bool unrolled = W <= 3 && count_of<S> <= 1 && stages == 12;
     static constexpr bool pairs = sizeof(Pair<R>) > sizeof(R);
     static_assert(unrolled || !pairs || W * size_of<S> % 2 == 0, "no room for the last pair");

@@ -85,7 +85,7 @@ template <class C> struct AnyFlow {
         power_law_flow.read(from + 1);
     }
     void seed(int constant, int j) { power_law_flow.seed(constant, j); }
-    // The rate of a nonlinear rule, and what remains under constant force.
+    // The flow of a nonlinear rule, and the remainder of x after a span of constant force.
     template <class S> HMSA_APART S other(const S &x) const { return power_law_flow(x); }
     double relaxed(double x, double speed, double span) const
     {

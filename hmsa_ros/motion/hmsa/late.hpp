@@ -10,7 +10,7 @@ struct Late {
     double push, until;  // level and end of the push from tau_p on; beta_1 without a lag
 };
 struct Before {
-    double field, load;  // at the start: load, and output of the amplifier
+    double field, load;  // at the start, as loads: field, and output of the amplifier
     double lag;
     const double *branches;  // (branch_count, branch_columns)
     int branch_count;
@@ -20,8 +20,8 @@ struct Before {
 template <int NB, class System> Late late(const System &system, const Branches<NB> &branches, const double *m,
     const Move &move, const Wanted &wanted, const Before &before)
 {
-    // Duration of the push, in time constants: it exceeds the holding level by as much as the
-    // previous level falls short of it.
+    // Duration of the push, in time constants: the push exceeds the holding level by as much as
+    // the previous level falls short of it.
     constexpr double length = 0.6931471805599453;
     Planner<System, NB> planner;
     auto &search = planner.search;

@@ -11,7 +11,7 @@ struct Shot {
     double *times, *loads;  // (levels,), changed in place
     const double *d_times, *d_loads;  // (levels, unknowns)
     double stretch, rate;
-    double field, load;  // at the start: load, and output of the amplifier
+    double field, load;  // at the start, as loads: field, and output of the amplifier
     double target, slew, lag;
     const double *branches;  // (branch_count, branch_columns)
     int branch_count;

@@ -1,6 +1,6 @@
 // Constant levels that keep an elastomer at rest on its target while its branches relax. Levels
-// are those of the amplifier. A lagging field attenuates the vibration that they leave, so that
-// its bound remains valid.
+// are those of the amplifier. A lagging field delays the vibration that they leave in the same way,
+// so that its bound remains valid.
 #pragma once
 #include "motion.hpp"
 
@@ -35,7 +35,8 @@ enum Row { time_column, excess_column, deviation_column, rate_column, field_colu
 struct Tail {
     // Vibration due to a pair of levels, in units of slope of the tail times duration^3/mass.
     static constexpr double pair_share = 0.05;
-    // Maximum duration of a level of a pair, in half periods, and the phase limit for a grid.
+    // Maximum duration of a level of a pair, in half periods, and the phase of a grid period above
+    // which there are no pairs.
     static constexpr double longest = 0.5, last_phase = 2.6;
     // Vibration about a single level relative to the drift during it: drift, the vibration after
     // a step of that height to both sides, and a margin.
@@ -43,7 +44,7 @@ struct Tail {
     static constexpr double forever = 1e15;  // maximum half periods of a single level
     // Half periods for which a branch with an endless decay is simulated.
     static constexpr double endless = 1e6;
-    // Phase after which a decayed term counts as zero.
+    // Time constants after which a decaying term counts as zero.
     static constexpr double faded_phase = 50;
     // Growth of the vibration until its levels fit, and number of bisections on the way back.
     static constexpr double coarser = 3;

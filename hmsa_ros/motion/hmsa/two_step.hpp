@@ -30,8 +30,8 @@ constexpr double linear = 1e-6;
 constexpr int most_passes = 80, newton_passes = 8, most_stuck = 4, most_crossing = 200000;
 constexpr double coarse = 3e-7, farthest = 1e3;
 
-// Difference between the cubic through two points with slopes, and the line through both, at a
-// fraction of the way.
+// Difference between the cubic through two points with given slopes, and its tangent at the first
+// one, at a fraction of the way to the second.
 inline double beyond_line(double share, double rise, double way, double slope, double other)
 {
     const double bend = way * (slope + other) - 2 * rise;
@@ -61,8 +61,7 @@ template <class System, int NB = 0> struct Search {
     Plan plan;
 
     double load() const { return held - direction * d; }
-    // The load that balances a force at fixed branch states, with the fraction that a motion
-    // feels.
+    // The load that balances a force at fixed branch states, with the given ratios.
     double balance(double force, const double *felt) const
     {
         double load = force;
@@ -72,7 +71,7 @@ template <class System, int NB = 0> struct Search {
     }
     // Without damping the energy balance gives d. For a linear oscillator, damping reduces it by
     // 2 K/(1 + K) with the decay K over half a period. The damping ratio is the damping force over
-    // that of the spring, at the rate half way from the balance. For fast motion branches are
+    // that of the spring, at the rate half way by the energy balance. For fast motion branches are
     // springs, for slow motion dampers.
     HMSA_APART double first_guess() const
     {
@@ -168,7 +167,8 @@ template <class System, int NB = 0> struct Search {
             high = min(high, d);
         double next = d + change;
         if (high == infinity() && pass > newton_passes)
-            // Newton's method approaches the bound in ever smaller steps: go on to the bound.
+            // Newton's method may approach an excess that never vanishes: go to the bound in large
+            // steps.
             next = max(next, 4 * d);
         // Relative to beta_p if it is smaller: close to a limit.
         double relative = abs(next - d) / min(d, 1 + abs(beta));
