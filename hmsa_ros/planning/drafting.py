@@ -229,7 +229,7 @@ def _along(
 
 
 def draft_setpoints(outset: Outset, setpoints: Sequence[Setpoint]) -> Steps[Draft | None]:
-    """Draft setpoints; None if the running plan already ends at the only one of them."""
+    """Draft setpoints; None if the only one is the last of the plan and has begun."""
     planned = outset.plan.segments
     if len(setpoints) == 1 and planned and planned[-1].stretch == setpoints[0].stretch \
             and planned[-1].since <= outset.begin:

@@ -15,7 +15,7 @@ from hmsa_ros.model.simulation import STUCK, with_followed
 
 
 def fade(share: Array) -> tuple[Array, Array, Array]:
-    """Return a polynomial from 0 to 1, with three zero derivatives at both ends, and two more."""
+    """Return a polynomial from 0 to 1, flat to third order at both ends, and two derivatives."""
     left = 1.0 - share
     return (share ** 4 * (35.0 - 84.0 * share + 70.0 * share ** 2 - 20.0 * share ** 3),
             140.0 * (share * left) ** 3, 420.0 * (share * left) ** 2 * (left - share))
@@ -34,7 +34,7 @@ def held_along(
     """
     Return the overstress (n,) of branches along a path, and the branch states (n, k).
 
-    Raises `HmsaError` if a branch is too fast to integrate.
+    Raise `HmsaError` if a branch is too fast to integrate.
     """
     forces = elastic_force(stretch, material)
     behind = np.empty((len(times), len(followed)))

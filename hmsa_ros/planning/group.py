@@ -205,7 +205,7 @@ def _rests(draft: Draft, segment: PlannedSegment) -> bool:
     """Return whether a joint can start a move later, since it rests until then."""
     level = draft.levels[bisect_left(draft.levels, segment.begin, key=lambda x: x.stamp)]
     model = level.model
-        # A creeping joint would have relaxed further by then.
+    # A creeping joint would have relaxed further by then.
     return not model.material.creep and (
         abs(level.state.rate) <= _AT_REST
         and math.isclose(

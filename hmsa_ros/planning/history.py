@@ -164,7 +164,7 @@ class History:
             return None
         level = self.levels[due[-1]]
         asked, options = level.flux_density, level.model.options
-        # Changes by a watchdog or another publisher come later, or are zero.
+        # Levels of a watchdog or another publisher come later, or are 0 T.
         soon = stamp - level.stamp <= max(options.lead_time, level.model.ns(1.0))
         short = _beyond(asked, flux_density) and not (
             self._near(asked, flux_density) or self._near(0.0, flux_density))

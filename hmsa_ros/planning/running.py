@@ -23,7 +23,7 @@ _SAMPLED_AT_REST = 1e-4
 _AGREES, _AGREES_WITHOUT_FIELD = 1e-3, 5e-3
 # Unplanned amplitude of stretch up to which drafts made before the report remain valid.
 _LITTLE = 1e-4
-# Past levels that are kept until reports of their effect may arrive.
+# Number of past levels that are kept, since reports of their effect may still arrive.
 _REMEMBERED = 32
 
 
@@ -48,7 +48,7 @@ class RunningPlan:
 
     @property
     def plan(self) -> Plan:
-        """The plan from the present level on."""
+        """Levels that took effect recently, and the plan from the present level on."""
         return self._history.plan
 
     def restart(self) -> None:
@@ -151,7 +151,7 @@ class RunningPlan:
         return self.plan.levels[first:end]
 
     def moves(self, now: int) -> bool:
-        """Return whether the plan is moving at a time in ns."""
+        """Return whether setpoints are still to be reached at a time in ns."""
         segments = self.plan.segments
         return bool(segments) and (segments[-1].arrival is None or now < segments[-1].arrival)
 

@@ -210,7 +210,7 @@ def _check_known(request: Request, levels: Sequence[Level], ends: tuple[float, f
     # The first swing about the last level is the widest.
     swing = 2.0 * math.pi / float(natural_frequency(target, material))
     if elastic.volts:
-            # Just below pull-in the motion lingers.
+        # Just below pull-in the motion lingers.
         swing *= _LINGERS
     times = np.linspace(
         levels[0].time, min(ends[1], ends[0] + swing), _LOOK, dtype=np.float64)

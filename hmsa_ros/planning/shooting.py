@@ -2,7 +2,7 @@
 Commands with free parameters, solved for rest at the target.
 
 The two-step command on ideal hardware has its own search, `hmsa_ros.motion.two_step`. All other
-commands (on a sampling grid, with ramps, or with two intermediate levels of given times) have two
+commands (on a sampling grid, with ramps, or with two intermediate levels of given loads) have two
 unknowns as well. They meet the same two conditions when the last level applies: stretch at the
 target, rate zero. If the field lags, it must also reach its final value, which needs a third
 unknown. Newton's method solves them with derivatives from the integration.

@@ -201,7 +201,7 @@ class PlannedLevel:
             sent_for=None if self.sent_for is None else self.sent_for + span)
 
     def at(self, time: int) -> State:
-        """Predict the dimensionless state at a time in ns, not before the timestamp."""
+        """Predict the dimensionless state at a time in ns, or at the timestamp if it is later."""
         if self.stamp == ALWAYS:
             return self.state
         return self.model.follow(
@@ -251,7 +251,7 @@ class PlannedSegment:
     #: Upper bound of the vibration that levels of the creep tail leave in stretch, peak to peak.
     vibration: float = 0.0
     until: int | None = None  #: end as requested; None if it is held on
-    carried_out: bool = True  #: whether its commands took effect, as far as reported
+    carried_out: bool = True  #: whether its commands were sent and took effect, as far as known
     #: Path to follow, in s from ``since`` on; None for a move.
     path: Path | None = field(default=None, compare=False, repr=False)
 
@@ -285,11 +285,11 @@ class Plan:
         return self.levels[first:None if limit is None else first + limit]
 
     def level(self, time: int) -> PlannedLevel:
-        """Return the level at a time, or the first one before it."""
+        """Return the level at a time; before all levels, the first one."""
         return self.levels[self.place(time)]
 
     def place(self, time: int) -> int:
-        """Return the index of the level at a time, or of the first one before it."""
+        """Return the index of the level at a time; before all levels, that of the first one."""
         return max(bisect_right(self.levels, time, key=lambda x: x.stamp) - 1, 0)
 
     def under_way(self, time: int) -> int:

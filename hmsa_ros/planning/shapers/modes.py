@@ -21,7 +21,8 @@ def oscillation(
     """
     Return the oscillating mode about rest at a stretch; None if the motion does not oscillate.
 
-    Branches are linearised at their present overstress.
+    Branches are taken as linear, with their relaxation rates at the stress ``above`` over their
+    ratio.
 
     The first item is the root, -decay + i frequency. The second are the rows (2, 2 + n) that map a
     state to a vector: deviation of the stretch, rate, and the n branch states less the force at

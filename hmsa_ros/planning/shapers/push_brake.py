@@ -30,7 +30,8 @@ _RTOL = 1e-12
 _MARGIN = 1e-4
 # Extra grid periods of push and brake to try if the minimum numbers give no solution.
 _MORE_PERIODS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 2), (3, 3))
-# With a lag: relative increment of the command duration, and duration of the last level in lags.
+# With a lag: inverse of the relative increment of the command duration, and duration of the last
+# level in lags.
 _STRIDES, _PUSH = 12, math.log(2.0)
 # Heights to try, as fractions of those that the limits allow.
 _SHARES = (1.0, 0.5, 0.25, 0.1, 0.05)
@@ -188,7 +189,7 @@ def _bounds(request: Request, holding: float) -> tuple[float, float]:
 
 
 def _turn(request: Request, state: State, load: float) -> tuple[float, float] | None:
-    """Return time and stretch of the turning point under a load, None if there is none."""
+    """Return time and stretch of the turning point under a load, None if none is found."""
     status, time, stretch, _, _ = motion.turning_point(
         state.stretch, state.rate, math.copysign(1.0, state.rate), load, 1.0,
         request.material.packed, _RTOL)

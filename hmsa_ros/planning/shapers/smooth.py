@@ -120,7 +120,7 @@ def _path(request: Request, holding: float, duration: float) -> _Path | None:
     if material.creep:
         loads = loads + held_along(times, stretch, followed, material)[0]
     if delivery.lag > 0.0:
-        # The field of the unforced motion needs no change of the level.
+        # The field that the present level would give needs no change of the level.
         more: Array = loads - field
         loads = request.load + more + delivery.lag * np.gradient(more, times[1], edge_order=2)
     slopes = np.gradient(loads, times[1], edge_order=2)

@@ -26,8 +26,8 @@ from hmsa_ros.planning.shooting import (
 )
 from hmsa_ros.planning.two_step import CODES, HOLD_TOLERANCE, plan_two_step, RTOL
 
-# Duration of the push that settles a lagging field, in time constants: it exceeds the holding
-# level by as much as the previous level falls short of it; others on a grid are longer.
+# Duration of the push that settles a lagging field, in time constants: the push exceeds the
+# holding level by as much as the previous level falls short of it; others on a grid are longer.
 _PUSH = math.log(2.0)
 # Extra grid periods; with a lag, also factors on the push.
 _MORE = (0, 1, 2, 3)
@@ -50,11 +50,11 @@ def two_step(request: Request) -> Move:
     Apply beta_p for tau_p, then beta_1 (Eq. 13): rest at the target without residual vibration.
 
     With viscoelastic branches, a tail of levels then follows their overstress at arrival. If the
-    field lags, a short push settles it. On a sampling grid the heights of one more level are
-    solved for, and with ramps beta_p and its duration. If no single level within the limits leads
-    to rest, levels of free heights do. If the response is overdamped and does not cross the
-    target, no such command exists; the unshaped step, which does not overshoot then, replaces it.
-    The move's reason reports each of these cases.
+    field lags, an additional short push settles it. On a sampling grid there is one more level,
+    and the loads are solved for; with ramps, beta_p and its duration. If no single level within
+    the limits leads to rest, levels of free heights do. If the response is overdamped and does not
+    cross the target, no such command exists; the unshaped step, which does not overshoot then,
+    replaces it. The move's reason reports each of these cases.
     """
     holding = request.holding_load()
     delivery, creeps = request.delivery, bool(len(request.material.branches))
