@@ -44,7 +44,7 @@ _FINER = {'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
 
 
 def allowed(fit: Fit) -> Array:
-    """Return the maximum standard deviation of each free coordinate that is determined."""
+    """Return the standard deviation of each free coordinate above which it is undetermined."""
     values = fit.values
     unit = values['time_unit']
     load = quantities.geometry_of(values).loaded * values['shear_modulus']
@@ -60,7 +60,7 @@ def allowed(fit: Fit) -> Array:
 
 
 def _of_law(fit: Fit, name: str) -> float:
-    """Return the maximum for a constant of the hyperelastic model or a logarithmic coordinate."""
+    """Return that limit for a constant of the model, and for all logarithmic coordinates."""
     quantity, value = quantities.quantity_of(name), float(fit.values[name])
     if quantity.scale == 'log':
         return _RELATIVE
