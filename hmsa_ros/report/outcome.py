@@ -86,7 +86,7 @@ class LevelResult:
     flux_density: float  #: in T
     times: int  #: number of intervals; the last interval of the run has a row of its own
     duration: float  #: total, in s
-    #: equilibrium stretch according to the run's parameters; NaN outside the model's range
+    #: equilibrium stretch with the planner's parameters; NaN outside the model's range
     rest: float
     #: measured stretch in these intervals; NaN without samples
     mean: float

@@ -21,7 +21,11 @@ def repeats_in(folder: Path) -> list[Path]:
 
 
 def statistics(each: Sequence[Sequence[Finding]]) -> list[dict[str, Any]]:
-    """Return mean, standard deviation and largest of vibration and offset, by setpoint."""
+    """
+    Return statistics of vibration and steady-state error, in % of the step, by setpoint.
+
+    They are the mean, the standard deviation, and the value of the largest size.
+    """
     found = []
     for group in zip(*each, strict=False):
         row: dict[str, Any] = {
