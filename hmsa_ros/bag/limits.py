@@ -44,7 +44,7 @@ YAML_SIZE = 16 * MEBIBYTE
 YAML_NODES = 300_000
 #: Lists and maps inside each other.
 YAML_DEPTH = 30
-#: Sentences about what cannot be read.
+#: Sentences about unreadable parts.
 PROBLEMS = 200
 
 

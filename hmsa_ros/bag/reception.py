@@ -85,7 +85,7 @@ def judge(
 
 def figures(
         status: Status, lost: Mapping[str, int], before: Mapping[str, int]) -> dict[str, str]:
-    """Return what a recorder's diagnostics say of its recording, by key; ``behind`` in seconds."""
+    """Return the values of a recorder's diagnostics, by key; ``behind`` is in seconds."""
     return {
         'file': status.file,
         'written': str(sum(status.written.values())),

@@ -20,12 +20,12 @@ from hmsa_ros.bag.topics import number_of
 from hmsa_ros.bag.writer import BagWriter, MIN_FILE_SIZE
 from hmsa_ros.errors import BadInputError, BagError
 
-# What a queued message takes in memory besides its payload.
+# Memory of a queued message in bytes, in addition to its payload.
 MESSAGE_OVERHEAD = 250
 RETRY_SECONDS = 1.0
-#: After so long the end does not wait any more: what is not yet written is counted as lost.
+#: Maximum time in s to write the queue at the end; the rest is counted as lost.
 END_SECONDS = 10.0
-# On top of it, for a disk that does not answer.
+# Further time in s for a disk that does not answer.
 _GRACE_SECONDS = 5.0
 #: Number of new files that may be opened immediately, and the interval in s after that: each file
 #: needs declarations and an index, and waits for the disk.

@@ -129,7 +129,7 @@ class BagWriter:
 
     @property
     def file_size(self) -> int:
-        """Return the size of the file's messages with what is not yet flushed, in bytes."""
+        """Return the size of the file's messages, including pending ones, in bytes."""
         return self._waiting_size + (self._file.message_size if self._file else 0)
 
     @property
