@@ -211,4 +211,4 @@ def _notes(run: Run, left_out: int, unapplied: int) -> Iterator[str]:
         yield (f'{unapplied} commands never took effect, as {run.topics[APPLIED]} shows: '
                'no node applied them')
     if left_out:
-        yield f'left out: {left_out} of the messages, which do not fit their topic'
+        yield f'left out: {left_out} of the messages, since they do not fit their topic'
