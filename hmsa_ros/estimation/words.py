@@ -14,8 +14,8 @@ from hmsa_ros.identification.quantities import modulus_of
 _SURE, _MATTERS = 3.0, 0.01
 # Minimum steady-state error and vibration to report, as fractions of the step.
 _OFFSET, _RINGING = 0.01, 0.01
-# Correlation above which a bias and a force hide each other, unless the rest position is known to
-# this accuracy.
+# Correlation above which a bias and a force hide each other, unless the standard deviation of the
+# bias, in stretch, is below the last value.
 _PAIR, _HIDDEN, _UNKNOWN = ('stretch_bias', 'constant_force'), 0.9, 1e-3
 # Quantities with the same effect on samples, unless the block is fast.
 _LATER = ('sensor_latency', 'coil_time_constant')
