@@ -1,5 +1,5 @@
 """
-Delivery of commands to the coil: at any time or on a sampling grid, in steps or in ramps.
+Delivery of commands to the coil: at any time or on a command grid, in steps or in ramps.
 
 A command contains a level. Ideal hardware applies it at once. Sampled hardware applies commands
 only at multiples of a period; an amplifier with a slew limit ramps to the level; the field of a
