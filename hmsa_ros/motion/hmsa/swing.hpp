@@ -81,8 +81,7 @@ template <class R, class System, int NB = 0> struct Swing {
         set(sign, i, direction);
         set(rtol, i, tolerance);
         const double fast = frequency + 3 * zeta, root = sqrt(sqrt(sqrt(tolerance)));
-        // A fixed phase of the local oscillation. Its frequency vanishes at an
-        // extremum of the force.
+        // A fixed phase of the local oscillation, whose frequency vanishes at extrema of the force.
         set(h, i, 7 * root / (fast + 1e-9));
         set(t, i, 0);
         set(steps, i, 0);

@@ -213,8 +213,8 @@ template <class C> struct AnyOf {
 using Any = AnyOf<double>;
 
 constexpr int most_branches = 3;
-// Columns of a branch: ratio, 1/time, number and constants of its flow rule and, if it is part of
-// the state, the force that it has followed.
+// Columns of a branch: ratio, 1/time, number and constants of its flow rule, and the force that it
+// has followed, from which it continues.
 enum Column { ratio_at, speed_at, flow_at, follower_at = flow_at + 1 + flow_constants, branch_columns };
 
 // Viscoelastic branches: branch i adds the force ratio (psi'(l) - w), where w follows the elastic
