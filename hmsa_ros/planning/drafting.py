@@ -44,7 +44,7 @@ _STOPPED = 1e-7
 # Duration of the return to a path, in natural periods; in a longer one, vibration swings farther
 # than without correction.
 _BACK = 0.4
-# Minimum deviation that a corrected path may leave, as a fraction of its range.
+# Minimum tolerance of a corrected path, as a fraction of its range.
 _ANEW = 1e-4
 # Setpoints checked between two pauses, in about 0.1 ms; levels take longer.
 _CHECKED = 200
@@ -240,7 +240,7 @@ def draft_setpoints(outset: Outset, setpoints: Sequence[Setpoint]) -> Steps[Draf
 def draft_stop(outset: Outset) -> Steps[Draft]:
     """Draft a stop: rest as near as the flux density limits allow."""
     # A two-step command with the hardest braking load as beta_p: that load up to the first turning
-    # point, then the load that holds this point. If a single brake is impossible (on a sampling
+    # point, then the load that holds this point. If a single brake is impossible (on a command
     # grid, with ramps or at a limit), plan a move to a stretch near by.
     model, state = outset.model, outset.state
     found = brake(model, state)

@@ -34,7 +34,7 @@ def held_along(
     """
     Return the overstress (n,) of branches along a path, and the branch states (n, k).
 
-    Raise `HmsaError` if a branch is too fast to integrate.
+    Raise `HmsaError` if the branches cannot be integrated.
     """
     forces = elastic_force(stretch, material)
     behind = np.empty((len(times), len(followed)))

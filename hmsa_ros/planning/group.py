@@ -191,7 +191,7 @@ class PlannerGroup:
             self, begin: int,
             limit: int) -> tuple[list[int], dict[str, list[tuple[float, float, float]]]]:
         """Return timestamps (ns) and, by joint, stretch, rate (1/s) and flux density (T)."""
-        # From the time at which all joints have a known level at begin, at most limit changes.
+        # From the latest change at or before begin on, at most limit changes of all joints.
         ahead = [
             [x.stamp for x in planner.plan.ahead(begin, limit)]
             for planner in self.planners.values()]

@@ -2,7 +2,7 @@
 Commands with free parameters, solved for rest at the target.
 
 The two-step command on ideal hardware has its own search, `hmsa_ros.motion.two_step`. All other
-commands (on a sampling grid, with ramps, or with two intermediate levels of given loads) have two
+commands (on a command grid, with ramps, or with two intermediate levels of given loads) have two
 unknowns as well. They meet the same two conditions when the last level applies: stretch at the
 target, rate zero. If the field lags, it must also reach its final value, which needs a third
 unknown. Newton's method solves them with derivatives from the integration.
@@ -74,7 +74,7 @@ def solve(
     Solve a template for rest at the target; the default delivery is that of the request.
 
     With creep and ramps, rest is at the end of the last ramp, or at least ``wait`` after the start
-    of the last level; on a sampling grid, after whole periods.
+    of the last level; on a command grid, after whole periods.
     """
     delivery = delivery or request.delivery
     times, loads = template.times.copy(), template.loads.copy()

@@ -47,7 +47,7 @@ class Options:
     flux_density_min: float = -math.inf  #: in T
     flux_density_max: float = math.inf  #: in T
     lead_time: int = 50_000_000  #: in ns, time from sending a command to its timestamp
-    period: int = 0  #: of the sampling grid of timestamps, in ns; 0 for any time
+    period: int = 0  #: of the command grid, in ns; 0 for any time
     slew_limit: float = math.inf  #: in T/s; infinite for steps
     order: int = 2  #: of the shapers robust and minimax
     coil_time_constant: float = 0.0  #: of a first-order lag, in s; 0 for none

@@ -54,7 +54,7 @@ def arrival(request: Request, found: Move) -> State:
     """Return the state that a move reaches, at rest at the target."""
     end = request.start
     if found.duration > 0.0:
-        # The last level applies from the end of the ramp to it.
+        # The last level counts only if a ramp to it starts before the arrival.
         end = follow(
             found.until(found.duration).levels, end, found.duration, request.material,
             request.delivery)

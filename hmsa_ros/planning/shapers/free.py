@@ -3,7 +3,7 @@ Levels of free heights, for moves that a single intermediate level cannot bring 
 
 The number of free levels equals the number of conditions: two for stretch and rate, and a third
 one if the field lags and must arrive with them. Levels have equal durations, the shortest first,
-with any sampling grid and ramps. If only ramps limit the command, the fastest one ramps without a
+with any command grid and ramps. If only ramps limit the command, the fastest one ramps without a
 pause and reverses twice.
 """
 

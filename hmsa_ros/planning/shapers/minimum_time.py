@@ -18,7 +18,7 @@ def minimum_time(request: Request) -> Move:
     """
     Push with the load limit on one side, brake with the other, then hold.
 
-    With ramps that do not reach the limits, reverse earlier. On a sampling grid, with ramps or
+    With ramps that do not reach the limits, reverse earlier. On a command grid, with ramps or
     with a field that lags, the two-step command can be at rest earlier, or be the only one within
     the limits; it is then used, and the move's reason says so. Raise `RefusedError` if none is
     found.

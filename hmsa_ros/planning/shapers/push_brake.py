@@ -57,7 +57,7 @@ def push_brake(request: Request) -> Move:
     if lags and request.delivery.period > 0.0:
         found = _fastest_on_grid(request, least, most)
     else:
-        # On a sampling grid or with ramps, full height may leave no time to switch.
+        # On a command grid or with ramps, full height may leave no time to switch.
         found = next(filter(None, (_attempt(
             request, *(holding + share * (x - holding) for x in (least, most)))
             for share in _SHARES)), None)

@@ -65,7 +65,7 @@ def _chain(request: Request, waypoints: list[float]) -> Move:
             return move
         last = move.levels[-1]
         if levels and begin > levels[-1].time and request.delivery.period > 0.0:
-            # At rest at the end of a ramp: the next command starts on the sampling grid.
+            # At rest at the end of a ramp: the next command starts on the command grid.
             begin = math.ceil(begin / request.delivery.period - 1e-9) * request.delivery.period
         levels += [Level(begin + x.time, x.load) for x in move.levels]
         begin += move.duration

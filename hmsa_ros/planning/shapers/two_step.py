@@ -50,7 +50,7 @@ def two_step(request: Request) -> Move:
     Apply beta_p for tau_p, then beta_1 (Eq. 13): rest at the target without residual vibration.
 
     With viscoelastic branches, a tail of levels then follows their overstress at arrival. If the
-    field lags, an additional short push settles it. On a sampling grid there is one more level,
+    field lags, an additional short push settles it. On a command grid there is one more level,
     and the loads are solved for; with ramps, beta_p and its duration. If no single level within
     the limits leads to rest, levels of free heights do. If the response is overdamped and does not
     cross the target, no such command exists; the unshaped step, which does not overshoot then,
@@ -61,7 +61,7 @@ def two_step(request: Request) -> Move:
     lags, at_once = delivery.lag > 0.0, delivery.period == 0.0 and delivery.slew == math.inf
     if lags and at_rest(request):
         return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
-    # On a sampling grid or with ramps, start without the lag, whose push needs another level.
+    # On a command grid or with ramps, start without the lag, whose push needs another level.
     code, levels = _late(request, delivery.lag if at_once else 0.0) \
         if lags or creeps else _plain(request)
     if code in _WITHOUT and not (lags and code is Code.HOLD):
