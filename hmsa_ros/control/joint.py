@@ -127,7 +127,7 @@ class Joint:
 
     @property
     def next_look(self) -> int:
-        """Time in ns of the next update; it is due at once if audits wait."""
+        """Time in ns of the next update; only `not_before` delays it while audits wait."""
         return max(self.not_before, 0 if self.audits else self.next_update)
 
     @property

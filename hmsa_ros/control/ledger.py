@@ -92,8 +92,9 @@ class Ledger:
         if more <= _WORSE * setpoint.step + _SURE * math.sqrt(variance):
             return ''
         return (
-            f'{setpoint.where}: feedback has left {setpoint.words(without + more)} of offset and '
-            f'vibration, where open loop leaves {setpoint.words(without)}')
+            f'{setpoint.where}: feedback has left {setpoint.words(without + more)} of '
+            'steady-state error and vibration, where open loop leaves '
+            f'{setpoint.words(without)}')
 
 
 def _or(value: float, other: float) -> float:

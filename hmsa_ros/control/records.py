@@ -14,7 +14,7 @@ from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import Progress
 
-#: How a trajectory with velocities is treated: rest at each point, or follow it as a path.
+#: How velocities in a trajectory are treated: refused, as it rests at each point, or as a path.
 TRAJECTORY_MODES = ('rest', 'path')
 #: What to do after a coil was cut off: wait for a request, or continue with a shaped move.
 AFTER_CUT_OFF = ('wait', 'resume')

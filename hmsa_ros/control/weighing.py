@@ -152,8 +152,8 @@ def worthwhile(
     Return whether to adopt a draft, given the errors without and with it in each scenario.
 
     The draft must not increase the error in any scenario, nor by chance in an untested one. If the
-    newest command was an exception (``unsure``), a small increase is allowed. Without further
-    ``news`` in time, a much smaller mean error is enough.
+    newest command was an exception (``unsure``), a small increase is allowed; if there will be no
+    further ``news`` in time either, a much smaller mean error is enough.
     """
     gain = before - after
     mean, harm = float(gain.mean()), float(-gain.min())
