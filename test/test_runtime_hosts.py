@@ -310,6 +310,7 @@ def test_a_model_that_cannot_be_followed_is_no_longer_in_the_way_once_it_is_repl
     rig.runtime.change(rig.runtime.settings, {'a': model}, simultaneous=False)
     rig.runtime.request(Target('a', 1.3))
     rig.run(START + 2600 * MS)
+    assert any('on joint_states, where nothing was predicted: ' in x for x in rig.notes())
     assert rig.residual(1.3) < 1e-6
 
 

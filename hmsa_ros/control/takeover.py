@@ -202,7 +202,7 @@ class Takeover:
         return True
 
     def _is_current(self, seen: Seen, settings: Settings) -> bool:
-        """Return whether a sample is recent in steady time, or by a shared clock, as if paused."""
+        """Return whether a sample is recent by the steady clock, or by a shared one, if paused."""
         return self._around.steady() - seen.came <= _RECENT or self._around.one_clock() and (
             abs(self._around.clock() - seen.stamp) <= settings.takeover_max_age)
 
@@ -244,9 +244,10 @@ class Takeover:
         if not contradicts and name not in self._doubted:
             return
         if self._take(name, seen, keep=keep) and contradicts:
+            expected = 'nothing' if math.isnan(predicted) else f'{predicted:.4g}'
             self._note(
-                f'joint {name} is at {seen.stretch:.4g} on joint_states, where {predicted:.4g} '
-                'was predicted: what comes next is planned from the sample')
+                f'joint {name} is at {seen.stretch:.4g} on joint_states, where {expected} was '
+                'predicted: what comes next is planned from the sample')
 
 
 def _tolerance(planner: Planner, time: int, predicted: float) -> float:
