@@ -63,7 +63,8 @@ def answered(
     """
     Return the answer of each request and whether it was accepted, and verdicts on other new plans.
 
-    Both are ordered by time. A request without an answer was accepted if nothing came after it.
+    Requests and verdicts are ordered by time. A request without an answer was accepted if no
+    verdict came after it, or if plans have no numbers.
     """
     begun = list(beginning(verdicts))
     new = {x.sent: x for x in begun}

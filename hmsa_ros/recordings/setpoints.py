@@ -130,7 +130,7 @@ def _under_way(run: Run, place: int, levels: Sequence[Level]) -> int | None:
 
 
 def _in_force(run: Run, level: Level) -> bool:
-    """Return whether a level equals the last field measured before its time."""
+    """Return whether a level equals, up to rounding, the last field measured before its time."""
     place = int(np.searchsorted(run.time, level.stamp)) - 1
     return place >= 0 and math.isclose(
         level.flux_density, run.flux_density[place], rel_tol=ROUNDED, abs_tol=_NO_FIELD)
@@ -172,7 +172,8 @@ def _fresh(
     """
     Return the time from which a plan differs from the previous one; infinite if it continues it.
 
-    ``sent`` are the timestamps of commands, if known: levels that were never sent are missing.
+    ``sent`` are the timestamps of commands, if known: levels of the previous plan that were never
+    sent count as missing from the new one.
     """
     if not plan:
         return math.inf
