@@ -24,8 +24,8 @@ class Cursor:
     """
     A position in the messages of a chunk or run, initially in stored order.
 
-    Only offsets are kept: the messages of a chunk could take ten times its size. Among equal log
-    times, the smaller ``key`` comes first; ``problem`` describes damage.
+    Only times and offsets are kept: the messages of a chunk could take ten times its size. Among
+    equal log times, the smaller ``key`` comes first; ``problem`` describes damage.
     """
 
     def __init__(
