@@ -77,7 +77,7 @@ def setpoints_of(value: Any, rest: float) -> tuple[Array, Array]:
     Raises
     ------
     BadInputError
-        If the value is no such columns, a stretch is impossible for an actuator with this rest,
+        If the value has no such columns, a stretch is impossible for an actuator with this rest,
         a duration is not above 0, or one before the last is infinite.
 
     """
