@@ -19,7 +19,7 @@ from hmsa_ros.model.equations import Array, natural_frequency
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.simulation import simulate
 
-# Number of parts of a move in which the level may change, and their end, in durations of the move.
+# Parts per duration of a move between which the level may change, and their end in durations.
 _PARTS, _END = 4, 1.5
 # Maximum change of a level, its expected standard deviation, and increment for derivatives, all
 # relative to the range of the levels.
@@ -85,10 +85,10 @@ class Target:
 
 @dataclass(frozen=True)
 class Left:
-    """Residual of a repeat at a target, relative to the step."""
+    """Errors that a repeat leaves at a target, as fractions of the step."""
 
     vibration: float  #: peak to peak in the first period
-    offset: float
+    offset: float  #: steady-state error
 
 
 @dataclass(frozen=True, eq=False)
