@@ -21,13 +21,14 @@ from hmsa_ros.model.laws.coordinate import Coordinate, coordinate_of
 from hmsa_ros.model.parameters import ActuatorParameters
 
 #: Default standard deviations: of the logarithm for parameters that are estimated by it, else of
-#: the value in SI units. Those of damping and J_lim are relative.
+#: the value, with the force as a load, and latency and lag in time scales. Those of damping and
+#: J_lim are relative.
 DEVIATIONS = {
     'shear_modulus': 0.15, 'density': 0.1, 'remanence': 0.1, 'time_unit': 0.1,
     'chain_limit': 0.1, 'damping_coefficient': 0.25, 'stretch_bias': 3e-3,
     'stretch_gain': 0.02, 'sensor_latency': 0.05, 'coil_time_constant': 0.05,
     'constant_force': 0.007, 'viscoelastic_ratio': 0.03, 'viscoelastic_time': 1.0}
-# Without a value, the deviation is relative to that of a usual block.
+# Minimum 1/J_lim and zeta of relative deviations, so that values of 0 have one.
 _LEAST_LIMIT, _LEAST_ZETA = 0.02, 0.1
 # Quantities that are no parameters of the planner.
 _SENSED = ('stretch_bias', 'stretch_gain', 'sensor_latency', 'constant_force')
@@ -70,8 +71,8 @@ class Prior:
         Return the prior of a block that was never identified.
 
         With suspects, those of `SUSPECTS` are tracked too. ``others`` are values of coil and
-        sensor that differ from the defaults, and ``deviations`` replace some of `DEVIATIONS`.
-        `BadInputError` contains the name that is unknown or cannot be tracked.
+        sensor that differ from the defaults, and ``deviations`` replace some of `DEVIATIONS`,
+        in SI units. Raise `BadInputError` with the name that is unknown or cannot be tracked.
         """
         free = check_free(free, actuator.law)
         wrong = [x for x in free if x in _NOT_TRACKED]
