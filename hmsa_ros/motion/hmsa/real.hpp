@@ -122,7 +122,7 @@ inline double log1p(double x)
     const double u = 1 + x;
     if (u == 1)
         return x;
-    // Restores what rounding took from u, after W. Kahan.
+    // Restores the part of x that rounding removed from u, after W. Kahan.
     return u < infinity() ? log(u) * (x / (u - 1)) : u;
 }
 inline double expm1(double x)
