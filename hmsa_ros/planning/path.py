@@ -260,7 +260,7 @@ class _Follower:
             before = levels
             wanted = target - more
             if free.stop is not None:
-                # The final field holds the end of the path, whatever it is just before.
+                # The final field holds the end of the path, regardless of the field before.
                 slope = once[-1, -1] - self._lack[0] - gained[-1] + lag * (
                     self._request.balance(self._followed) - values[-1, -1])
                 coefficients[-2:] = wanted[-1, -1] - 0.5 * inner[-1, 0] * slope, wanted[-1, -1]

@@ -43,7 +43,7 @@ class Scales:
     flux_density_unit: float  #: level of the dimensionless load 1, mu0 G/Br in T, or in V
     #: Stretches within reach of the coil, and the levels that hold them.
     flux_densities: tuple[tuple[float, float], ...]
-    stretch_limits: tuple[float, float]  #: limiting stretches of the chains
+    stretch_limits: tuple[float, float]  #: between which the force increases
     held: tuple[float, float]  #: minimum and maximum stretch that the coil can hold
     #: Minimum and maximum stretch that a two-step command reaches from rest; rest if none.
     reached: tuple[float, float]

@@ -20,7 +20,7 @@ def minimum_time(request: Request) -> Move:
 
     With ramps that do not reach the limits, reverse earlier. On a command grid, with ramps or
     with a field that lags, the two-step command can be at rest earlier, or be the only one within
-    the limits; it is then used, and the move's reason says so. Raise `RefusedError` if none is
+    the limits; it is then used, and the move's reason reports it. Raise `RefusedError` if none is
     found.
     """
     found: list[Move] = []

@@ -15,7 +15,7 @@ from hmsa_ros.planning.shapers.request import Request
 
 # Strides from no damping to full damping, and Newton iterations of each.
 _STRIDES, _PASSES = 16, 4
-# Decay over frequency that replaces a steeper one, with which the motion hardly oscillates.
+# Minimum of root.real/root.imag: steeper decays, which hardly oscillate, are limited to it.
 _STEEPEST = -6.0
 
 
