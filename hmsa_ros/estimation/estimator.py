@@ -298,7 +298,7 @@ class Estimator:
         return replace(prior, values=values, covariance=known)
 
     def _new_window(self, stamp: int, shown: float, prior: Prior | None = None) -> Window:
-        """Return a window at the equilibrium of the present level or, without one, at the reading."""
+        """Return a window at the equilibrium of the present level, else at the reading."""
         if not self._levels or self._levels[0][0] > stamp:
             self._levels.insert(0, (stamp, 0.0))
         self._origin = stamp
