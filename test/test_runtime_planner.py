@@ -689,7 +689,7 @@ def test_the_plan_goes_on_when_the_clock_is_set(by):
     gaps = [now - before for (before, _), (now, _) in zip(
         rig.sent[known:], rig.sent[known + 1:], strict=False)]
     assert max(gaps) <= 20 * MS
-    words = f'{"ahead" if by > 0 else "back"} by {abs(by) / 1e9:.3f} s: what is planned goes on'
+    words = f'{"ahead" if by > 0 else "back"} by {abs(by) / 1e9:.3f} s: planned levels apply'
     assert [words in x for x in rig.notes()] == [True]
     assert rig.residual(1.4) < RESIDUAL
     assert rig.status.progress.state == 'at_rest'

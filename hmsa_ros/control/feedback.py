@@ -106,7 +106,7 @@ class Feedback:
         """Discard the estimates and return a confirmation; refused if feedback is off."""
         self._check_on()
         self.restart()
-        return 'what was learnt is forgotten: plans use the parameters as given'
+        return 'the estimates are discarded: plans use the parameters as given'
 
     def save(self, *, by_joint: bool) -> str:
         """Write the estimates to the configured file and return a confirmation, or refuse."""

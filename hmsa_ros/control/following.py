@@ -137,7 +137,7 @@ class Following:
         words = (
             f'amplifier of joint {joint} saturated: {reached:.4g} T took effect where {asked:.4g} '
             'T was commanded; nothing beyond that is commanded until the next request; set '
-            f'{name} to what the amplifier gives')
+            f'{name} to the limit of the amplifier')
         given = self._saturated.get(joint, (words, options))[1]
         self._saturated[joint] = words, given
         self._limit(

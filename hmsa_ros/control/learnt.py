@@ -147,7 +147,7 @@ def known_of(estimate: Estimate) -> Known:
 def file_text(estimates: Mapping[str, Estimate], now: datetime) -> str:
     """Return a parameter file with the learnt values by joint; '' names all joints."""
     lines = [
-        f'# What feedback learnt of an actuator until {now.isoformat(" ", "seconds")}.',
+        f'# Parameters that feedback learnt until {now.isoformat(" ", "seconds")}.',
         '# Planner and plant take it after their own parameter file.',
         '/**:', '  ros__parameters:']
     for joint, estimate in estimates.items():
@@ -176,8 +176,8 @@ def save(file: str, estimates: Mapping[str, Estimate | None], *, by_joint: bool)
         if estimate is None or not estimate.trusted:
             why = 'no samples yet' if estimate is None else estimate.trouble
             raise BadInputError(
-                f'what was learnt of joint {name} is not saved: {why}; expected samples on '
+                f'the estimate of joint {name} is not saved: {why}; expected samples on '
                 'joint_states that fit')
         found[name if by_joint else ''] = estimate
     write_text(Path(file), file_text(found, datetime.now()))
-    return f'saved what was learnt to {file}'
+    return f'saved the estimate to {file}'

@@ -271,7 +271,7 @@ class PlannerRuntime:
             f'the clock jumped back by {back / NANOSECONDS:.3f} s: the plan is dropped, and the '
             'actuator is assumed where it began, at initial_stretch, unless joint_states shows '
             'otherwise' if back else
-            clock_set_words(by, 'what is planned goes on,')), log=True)
+            clock_set_words(by, 'planned levels apply')), log=True)
 
     def deactivate(self) -> None:
         """Come to rest, sending all commands for that now, and accept no more requests."""

@@ -247,7 +247,7 @@ class Takeover:
             expected = 'nothing' if math.isnan(predicted) else f'{predicted:.4g}'
             self._note(
                 f'joint {name} is at {seen.stretch:.4g} on joint_states, where {expected} was '
-                'predicted: what comes next is planned from the sample')
+                'predicted: planning continues from the sample')
 
 
 def _tolerance(planner: Planner, time: int, predicted: float) -> float:
