@@ -262,7 +262,7 @@ class PlantNode(DeviceNode):
             self._run(now)
 
     def _run(self, target: float) -> None:
-        """Simulate up to a time in ns, for at most the duration of a tick."""
+        """Simulate up to a time in ns, for about `_BUDGET_NS` of real time at most."""
         begin = monotonic_ns()
         while self.device.next_sample <= target and monotonic_ns() - begin < _BUDGET_NS:
             self._sample()
