@@ -59,7 +59,7 @@ class _Choice:
 
 @dataclass(frozen=True)
 class Selection(_Choice):
-    """Topics to record, by full names or expressions; all that are not hidden on request."""
+    """Topics to record, by full names or expressions; by default all that are not hidden."""
 
     all_topics: bool = False
     expressions = ('record.regex', 'record.exclude_regex')
