@@ -53,7 +53,7 @@ def test_a_field_that_rises_between_two_readings_has_honest_intervals(lag):
     right = 0
     for seed in range(20):
         random = np.random.default_rng(seed)
-        transport = random.uniform(0.0, 3e-3)
+        transport = random.uniform(-5e-4, 3e-3)  # a field may lead the reported times
         begins = 1.0 + np.cumsum(random.uniform(0.12, 0.2, 24))
         levels = np.resize([0.02, -0.01, 0.03, 0.005], 24)
         time = np.arange(1.0, begins[-1] + 0.2, 1e-3)
@@ -65,7 +65,7 @@ def test_a_field_that_rises_between_two_readings_has_honest_intervals(lag):
         found = field_delays(time, field, begins, levels)
         right += (found.transport.low <= transport <= found.transport.high
                   and found.lag.low <= lag <= found.lag.high)
-        assert found.transport.value == pytest.approx(transport, abs=2e-4)
+        assert transport < 0.0 or found.transport.value == pytest.approx(transport, abs=2e-4)
     assert right >= 17
 
 

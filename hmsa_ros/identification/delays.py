@@ -103,8 +103,10 @@ def field_delays(
     coarse = 1e-3 * search(_TRANSPORTS, _LAGS)[0]
     # The cost of a short lag is constant between two readings.
     spacing = float(np.ptp(since)) / len(since)
+    step = max(spacing, 1e-5)
+    most = math.ceil(5e-4 / step)
     best = search(
-        coarse + np.arange(-5e-4, 5e-4, max(spacing, 1e-5)), np.append(0.25 * spacing, _LAGS))
+        coarse + step * np.arange(-most, most + 1), np.append(0.25 * spacing, _LAGS))
     found = least_squares(
         off, best, x_scale='jac', xtol=1e-12, ftol=1e-12, bounds=([-np.inf, 0.0], np.inf))
     freedom = len(since) - 2
@@ -120,7 +122,8 @@ def field_delays(
     begin, end = values[0], values[0] + 3.0 * values[1]
     if np.count_nonzero((since_ms > begin) & (since_ms < end)) < _RISE:
         # The readings only show an interval in which the field starts and rises for three lags.
-        before = float(np.max(since_ms, where=since_ms <= begin, initial=0.0))
+        earliest = 0.0 if begin > 0.0 else 1e3 * float(_TRANSPORTS[0])
+        before = float(np.max(since_ms, where=since_ms <= begin, initial=earliest))
         after = float(np.min(since_ms, where=since_ms >= end, initial=1e3 * _LONGEST))
         half = (after - before) / np.array([2.0, 6.0])
         values = np.array([before, 0.0]) + half
