@@ -443,7 +443,7 @@ class Actuator:
         periods, max_rate : float
             For smooth: minimum duration of a move in natural periods, and maximum rate in 1/s.
         period : float
-            Of the sampling grid of the command in s; 0 for any time.
+            Of the command grid in s; 0 for any time.
         short_spell : {'refuse', 'continue'}
             How to treat a duration that is shorter than the move.
 
@@ -515,7 +515,7 @@ class Actuator:
         tolerance : float
             Deviation that the levels may leave, as a fraction of the range of the path.
         period : float
-            Of the sampling grid of the command in s; 0 for any time.
+            Of the command grid in s; 0 for any time.
 
         Returns
         -------

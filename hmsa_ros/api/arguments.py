@@ -18,7 +18,7 @@ from hmsa_ros.planning.setpoint import impossible
 # Arguments of `Actuator` that are single numbers, and those that may be None.
 _NUMBERS = {x.name.rpartition('.')[2]: x for x in (*ACTUATOR, COIL_TIME_CONSTANT)}
 _OPTIONAL = ('shear_modulus', 'half_thickness', 'zeta', 'damping_coefficient', 'constants')
-# Shortest period of a sampling grid in s.
+# Shortest period of a command grid in s.
 _FINEST = 1e-9
 #: Alternative names of columns.
 _ALIASES = {'duration': ('span', 'seconds'), 'stretch': ('deflection', 'position')}
@@ -100,7 +100,7 @@ def file_of(value: Any, what: str = 'the path of a file') -> Path:
 
 
 def grid_of(period: Any) -> float:
-    """Return the period of a sampling grid in s, 0 for none, or raise `BadInputError`."""
+    """Return the period of a command grid in s, 0 for none, or raise `BadInputError`."""
     if 0.0 < number(period, 'period', 's', least=0.0) < _FINEST:
         raise BadInputError(
             f'period is {period:g} s: expected 0 for any time, or at least {_FINEST:g} s')
