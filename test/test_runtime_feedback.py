@@ -298,7 +298,7 @@ def test_what_was_learnt_can_be_frozen_and_forgotten():
     loop.run((1.1, 300 * MS), (1.4, 300 * MS))
     assert planner.model.actuator == learnt
     assert estimates(loop)[-1].values['learning'] is False
-    assert 'forgotten' in loop.runtime.feedback.reset()
+    assert 'discarded' in loop.runtime.feedback.reset()
     assert planner.model.actuator.shear_modulus == 1e4
     loop.runtime.change(
         Settings(takeover_timeout=0), {'a': planner.model}, simultaneous=False)
