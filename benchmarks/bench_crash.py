@@ -8,6 +8,7 @@ moment, fifty in all. Each bag is recovered and read by an independent reader. T
 time from the last message in the bag to the kill.
 """
 
+import contextlib
 import os
 from pathlib import Path
 import random
@@ -52,8 +53,13 @@ class Recorder:
     def wait(self):
         """Wait until something has been recorded."""
         from hmsa_ros.bag.reader import BagReader
+        from hmsa_ros.errors import HmsaError
         end = time.monotonic() + 60.0
-        while not (self.folder.is_dir() and any(BagReader(self.folder).counts().values())):
+        while True:
+            # Until its first bytes are written there is no bag.
+            with contextlib.suppress(HmsaError):
+                if any(BagReader(self.folder).counts().values()):
+                    return
             if time.monotonic() > end:
                 raise RuntimeError('nothing was recorded within 60 s')
             time.sleep(0.05)
