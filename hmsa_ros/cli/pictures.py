@@ -60,9 +60,7 @@ def paper_of(
         kind_of(picture)
     paper = Paper(arguments.width, arguments.font_size, arguments.dpi,
                   getattr(arguments, 'data', False))
-    check_targets(
-        *targets, *pictures, *(dict.fromkeys(x.with_suffix('.csv') for x in pictures)
-                               if paper.data else ()), sources=sources)
+    check_targets(*targets, *pictures, *paper.tables(pictures), sources=sources)
     return paper
 
 

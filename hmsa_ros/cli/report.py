@@ -43,8 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     out = arguments.out or Path(f'{arguments.bags[0].resolve().stem}_report.html')
     pictures: list[Path] = arguments.picture
     paper = paper_of(arguments, out, sources=arguments.bags)
-    targets = [out, *pictures, *(
-        dict.fromkeys(x.with_suffix('.csv') for x in pictures) if paper.data else ())]
+    targets = [out, *pictures, *paper.tables(pictures)]
 
     from hmsa_ros.recordings.bags import read_runs
     from hmsa_ros.recordings.parameters import read_parameter_file

@@ -51,6 +51,10 @@ class Paper:
         """Return how many panels fit side by side, 1 to ``most``."""
         return max(1, min(most, int(self.width * 8.0 / self.letters // _PANEL)))
 
+    def tables(self, pictures: Sequence[Path]) -> list[Path]:
+        """Return the CSV files with the data of figures; none without ``data``."""
+        return list(dict.fromkeys(x.with_suffix('.csv') for x in pictures if self.data))
+
 
 #: Figures of the documentation.
 SCREEN = Paper(dpi=200.0)

@@ -100,7 +100,7 @@ def picture(
                     beside.write_text(pgf(figure, path), encoding='utf-8')
                 else:
                     figure.savefig(beside, format=kind, metadata=_METADATA[kind])
-        for path in dict.fromkeys(x.with_suffix('.csv') for x in paths if paper.data):
+        for path in paper.tables(paths):
             with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
                 rows = list(figure.rows())
                 writer = csv.writer(file, lineterminator='\n')

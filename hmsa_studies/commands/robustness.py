@@ -164,7 +164,7 @@ def _write(
     drawn.append(named(folder, 'front', kinds))
     draw_front(drawn[-1], studies, paper)
     for paths in drawn:
-        files += [*paths, *([paths[0].with_suffix('.csv')] if paper.data else [])]
+        files += [*paths, *paper.tables(paths)]
     return files
 
 

@@ -122,8 +122,7 @@ class _Picture:
         self._default = arguments.show is None and self._paper == Paper()
         if out is not None and _is_folder(out) and not asked:
             self._paths = named(out, 'table', formats_of(arguments))
-        self._tables = list(dict.fromkeys(
-            x.with_suffix('.csv') for x in self._paths if self._paper.data))
+        self._tables = self._paper.tables(self._paths)
         if not self._paths:
             return
         try:
