@@ -50,19 +50,21 @@ def write_text(path: Path, text: str) -> None:
 
 def check_targets(*targets: Path | None, sources: Iterable[Path | None] = ()) -> None:
     """Raise `BadInputError` for a target that cannot be written, or is a source or named twice."""
-    read = [x.resolve() for x in sources if x is not None]
-    named = [x for x in targets if x is not None]
-    for i, target in enumerate(named):
+    read = {x.resolve() for x in sources if x is not None}
+    written: set[Path] = set()
+    for target in filter(None, targets):
+        place = target.resolve()
         why = ('it is a folder; expected a file' if target.is_dir() else
                f'{target.parent} is no folder; expected one that exists'
-               if not target.resolve().parent.is_dir() else
-               'the command reads it; expected another name' if target.resolve() in read else
+               if not place.parent.is_dir() else
+               'the command reads it; expected another name' if place in read else
                'it may be part of a bag; expected another name'
                if target.suffix == '.mcap' or target.name == 'metadata.yaml' else
                'two outputs name the same file; expected different files'
-               if target.resolve() in [x.resolve() for x in named[:i]] else '')
+               if place in written else '')
         if why:
             raise BadInputError(f'cannot write {target}: {why}')
+        written.add(place)
 
 
 def make_folder(folder: Path) -> None:
