@@ -218,6 +218,8 @@ class Devices:
         """
         Return whether planning must wait until a cut-off device obeys and commands arrive.
 
+        Cut-offs are acknowledged meanwhile: here, since without a request nothing may be sent.
+
         Raises
         ------
         RefusedError
