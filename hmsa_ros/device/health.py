@@ -1,14 +1,10 @@
-"""Status of a device: its commands, its hardware, and its sampling rate."""
+"""Status of a device: its commands, its hardware, and its interlock."""
 
 from collections.abc import Sequence
-import math
 
 from hmsa_ros.errors import listed
-from hmsa_ros.model.parameters import ActuatorParameters
 
 _OK, _WARN, _ERROR = 0, 1, 2
-# With fewer samples per period, peaks of a vibration are missed.
-_SAMPLES_A_PERIOD = 10.0
 
 
 def judge_commands(
@@ -49,18 +45,3 @@ def _verdict(fine: str, *notes: tuple[int, str]) -> tuple[int, str]:
 def judge_interlock(why: str) -> tuple[int, str]:
     """Return the status of an interlock from the reason why it is open."""
     return (_ERROR, f'open: {why}') if why else (_OK, 'closed')
-
-
-def enough_samples(actuator: ActuatorParameters) -> float:
-    """Return the smallest sampling rate in Hz that resolves the actuator's small vibration."""
-    return _SAMPLES_A_PERIOD / actuator.period
-
-
-def too_few_samples(actuator: ActuatorParameters, rate: float) -> str:
-    """Return a warning if a sampling rate in Hz is too low for an actuator; else empty."""
-    enough = enough_samples(actuator)
-    if rate >= enough:
-        return ''
-    return (f'publish_rate {rate:g} Hz gives {_SAMPLES_A_PERIOD * rate / enough:.1f} samples in '
-            'a period of the actuator, and peaks of its vibration are missed: expected at least '
-            f'{_SAMPLES_A_PERIOD:g}, a publish_rate of {math.ceil(enough):d}')

@@ -9,7 +9,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 
-from hmsa_ros.device.health import too_few_samples
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.errors import BadInputError
@@ -19,6 +18,7 @@ from hmsa_ros.interfaces.actuator import planned_from
 from hmsa_ros.interfaces.parameters import ParameterSpec
 from hmsa_ros.model.actuators import check_stretch, Setup, unheld
 from hmsa_ros.model.pacer import Pacer
+from hmsa_ros.model.sampling import too_few_samples
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.device_node import COMMON, DeviceJoint, DeviceNode, FALLBACK, fallback_from
