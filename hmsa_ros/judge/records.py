@@ -60,8 +60,11 @@ class Setpoint:
         """Time in ns from which the actuator should rest, as requested."""
         if self.arrival is not None:
             return self.arrival
-        # Approached only: until a vibration of the step has decayed to a thousandth.
-        settled = self.begins + round(7.0 / max(self.decay, 1e-9) * NANOSECONDS)
+        # Approached only: until a motion of the step has decayed to a thousandth. Without
+        # overshoot, the slower of two exponentials remains.
+        ratio = max(1.0, self.decay / self.frequency)
+        decay = self.decay / (ratio * (ratio + math.sqrt(ratio**2 - 1.0)))
+        settled = self.begins + round(7.0 / max(decay, 1e-9) * NANOSECONDS)
         last = settled if self.end is None else self.end - self.look
         return max(min(settled, last), self.begins)
 
