@@ -5,10 +5,15 @@ from dataclasses import dataclass
 from html import escape
 import math
 import shutil
+import sys
 import textwrap
 from typing import Any
 
 from hmsa_ros.errors import BadInputError
+
+#: Heading of the standard deviation of the column before.
+DEVIATION = '±'
+_GAP = '  '
 
 
 @dataclass(frozen=True)
@@ -24,7 +29,7 @@ class Column:
     def title(self) -> str:
         """The name with its unit."""
         name = self.head or self.name
-        return f'{name} ({self.unit})' if self.unit and name != '±' else name
+        return f'{name} ({self.unit})' if self.unit and name != DEVIATION else name
 
     def shown(self, value: object) -> str:
         """Return a value as text, a dash for a missing one."""
@@ -69,18 +74,30 @@ class Table:
         return str(self)  # shown at a prompt
 
     def __str__(self) -> str:
-        cells = [[x.title for x in self.columns], *self._texts()]
-        widths = [max(map(len, x)) for x in zip(*cells, strict=True)]
+        texts = list(self._texts())
         right = [all(not isinstance(row[i], str) for row in self.rows)
                  for i in range(len(self.columns))]
-        lines = ['  '.join(
-            f'{x:>{n}}' if number else f'{x:<{n}}'
-            for x, n, number in zip(row, widths, right, strict=True)).rstrip() for row in cells]
-        lines.insert(1, '  '.join('─' * n for n in widths))
+        room = _room()
+        heads = [[x.title] for x in self.columns]
+        if _width(_widths(heads, texts)) > room:
+            heads = [_stacked(x.title, y) for x, y in zip(
+                self.columns, _widths([[''] for _ in heads], texts), strict=True)]
+        lines: list[str] = []
+        for block in _blocks(
+                [x.title for x in self.columns], _widths(heads, texts), self._keys(), room):
+            lines += [''] * bool(lines) + _aligned(
+                [heads[i] for i in block], [[row[i] for i in block] for row in texts],
+                [right[i] for i in block])
         room = max(shutil.get_terminal_size().columns, 60)
         for text in (self.caption, *(f'note: {x}' for x in self.notes)):
             lines += textwrap.wrap(text, room, break_long_words=False, break_on_hyphens=False)
         return '\n'.join(lines)
+
+    def _keys(self) -> int:
+        """Return the number of leading columns that name a row."""
+        named = [all(isinstance(row[i], (str, int)) for row in self.rows)
+                 for i in range(len(self.columns))]
+        return max(1, named.index(False) if False in named else 1)
 
     def _repr_html_(self) -> str:
         def row(cells: Sequence[str], tag: str) -> str:
@@ -112,6 +129,66 @@ class Table:
         """
         return frame({
             f'{x.name} ({x.unit})' if x.unit else x.name: self[x.name] for x in self.columns})
+
+
+# Characters in a line of a notebook, which has no width of its own.
+_NOTEBOOK = 80
+
+
+def _room() -> float:
+    """
+    Return the characters in a line of the output; infinite for files and pipes.
+
+    A terminal and a notebook break longer lines anywhere.
+    """
+    if sys.stdout.isatty() or 'ipykernel' in sys.modules:
+        return shutil.get_terminal_size((_NOTEBOOK, 24)).columns
+    return math.inf
+
+
+def _stacked(title: str, width: int) -> list[str]:
+    """Return a heading in several lines, as narrow as its words and the cells allow."""
+    most = max([width, *map(len, title.split())])
+    return textwrap.wrap(title, most, break_long_words=False, break_on_hyphens=False) or ['']
+
+
+def _widths(heads: Sequence[Sequence[str]], texts: Sequence[Sequence[str]]) -> list[int]:
+    """Return the width of each column."""
+    return [max(map(len, (*head, *(row[i] for row in texts)))) for i, head in enumerate(heads)]
+
+
+def _width(widths: Sequence[int]) -> int:
+    """Return the length of a line with columns of these widths."""
+    return sum(widths) + len(_GAP) * (len(widths) - 1)
+
+
+def _blocks(
+        titles: Sequence[str], widths: Sequence[int], keys: int, room: float) -> list[list[int]]:
+    """Return the columns of each block that fits into a line; each starts with the keys."""
+    first = list(range(keys))
+    blocks = [first[:]]
+    for i in range(keys, len(widths)):
+        if titles[i] == DEVIATION and len(blocks[-1]) > keys:
+            continue  # with the column before
+        added = [i, i + 1] if titles[i + 1:i + 2] == [DEVIATION] else [i]
+        if len(blocks[-1]) > keys and _width([widths[x] for x in (*blocks[-1], *added)]) > room:
+            blocks.append(first[:])
+        blocks[-1] += added
+    return blocks
+
+
+def _aligned(
+        heads: Sequence[Sequence[str]], texts: Sequence[Sequence[str]],
+        right: Sequence[bool]) -> list[str]:
+    """Return the lines of a table."""
+    widths, tall = _widths(heads, texts), max(map(len, heads))
+    above = zip(*([*[''] * (tall - len(x)), *x] for x in heads), strict=True)
+    lines = [_GAP.join(
+        f'{x:>{n}}' if number else f'{x:<{n}}'
+        for x, n, number in zip(row, widths, right, strict=True)).rstrip()
+        for row in (*above, *texts)]
+    lines.insert(tall, _GAP.join('─' * n for n in widths))
+    return lines
 
 
 def frame(columns: dict[str, Any]) -> Any:
