@@ -9,6 +9,7 @@ import math
 from pathlib import Path
 import subprocess
 import sys
+from types import SimpleNamespace
 
 from core_oracle import follow
 import numpy as np
@@ -349,7 +350,7 @@ def test_of_an_unshaped_step_the_residual_is_shown_beside_what_is_left_when_it_i
     block = hmsa_ros.Actuator()
     runs = [block.plan([(1.1, 0.5)], shaper=x).simulate() for x in ('two_step', 'step')]
     table = hmsa_ros.compare(*runs)
-    assert table['verdict'] == ['arrived', 'arrived']
+    assert table['verdict'] == ['arrived', 'arrived after ringing']
     shaped, unshaped = table['residual']
     assert shaped < 1e-4
     # What its overshoot of 78 % and its swing back of 57 % are together, by the model.
@@ -362,6 +363,58 @@ def test_of_an_unshaped_step_the_residual_is_shown_beside_what_is_left_when_it_i
     assert alone['residual'] == [unshaped]
     titles = [x.get_title(loc='right') for x in runs[1].plot().axes]
     assert f'to 1.1: residual {unshaped:.1f} %' in titles
+    # From then on, and not before, the deviation is 2 % of the step at most.
+    settled = table['settling time']
+    assert settled[0] < table['move time'][0]
+    for run, after in zip(runs, settled, strict=True):
+        off = np.abs(run.stretches - 1.1) > 0.02 * 0.1
+        last = 1e3 * run.times[off][-1]
+        assert last <= after <= last + 1.01e3 * run.times[1]
+    assert alone['verdict'] == ['arrived after ringing']
+
+
+def test_an_overdamped_step_arrives_without_ringing_and_a_setpoint_cut_off_has_a_reason():
+    slow = hmsa_ros.Actuator(zeta=3.0).plan([(1.1, 5.0)], 'step').simulate()
+    assert slow.report()['verdict'] == ['arrived']
+    block = hmsa_ros.Actuator()
+    cut = block.plan([(1.1, 0.5), (1.0, 0.5)]).simulate(until=0.5)
+    said = 'setpoint 2 of 2: 1 is predicted, not measured: the samples end before its arrival'
+    assert cut.report()['verdict'] == ['arrived', 'unobserved']
+    assert cut.report().notes == (said,)
+    assert hmsa_ros.compare(cut, cut).notes[1] == f'simulated (2), {said}'
+
+
+@pytest.mark.parametrize('where', ['notebook', 'terminal'])
+def test_rows_of_a_table_are_broken_between_columns_only(monkeypatch, where):
+    runs = [hmsa_ros.Actuator().plan([(1.1, 0.5)], shaper=x).simulate(label=x)
+            for x in ('two_step', 'step')]
+    table = hmsa_ros.compare(*runs)
+    monkeypatch.delenv('COLUMNS', raising=False)
+    whole = str(table).splitlines()
+    assert len(whole[0]) > 140   # in a file or a pipe
+    room = 80
+    if where == 'notebook':
+        monkeypatch.setitem(sys.modules, 'ipykernel', object())
+    else:
+        room = 100
+        monkeypatch.setenv('COLUMNS', str(room))
+        monkeypatch.setattr(sys, 'stdout', SimpleNamespace(isatty=lambda: True))
+    lines = str(table).splitlines()
+    monkeypatch.undo()
+    assert max(map(len, lines)) <= room
+    blocks = [x.splitlines() for x in '\n'.join(lines).split('\n\n')]
+    rows = [x for block in blocks for x in block if x.lstrip().startswith('1  ')]
+    assert [x.split()[1] for x in rows] == ['two_step', 'step'] * len(blocks)
+    # All cells are there, once, beside the keys.
+    for i, row in enumerate(whole[2:4]):
+        cells = row.split('  ')
+        found = [y for x in rows[i::2] for y in x.split('  ')]
+        keys = 2 * (len(blocks) - 1)
+        assert len([x for x in found if x]) - keys == len([x for x in cells if x])
+    # The first block names the winner.
+    assert rows[1].endswith('arrived after ringing') or 'arrived after ringing  ' in rows[1]
+    # A deviation stays beside its value.
+    assert not any(x.split()[2:3] == ['±'] for x in lines if 'setpoint' in x)
 
 
 def test_a_law_is_chosen_by_option(files, capsys):

@@ -99,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
         levels = [y for x in parts for y in level_results(x.run)] if experiment.levels else []
         findings = [y for x in parts for y in x.evaluation.findings] if (
             experiment.setpoints) else []
-        verdict, reason = _verdict(experiment, findings, done)
+        verdict, reason = _verdict(experiment, findings, done, parts)
         each.append(findings)
         records.append({
             'verdict': verdict, 'reason': reason, 'setpoints': [x.to_dict() for x in findings],
@@ -186,9 +186,11 @@ def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
 
 
 def _verdict(
-        experiment: 'Experiment', findings: 'list[Finding]', done: 'Conducted') -> tuple[str, str]:
+        experiment: 'Experiment', findings: 'list[Finding]', done: 'Conducted',
+        parts: 'list[Part]') -> tuple[str, str]:
     """Return the verdict on all setpoints, or on the end of levels, and its reason."""
     from hmsa_ros.judge.records import worst
+    from hmsa_ros.report.comparison import ringing
 
     if not experiment.setpoints or not done.measured:
         reason = ('the levels or the path end at rest' if done.measured
@@ -204,7 +206,7 @@ def _verdict(
             f'the bag shows {len(findings)} of {count} setpoints: expected all, with samples')
     if found.arrived:
         moves = f'all {count} moves' if count > 1 else 'the move'
-        return 'arrived', f'{moves} arrived and stayed within tolerance'
+        return 'arrived', f'{moves} arrived and stayed within tolerance{ringing(parts)}'
     others = sum(not x.arrived for x in findings) - 1
     return str(found.verdict), found.message + (
         f'; {others} more of {count} did not arrive' if others else '')

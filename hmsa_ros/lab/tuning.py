@@ -31,6 +31,7 @@ from hmsa_ros.recordings.bags import read_run
 from hmsa_ros.recordings.parameters import Entries
 from hmsa_ros.recordings.record import Run
 from hmsa_ros.report.arrivals import Part
+from hmsa_ros.report.comparison import ringing
 from hmsa_ros.report.looks import RUNS
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ class Tuned:
         if found is None:
             return 'unobserved', 'the bag shows no setpoint after tuning'
         if found.arrived:
-            return 'tuned', 'all moves arrived and stayed within tolerance'
+            return 'tuned', f'all moves arrived and stayed within tolerance{ringing([self.after])}'
         if found.verdict in ('undecided', 'unobserved'):
             return str(found.verdict), found.message
         lacks = self.identified.cost

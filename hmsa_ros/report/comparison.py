@@ -9,9 +9,9 @@ import numpy as np
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.recordings.record import Run
 from hmsa_ros.report.arrivals import around, Part
-from hmsa_ros.report.evaluation import judged_from, MoveResult
+from hmsa_ros.report.evaluation import judged_from, result_of, verdict_on
 from hmsa_ros.report.looks import RUNS
-from hmsa_ros.table import Column, Table
+from hmsa_ros.table import Column, DEVIATION, Table
 
 
 def labelled(runs: list[Run]) -> list[Run]:
@@ -50,63 +50,71 @@ def comparison(parts: Sequence[Part]) -> Table:
             'requests or levels that hold a stretch')
     labels = [x.label for x in labelled([x.run for x in parts])]
     rows = [
-        (number + 1, label, *_measured(part, number), _apart(parts[0], part, number),
-         _verdict(part, number))
+        (number + 1, label, *_measured(part, number), _apart(parts[0], part, number))
         for number in range(count) for label, part in zip(labels, parts, strict=True)
         if number < len(part.evaluation.findings)]
     return Table(
-        (Column('setpoint'), Column('run'), *_MEASURED, Column('apart', '%', '%'),
-         Column('verdict')), tuple(rows),
+        (Column('setpoint'), Column('run'), *_MEASURED, Column('apart', '%', '%')), tuple(rows),
         f'{_CAPTION}; apart: largest distance from the curve of {labels[0]}, from the start of '
-        'the move on; in % of the step')
+        'the move on; in % of the step', tuple(
+            f'{label}, {note}' for label, part in zip(labels, parts, strict=True)
+            for note in _open(part)))
 
 
 def setpoints(parts: Sequence[Part]) -> Table:
     """Return the results of each setpoint of a run; ``parts`` are its joints."""
     return Table(
-        (Column('setpoint'), *_MEASURED, Column('frequency', 'Hz', '.3g', 'f'),
-         Column('verdict')),
+        (Column('setpoint'), *_MEASURED, Column('frequency', 'Hz', '.3g', 'f')),
         tuple((
             f'{x.setpoint.joint} {x.setpoint.number}' if x.setpoint.joint else x.setpoint.number,
-            *_measured(part, number), x.frequency, _verdict(part, number))
+            *_measured(part, number), x.frequency)
             for part in parts for number, x in enumerate(part.evaluation.findings)),
-        f'{_CAPTION}; f: frequency of the vibration; in % of the step')
+        f'{_CAPTION}; f: frequency of the vibration; in % of the step',
+        tuple(note for part in parts for note in _open(part)))
+
+
+def _open(part: Part) -> list[str]:
+    """Return why setpoints of a run have no verdict."""
+    return [x.message for x in part.evaluation.findings if x.open]
+
+
+def ringing(parts: Sequence[Part]) -> str:
+    """Return how long unshaped steps rang before they arrived, as the end of a sentence."""
+    rang = [result_of(x.evaluation, i) for x in parts for i in range(len(x.evaluation.findings))
+            if verdict_on(x.evaluation, i).endswith('ringing')]
+    most = max((x.settled for x in rang if x is not None), default=math.nan)
+    return f', unshaped steps after ringing for up to {1e3 * most:.3g} ms' if rang else ''
 
 
 _MEASURED = (
-    Column('target'), Column('move time', 'ms', '.4g'), Column('residual', '%', '%'),
+    Column('target'), Column('move time', 'ms', '.4g'),
+    Column('settling time', 'ms', '.4g', 'settled'), Column('residual', '%', '%'),
+    Column('verdict'),
     Column('judged from', 'ms', '.4g'), Column('offset', '%', '+%'),
-    Column('offset std', '%', '%', '±'), Column('vibration', '%', '%'),
-    Column('vibration std', '%', '%', '±'))
+    Column('offset std', '%', '%', DEVIATION), Column('vibration', '%', '%'),
+    Column('vibration std', '%', '%', DEVIATION))
 _CAPTION = (
     'move time: from the first level to planned rest, half a period for an unshaped step; '
-    'residual: peak to peak from then on; judged from: start of the samples that decide the '
-    'verdict, for an unshaped step once its vibration should have faded; offset: their mean less '
-    'the target; vibration: peak to peak in their first period; ±: standard deviations')
+    'settled: from then on it stays within arrival_tolerance of the target; residual: peak to '
+    'peak after the move time; judged from: start of the samples that decide the verdict, for an '
+    'unshaped step once its vibration should have faded; offset: their mean less the target; '
+    'vibration: peak to peak in their first period; ±: standard deviations')
 
 
-def _measured(part: Part, number: int) -> tuple[float, ...]:
+def _measured(part: Part, number: int) -> tuple[float | str, ...]:
     """Return the values of the columns `_MEASURED`; NaN if not measured."""
-    found, result = part.evaluation.findings[number], _result(part, number)
+    found, result = part.evaluation.findings[number], result_of(part.evaluation, number)
     return (
-        found.setpoint.target, *((math.nan, math.nan) if result is None else (
-            1e3 * result.arrival, 100.0 * result.residual)), 1e3 * judged_from(found),
+        found.setpoint.target, *((math.nan,) * 3 if result is None else (
+            1e3 * result.arrival, 1e3 * result.settled, 100.0 * result.residual)),
+        verdict_on(part.evaluation, number), 1e3 * judged_from(found),
         *(found.setpoint.percent(x) for x in (
             found.offset, found.offset_std, found.vibration, found.vibration_std)))
 
 
-def _verdict(part: Part, number: int) -> str:
-    return str(part.evaluation.findings[number].verdict).replace('_', ' ')
-
-
-def _result(part: Part, number: int) -> MoveResult | None:
-    """Return the result of a setpoint; None without an arrival in the recording."""
-    return next((x for x in part.evaluation.results if x.place == number), None)
-
-
 def _apart(first: Part, part: Part, number: int) -> float:
     """Return the largest distance of two curves around an arrival, in percent of the step."""
-    reference, move = _result(first, number), _result(part, number)
+    reference, move = (result_of(x.evaluation, number) for x in (first, part))
     if part is first or reference is None or move is None:
         return math.nan
     (time, off), (other, values) = (

@@ -12,7 +12,7 @@ import numpy as np
 
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.interfaces.topics import PLANNER
-from hmsa_ros.judge.records import Finding, Tolerances
+from hmsa_ros.judge.records import Finding, Setpoint, Tolerances
 from hmsa_ros.model.delivery import Delivery
 from hmsa_ros.model.equations import (
     Array,
@@ -31,7 +31,7 @@ from hmsa_ros.recordings.parameters import creep_of
 from hmsa_ros.recordings.record import Run, Times
 from hmsa_ros.recordings.setpoints import Requested, SAME, setpoints_of, start_of
 from hmsa_ros.report.curves import Curve, fine, through
-from hmsa_ros.report.outcome import findings_of
+from hmsa_ros.report.outcome import findings_of, tolerances_of
 
 #: With fewer samples per period, peaks are missed.
 FEW_SAMPLES = 10
@@ -72,6 +72,9 @@ class MoveResult:
     #: unshaped steps of the same plant; NaN without samples, and for a block that did not move
     residual: float
     residual_unshaped: float
+    #: from the begin until the recorded stretch stays within the tolerance of the target, in s;
+    #: NaN if it does not, or without samples
+    settled: float
     #: whether the mean after arrival lies at least a tenth of the step from the start
     moved: bool
     place: int = 0  #: index among all requested setpoints
@@ -119,17 +122,28 @@ def judged_from(finding: Finding) -> float:
 
 def verdicts(evaluations: Sequence[Evaluation], number: int) -> str:
     """Return the different verdicts on a move in several runs, each after a comma."""
-    places = [(x.findings, x.results[number].place) for x in evaluations
-              if number < len(x.results)]
+    places = [(x, x.results[number].place) for x in evaluations if number < len(x.results)]
     return ''.join(f', {x}' for x in dict.fromkeys(
-        _verdict(found[i]) for found, i in places if i < len(found)))
+        verdict_on(found, i) for found, i in places if i < len(found.findings)))
 
 
-def _verdict(finding: Finding) -> str:
-    """Return a verdict in words, with the time of rest for a target that is only approached."""
-    words = str(finding.verdict).replace('_', ' ')
-    late = finding.setpoint.arrival is None and finding.arrived
-    return f'{words} after {1e3 * judged_from(finding):.3g} ms' if late else words
+def verdict_on(evaluation: Evaluation, number: int) -> str:
+    """
+    Return the verdict on a setpoint in words.
+
+    An unshaped step is judged once its vibration has faded: the words say that it rang before.
+    """
+    finding, result = evaluation.findings[number], result_of(evaluation, number)
+    setpoint, words = finding.setpoint, str(finding.verdict).replace('_', ' ')
+    approached = setpoint.arrival is None and setpoint.moved is None
+    rang = approached and setpoint.decay < setpoint.frequency and (
+        result is not None and not result.settled <= result.arrival)
+    return f'{words} after ringing' if finding.arrived and rang else words
+
+
+def result_of(evaluation: Evaluation, number: int) -> MoveResult | None:
+    """Return the result of a setpoint; None without an arrival in the recording."""
+    return next((x for x in evaluation.results if x.place == number), None)
 
 
 def evaluate(run: Run, tolerances: Tolerances | None = None) -> Evaluation:
@@ -143,15 +157,17 @@ def evaluate(run: Run, tolerances: Tolerances | None = None) -> Evaluation:
     time = (run.time - first) / NANOSECONDS
     period = run.plant.period
     plain = _plain(run, time, found, first, start)
-    results = [_measure(run, time, plain, x, first) for x in found]
+    recorded = through(Curve(time, run.stretch, run.rate), period)
+    tolerances = tolerances or tolerances_of(run)
+    results = [_measure(
+        run, time, recorded, plain, x, first, asked[x.place].setpoint, tolerances) for x in found]
     stamps = run.time
     if plan:
         between = np.rint(fine(time, period) * NANOSECONDS).astype(np.int64) + first
         stamps = np.unique(np.concatenate([run.time, between, [
             x.stamp for x in plan if run.time[0] <= x.stamp <= run.time[-1]]]).astype(np.int64))
     return Evaluation(
-        first, time, start, levels, found, tuple(results),
-        through(Curve(time, run.stretch, run.rate), period), plain, plan,
+        first, time, start, levels, found, tuple(results), recorded, plain, plan,
         Curve((stamps - first) / NANOSECONDS, *_predict(run, plan, stamps)),
         tuple(findings_of(run, tolerances, asked=asked)))
 
@@ -221,7 +237,9 @@ def _delivery(run: Run, actuator: ActuatorParameters, node: str) -> Delivery:
         lag=run.number(f'{node}.coil_time_constant') / unit)
 
 
-def _measure(run: Run, time: Array, plain: Curve, move: Move, zero: int) -> MoveResult:
+def _measure(
+        run: Run, time: Array, recorded: Curve, plain: Curve, move: Move, zero: int,
+        setpoint: Setpoint, tolerances: Tolerances) -> MoveResult:
     """Evaluate one setpoint."""
     step = move.stretch - move.start
     begin, arrival, end = (
@@ -238,13 +256,23 @@ def _measure(run: Run, time: Array, plain: Curve, move: Move, zero: int) -> Move
             residual = residual_vibration(time, run.stretch, **window)
         unshaped = residual_vibration(plain.time, plain.stretch, **window)
     of_level = run.planner.units.of_level
+    allowed, _ = tolerances.of(setpoint)
     return MoveResult(
         stretch=move.stretch, start=move.start,
         b_p=float(signed_root(of_level(move.flux_densities[0]))),
         tau_p=(arrival - begin) / run.planner.time_unit,
         b_1=float(signed_root(of_level(move.flux_densities[-1]))), begin=begin,
         arrival=arrival - begin, end=end, error=error, residual=residual,
-        residual_unshaped=unshaped, moved=moved, place=move.place)
+        residual_unshaped=unshaped,
+        settled=_settled(recorded.between(begin, end), move.stretch, allowed) - begin,
+        moved=moved, place=move.place)
+
+
+def _settled(curve: Curve, target: float, allowed: float) -> float:
+    """Return the time in s from which a curve stays within a distance of the target; else NaN."""
+    off = np.flatnonzero(np.abs(curve.stretch - target) > allowed)
+    place = int(off[-1]) + 1 if len(off) else 0
+    return float(curve.time[place]) if place < len(curve.time) else math.nan
 
 
 def _predict(run: Run, plan: Sequence[Level], stamps: Times) -> tuple[Array, Array]:

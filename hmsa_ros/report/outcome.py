@@ -10,6 +10,7 @@ from hmsa_ros.control.holds import Hold
 from hmsa_ros.interfaces.parameters import number_of
 from hmsa_ros.judge.records import Finding, Sensor, Tolerances, unobserved
 from hmsa_ros.model.equations import equilibrium_stretch
+from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import Drive, FLUX, NANOSECONDS
 from hmsa_ros.recordings.parameters import of_joint
 from hmsa_ros.recordings.record import Run
@@ -17,6 +18,7 @@ from hmsa_ros.recordings.setpoints import Requested, setpoints_of
 from hmsa_ros.table import Column, Table
 
 _LEFT_OUT = 'no time was left for it'
+_CUT_SHORT = 'the samples end before its arrival'
 _SENSOR = Sensor()
 # Later than any timestamp, in ns.
 _END = 2**62
@@ -28,11 +30,15 @@ def findings_of(
         run: Run, tolerances: Tolerances | None = None, *,
         asked: Sequence[Requested] | None = None) -> list[Finding]:
     """Judge each requested setpoint, by default with the tolerances of the run's planner."""
-    if tolerances is None:
-        own = {x: number_of(of_joint(run.parameters, run.joint, f'planner.{x}_tolerance'))
-               for x in ('arrival', 'vibration', 'stretch')}
-        tolerances = Tolerances(**{x: y for x, y in own.items() if y is not None and y >= 0.0})
+    tolerances = tolerances or tolerances_of(run)
     return [_judged(run, x, tolerances) for x in (setpoints_of(run) if asked is None else asked)]
+
+
+def tolerances_of(run: Run) -> Tolerances:
+    """Return the tolerances of a run's planner."""
+    own = {x: number_of(of_joint(run.parameters, run.joint, f'planner.{x}_tolerance'))
+           for x in ('arrival', 'vibration', 'stretch')}
+    return Tolerances(**{x: y for x, y in own.items() if y is not None and y >= 0.0})
 
 
 def _judged(run: Run, asked: Requested, tolerances: Tolerances) -> Finding:
@@ -75,7 +81,10 @@ def _judged(run: Run, asked: Requested, tolerances: Tolerances) -> Finding:
         # All samples have been added.
         hold.judge(_END, patience, tolerances, sensor, observable=False)
         patience *= 2
-    return hold.found or unobserved(hold.setpoint)
+    found = hold.found or unobserved(hold.setpoint)
+    if found.verdict is Code.UNOBSERVED and run.time[-1] < found.setpoint.rests_from:
+        return unobserved(found.setpoint, _CUT_SHORT)
+    return found
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from hmsa_ros.recordings.topics import APPLIED
 from hmsa_ros.report import charts, curves, looks
 from hmsa_ros.report.arrivals import NOT_MOVED, Part, residual_text, title, worst
 from hmsa_ros.report.charts import Figure, TimeUnit
-from hmsa_ros.report.evaluation import FEW_SAMPLES, plan_points
+from hmsa_ros.report.evaluation import FEW_SAMPLES, plan_points, verdict_on
 from hmsa_ros.table import Column, Table
 
 _FOLDER = Path(__file__).parent
@@ -211,14 +211,15 @@ def _setpoints(parts: Sequence[Part]) -> Table:
         for i, found in enumerate(part.evaluation.findings):
             move, x = moves.get(i, (None, None))
             levels = 0 if move is None else len(move.flux_densities)
-            of_move = (math.nan,) * 9 if x is None else (
-                x.b_p, x.tau_p, x.b_1, x.begin * 1e3, x.arrival * 1e3, (x.end - x.begin) * 1e3,
+            of_move = (math.nan,) * 10 if x is None else (
+                x.b_p, x.tau_p, x.b_1, x.begin * 1e3, x.arrival * 1e3, x.settled * 1e3,
+                (x.end - x.begin) * 1e3,
                 100.0 * x.error, 100.0 * x.residual if x.moved else NOT_MOVED,
                 100.0 * x.residual_unshaped)
             share = found.setpoint.percent
             rows.append((
                 part.run.label, i + 1, found.setpoint.target,
-                str(found.verdict).replace('_', ' '), share(found.offset),
+                verdict_on(part.evaluation, i), share(found.offset),
                 share(found.offset_std), share(found.vibration),
                 share(found.vibration_std), found.frequency, *of_move,
                 'unshaped step' if levels == 1 else f'{levels} levels' if levels else '–'))
@@ -228,8 +229,9 @@ def _setpoints(parts: Sequence[Part]) -> Table:
             'offset [%]': '+%', '± [%]': '%', 'vibration [%]': '%', '± of it [%]': '%',
             'frequency [Hz]': '.3g',
             'b_p [1]': '.5f', 'tau_p [1]': '.5f', 'b_1 [1]': '.5f', 'begin [ms]': '.3f',
-            'arrival [ms]': '.3f', 'end [ms]': '.3f', 'largest error [%]': '%',
-            'residual [%]': '%', 'unshaped steps [%]': '%', 'command': ''}, rows)
+            'arrival [ms]': '.3f', 'settled [ms]': '.3f', 'end [ms]': '.3f',
+            'largest error [%]': '%', 'residual [%]': '%', 'unshaped steps [%]': '%',
+            'command': ''}, rows)
 
 
 def _requests(parts: Sequence[Part], unit: TimeUnit) -> Table:
