@@ -35,7 +35,7 @@ DECLARED: dict[str, tuple[ParameterSpec, ...]] = {
 DIMENSIONLESS = {
     'creep_tolerance', 'marker_scale', 'max_points', 'minimax_errors', 'path_tolerance',
     'actuator.chain_limit', 'initial_stretch', 'real_time_factor', 'robust_order', 'play.rate',
-    'play.read_ahead_queue_size', 'play.realtime_priority', 'record.queue_depth',
+    'play.read_ahead_queue_size', 'record.queue_depth',
     'reset_stretch', 'seed', 'law.alpha', 'law.lambda_m', 'law.permittivity', 'law.stretch',
     'step_count',
     # In one unit of length, whichever.

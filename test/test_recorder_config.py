@@ -38,8 +38,7 @@ def test_commands_pass_only_by_name():
     for topic in ('/left/flux_density_command', '/planner/joint_trajectory',
                   '/planner/setpoint'):
         for chosen, withheld in (
-                (free, True), (Filter(regex='.*'), True), (Filter(topics=(topic,)), False),
-                (Filter(allow_commands=(topic,)), False)):
+                (free, True), (Filter(regex='.*'), True), (Filter(topics=(topic,)), False)):
             assert chosen.withholds(topic, topic, '') is withheld
     assert not free.withholds('/joint_states', '/joint_states', '')
     with pytest.raises(BadInputError, match='expected a regular expression'):

@@ -255,8 +255,8 @@ def test_policies_grant_exactly_what_the_nodes_do(tmp_path, start, ros):
     plant = start.hmsa('plant', '--ros-args', *simulated)
     player = start.hmsa(
         'player', '--ros-args', '-p', f'storage.uri:={bag}', '-p', 'play.rate:=0.001',
-        '-p', 'play.clock_publish_frequency:=100.0', '-p', 'play.discovery_time:=0.0',
-        '-p', f'play.allow_commands:=[{COMMAND}]',
+        '-p', 'play.clock_publish_frequency:=100.0',
+        '-p', f'play.topics_to_filter:=[{COMMAND}]', '-p', 'play.regex_to_filter:=.*',
         '-p', f'play.wait_for_samples:=[{topics.JOINT_STATES.name}]')
     watch(ros, ('player', 'plant', 'recorder'), seen,
           lambda: nothing_left('plant', 'recorder')()

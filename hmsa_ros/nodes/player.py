@@ -5,7 +5,7 @@ The node's executor serves services and parameters. A thread publishes each mess
 an absolute schedule, so that delays do not accumulate. A second thread reads ahead.
 
 Commands cause motion. Topics with commands (see `hmsa_ros.nodes.selection`) are omitted unless
-they are selected by name, in ``play.topics_to_filter`` or ``play.allow_commands``.
+they are selected by name, in ``play.topics_to_filter``.
 
 As a managed node, it opens the bag and creates its publishers when it is configured, plays while
 it is active, and releases both when it is cleaned up.
@@ -23,7 +23,6 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.duration import Duration
 from rclpy.expand_topic_name import expand_topic_name
 
-from hmsa_ros.bag.limits import CHUNK_SIZE
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.bag.sender import CLOCK_WHILE_WAITING_SECONDS, ClockOut, Excerpt, Sender
 from hmsa_ros.bag.transport import Transport
@@ -44,14 +43,16 @@ _POLL_SECONDS = 0.02
 # DDS requests them, every 3 s with profiles other than ours. The wait at the end has to last for
 # several heartbeats, in slices.
 _ACKNOWLEDGED_SECONDS = 0.5
+# Discovery may take three seconds, the period of participant announcements. Later subscribers are
+# not waited for.
+_DISCOVERY_SECONDS = 3.5
+# Of the sending thread: precise timing on a busy machine needs it.
+_REALTIME_PRIORITY = 1
 # Limit of builtin_interfaces/Time.
 _LATEST_CLOCK = 2**31 * 10**9
 
 PARAMETERS = (
     ParameterSpec('storage.uri', '', 'Folder of the bag, or an .mcap file.'),
-    ParameterSpec(
-        'storage.max_chunk_size', CHUNK_SIZE,
-        'Largest chunk or message to read; larger ones are skipped.', 'B', 1),
     ParameterSpec('play.rate', 1.0, 'Playback speed relative to the recording.', '', 1e-3, 1e3,
                   read_only=False),
     ParameterSpec('play.loop', False, 'Whether to start again at the end.'),
@@ -67,14 +68,11 @@ PARAMETERS = (
         'Topics to send; empty for all except commands.'),
     ParameterSpec(
         'play.regex_to_filter', '',
-        'Regular expression; only topics that contain a match are sent.'),
+        'Regular expression; topics that contain a match are sent too, except commands.'),
     ParameterSpec('play.exclude_topics_to_filter', [], 'Topics not to send.'),
     ParameterSpec(
         'play.exclude_regex_to_filter', '',
         'Regular expression; topics that contain a match are not sent.'),
-    ParameterSpec(
-        'play.allow_commands', [],
-        'Command topics that may be sent, besides those in play.topics_to_filter.'),
     ParameterSpec(
         'play.clock_publish_frequency', 0.0,
         "Rate at which /clock is published, in the bag's time; 0 for never.", 'Hz', 0.0, 1e5),
@@ -99,18 +97,10 @@ PARAMETERS = (
         'play.wait_for_samples', [],
         'Topics of samples (sensor_msgs/msg/JointState) from nodes that follow /clock: at the end '
         'the player waits until they have reached the time of the last message.'),
-    ParameterSpec(
-        'play.discovery_time', 3.5,
-        'How long to look for existing subscribers; ends early once every topic has one, or '
-        'every topic in play.wait_for_subscribers.', 's', 0.0, 3600.0),
     *duration_specs('play.delay', 0, 'Whole seconds to wait before playing.'),
     ParameterSpec(
         'play.read_ahead_queue_size', 1000, 'Number of messages to read ahead.',
         '', 1, 10_000_000),
-    ParameterSpec(
-        'play.realtime_priority', 1,
-        'Real-time priority of the sending thread, if the system grants it; 0 for an ordinary '
-        'thread.', '', 0, 99),
     *duration_specs(
         'play.wait_acked_timeout', 20,
         'Whole seconds to wait at the end for acknowledgements of reliable subscribers, and for '
@@ -148,8 +138,7 @@ class Player(ManagedNode):
             raise BadInputError(
                 'parameter storage.uri is empty: expected the folder of a bag or an .mcap file, '
                 'for example -p storage.uri:=run1')
-        self._reader = BagReader(
-            values['storage.uri'], max_chunk_size=values['storage.max_chunk_size'])
+        self._reader = BagReader(values['storage.uri'])
         self._problems_reported = 0
         self._report_problems()
         self._excerpt = self._choose_excerpt()
@@ -158,7 +147,7 @@ class Player(ManagedNode):
             self, self._reader, Filter(
                 self._names('play.topics_to_filter'), values['play.regex_to_filter'],
                 self._names('play.exclude_topics_to_filter'),
-                values['play.exclude_regex_to_filter'], self._names('play.allow_commands')),
+                values['play.exclude_regex_to_filter']),
             own_clock=self._clock_out is not None)
         self._audience = Audience(
             self, self._senders, self._names('play.wait_for_subscribers'),
@@ -253,11 +242,9 @@ class Player(ManagedNode):
 
     def _run(self, transport: Transport) -> None:
         """Play, then end the process."""
-        # Real-time priority, if the system grants it: precise timing on a busy machine needs it.
-        priority = self._values['play.realtime_priority']
-        if priority:
-            with contextlib.suppress(OSError):
-                os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
+        # If the system grants it.
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(_REALTIME_PRIORITY))
         try:
             self._wait_for_audience(transport)
             transport.rest(duration_from(self._values, 'play.delay') * 1e-9)
@@ -281,9 +268,7 @@ class Player(ManagedNode):
         """Wait until the required subscribers are present."""
         begin = next_clock = time.monotonic()
         timeout = self._values['play.wait_for_subscribers_timeout']
-        # Discovery may take three seconds, the period of participant announcements. Later
-        # subscribers are not waited for.
-        settled = begin + self._values['play.discovery_time']
+        settled = begin + _DISCOVERY_SECONDS
         while not transport.rest(_POLL_SECONDS):
             now = time.monotonic()
             if self._clock_out is not None and now >= next_clock:

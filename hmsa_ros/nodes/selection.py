@@ -92,14 +92,13 @@ class Selection(_Choice):
 class Filter(_Choice):
     """Topics to play, by full names or expressions, and commands that are permitted."""
 
-    allow_commands: tuple[str, ...] = ()
     expressions = ('play.regex_to_filter', 'play.exclude_regex_to_filter')
 
     def passes(self, topic: str) -> bool:
         """Return whether a topic is selected, commands aside; exclusion takes precedence."""
         if self._excludes(topic):
             return False
-        if topic in self.topics or topic in self.allow_commands:
+        if topic in self.topics:
             return True
         if self.regex:
             return re.search(self.regex, topic) is not None
@@ -107,7 +106,7 @@ class Filter(_Choice):
 
     def withholds(self, topic: str, resolved: str, type_name: str) -> bool:
         """Return whether a topic, resolved for publishing, is a command not selected by name."""
-        if topic in self.topics or topic in self.allow_commands:
+        if topic in self.topics:
             return False
         return (_last(topic) in COMMAND_TOPICS or _last(resolved) in COMMAND_TOPICS
                 or (type_name in _COMMAND_TYPES and _last(resolved) not in _REPORTS))

@@ -49,7 +49,7 @@ def create_senders(
             reports.append(f'topic {name} is left out: {reason}')
     if len(reports) > NAMED_AT_MOST:
         reports[NAMED_AT_MOST:] = [f'{len(reports) - NAMED_AT_MOST} more topics are left out']
-    missing = [x for x in (*selection.topics, *selection.allow_commands) if x not in held]
+    missing = [x for x in selection.topics if x not in held]
     if missing:
         reports.append(
             f'the bag has no topic {", ".join(missing)}; it has '
@@ -66,8 +66,7 @@ def _left_out(
         return 'it cannot be published, its name is not a valid ROS name'
     resolved = node.resolve_topic_name(name)
     if selection.withholds(name, resolved, info.type):
-        return ('it carries commands; name it in play.topics_to_filter or '
-                'play.allow_commands to send it')
+        return 'it carries commands; name it in play.topics_to_filter to send it'
     if resolved == topics.CLOCK_TOPIC.name and own_clock:
         return 'the player publishes the clock itself'
     if info.encoding != 'cdr':
