@@ -80,10 +80,6 @@ EXTRAS_REQUIRE = {
     'bench': [
         'casadi>=3.6',
     ],
-    # Some 500 MB; opens bags without ROS.
-    'viewers': [
-        'rerun-sdk>=0.39',
-    ],
     'release': [
         'build>=1.0',
     ],

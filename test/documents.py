@@ -48,8 +48,8 @@ NO_CODE = {'toctree', 'math', 'figure', 'image', 'literalinclude', 'contents'}
 # Programs of a full installation whose arguments do not concern this package.
 FOREIGN = {
     'apt', 'cd', 'colcon', 'export', 'foxglove-studio', 'git', 'mkdir', 'plotjuggler', 'rosdep',
-    'rqt', 'rqt_graph', 'rqt_plot', 'rviz2', 'source', 'sudo', '.', 'pip', 'rerun', 'kill',
-    'wait', 'unset', 'echo', 'cp', 'openssl', 'scp', 'ssh', 'systemctl', 'ulimit', 'chrt'}
+    'rqt', 'rqt_graph', 'rqt_plot', 'rviz2', 'source', 'sudo', '.', 'pip', 'kill', 'wait',
+    'unset', 'echo', 'cp', 'openssl', 'scp', 'ssh', 'systemctl', 'ulimit', 'chrt'}
 KEYWORDS = {'do', 'done', 'else', 'fi', 'if', 'then', 'until', 'while'}
 PATIENCE_SECONDS = 200.0
 # Default lead time, unless a page sets one: long enough that a busy machine sends no late

@@ -34,7 +34,7 @@ MODULES = {'PyYAML': 'yaml', 'mcap-ros2-support': 'mcap_ros2'}
 # What only a part of the package needs.
 OPTIONAL = {'dask', 'distributed', 'pyarrow', 'tornado'}
 # What the package asks for in one line where it is missing: the user's choice.
-BESIDE = {'pandas', 'rerun'}
+BESIDE = {'pandas'}
 # Needed to install, or to be launched, not to be imported.
 NOT_IMPORTED = {'setuptools', 'ros2launch'}
 # What setup() was called with, without building anything.

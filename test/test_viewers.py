@@ -1,31 +1,22 @@
 """
-Files for viewers in config/, compared with the package's topics, and Rerun.
+Files for viewers in config/, compared with the package's topics.
 
 The viewers are not Python packages, so their files are compared with the requirements of their
-readers. Rerun shows a bag if rerun-sdk is installed.
+readers.
 """
 
 from collections.abc import Iterator, Mapping
 import json
 from pathlib import Path
 import re
-import subprocess
-import sys
 from typing import Any
 from xml.etree import ElementTree
 
-from beam_oracle import silicone
-import numpy as np
 import pytest
-from std_msgs.msg import Float64
 import yaml
 
-from hmsa_ros import rerun_view
 from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.actuator import parameters_of
-from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.nodes.endpoints import interface_class
-from hmsa_ros.nodes.markers import Block, Scene, State
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIG = ROOT / 'config'
@@ -225,120 +216,3 @@ def test_plotjuggler_shows_topics_and_fields_that_there_are():
             assert fields in ('position', 'velocity', 'effort')
         else:
             field(known[topic].type, fields.replace('/', '.'))
-
-
-def test_rerun_view_names_topics_that_there_are():
-    known = by_name()
-    assert f'/{rerun_view.JOINT_STATES}' in known
-    assert all(known[f'/{name}'] is topics.MARKERS for name in rerun_view.MARKERS)
-    for path in list(rerun_view.views().values())[:-1]:
-        topic, _, fields = path.rpartition('/')
-        field(known[topic].type, f'{fields}[0]')
-    assert rerun_view.views('left')['Stretch'] == '/left/joint_states/position'
-    assert list(rerun_view.views(coordinate='deflection'))[:2] == [
-        'Deflection', 'Deflection rate (1/s)']
-
-
-def test_rerun_names_the_position_as_the_recorded_law_does():
-    def named(*actuators, space='', joints=''):
-        told = {f'{space}/plant.use_sim_time': 'false', f'{space}/plant.joints': joints} | {
-            f'{space}/plant.{joint}{name}': json.dumps(value)
-            for joint, actuator in zip(('one.', 'two.') if joints else ('',), actuators,
-                                       strict=True)
-            for name, value in parameters_of(actuator).items()}
-        return rerun_view._coordinate(told, space)
-
-    assert (named(paper_actuator()), rerun_view._coordinate({}, '')) == ('stretch', 'stretch')
-    assert named(silicone(), space='/left') == 'deflection'
-    both = '["one", "two"]'
-    assert named(silicone(), silicone(), joints=both) == 'deflection'
-    assert named(paper_actuator(), silicone(), joints=both) == 'position'
-
-
-def test_without_rerun_it_is_asked_for_in_one_line(tmp_path, capfd, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'rerun', None)
-    assert rerun_view.main([str(tmp_path)]) == 2
-    assert 'expected it installed' in capfd.readouterr().err
-
-
-@pytest.fixture
-def rerun_program() -> list[str]:
-    """Return the executable of Rerun in rerun-sdk."""
-    pytest.importorskip('rerun', reason='rerun-sdk is not installed')
-    return [sys.executable, '-m', 'rerun']
-
-
-@pytest.mark.ros
-def test_rerun_has_data_under_every_path_that_its_views_show(
-        rerun_program, tmp_path, start, ros, capfd):
-    bag = tmp_path / 'run'
-    recorder = start.hmsa('recorder', '--ros-args', '-p', f'storage.uri:={bag}')
-    start.hmsa('plant')
-    start.hmsa('planner')
-    # The test itself and the recorder.
-    setpoint = ros.publisher(
-        topics.SETPOINT.type, '/planner/setpoint', topics.SETPOINT.qos, subscribers=2)
-    states, targets = (
-        ros.collect(topics.MARKERS.type, f'/{node}/markers', topics.MARKERS.qos)
-        for node in topics.MARKERS.publishers)
-    for text in ('/plant/markers', '/planner/markers', '/joint_states'):
-        recorder.wait_for_output(f'subscribed to {text}')
-    setpoint.publish(Float64(data=1.1))
-    # Until it has set out: its field is there.
-    ros.spin_until(
-        lambda: targets and targets[-1].markers[0].action == 0
-        and states and states[-1].markers[2].action == 0, 'the block to set out')
-    assert recorder.stop() == 0, recorder.output
-    saved = tmp_path / 'run.rrd'
-    assert rerun_view.main([str(bag), '--save', str(saved)]) == 0
-    stats = subprocess.run(
-        [*rerun_program, 'rrd', 'stats', saved], check=True, capture_output=True, text=True)
-    chunks = {path: int(count) for path, count in re.findall(
-        r'^(/\S*): (\d+)$', stats.stdout + stats.stderr, re.M)}
-    for path in rerun_view.views().values():
-        assert any(x == path or x.startswith(f'{path}/') for x in chunks), path
-    assert sum(path.startswith('/view/') and path.count('/') == 2 for path in chunks) == len(
-        rerun_view.views())
-    # The block, its magnetisation, the field, the name and the target.
-    assert {f'/markers/{JOINT}/{number}' for number in range(5)} <= set(chunks)
-    verified = subprocess.run(
-        [*rerun_program, 'rrd', 'verify', saved], check=False, capture_output=True, text=True)
-    assert verified.returncode == 0, verified.stderr
-
-
-def test_bag_without_samples_is_refused_in_one_line(rerun_program, tmp_path, capfd):
-    assert rerun_view.main([str(tmp_path), '--save', str(tmp_path / 'x.rrd')]) == 2
-    assert capfd.readouterr().err.count('\n') == 1
-
-
-def test_a_bent_beam_is_a_shaded_mesh_in_rerun_at_its_place(tmp_path):
-    rerun = pytest.importorskip('rerun', reason='rerun-sdk is not installed')
-    from rerun.chunk import RrdReader
-
-    blocks = (Block.of(JOINT, silicone()), Block.of('other', paper_actuator()))
-    scene = Scene(blocks, 'coil', 2.0)
-    saved = tmp_path / 'beam.rrd'
-    recording = rerun.RecordingStream('test')
-    recording.save(saved)
-    shown = scene.states(0, [State(0.4, 0.001), State(1.0, 0.0)])
-    for marker in shown.markers:
-        rerun_view._log_marker(recording, '/markers', marker)
-    recording.disconnect()
-    found = {}
-    for chunk in RrdReader(saved).stream():
-        batch = chunk.to_record_batch()
-        for name in batch.schema.names:
-            if str(chunk.entity_path) == f'/markers/{JOINT}/0' and 'Mesh3D' in name:
-                found[name.split(':')[1]] = np.array(batch.column(name).to_pylist()[0])
-    corners, normals = found['vertex_positions'], found['vertex_normals']
-    body = shown.markers[0]
-    wanted = np.array([(p.x, p.y, p.z) for p in body.points]) + [body.pose.position.x, 0.0, 0.0]
-    assert corners == pytest.approx(wanted, abs=1e-7)
-    # Half of the mesh from the pose on, the tip up by 0.4 of the length, at twice the size.
-    assert corners[:, 2].max() == pytest.approx(2.0 * 0.4 * 0.025, abs=2e-3)
-    assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0, abs=1e-6)
-    # Outwards: they and the corners agree on the volume.
-    faces = corners.reshape(-1, 3, 3)
-    areas = np.linalg.norm(np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0]), axis=1)
-    volume = np.sum(areas * np.einsum('ij,ij->i', normals[::3], faces.mean(axis=1))) / 6.0
-    assert volume == pytest.approx(8.0 * 0.025 * 0.005 * 0.001, rel=0.02)
