@@ -49,7 +49,6 @@ EXTRAS_REQUIRE = {
         'hypothesis>=6.98',
         'mypy>=1.9',
         'pyserial>=3.5',
-        'pyte>=0.8',
         # From 9.2 on, groups of pytest-xdist 3.8 are lost: it writes to a private attribute.
         'pytest>=7.4,<9.2',
         'pytest-timeout>=2.2',

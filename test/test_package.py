@@ -26,9 +26,8 @@ KEYS = {
     'lz4': 'mcap-ros2-support', 'mcap': 'mcap-ros2-support',
     'mcap-ros2-support': 'mcap-ros2-support', 'zstandard': 'mcap-ros2-support',
     'PyYAML': 'python3-yaml', 'pyserial': 'python3-serial', 'rosbags': 'python3-rosbags-pip'}
-# No key: ruff, type stubs, a terminal for tests, and plotly, without which only the page of a
-# report is missing.
-WITHOUT_KEY = {'plotly', 'pyte', 'ruff', 'types-PyYAML'}
+# No key: ruff, type stubs, and plotly, without which only the page of a report is missing.
+WITHOUT_KEY = {'plotly', 'ruff', 'types-PyYAML'}
 # Requirements whose module has another name.
 MODULES = {'PyYAML': 'yaml', 'mcap-ros2-support': 'mcap_ros2'}
 # What only a part of the package needs.

@@ -28,8 +28,7 @@ from hmsa_ros.nodes.service_call import ServiceCall
 from hmsa_ros.panel.recording import Recording
 from hmsa_ros.panel.server import Server
 from hmsa_ros.watch.listener import Listener
-from hmsa_ros.watch.scene import History, LEVELS, Scene, SLOTS
-from hmsa_ros.watch.screen import as_json
+from hmsa_ros.watch.scene import as_json, History, LEVELS, Scene, SLOTS
 
 # Frame interval in s; number of chart slots in a frame; time in s for which a new page gets all.
 _PERIOD, _TAIL, _NEW_SECONDS = 0.02, 24, 1.0
@@ -270,4 +269,4 @@ class Desk:
 
 def _tail(history: History, now: float, count: int) -> list[list[float]]:
     """Return minima and maxima in the last slots of a history."""
-    return [np.round(side[-count:], 7).tolist() for side in history.ranges(now, SLOTS)]
+    return [np.round(side[-count:], 7).tolist() for side in history.ranges(now)]

@@ -1,6 +1,5 @@
 """
-The live view in the terminal.
+Showing running nodes.
 
-`listener` collects data from ROS into the records of `scene`. `screen` formats them as text and
-does not depend on ROS.
+`listener` collects data from ROS into the records of `scene`, which does not depend on ROS.
 """

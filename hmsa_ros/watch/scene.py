@@ -1,11 +1,14 @@
-"""State of a run at one moment."""
+"""State of a run at one moment, also as a line for a log, or JSON for a program."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 import math
+from typing import Any
 
 import numpy as np
 
+from hmsa_ros.files import finite
 from hmsa_ros.interfaces.status import Verdict
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import drive_of, POSITION
@@ -15,6 +18,10 @@ from hmsa_ros.model.units import Drive
 SLOTS = 480
 #: Names of the levels of diagnostics and verdicts.
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
+#: Counters of problems, the only ones in a line.
+TROUBLES = ('late', 'replanned', 'lost', 'refused', 'failed', 'timeouts')
+# Time in s without a report, normally one a second, after which a node is silent.
+_SILENT_AFTER = 3.5
 
 
 class History:
@@ -47,15 +54,12 @@ class History:
         self._low[begun] = self._high[begun] = np.nan
         self._newest = max(newest, self._newest)
 
-    def ranges(self, now: float, columns: int) -> tuple[Array, Array]:
-        """Return minima and maxima by column up to ``now`` in s; NaN if empty."""
+    def ranges(self, now: float) -> tuple[Array, Array]:
+        """Return minima and maxima by slot up to ``now`` in s; NaN if empty."""
         self._advance(now)
         count = len(self._low)
         order = np.arange(self._newest - count + 1, self._newest + 1) % count
-        begins = np.linspace(0, count, columns, endpoint=False).astype(np.int64)
-        # NaN is ignored; a column without values gives NaN.
-        return np.fmin.reduceat(self._low[order], begins), np.fmax.reduceat(
-            self._high[order], begins)
+        return self._low[order], self._high[order]
 
 
 @dataclass
@@ -114,3 +118,67 @@ class Scene:
     progress: float = math.nan
     reports: Sequence[Report] = field(default_factory=list)
     waiting: Sequence[str] = field(default_factory=list)
+
+
+def line(scene: Scene) -> str:
+    """Return a scene as one line of plain text, without a newline."""
+    parts = [] if math.isnan(scene.stamp) else [_time(scene.stamp)]
+    parts += [
+        f'{x.name} {_number(x.stretch)} (target {_number(x.target)}, {_level(x)})'
+        for x in scene.joints]
+    request = scene.request
+    if request is not None:
+        count = f' {request.setpoint}/{request.setpoints}' if request.setpoints else ''
+        parts.append(
+            f'{request.state.replace("_", " ")}{count}, {LEVELS[min(request.level, 3)]} '
+            f'{request.message}')
+        if request.finding not in request.message:
+            parts.append(request.finding)
+    for report in scene.reports:
+        if report.age > _SILENT_AFTER:
+            parts.append(f'{report.name}: silent for {report.age:.0f} s')
+            continue
+        troubles = [f'{x} {report.counts[x]}' for x in TROUBLES if report.counts.get(x)]
+        if troubles or report.level:
+            parts.append(f'{report.name}: ' + ', '.join([report.message, *troubles]))
+    parts += scene.waiting
+    return '; '.join(parts)
+
+
+def _number(value: float) -> str:
+    """Return a number as text; a question mark if unknown."""
+    return f'{value:.5f}' if math.isfinite(value) else '?'
+
+
+def _level(joint: Joint) -> str:
+    value = joint.flux_density
+    return joint.drive.text(value, '+.3f') if math.isfinite(value) else '?'
+
+
+def _time(stamp: float) -> str:
+    """Return a timestamp as the time of day, or in seconds for simulated time."""
+    if stamp < 1e8:
+        return f'{stamp:.3f} s (simulated)'
+    return datetime.fromtimestamp(stamp).strftime('%H:%M:%S')
+
+
+def as_json(scene: Scene) -> dict[str, Any]:
+    """Return a scene for JSON, with None for unknown values."""
+    request = scene.request
+    found: dict[str, Any] = finite({
+        'where': scene.where, 'stamp': scene.stamp, 'age': scene.age,
+        'sample_rate': scene.sample_rate,
+        'joints': [{
+            'name': x.name, 'stretch': x.stretch, 'stretch_rate': x.rate,
+            'flux_density': x.flux_density, 'target': x.target,
+            'flux_density_command': x.commanded} for x in scene.joints],
+        'request': request and {
+            'level': LEVELS[min(request.level, 3)], 'message': request.message,
+            'code': request.code, 'state': request.state, 'setpoint': request.setpoint,
+            'setpoints': request.setpoints, 'finding': dict(request.figures) or None},
+        'progress': scene.progress,
+        'reports': [{
+            'name': x.name, 'level': LEVELS[min(x.level, 3)], 'message': x.message,
+            'counts': x.counts, 'age': x.age} for x in scene.reports],
+        'waiting': list(scene.waiting)})
+    return found
