@@ -8,11 +8,13 @@ obvious, the remedy.
 from collections.abc import Iterable
 import reprlib
 import sys
+import warnings
 
 # Long enough for a mistyped value, short enough not to flood a log.
 _EXCERPT = reprlib.Repr()
 _EXCERPT.maxstring = _EXCERPT.maxother = 80
 _EXCERPT.maxlist = 4
+_PACKAGE = __name__.removesuffix('errors')
 
 
 class HmsaError(Exception):
@@ -34,6 +36,23 @@ class BadInputError(HmsaError, ValueError):
 
 class BagError(HmsaError):
     """A recording that cannot be read or written."""
+
+
+class AssumedWarning(UserWarning):
+    """
+    An assumption that the input leaves open, such as which of its columns is the time.
+
+    ``warnings.simplefilter('ignore', hmsa_ros.AssumedWarning)`` accepts all of them; commands show
+    each as one line.
+    """
+
+
+def assume(text: str) -> None:
+    """State an assumption, as a warning at the line outside this package that led to it."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_globals.get('__name__', '').startswith(_PACKAGE):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(text, AssumedWarning, stacklevel=level)
 
 
 def complain(error: Exception, status: int | None = None) -> int:

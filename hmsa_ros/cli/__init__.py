@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 
 from hmsa_ros import __version__
 from hmsa_ros.cli.node import NODES
+from hmsa_ros.cli.notes import notes_shown
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import complain, HmsaError
 
@@ -93,7 +94,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.ros_args = words[len(split_ros_args(words)):]
     ENDING.interrupt()
     try:
-        status: int = arguments.run(arguments)
+        with notes_shown():
+            status: int = arguments.run(arguments)
         print(end='', flush=True)  # also where standard output is closed
         return status
     except HmsaError as error:

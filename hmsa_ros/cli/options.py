@@ -140,9 +140,10 @@ def show(
         arguments: argparse.Namespace, record: dict[str, Any], *lines: object,
         written: Iterable[Path | None] = ()) -> int:
     """Print a result as JSON with --json, otherwise as lines with the files written; return 0."""
+    from hmsa_ros.cli.notes import with_notes
     from hmsa_ros.files import json_text
 
-    for line in [json_text(record)] if arguments.json else [
+    for line in [json_text(with_notes(record))] if arguments.json else [
             *lines, *(f'{x} written' for x in written if x is not None)]:
         print(line)
     return 0

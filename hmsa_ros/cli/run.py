@@ -17,6 +17,7 @@ from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
+from hmsa_ros.cli.notes import with_notes
 from hmsa_ros.cli.options import add_command, JOINTS, NAMESPACE
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import SEQUENCE, sequence_of
@@ -109,8 +110,8 @@ def run(arguments: argparse.Namespace) -> int:
             _print(experiment, parts, levels, reason, done, report)
     from hmsa_ros.report.repeats import statistics, statistics_table
     if arguments.json:
-        print(json_text(records[0] if arguments.repeat == 1 else {
-            'repeats': records, 'statistics': statistics(each)}))
+        print(json_text(with_notes(records[0] if arguments.repeat == 1 else {
+            'repeats': records, 'statistics': statistics(each)})))
     elif arguments.repeat > 1 and any(each):
         print(statistics_table({'': statistics(each)}))
     return 0 if all(x['verdict'] in ('arrived', NOT_MEASURED) for x in records) else 1
