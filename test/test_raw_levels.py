@@ -136,7 +136,7 @@ def test_a_run_of_levels_has_them_in_force_and_ends_at_rest(start, tmp_path):
                 applied.append((stamp, message.magnetic_field.z))
             else:
                 samples.append((stamp, message.position[0]))
-    times, levels, _ = read_levels(file)
+    times, levels = read_levels(file)
     changes = np.array(sorted(set(applied)))[-(len(levels) - 1):]
     # The first level is the one in force before: no change.
     assert levels[0] == 0.0

@@ -675,7 +675,7 @@ class Actuator:
         from hmsa_ros.identification.tables import read_levels
 
         if isinstance(levels, (str, Path)):
-            times, values, _ = read_levels(file_of(levels))
+            times, values = read_levels(file_of(levels))
         else:
             times, values = columns_of(levels, ('time', 'flux_density'), 'levels')
         return simulated(

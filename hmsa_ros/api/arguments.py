@@ -136,11 +136,11 @@ def whole(value: Any, what: str, least: float = -math.inf) -> int:
 
 
 def _column(value: Any, name: str, what: str) -> Any:
-    found = next((x for x in (name, *_ALIASES.get(name, ())) if x in value), None)
-    if found is None:
+    found = [name] if name in value else [x for x in _ALIASES.get(name, ()) if x in value]
+    if len(found) != 1:
         raise BadInputError(
             f'{what} have the columns {", ".join(map(str, value))}: expected one named {name}')
-    return value[found]
+    return value[found[0]]
 
 
 def numbers(value: Any, what: str, expected: str = 'expected numbers') -> Array:

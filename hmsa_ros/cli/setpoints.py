@@ -38,7 +38,7 @@ def sequence_of(
     else:
         from hmsa_ros.identification.tables import read_levels
 
-        times, levels, _ = read_levels(arguments.levels)
+        times, levels = read_levels(arguments.levels)
         rows = list(zip(times.tolist(), levels.tolist(), strict=True))
     return [(x - rows[0][0], y) for x, y in rows], []
 

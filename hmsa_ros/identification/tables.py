@@ -31,14 +31,14 @@ _OTHER_UNITS = {1e3: 'ms', 1e6: 'us', 1e9: 'ns'}
 _BETTER = 0.5
 
 
-def read_levels(path: Path) -> tuple[Array, Array, tuple[str, ...]]:
+def read_levels(path: Path, notes: list[str] | None = None) -> tuple[Array, Array]:
     """
-    Read the levels of the field from CSV: times in s, flux densities in T, and notes.
+    Read the levels of the field from CSV: times in s and flux densities in T.
 
     The columns are ``time`` (s) and ``flux_density`` (T); each level applies from its time on.
-    Raise `BadInputError` if the file cannot be used.
+    ``notes`` are those of `read_table`. Raise `BadInputError` if the file cannot be used.
     """
-    table = read_table(path, ('time', 'flux_density'))
+    table = read_table(path, ('time', 'flux_density'), notes=notes)
     if not len(table.lines):
         raise BadInputError(f'{path} has a header and no row: expected levels')
     times, levels = table.columns['time'], table.columns['flux_density']
@@ -50,29 +50,31 @@ def read_levels(path: Path) -> tuple[Array, Array, tuple[str, ...]]:
             f'{times[back[0]]:.9g} to {times[back[0] + 1]:.9g} s: expected increasing times')
     # Of levels at the same time the last one applies.
     keep = np.append(np.diff(times) > 0.0, True)
-    return times[keep], levels[keep], table.notes
+    return times[keep], levels[keep]
 
 
 def read_csv(
         path: Path, commands: Path | None = None, *, slew_limit: float = math.inf,
-        coordinate: Coordinate = STRETCH) -> Recording:
+        coordinate: Coordinate = STRETCH, rest_length: float | None = None) -> Recording:
     """
     Read a recording from CSV, with notes on rows that were left out.
 
     The columns are ``time`` (s) and ``stretch``, and ``flux_density`` (T) unless another file
-    contains the levels as ``time`` and ``flux_density``, which apply from that time on. Raise
-    `BadInputError` if a file cannot be used.
+    contains the levels as ``time`` and ``flux_density``, which apply from that time on. With a
+    ``rest_length`` in m, a column of lengths replaces the stretch. Raise `BadInputError` if a file
+    cannot be used.
     """
     own = () if commands is not None else ('flux_density',)
-    table = read_table(path, ('time', 'stretch', *own), kind='a CSV or the folder of a bag')
-    notes = list(table.notes)
+    notes: list[str] = []
+    table = read_table(
+        path, ('time', 'stretch', *own), kind='a CSV or the folder of a bag',
+        rest_length=rest_length, notes=notes)
     if not len(table.lines):
         raise BadInputError(f'{path} has a header and no row: expected samples')
     keep = _kept(path, table, notes)
     time, stretch = table.columns['time'][keep], table.columns['stretch'][keep]
     if commands is not None:
-        times, levels, more = read_levels(commands)
-        notes += more
+        times, levels = read_levels(commands, notes)
         if time[0] - times[-1] > _ANOTHER_CLOCK:
             raise BadInputError(
                 f'{commands} ends at {times[-1]:.9g} s, and the first sample of {path} is at '
