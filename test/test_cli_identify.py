@@ -159,7 +159,7 @@ def test_levels_sampled_beside_the_stretch_serve_with_semicolons_and_units(folde
     found = json.loads(out)
     x = found['parameters']['shear_modulus']
     assert abs(x['value'] - BLOCK.shear_modulus) < 4.0 * x['std']
-    for word in ('column time [ms] was', 'column flux_density [mT] was', 'is estimated too'):
+    for word in ("column 'time [ms]' was", "column 'flux_density [mT]' was", 'is estimated too'):
         assert any(word in note for note in found['warnings'])
 
 
@@ -234,7 +234,30 @@ def test_files_of_spreadsheets_are_read(folder, capsys, encoding, micro):
     (folder / 'camera.csv').write_text(text, encoding=encoding)
     status, out, _ = identify(capsys, 'camera.csv', '--commands', 'levels.csv', '--json')
     assert status == 0
-    assert f'column time [{micro}s] was converted' in json.loads(out)['warnings'][0]
+    assert f"column 'time [{micro}s]' was converted" in json.loads(out)['warnings'][0]
+
+
+def test_lengths_are_divided_by_the_length_at_rest(folder, capsys):
+    rows = zip(TIMES, 20.0 * STRETCH, strict=True)
+    write('lengths.csv', 'time,length [mm]', rows)
+    own = identify(capsys, 'camera.csv', '--commands', 'levels.csv', '--json')
+    status, out, err = identify(
+        capsys, 'lengths.csv', '--commands', 'levels.csv', '--rest-length', '20mm', '--json')
+    assert (status, err) == (0, '')
+    found = json.loads(out)
+    assert found['parameters']['shear_modulus']['value'] == pytest.approx(
+        json.loads(own[1])['parameters']['shear_modulus']['value'], rel=1e-6)
+    assert "'length [mm]' was divided by the length at rest, 0.02 m" in found['warnings'][0]
+
+
+@pytest.mark.parametrize(('file', 'message'), [
+    ('camera.csv', "column 'stretch': expected a unit of length in its header"),
+    ('.', 'a bag contains stretches')])
+def test_a_length_at_rest_needs_lengths(folder, capsys, file, message):
+    status, _, err = identify(
+        capsys, file, *['--commands', 'levels.csv'] * (file != '.'), '--rest-length', '0.02')
+    assert status == 2
+    assert message in err
 
 
 def test_a_few_samples_of_nothing_are_no_other_unit(folder, capsys):

@@ -16,7 +16,7 @@ from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, JSON, show
+from hmsa_ros.cli.options import add_command, JSON, of_unit, show
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.quantities import number_of
 from hmsa_ros.errors import BadInputError
@@ -34,6 +34,8 @@ def add_parser(subparsers: Any) -> None:
         ('recording', 'RUN', Path, 'a bag, or a CSV of samples'),
         ('--commands', 'CSV', Path,
          'CSV of time, flux_density: the level in force from that time on'),
+        of_unit('--rest-length', 'm', 'length at rest, by which a column of lengths in the CSV, '
+                'such as length [mm], is divided to obtain the stretch'),
         ('--params-file', 'YAML', Path,
          'parameter file with the known values, such as geometry and density'),
         ('--free', 'NAME,...', str,
@@ -153,6 +155,10 @@ def _read(
             raise BadInputError(
                 f'--commands {arguments.commands} is given for the bag {path}: a bag has its '
                 'own commands; expected a CSV of samples with it')
+        if arguments.rest_length is not None:
+            raise BadInputError(
+                f'--rest-length is given for the bag {path}: a bag contains stretches, to which '
+                'driver or sense node converts lengths; expected a CSV of lengths with it')
         given = belief.actuator if arguments.params_file is not None else None
         recording, actuator, known = read_bag(path, joint=arguments.joint, actuator=given)
         return recording, replace(
@@ -162,4 +168,4 @@ def _read(
     slew = belief.number('slew_limit', 0.0) or math.inf
     return read_csv(
         path, arguments.commands, slew_limit=slew,
-        coordinate=belief.actuator.coordinate), belief
+        coordinate=belief.actuator.coordinate, rest_length=arguments.rest_length), belief
