@@ -47,12 +47,20 @@ class AssumedWarning(UserWarning):
     """
 
 
-def assume(text: str) -> None:
-    """State an assumption, as a warning at the line outside this package that led to it."""
+class UnusualWarning(UserWarning):
+    """
+    A parameter that is possible but unusual, such as 45 Pa where 45 kPa may be meant.
+
+    ``warnings.simplefilter('ignore', hmsa_ros.UnusualWarning)`` accepts all of them.
+    """
+
+
+def assume(text: str, kind: type[Warning] = AssumedWarning) -> None:
+    """State an assumption or a doubt, as a warning at the line outside this package behind it."""
     frame, level = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get('__name__', '').startswith(_PACKAGE):
         frame, level = frame.f_back, level + 1
-    warnings.warn(text, AssumedWarning, stacklevel=level)
+    warnings.warn(text, kind, stacklevel=level)
 
 
 def complain(error: Exception, status: int | None = None) -> int:

@@ -20,8 +20,8 @@ import hmsa_ros
 from hmsa_ros.cli import main
 from hmsa_ros.table import Column, Table
 
-FACE = {'Actuator', 'BadInputError', 'HmsaError', 'Identified', 'Motion', 'Plan', 'Table',
-        'compare', 'identify', 'read'}
+FACE = {'Actuator', 'AssumedWarning', 'BadInputError', 'HmsaError', 'Identified', 'Motion', 'Plan',
+        'Table', 'UnusualWarning', 'compare', 'identify', 'read'}
 LEVELS = [(0.0, 0.0), (0.02, 0.03), (0.12, -0.02), (0.25, 0.02), (0.4, 0.0)]
 MU_0 = 1.25663706127e-6
 
@@ -115,7 +115,7 @@ def test_limits_laws_creep_lag_and_beams_reach_the_plan(block):
     yeoh = hmsa_ros.Actuator(law='yeoh', constants={'c10': 5e3, 'c20': 300.0})
     assert yeoh.shear_modulus == 1e4
     assert yeoh.scaled(shear_modulus=1.1).parameters['law.c20'] == pytest.approx(330.0)
-    beam = hmsa_ros.Actuator.beam(length=0.025, thickness=1e-3, width=5e-3, youngs_modulus=1e6)
+    beam = hmsa_ros.Actuator.beam(length=0.01, thickness=1e-3, width=5e-3, youngs_modulus=2e6)
     report = beam.plan([(0.1, 0.4)]).simulate().report()
     assert report['verdict'] == ['arrived']
 
@@ -226,6 +226,71 @@ WELL = {
     'path': 'nothing', 'values': {}}
 
 
+@pytest.mark.parametrize(('given', 'said'), [
+    ({'shear_modulus': 45.0}, 'shear modulus 45 Pa is unusual (did you mean kPa?)'),
+    ({'half_length': 4.0}, 'half length 4 m is unusual (did you mean mm?)'),
+    ({'remanence': 60.0}, 'remanence 60 T is unusual (the strongest sintered NdFeB magnets'),
+    ({'half_thickness': 1e-4}, 'half thickness over half length is 0.01: the model describes'),
+    ({'flux_density_limits': 1e-4}, 'the coil only reaches stretches from'),
+    ({'zeta': 2.5}, 'zeta 2.5 is above the critical 2.44949'),
+    ({'chain_limit': 300.0}, 'j lim 300 is unusual'),
+])
+def test_an_unusual_value_causes_the_warning_of_the_command(tmp_path, capsys, given, said):
+    with pytest.warns(hmsa_ros.UnusualWarning) as found:
+        made = hmsa_ros.Actuator(**given)
+    assert all(x.filename == __file__ for x in found)
+    words = [str(x.message) for x in found]
+    assert any(x.startswith(said) for x in words)
+    with pytest.warns(hmsa_ros.UnusualWarning) as again:
+        assert hmsa_ros.Actuator().replace(**{
+            'half_thickness': made.block.half_thickness, **given}) == made
+    assert [str(x.message) for x in again] == words
+    names = {'chain_limit': 'j_lim', 'flux_density_limits': 'flux_max'}
+    options = [y for key, x in given.items()
+               for y in (f'--{names.get(key, key).replace("_", "-")}', str(x))]
+    assert main(['init', *options, '--yes', '--out', str(tmp_path / 'a.yaml')]) == 0
+    said_there = capsys.readouterr().err
+    assert all(f'hmsa: warning: {x}\n' in said_there for x in words)
+
+
+def test_usual_actuators_cause_no_warning_and_models_without_j_lim_none_about_it():
+    # Warnings are errors in tests.
+    hmsa_ros.Actuator(chain_limit=math.inf)
+    hmsa_ros.Actuator(law='neo_hookean', chain_limit=1e4)
+    hmsa_ros.Actuator(law='yeoh', constants={'c10': 15e3})
+    hmsa_ros.Actuator.dielectric(layer_thickness=50e-6, shear_modulus=100e3)
+    hmsa_ros.Actuator().scaled(shear_modulus=1e-2)
+    with pytest.warns(hmsa_ros.UnusualWarning, match='sags by') as found:
+        hmsa_ros.Actuator.beam(length=25e-3, thickness=1e-3, width=5e-3, youngs_modulus=1e6)
+    assert found[0].filename == __file__
+
+
+def test_damping_is_zeta_a_ratio_or_a_coefficient(block):
+    # Critical damping of a cube at rest: sqrt(6).
+    assert block.damping_ratio == pytest.approx(0.1 / 6.0**0.5, rel=1e-9)
+    same = hmsa_ros.Actuator(
+        shear_modulus=30e3, half_length=5e-3, remanence=0.08, damping_ratio=0.1 / 6.0**0.5)
+    assert same.zeta == pytest.approx(0.1, rel=1e-9)
+    assert block.replace(damping_ratio=0.2).damping_ratio == pytest.approx(0.2, rel=1e-9)
+    # By the logarithmic decrement of small free vibrations.
+    moved = same.simulate([(0.0, 0.0)], start=1.001, until=0.05, rate=1e5)
+    tops = [x for x in range(1, len(moved.times) - 1)
+            if moved.stretches[x - 1] < moved.stretches[x] >= moved.stretches[x + 1]]
+    one, other = (moved.stretches[x] - 1.0 for x in tops[:2])
+    decrement = math.log(one / other)
+    assert decrement / math.hypot(decrement, 2.0 * math.pi) == pytest.approx(
+        same.damping_ratio, rel=2e-3)
+    for given in ({'zeta': 0.1, 'damping_ratio': 0.1},
+                  {'damping_ratio': 0.1, 'damping_coefficient': 0.1}):
+        with pytest.raises(hmsa_ros.BadInputError, match='both .* are given'):
+            hmsa_ros.Actuator(**given)
+        with pytest.raises(hmsa_ros.BadInputError, match='both .* are given'):
+            block.replace(**given)
+    with pytest.raises(hmsa_ros.BadInputError, match='damping_ratio is -1'):
+        hmsa_ros.Actuator(damping_ratio=-1.0)
+
+
+@pytest.mark.filterwarnings('ignore::hmsa_ros.UnusualWarning')
 @pytest.mark.parametrize('name', [
     'Actuator', 'Actuator.beam', 'Actuator.dielectric', 'Actuator.from_parameters',
     'Actuator.from_yaml', 'block.plan', 'block.follow', 'block.wave', 'block.wave_bands',
@@ -374,7 +439,9 @@ def test_of_an_unshaped_step_the_residual_is_shown_beside_what_is_left_when_it_i
 
 
 def test_an_overdamped_step_arrives_without_ringing_and_a_setpoint_cut_off_has_a_reason():
-    slow = hmsa_ros.Actuator(zeta=3.0).plan([(1.1, 5.0)], 'step').simulate()
+    with pytest.warns(hmsa_ros.UnusualWarning):
+        overdamped = hmsa_ros.Actuator(zeta=3.0)
+    slow = overdamped.plan([(1.1, 5.0)], 'step').simulate()
     assert slow.report()['verdict'] == ['arrived']
     block = hmsa_ros.Actuator()
     cut = block.plan([(1.1, 0.5), (1.0, 0.5)]).simulate(until=0.5)

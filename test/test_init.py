@@ -15,8 +15,8 @@ import pytest
 import yaml
 
 from hmsa_ros.cli import main
-from hmsa_ros.cli.quantities import BY_KEY, DAMPING, OPTIONAL, QUANTITIES
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces.quantities import BY_KEY, DAMPING, OPTIONAL, QUANTITIES
 from hmsa_ros.model.equations import elastic_force, natural_frequency
 from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters, paper_actuator
 from hmsa_ros.model.simulation import simulate

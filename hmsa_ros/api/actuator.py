@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from hmsa_ros.api.arguments import (
     columns_of,
+    DAMPED,
     file_of,
     grid_of,
     limits_of,
@@ -22,6 +23,7 @@ from hmsa_ros.api.arguments import (
     setpoints_of,
     whole,
 )
+from hmsa_ros.api.doubts import unquestioned, warn
 from hmsa_ros.api.facts import facts
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.files import write_text, yaml_text
@@ -78,8 +80,10 @@ class Actuator:
         Residual flux density Br in T.
     chain_limit : float
         J_lim of the Gent model; infinite for neo-Hookean.
-    zeta, damping_coefficient : float, optional
-        Damping, dimensionless or in N s/m; default zeta 0.2.
+    zeta, damping_ratio, damping_coefficient : float, optional
+        Damping, one of: the paper's c/(8 L H sqrt(rho G)); the fraction of critical damping at
+        rest, from the ringing; c in N s/m. Default zeta 0.2. The ratio is zeta over the critical
+        zeta, which is 2.449 for a cube, so that zeta 0.1 is a ratio of 0.041.
     law : str
         Name of the hyperelastic model, a key of `hmsa_ros.model.laws.LAWS`, such as ``'yeoh'``.
     constants : mapping of str, optional
@@ -98,10 +102,17 @@ class Actuator:
     BadInputError
         If a value has the wrong type or is out of range.
 
+    Warns
+    -----
+    UnusualWarning
+        If a value is possible but unusual; ``hmsa init`` says the same.
+
     Examples
     --------
     >>> from hmsa_ros import Actuator
     >>> block = Actuator(shear_modulus=30e3, half_length=5e-3, remanence=0.08, zeta=0.1)
+    >>> round(block.damping_ratio, 3)
+    0.041
     >>> round(1e3 * block.flux_density(1.1), 1)   # mT that hold a stretch of 1.1
     129.6
     >>> silicone = Actuator(law='yeoh', constants={'c10': 15e3, 'c20': 500.0, 'c30': 20.0})
@@ -114,8 +125,8 @@ class Actuator:
             self, *, shear_modulus: float | None = None, density: float = 1900.0,
             half_length: float = 0.01, half_thickness: float | None = None,
             remanence: float = 0.1, chain_limit: float = 5.0, zeta: float | None = None,
-            damping_coefficient: float | None = None, law: str = 'gent',
-            constants: Mapping[str, Any] | None = None,
+            damping_ratio: float | None = None, damping_coefficient: float | None = None,
+            law: str = 'gent', constants: Mapping[str, Any] | None = None,
             creep: Sequence[tuple[float, float]] = (),
             flux_density_limits: float | tuple[float, float] = _STRONGEST,
             slew_limit: float = math.inf, coil_time_constant: float = 0.0) -> None:
@@ -123,14 +134,16 @@ class Actuator:
             'shear_modulus': shear_modulus, 'density': density, 'half_length': half_length,
             'half_thickness': half_length if half_thickness is None else half_thickness,
             'remanence': remanence, 'chain_limit': chain_limit, 'zeta': zeta,
-            'damping_coefficient': damping_coefficient, 'law': law, 'constants': constants,
-            'creep': creep, 'flux_density_limits': flux_density_limits, 'slew_limit': slew_limit,
+            'damping_ratio': damping_ratio, 'damping_coefficient': damping_coefficient,
+            'law': law, 'constants': constants, 'creep': creep,
+            'flux_density_limits': flux_density_limits, 'slew_limit': slew_limit,
             'coil_time_constant': coil_time_constant}
-        if zeta is None and damping_coefficient is None:
+        if all(given[x] is None for x in DAMPED):
             zeta = ZETA
         #: Parameters that plans are made with.
-        self.model = _model(parameters_in(given), zeta)
+        self.model = _model(parameters_in(given), zeta, damping_ratio)
         self._belief: Belief | Path | None = None
+        warn(self)
 
     @classmethod
     def from_parameters(
@@ -201,15 +214,18 @@ class Actuator:
         Examples
         --------
         >>> from hmsa_ros import Actuator
-        >>> strip = Actuator.beam(length=25e-3, thickness=1e-3, width=5e-3, youngs_modulus=1e6)
+        >>> strip = Actuator.beam(length=10e-3, thickness=1e-3, width=5e-3, youngs_modulus=2e6)
         >>> strip.plan([(0.1, 0.5)]).report()['status']
         ['two_step']
 
         """
-        return _damped(cls, damping_ratio, damping_coefficient, {
-            'half_length': 0.5 * number(length, 'length', 'm'),
-            'half_thickness': 0.5 * number(thickness, 'thickness', 'm'), 'law': 'beam',
-            'constants': {'youngs_modulus': youngs_modulus, 'width': width}, **more})
+        with unquestioned():
+            made = cls(**_damping(damping_ratio, damping_coefficient), **{
+                'half_length': 0.5 * number(length, 'length', 'm'),
+                'half_thickness': 0.5 * number(thickness, 'thickness', 'm'), 'law': 'beam',
+                'constants': {'youngs_modulus': youngs_modulus, 'width': width}, **more})
+        warn(made)
+        return made
 
     @classmethod
     def dielectric(
@@ -259,11 +275,14 @@ class Actuator:
             raise BadInputError(
                 f'remanence is {excerpt(more["remanence"])}: expected none, since nothing in a '
                 'dielectric elastomer is magnetised')
-        return _damped(cls, damping_ratio, damping_coefficient, {
-            'law': 'dielectric', 'constants': {
-                'permittivity': permittivity, 'layer_thickness': layer_thickness},
-            'flux_density_limits': (0.0, number(voltage_max, 'voltage_max', 'V', above=0.0)),
-            **more})
+        with unquestioned():
+            made = cls(**_damping(damping_ratio, damping_coefficient), **{
+                'law': 'dielectric', 'constants': {
+                    'permittivity': permittivity, 'layer_thickness': layer_thickness},
+                'flux_density_limits': (
+                    0.0, number(voltage_max, 'voltage_max', 'V', above=0.0)), **more})
+        warn(made)
+        return made
 
     # -- properties ----------------------------------------------------------------------------
 
@@ -291,6 +310,12 @@ class Actuator:
     def zeta(self) -> float:
         """Dimensionless damping."""
         return self.model.material.zeta
+
+    @property
+    def damping_ratio(self) -> float:
+        """Fraction of critical damping, of small motion about rest: zeta over critical zeta."""
+        material = self.model.material
+        return material.zeta / float(critical_zeta(material.rest, material))
 
     @property
     def law(self) -> str:
@@ -373,9 +398,13 @@ class Actuator:
         groups = ('law',) * (changed[LAW_NAME.name] != self.law) + (
             'viscoelastic',) * ('creep' in parameters)
         zeta = self.zeta if parameters.get('zeta') is None else parameters['zeta']
-        return self._of(_model({x: y for x, y in self.parameters.items()
-                                if x.partition('.')[0] not in groups} | changed,
-                               None if 'actuator.damping_coefficient' in changed else zeta))
+        made = self._of(_model(
+            {x: y for x, y in self.parameters.items()
+             if x.partition('.')[0] not in groups} | changed,
+            None if 'actuator.damping_coefficient' in changed else zeta,
+            parameters.get('damping_ratio')))
+        warn(made)
+        return made
 
     def scaled(self, **factors: float) -> 'Actuator':
         """
@@ -733,22 +762,23 @@ class Actuator:
             *(f'    {x}: {yaml_text(y)}' for x, y in self.parameters.items())]) + '\n')
 
 
-def _damped(
-        cls: type[Actuator], ratio: float | None, coefficient: float | None,
-        made: Mapping[str, Any]) -> Actuator:
-    """Return an actuator with a damping coefficient or a damping ratio at rest (default 0.05)."""
-    if coefficient is not None:
-        return cls(**made, damping_coefficient=coefficient)
-    undamped = cls(**made, zeta=0.0).model.material
-    ratio = number(0.05 if ratio is None else ratio, 'damping_ratio')
-    return cls(**made, zeta=ratio * float(critical_zeta(undamped.rest, undamped)))
+def _damping(ratio: float | None, coefficient: float | None) -> dict[str, Any]:
+    """Return the damping of a beam or a dielectric elastomer, by default a ratio of 0.05."""
+    if ratio is None and coefficient is None:
+        ratio = 0.05
+    return {'damping_ratio': ratio, 'damping_coefficient': coefficient}
 
 
 _KEYS = tuple(x for x in Actuator.__init__.__annotations__ if x != 'return')
 
 
-def _model(values: Mapping[str, Any], zeta: float | None = None) -> Model:
-    """Return the planning model of parameters; a zeta replaces the damping coefficient."""
+def _model(
+        values: Mapping[str, Any], zeta: float | None = None, ratio: float | None = None) -> Model:
+    """Return the planning model of parameters; zeta or a ratio replace the damping coefficient."""
+    if ratio is not None:
+        undamped = _model(values, 0.0).material
+        zeta = number(ratio, 'damping_ratio', least=0.0) * float(
+            critical_zeta(undamped.rest, undamped))
     if zeta is not None:
         unit = actuator_from(_checked(values)).damping_unit
         values = {**values, 'actuator.damping_coefficient': unit * number(

@@ -15,9 +15,11 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws import LAWS
 from hmsa_ros.planning.setpoint import impossible
 
+#: Arguments of `Actuator` of which one describes the damping.
+DAMPED = ('zeta', 'damping_ratio', 'damping_coefficient')
 # Arguments of `Actuator` that are single numbers, and those that may be None.
 _NUMBERS = {x.name.rpartition('.')[2]: x for x in (*ACTUATOR, COIL_TIME_CONSTANT)}
-_OPTIONAL = ('shear_modulus', 'half_thickness', 'zeta', 'damping_coefficient', 'constants')
+_OPTIONAL = ('shear_modulus', 'half_thickness', *DAMPED, 'constants')
 # Shortest period of a command grid in s.
 _FINEST = 1e-9
 #: Alternative names of columns.
@@ -190,7 +192,7 @@ def several(value: Any) -> list[Any]:
 
 def parameters_in(given: Mapping[str, Any], law: str = 'gent') -> dict[str, Any]:
     """
-    Return the node parameters for arguments of `Actuator`, except zeta.
+    Return the node parameters for arguments of `Actuator`, except zeta and the damping ratio.
 
     The constants belong to the model in ``given``, else to ``law``.
 
@@ -201,8 +203,9 @@ def parameters_in(given: Mapping[str, Any], law: str = 'gent') -> dict[str, Any]
 
     """
     given = {x: y for x, y in given.items() if y is not None or x not in _OPTIONAL}
-    if 'zeta' in given and 'damping_coefficient' in given:
-        raise BadInputError('both zeta and damping_coefficient are given: expected one of them')
+    damped = [x for x in DAMPED if x in given]
+    if len(damped) > 1:
+        raise BadInputError(f'both {" and ".join(damped)} are given: expected one of them')
     values: dict[str, Any] = {
         x.name: number(given[name], name, x.unit) for name, x in _NUMBERS.items() if name in given}
     values |= _law_values(

@@ -18,9 +18,9 @@ from hmsa_ros.cli.check_driver import settings_of
 from hmsa_ros.cli.options import add_command, JSON, Row, show
 from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
-from hmsa_ros.cli.quantities import number_of
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.files import check_targets, write_text, yaml_text
+from hmsa_ros.interfaces.quantities import number_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -18,9 +18,9 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_command, JSON, of_unit, show
 from hmsa_ros.cli.progress import progress
-from hmsa_ros.cli.quantities import number_of
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import check_targets, write_text
+from hmsa_ros.interfaces.quantities import number_of
 
 if TYPE_CHECKING:
     from hmsa_ros.identification.files import Belief

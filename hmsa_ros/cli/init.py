@@ -28,7 +28,10 @@ from hmsa_ros.cli.options import (
     Row,
     show,
 )
-from hmsa_ros.cli.quantities import (
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import check_targets, write_text, yaml_text
+from hmsa_ros.interfaces.parameters import LAW, LAW_NAME, PUBLISH_RATE
+from hmsa_ros.interfaces.quantities import (
     DAMPING,
     default_of,
     EVERY,
@@ -38,9 +41,6 @@ from hmsa_ros.cli.quantities import (
     QUANTITIES,
     Quantity,
 )
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import check_targets, write_text, yaml_text
-from hmsa_ros.interfaces.parameters import LAW, LAW_NAME, PUBLISH_RATE
 
 if TYPE_CHECKING:
     from hmsa_ros.api.actuator import Actuator
@@ -59,13 +59,8 @@ _FILE = Path('actuator.yaml')
 _FOLLOWS = {'half_thickness': 'as --half-length', 'flux_min': 'minus --flux-max'}
 # Quantities that vary between elastomers and are missing in data sheets.
 _GUESSES = ('zeta', 'j_lim', 'damping_ratio')
-# Deflection under its own weight, over the length, from which a beam must not lie flat.
-_SAG = 0.02
-_GRAVITY = 9.81
 # Sample rate in Hz that one plant sustains, together with its planner, on two cores.
 _KEPT_UP = 4000.0
-# Reachable change of the stretch that is hardly visible.
-_HARDLY = 0.01
 
 
 def add_parser(subparsers: Any) -> None:
@@ -123,12 +118,13 @@ def run(arguments: argparse.Namespace) -> int:
     for quantity in asked:
         if not _known(quantity.key, given):
             given[quantity.key] = default_of(quantity, given)
+    from hmsa_ros.api.doubts import doubts as doubts_of
     from hmsa_ros.api.facts import facts
 
     made = _actuator(form, given, arguments.law)
     found = made.scales
     given.setdefault('shear_modulus', made.block.shear_modulus)
-    doubts = _doubts(form, given, made)
+    doubts = doubts_of(made)
     if guessed:
         doubts.append(
             f'{" and ".join(f"{x.words} {given[x.key]:g}" for x in guessed)} '
@@ -257,6 +253,7 @@ def _answer(question: str) -> str:
 def _actuator(form: str, given: Mapping[str, float], law: str | None) -> 'Actuator':
     """Return the actuator with its coil."""
     from hmsa_ros.api.actuator import Actuator
+    from hmsa_ros.api.doubts import unquestioned
 
     # Only the one that is given.
     damping = (DAMPING.key,) if DAMPING.key in given else _DAMPED
@@ -271,42 +268,8 @@ def _actuator(form: str, given: Mapping[str, float], law: str | None) -> 'Actuat
         values['law'], values['constants'] = law_of(law)
     makers: dict[str, Callable[..., Actuator]] = {
         'block': Actuator, 'beam': Actuator.beam, 'dielectric': Actuator.dielectric}
-    return makers[form](**values)
-
-
-def _doubts(form: str, given: Mapping[str, float], made: 'Actuator') -> list[str]:
-    """Return a sentence about each implausible value."""
-    found = made.scales
-    values = {**given, 'zeta': found.zeta, 'damping_ratio': found.zeta / found.critical_zeta}
-    doubts = [x for quantity in FORMS[form]
-              if quantity.key in values and (x := quantity.doubt(values[quantity.key]))]
-    if found.zeta >= found.critical_zeta:
-        doubts.append(
-            f'zeta {found.zeta:g} is above the critical {found.critical_zeta:g}: small motion '
-            'about rest does not oscillate, and there is no two-step command for it')
-    if found.held[1] - found.held[0] < 2.0 * _HARDLY:
-        drive = made.block.coordinate.drive
-        move = {'beam': 'deflection of 0.1', 'dielectric': 'ratio of 1.1',
-                'block': 'stretch of 1.1 or 0.9'}[form]
-        doubts.append(
-            f'the {"amplifier" if drive.squared else "coil"} only reaches '
-            f'{made.block.coordinate.plural} from {found.held[0]:.6g} to {found.held[1]:.6g}: a '
-            f'{move} needs about {0.3 * found.flux_density_unit:.3g} {drive.unit}')
-    if form == 'beam':
-        # q L^4/(8 E I) of an even load, over L.
-        sag = 1.5 * given['density'] * _GRAVITY * given['length'] ** 3 / (
-            given['youngs_modulus'] * given['thickness'] ** 2)
-        if sag > _SAG:
-            doubts.append(
-                f'lying, the beam sags by {sag:.2g} of its length under its own weight, which the '
-                'model does not know: clamp it so that it bends in a horizontal plane')
-    if form == 'block':
-        ratio = given['half_thickness'] / given['half_length']
-        if not 0.05 <= ratio <= 20.0:
-            doubts.append(
-                f'half thickness over half length is {ratio:.3g}: the model describes a block '
-                'with sides of similar length; a thin film or a long rod bends instead')
-    return doubts
+    with unquestioned():  # of which `run` prints the doubts
+        return makers[form](**values)
 
 
 def _lines(form: str, parameters: Mapping[str, Any]) -> list[str]:

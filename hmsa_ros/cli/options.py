@@ -37,7 +37,7 @@ LAW_OPTION: Row = (
 
 def law_of(text: str) -> tuple[str, dict[str, Any]]:
     """Return name and constants of `LAW_OPTION`; raise `BadInputError` if invalid."""
-    from hmsa_ros.cli.quantities import number_of
+    from hmsa_ros.interfaces.quantities import number_of
     from hmsa_ros.model.laws import LAWS
 
     name, _, rest = text.partition(':')
@@ -77,7 +77,7 @@ def argument(read: Callable[[str], T]) -> Callable[[str], T]:
 def of_unit(option: str, unit: str, text: str) -> Row:
     """Return an option for a number above 0, in SI or with another unit."""
     def read(words: str) -> float:
-        from hmsa_ros.cli.quantities import number_of
+        from hmsa_ros.interfaces.quantities import number_of
 
         value = number_of(words, unit, option)
         if not value > 0.0:

@@ -1,5 +1,7 @@
 """
-Quantities of ``hmsa init``: names, units, defaults, limits, and usual ranges.
+Quantities of an actuator: names, units, defaults, limits, and usual ranges.
+
+``hmsa init`` asks for them, and `hmsa_ros.api` warns of unusual ones.
 
 The options of the command line depend on this module, so it imports nothing slow.
 """
