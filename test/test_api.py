@@ -7,11 +7,13 @@ import inspect
 import json
 import math
 from pathlib import Path
+import pickle
 import subprocess
 import sys
 from types import SimpleNamespace
 
 from core_oracle import follow
+from matplotlib.figure import Figure
 import numpy as np
 import pytest
 from scipy.io import loadmat
@@ -351,6 +353,62 @@ def test_a_notebook_shows_tables_and_pictures(block, tmp_path):
     # As a prompt without HTML shows them.
     assert repr(table) == str(table)
     assert repr(plan) == '<Plan two_step: 1 setpoints, 2 levels in 0.00165067 s>'
+
+
+def test_samples_and_levels_are_read_only_and_the_given_arrays_are_not(block):
+    plan = block.plan([(1.1, 0.02)])
+    motion = plan.simulate()
+    for array in (motion.times, motion.stretches, motion.rates, motion.flux_densities,
+                  motion.levels, motion.run.time, plan.levels, plan.times, plan.flux_densities,
+                  plan.setpoints, plan.move_times):
+        with pytest.raises(ValueError, match='read-only'):
+            array[0] = 5.0
+    own = motion.stretches.copy()
+    own[0] = 5.0
+    times, levels = np.array([0.0, 0.01]), np.array([0.0, 0.02])
+    block.simulate((times, levels), until=0.02)
+    times[0] = levels[0] = 0.0
+
+
+@pytest.mark.parametrize('make', [
+    lambda x: x.plan([(1.1, 0.5), (1.0, 0.5)]), lambda x: x.plan([(1.1, 0.5)], 'robust'),
+    lambda x: x.replace(creep=[(0.2, 1.0)]).plan([(1.1, 0.5)]),
+    lambda x: x.follow([0.0, 0.1, 0.2], [1.0, 1.05, 1.1])])
+def test_plans_of_equal_requests_are_equal(block, make):
+    plan, other = make(block), make(block.replace())
+    assert plan == other
+    assert plan == pickle.loads(pickle.dumps(plan))
+    assert {plan: 1}[other] == 1
+    assert plan != make(block.replace(zeta=0.11))
+    assert plan not in (block.plan([(1.1, 0.4)]), block.plan([(1.1, 0.5)], 'step'), 'plan')
+
+
+def test_a_motion_and_a_plan_are_drawn_into_given_axes(block):
+    plan = block.plan([(1.1, 0.02)])
+    motion = plan.simulate(label='mine')
+    figure = Figure()
+    one, other, last = figure.subplots(1, 3)
+    other.set_xlabel('own')
+    assert motion.plot(ax=one, color='k') is one
+    plan.plot(ax=one)
+    assert [x.get_label() for x in one.get_lines()] == ['mine', 'two_step']
+    assert one.get_lines()[0].get_color() == 'k'
+    assert np.array_equal(one.get_lines()[0].get_xdata(), motion.times)
+    assert np.array_equal(one.get_lines()[0].get_ydata(), motion.stretches)
+    assert (one.get_xlabel(), one.get_ylabel()) == ('time $t$ (s)', r'stretch $\lambda$')
+    motion.plot(ax=other, panel='command')
+    assert np.array_equal(
+        other.get_lines()[0].get_ydata(), [*plan.flux_densities, plan.flux_densities[-1]])
+    assert (other.get_xlabel(), other.get_ylabel()) == ('own', 'flux density $B$ (T)')
+    motion.plot(ax=last, panel='phase')
+    assert np.array_equal(last.get_lines()[0].get_ydata(), motion.rates)
+    assert figure.axes == [one, other, last]
+    for given, said in (
+            ({'ax': 'axes'}, "ax is 'axes'"), ({'ax': one, 'panel': 'map'}, "panel is 'map'"),
+            ({'panel': 'phase'}, 'with a panel'), ({'ax': one, 'path': 'a.png'}, "path 'a.png'"),
+            ({'ax': one, 'width': 'x'}, 'width cannot be drawn')):
+        with pytest.raises(hmsa_ros.BadInputError, match=said):
+            motion.plot(**given)
 
 
 # -- the commands that use it -------------------------------------------------------------------

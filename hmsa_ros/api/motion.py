@@ -15,7 +15,7 @@ from hmsa_ros.model.simulation import check_stretch, longest_motion, response
 from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.levels import Level
-from hmsa_ros.recordings.record import RecordedRequest, Run
+from hmsa_ros.recordings.record import read_only, RecordedRequest, Run
 from hmsa_ros.recordings.tables import levels_of, samples_of, write_run
 from hmsa_ros.table import frame, Table
 
@@ -35,7 +35,8 @@ class Motion:
     """
     Samples of a motion, and the field levels that drove it.
 
-    `read` returns a recorded motion; `Plan.simulate` and `Actuator.simulate` simulate one.
+    `read` returns a recorded motion; `Plan.simulate` and `Actuator.simulate` simulate one. Its
+    arrays are read-only: copy an array to change it.
 
     Examples
     --------
@@ -51,7 +52,7 @@ class Motion:
     @property
     def times(self) -> Array:
         """Times of the samples in s from the first, shape (n,)."""
-        return samples_of(self.run)['time']
+        return read_only(samples_of(self.run)['time'])
 
     @property
     def stretches(self) -> Array:
@@ -66,12 +67,12 @@ class Motion:
     @property
     def flux_densities(self) -> Array:
         """Flux densities in T at the samples, NaN where unknown, shape (n,)."""
-        return samples_of(self.run)['flux_density']
+        return read_only(samples_of(self.run)['flux_density'])
 
     @property
     def levels(self) -> Array:
         """Times in s and flux densities in T of the levels, shape (m, 2)."""
-        return np.column_stack(list(levels_of(self.run).values()))
+        return read_only(np.column_stack(list(levels_of(self.run).values())))
 
     @property
     def actuator(self) -> 'Actuator':
@@ -105,30 +106,57 @@ class Motion:
 
         return level_table(level_results(self.run), self.run.plant.coordinate.drive)
 
-    def plot(self, path: str | Path | Sequence[str | Path] | None = None, **paper: Any) -> Any:
+    def plot(
+            self, path: str | Path | Sequence[str | Path] | None = None, *, ax: Any = None,
+            panel: Any = 'response', **more: Any) -> Any:
         """
         Draw command, response, phase plane and moves, as ``hmsa report --picture`` does.
+
+        With ``ax``, draw one line into axes of your own, in seconds and tesla.
 
         Parameters
         ----------
         path : str, Path or sequence of these, optional
             Files to write; names end in .png, .pdf, .svg or .pgf.
-        **paper
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw into, which keep their own labels, if any.
+        panel : {'response', 'command', 'phase'}
+            With ``ax``: stretch over time, flux density over time, or rate over stretch.
+        **more
             ``width`` in mm, ``letters`` in pt, ``dpi``, and ``data`` for a CSV file of the curves;
-            see `hmsa_ros.report.paper.Paper`.
+            see `hmsa_ros.report.paper.Paper`. With ``ax``, properties of the line, such as
+            ``color`` and ``label`` (default the name of the motion).
 
         Returns
         -------
-        Figure
-            The Matplotlib figure, which a notebook displays.
+        Figure or Axes
+            The Matplotlib figure, which a notebook displays, or the given axes.
 
         Raises
         ------
         BadInputError
             If an argument is out of range, or a file cannot be written.
 
+        Examples
+        --------
+        >>> from matplotlib.figure import Figure
+        >>> from hmsa_ros import Actuator
+        >>> block, ax = Actuator(), Figure().subplots()
+        >>> for shaper in ('two_step', 'step'):
+        ...     motion = block.plan([(1.1, 0.2)], shaper).simulate(label=shaper)
+        ...     _ = motion.plot(ax=ax)
+        >>> [x.get_label() for x in ax.get_lines()]
+        ['two_step', 'step']
+
         """
-        return _draw([self.run], path, paper)
+        own = ax is not None
+        if not own and isinstance(panel, str) and panel == 'response':
+            return _draw([self.run], path, more)
+        if path is not None or not own:
+            raise BadInputError(
+                f'plot has path {excerpt(path)}, ax {excerpt(ax)} and panel {excerpt(panel)}: '
+                'expected files, or ax to draw into with a panel')
+        return _draw_into(ax, self, panel, more)
 
     def save(self, path: str | Path) -> list[Path]:
         """
@@ -242,6 +270,43 @@ def _draw(runs: list[Run], path: Any, paper: Mapping[str, Any]) -> Any:
             f'pictures have {", ".join(paper)}: expected numbers for width (mm), letters (pt) '
             'and dpi, and data') from error
     return draw(paths, parts_of(runs), size)
+
+
+def _draw_into(ax: Any, motion: Motion, panel: Any, line: Mapping[str, Any]) -> Any:
+    """Draw one curve of a motion into axes; return them."""
+    from matplotlib.axes import Axes
+
+    from hmsa_ros.report.style import axis
+
+    what = motion.run.plant.coordinate
+    time = axis('time', 't', 's')
+    position = axis(what.name, what.tex)
+    panels = {
+        'response': (time, position),
+        'command': (time, axis(what.drive.name, what.drive.symbol, what.drive.unit)),
+        'phase': (position, axis(f'{what.name} rate', rf'\dot{{{what.tex}}}', '1/s'))}
+    if not isinstance(ax, Axes):
+        raise BadInputError(f'ax is {excerpt(ax)}: expected axes of Matplotlib')
+    if not isinstance(panel, str) or panel not in panels:
+        raise BadInputError(f'panel is {excerpt(panel)}: expected one of {", ".join(panels)}')
+    line = {'label': motion.run.label, **line}
+    try:
+        if panel == 'command':
+            switches, values = motion.levels.T
+            end = motion.times[-1:]
+            ax.step(np.append(switches, end), np.append(values, values[-1:]), where='post', **line)
+        elif panel == 'phase':
+            ax.plot(motion.stretches, motion.rates, **line)
+        else:
+            ax.plot(motion.times, motion.stretches, **line)
+    except (AttributeError, TypeError, ValueError) as error:
+        raise BadInputError(
+            f'{", ".join(line)} cannot be drawn: {error}; expected properties of a line of '
+            'Matplotlib') from error
+    x_label, y_label = panels[panel]
+    ax.set_xlabel(ax.get_xlabel() or x_label)
+    ax.set_ylabel(ax.get_ylabel() or y_label)
+    return ax
 
 
 def simulated(

@@ -15,6 +15,7 @@ from hmsa_ros.api.motion import Motion, simulated
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.equations import Array
 from hmsa_ros.planning.sequence import Segment
+from hmsa_ros.recordings.record import read_only
 from hmsa_ros.recordings.tables import write_table
 from hmsa_ros.table import Column, frame, Table
 
@@ -52,7 +53,8 @@ class Plan:
     """
     A planned command: field levels, each valid from its time on.
 
-    `Actuator.plan` makes plans.
+    `Actuator.plan` makes plans. Equal plans have the same actuator, setpoints, levels and shaper.
+    Their arrays are read-only.
 
     Examples
     --------
@@ -81,7 +83,7 @@ class Plan:
             rows += [(segment.begin + x.time, x.load) for x in segment.move.levels
                      if last or x.time < segment.setpoint.span]
         times, loads = np.array(rows).T
-        return np.column_stack([times * units.time, units.level(loads)])
+        return read_only(np.column_stack([times * units.time, units.level(loads)]))
 
     @property
     def times(self) -> Array:
@@ -96,14 +98,15 @@ class Plan:
     @property
     def setpoints(self) -> Array:
         """Stretches and durations in s, shape (n, 2)."""
-        return np.array([
+        return read_only(np.array([
             (x.setpoint.stretch, x.setpoint.span * self.actuator.model.units.time)
-            for x in self.segments])
+            for x in self.segments]))
 
     @property
     def move_times(self) -> Array:
         """Move times in s; infinite where a target is only approached, shape (n,)."""
-        return np.array([x.move.duration for x in self.segments]) * self.actuator.model.units.time
+        return read_only(np.array(
+            [x.move.duration for x in self.segments]) * self.actuator.model.units.time)
 
     def currents(self, tesla_per_ampere: float) -> Array:
         """
@@ -182,9 +185,11 @@ class Plan:
             self.segments[0].start.stretch, self, until=until, rate=rate, noise=noise, seed=seed,
             label=label)
 
-    def plot(self, path: str | Path | None = None, **paper: Any) -> Any:
+    def plot(
+            self, path: str | Path | Sequence[str | Path] | None = None, *, ax: Any = None,
+            panel: str = 'response', **more: Any) -> Any:
         """Draw the motion that the plan predicts, as `Motion.plot` does."""
-        return self.simulate().plot(path, **paper)
+        return self.simulate(label=self.shaper).plot(path, ax=ax, panel=panel, **more)
 
     def save(self, path: str | Path) -> None:
         """
@@ -198,6 +203,17 @@ class Plan:
     def to_pandas(self) -> Any:
         """Return the levels as a DataFrame."""
         return frame({'time': self.times, 'flux_density': self.flux_densities})
+
+    def _values(self) -> tuple[object, ...]:
+        """Return what makes plans equal; adding 0 makes -0 and 0 the same bytes."""
+        return (self.actuator, self.shaper, self.segments[0].start.stretch,
+                *((x + 0.0).tobytes() for x in (self.setpoints, self.levels)))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Plan) and self._values() == other._values()
+
+    def __hash__(self) -> int:
+        return hash(self._values())
 
     def __repr__(self) -> str:
         return (f'<Plan {self.shaper}: {len(self.segments)} setpoints, {len(self.levels)} levels '

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,13 @@ if TYPE_CHECKING:
     from hmsa_ros.bag.info import BagSummary
 
 Times = NDArray[np.int64]
+
+
+def read_only(values: NDArray[Any]) -> NDArray[Any]:
+    """Return a view of an array that cannot be written to."""
+    view = values.view()
+    view.flags.writeable = False
+    return view
 
 
 @dataclass(frozen=True)
@@ -93,7 +100,9 @@ class Run:
     origin: str = 'recorded'  # or simulated
 
     def __post_init__(self) -> None:
-        """Check the arrays."""
+        """Check the arrays, and protect the record from changes."""
+        for name in ('time', 'logged', 'stretch', 'rate', 'flux_density'):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
         shapes = {x.shape for x in (
             self.time, self.logged, self.stretch, self.rate, self.flux_density)}
         if len(shapes) != 1 or not len(self.time) or np.any(np.diff(self.time) <= 0):
