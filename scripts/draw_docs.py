@@ -26,7 +26,6 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from benchmarks.beam_segments import Chain  # noqa: E402
-from hmsa_ros.api.actuator import Actuator  # noqa: E402
 from hmsa_ros.interfaces.actuator import actuator_from  # noqa: E402
 from hmsa_ros.interfaces.parameters import BLOCK  # noqa: E402
 from hmsa_ros.lab.adapting import second_act  # noqa: E402
@@ -271,39 +270,6 @@ def beam(path: Path) -> None:
             left, style.axis('time', 't', 'ms'), style.axis('error', unit='% of step'), 'c')
 
 
-def dielectric(path: Path) -> None:
-    """Draw the voltages that hold a dielectric actuator, and a move by a step and by two."""
-    stack = Actuator.dielectric(
-        half_length=5e-3, half_thickness=2e-3, layer_thickness=50e-6, permittivity=3.0,
-        shear_modulus=100e3, density=1100.0, chain_limit=50.0, damping_ratio=0.05)
-    target = 1.6
-    with style.picture(path, 2.9, replace(SCREEN, width=183)) as figure:
-        held, volts, move = figure.subplots(1, 3)
-        for limit, look in zip((math.inf, 50.0, 5.0), looks.CASES, strict=False):
-            case = stack.replace(chain_limit=limit)
-            ratio = np.linspace(1.0, min(5.0, 0.99 * case.block.law.limits[1]), 400)
-            held.plot(ratio, case.flux_density(ratio), **look.line(
-                label=f'$J_\\mathrm{{lim}}$ {"infinite" if limit == math.inf else f"{limit:g}"}'))
-            end = case.scales.stretch_limits[1]
-            if end < 5.0:
-                held.plot([end], [case.flux_density(end)], **style.EQUILIBRIUM)
-        held.legend(loc='lower right')
-        for shaper, label, look in (
-                ('step', 'unshaped step', style.UNSHAPED), ('two_step', 'two-step', style.SHAPED)):
-            plan = stack.plan([(target, 6e-3)], shaper)
-            seen = plan.simulate(rate=1e5)
-            times = 1e3 * np.append(plan.times, 6e-3)
-            volts.step(
-                np.append(0.0, times), np.append(0.0, np.append(
-                    plan.flux_densities, plan.flux_densities[-1])), where='post', **look)
-            move.plot(1e3 * seen.times, seen.stretches, label=label, **look)
-        move.legend(loc='lower right')
-        position = style.axis('capacitance ratio', 'C/C_0')
-        style.finish(held, position, style.axis('holding voltage', 'V', 'V'), 'a')
-        style.finish(volts, style.axis('time', 't', 'ms'), style.axis('voltage', 'V', 'V'), 'b')
-        style.finish(move, style.axis('time', 't', 'ms'), position, 'c')
-
-
 def simulated(*setpoints: tuple[float, float], rate: float) -> Run:
     """Return the run of setpoints (stretch, span in s), as its recorder would see it."""
     block, start, lead = paper_actuator(), NANOSECONDS, 5_000_000
@@ -403,7 +369,7 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     'demo': demo, 'adapting': adapting, 'moves': moves, 'figure_05': figure(5),
     'figure_08': figure(8), 'theory_force': force, 'theory_two_steps': two_steps,
     'theory_paths': energy, 'theory_deliveries': deliveries, 'theory_smooth': smooth,
-    'laws': laws, 'creep': creep, 'beam': beam, 'dielectric': dielectric,
+    'laws': laws, 'creep': creep, 'beam': beam,
     **STUDIES}
 #: What draws each animation.
 ANIMATIONS: dict[str, Callable[[Path], None]] = {'moving': moving}

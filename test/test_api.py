@@ -224,7 +224,7 @@ GARBAGE = (
 WELL = {
     'setpoints': [(1.1, 0.05)], 'levels': [(0.0, 0.01)], 'frequency': 5.0, 'amplitude': 0.05,
     'shape': 'sine', 'times': [0.0, 1.0], 'stretches': [1.0, 1.1], 'length': 0.01,
-    'thickness': 1e-3, 'width': 1e-3, 'youngs_modulus': 1e5, 'layer_thickness': 1e-4,
+    'thickness': 1e-3, 'width': 1e-3, 'youngs_modulus': 1e5,
     'path': 'nothing', 'values': {}}
 
 
@@ -260,7 +260,6 @@ def test_usual_actuators_cause_no_warning_and_models_without_j_lim_none_about_it
     hmsa_ros.Actuator(chain_limit=math.inf)
     hmsa_ros.Actuator(law='neo_hookean', chain_limit=1e4)
     hmsa_ros.Actuator(law='yeoh', constants={'c10': 15e3})
-    hmsa_ros.Actuator.dielectric(layer_thickness=50e-6, shear_modulus=100e3)
     hmsa_ros.Actuator().scaled(shear_modulus=1e-2)
     with pytest.warns(hmsa_ros.UnusualWarning, match='sags by') as found:
         hmsa_ros.Actuator.beam(length=25e-3, thickness=1e-3, width=5e-3, youngs_modulus=1e6)
@@ -294,7 +293,7 @@ def test_damping_is_zeta_a_ratio_or_a_coefficient(block):
 
 @pytest.mark.filterwarnings('ignore::hmsa_ros.UnusualWarning')
 @pytest.mark.parametrize('name', [
-    'Actuator', 'Actuator.beam', 'Actuator.dielectric', 'Actuator.from_parameters',
+    'Actuator', 'Actuator.beam', 'Actuator.from_parameters',
     'Actuator.from_yaml', 'block.plan', 'block.follow', 'block.wave', 'block.wave_bands',
     'block.simulate', 'block.amplifiers', 'block.stretch', 'block.flux_density', 'plan.simulate',
     'plan.currents', 'plan.save', 'plan.plot', 'motion.report', 'motion.save', 'identify', 'read'])

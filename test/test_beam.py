@@ -31,6 +31,7 @@ from hmsa_ros.model import equations
 from hmsa_ros.model.actuators import check_stretch
 from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.laws import bending
+from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.model.simulation import ActuatorSimulation
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import MU_0
@@ -135,6 +136,12 @@ def test_refusals_speak_of_the_deflection(points, message):
         planner.request(points, 0, 0)
     with pytest.raises(BadInputError, match='^reset_stretch is 0.9: expected a deflection'):
         check_stretch(0.9, silicone().nondimensional, 'reset_stretch')
+
+
+def test_the_law_of_a_running_planner_does_not_turn_stretches_into_deflections():
+    planner = Planner(paper_actuator(), Options())
+    with pytest.raises(BadInputError, match='would turn stretches into deflections'):
+        planner.checked_model(Options(), silicone())
 
 
 def test_the_tangent_of_a_bent_beam_is_the_slope_of_its_centreline():

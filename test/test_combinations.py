@@ -27,7 +27,6 @@ CONSTANTS = {
     'mooney_rivlin': {'law.c10': 3e3, 'law.c01': 2e3},
     'yeoh': {'law.c10': 5e3, 'law.c20': -200.0, 'law.c30': 40.0},
     'ogden': {'law.mu': [6e3, -1500.0, 10.0], 'law.alpha': [1.5, -3.0, 8.0]},
-    'dielectric': {'law.permittivity': 3.0, 'law.layer_thickness': 5e-5},
     'arruda_boyce': {'law.mu': [9e3], 'law.lambda_m': 2.0},
     'table': {'law.stretch': STRETCHES.tolist(), 'law.flux_density': (
         0.12566 * elastic_force(STRETCHES, NondimensionalParameters())).tolist()}}

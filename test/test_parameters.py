@@ -36,7 +36,7 @@ DIMENSIONLESS = {
     'creep_tolerance', 'marker_scale', 'max_points', 'minimax_errors', 'path_tolerance',
     'actuator.chain_limit', 'initial_stretch', 'real_time_factor', 'robust_order', 'play.rate',
     'play.read_ahead_queue_size', 'record.queue_depth',
-    'reset_stretch', 'seed', 'law.alpha', 'law.lambda_m', 'law.permittivity', 'law.stretch',
+    'reset_stretch', 'seed', 'law.alpha', 'law.lambda_m', 'law.stretch',
     'step_count',
     # In one unit of length, whichever.
     'sensor.gain', 'sensor.offset', 'sensor.rest_length',
@@ -270,7 +270,7 @@ def test_former_or_misspelt_name_is_refused_with_the_present_one(ros, serve):
 @pytest.mark.ros
 def test_value_out_of_range_is_refused_while_running_too(ros, serve):
     serve(PlannerNode)
-    for name, value in (('robust_order', 17), ('flux_density_max', 1.1e5)):
+    for name, value in (('robust_order', 17), ('flux_density_max', 1001.0)):
         result, = ros.set_parameters('planner', [Parameter(name, value=value)])
         assert not result.successful
         assert name in result.reason

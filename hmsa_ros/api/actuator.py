@@ -227,63 +227,6 @@ class Actuator:
         warn(made)
         return made
 
-    @classmethod
-    def dielectric(
-            cls, *, layer_thickness: float, permittivity: float = 3.0, voltage_max: float = 5e3,
-            damping_ratio: float | None = None, damping_coefficient: float | None = None,
-            **more: Any) -> 'Actuator':
-        """
-        Return a dielectric elastomer between compliant electrodes, driven by steps of a voltage.
-
-        The actuator is a layer or a stack of layers, free at its sides. Positions are capacitances
-        relative to that at rest; `levels` and ``flux_densities`` contain voltages in V.
-
-        Parameters
-        ----------
-        layer_thickness : float
-            Thickness of the elastomer between two electrodes at rest, in m.
-        permittivity : float
-            Relative permittivity.
-        voltage_max : float
-            Maximum voltage of the amplifier, in V; the minimum is 0.
-        damping_ratio, damping_coefficient : float, optional
-            Damping ratio at rest, or c of the thickness in N s/m; default a ratio of 0.05.
-        **more
-            Shear modulus, density, half length, half thickness and chain limit of `Actuator`.
-
-        Returns
-        -------
-        Actuator
-            The actuator; its `law` is ``'dielectric'``.
-
-        Raises
-        ------
-        BadInputError
-            If a value has the wrong type or is out of range, or a remanence, creep, slew limit or
-            coil time constant is given.
-
-        Examples
-        --------
-        >>> from hmsa_ros import Actuator
-        >>> stack = Actuator.dielectric(layer_thickness=50e-6, shear_modulus=100e3)
-        >>> plan = stack.plan([(1.1, 0.5)])
-        >>> plan.report()['status'], round(plan.flux_densities[-1])   # V
-        (['two_step'], 1094)
-
-        """
-        if 'remanence' in more:
-            raise BadInputError(
-                f'remanence is {excerpt(more["remanence"])}: expected none, since nothing in a '
-                'dielectric elastomer is magnetised')
-        with unquestioned():
-            made = cls(**_damping(damping_ratio, damping_coefficient), **{
-                'law': 'dielectric', 'constants': {
-                    'permittivity': permittivity, 'layer_thickness': layer_thickness},
-                'flux_density_limits': (
-                    0.0, number(voltage_max, 'voltage_max', 'V', above=0.0)), **more})
-        warn(made)
-        return made
-
     # -- properties ----------------------------------------------------------------------------
 
     @property
@@ -763,7 +706,7 @@ class Actuator:
 
 
 def _damping(ratio: float | None, coefficient: float | None) -> dict[str, Any]:
-    """Return the damping of a beam or a dielectric elastomer, by default a ratio of 0.05."""
+    """Return the damping of a beam, by default a ratio of 0.05."""
     if ratio is None and coefficient is None:
         ratio = 0.05
     return {'damping_ratio': ratio, 'damping_coefficient': coefficient}

@@ -236,7 +236,7 @@ def _law_values(name: Any, constants: Any, modulus_given: bool) -> dict[str, Any
         raise BadInputError(
             f'law {name} has no constant {unknown[0]!r}: expected '
             + (', '.join(names) or 'none'))
-    if modulus_given and law.scaled is not None and law.own_modulus:
+    if modulus_given and law.scaled is not None:
         raise BadInputError(
             f'shear_modulus is given with law {name}, whose constants it follows from: expected '
             f'constants={{...}} of {", ".join(names)} alone')

@@ -62,7 +62,7 @@ def _values(actuator: 'Actuator', form: str) -> Mapping[str, float]:
         'zeta': actuator.zeta, 'damping_ratio': actuator.damping_ratio,
         'shear_modulus': block.shear_modulus, 'flux_max': high, 'flux_min': low}
     law = LAWS[actuator.law]
-    if law.endless or law.scaled is not None and law.own_modulus or math.isinf(block.chain_limit):
+    if law.endless or law.scaled is not None or math.isinf(block.chain_limit):
         values.pop('j_lim', None)
     return values
 
@@ -76,15 +76,12 @@ def _of_motion(actuator: 'Actuator', form: str) -> Iterator[str]:
             f'zeta {zeta:g} is above the critical {critical:g}: small motion about rest does not '
             'oscillate, and there is no two-step command for it')
     low, high = (float(x) for x in equilibrium_stretch(
-        block.units.range(*actuator.flux_density_limits), material))
+        [block.units.of_level(x) for x in actuator.flux_density_limits], material))
     if high - low < 2.0 * _HARDLY:
-        drive = block.coordinate.drive
-        move = {'beam': 'deflection of 0.1', 'dielectric': 'ratio of 1.1',
-                'block': 'stretch of 1.1 or 0.9'}[form]
+        move = {'beam': 'deflection of 0.1', 'block': 'stretch of 1.1 or 0.9'}[form]
         yield (
-            f'the {"amplifier" if drive.squared else "coil"} only reaches '
-            f'{block.coordinate.plural} from {low:.6g} to {high:.6g}: a {move} needs about '
-            f'{0.3 * block.units.load:.3g} {drive.unit}')
+            f'the coil only reaches {block.coordinate.plural} from {low:.6g} to {high:.6g}: a '
+            f'{move} needs about {0.3 * block.units.load:.3g} T')
 
 
 def _of_sizes(form: str, values: Mapping[str, float]) -> Iterator[str]:

@@ -4,13 +4,13 @@ import math
 
 from hmsa_ros.model.laws.record import ENDLESS
 from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.model.units import flux_text
 from hmsa_ros.planning.scales import Scales
 
 
 def facts(found: Scales, block: ActuatorParameters) -> list[tuple[str, str]]:
     """Return names and values, with units, of the derived quantities."""
-    beam, drive = block.rest == 0.0, block.coordinate.drive
-    words = block.coordinate.plural
+    beam, words = block.rest == 0.0, block.coordinate.plural
     return [
         ('time unit' if beam else 'time unit L sqrt(rho/G)', _time_text(found.time_unit)),
         ('natural frequency at rest', f'{found.frequency:.5g} Hz'),
@@ -20,10 +20,9 @@ def facts(found: Scales, block: ActuatorParameters) -> list[tuple[str, str]]:
         *([] if found.stretch_limits in (ENDLESS, (0.0, math.inf))
           else [(f'limiting {words}', '{:.4f} and {:.4f}'.format(*found.stretch_limits))]),
         *([] if beam else [('shape c1', f'{found.c1:.4g}')]),
-        *((f'{drive.name} for {stretch:.6g}', drive.text(level, '.4g'))
+        *((f'flux density for {stretch:.6g}', flux_text(level, '.4g'))
           for stretch, level in found.flux_densities),
-        (f'{"amplifier" if drive.squared else "coil"} holds {words}',
-         '{:.6g} to {:.6g}'.format(*found.held)),
+        (f'coil holds {words}', '{:.6g} to {:.6g}'.format(*found.held)),
         ('two steps reach from rest', 'nothing' if found.reached == (block.rest,) * 2
          else '{:.6g} to {:.6g}'.format(*found.reached)),
         ('a move from rest', 'none in two steps' if math.isnan(found.duration)

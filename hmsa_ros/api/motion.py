@@ -104,7 +104,7 @@ class Motion:
             return setpoints([part])
         from hmsa_ros.report.outcome import level_results, level_table
 
-        return level_table(level_results(self.run), self.run.plant.coordinate.drive)
+        return level_table(level_results(self.run))
 
     def plot(
             self, path: str | Path | Sequence[str | Path] | None = None, *, ax: Any = None,
@@ -283,7 +283,7 @@ def _draw_into(ax: Any, motion: Motion, panel: Any, line: Mapping[str, Any]) -> 
     position = axis(what.name, what.tex)
     panels = {
         'response': (time, position),
-        'command': (time, axis(what.drive.name, what.drive.symbol, what.drive.unit)),
+        'command': (time, axis('flux density', 'B', 'T')),
         'phase': (position, axis(f'{what.name} rate', rf'\dot{{{what.tex}}}', '1/s'))}
     if not isinstance(ax, Axes):
         raise BadInputError(f'ax is {excerpt(ax)}: expected axes of Matplotlib')
@@ -320,20 +320,20 @@ def simulated(
     those of `Actuator.simulate`. Raise `BadInputError` for unusable arguments, `HmsaError` for
     levels that cannot be simulated.
     """
-    model, units, unit = truth.model, truth.model.units, truth.model.units.load_name
+    model, units = truth.model, truth.model.units
     back = np.flatnonzero(np.diff(times) <= 0.0)
     if len(back) or times[0] < 0.0 or not np.all(np.isfinite(times) & np.isfinite(levels)):
         place = int(back[0]) + 1 if len(back) else 0
         raise BadInputError(
-            f'levels have the time {times[place]:g} s and the {units.drive.name} '
-            f'{levels[place]:g}{unit} in row {place + 1}: expected finite numbers, and increasing '
+            f'levels have the time {times[place]:g} s and the flux density '
+            f'{levels[place]:g} T in row {place + 1}: expected finite numbers, and increasing '
             'times from 0 s on')
     low, high = truth.flux_density_limits
     beyond = np.flatnonzero((levels < low) | (levels > high))
     if plan is None and len(beyond):
         raise BadInputError(
-            f'level {levels[beyond[0]]:g}{unit} in row {int(beyond[0]) + 1} is beyond the limits '
-            f'of the coil, {low:g} to {high:g}{unit}: expected {units.drive.plural} in{unit}, or '
+            f'level {levels[beyond[0]]:g} T in row {int(beyond[0]) + 1} is beyond the limits '
+            f'of the coil, {low:g} to {high:g} T: expected flux densities in T, or '
             'flux_density_limits (in a parameter file flux_density_max) that allow it')
     begin = number(model.material.rest if start is None else start, 'start')
     check_stretch(begin, model.material, 'start stretch')

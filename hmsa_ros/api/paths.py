@@ -137,7 +137,7 @@ def wave_path(
         raise RefusedError(
             Code.FLUX_LIMIT,
             f'an amplitude of {wave.amplitude:g} about {wave.mean:g} needs more than '
-            f'{model.units.drive.name} and slew limits allow at {sweep[0]:g}'
+            f'flux density and slew limits allow at {sweep[0]:g}'
             + (f' to {sweep[1]:g}' if last != first else '') + f' Hz: expected {reach or "less"}')
     return wave.path(frame, first, last, cycles)
 

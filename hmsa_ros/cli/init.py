@@ -11,7 +11,7 @@ example: hmsa init --half-length 5mm --half-thickness 5mm --density 1.9g/cm3 \
 """
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 import math
 from pathlib import Path
@@ -51,7 +51,7 @@ _NODES = ('plant', 'planner')  # that read the file
 # Quantities of the coil, and those with another name in `Actuator`.
 _COIL = ('flux_max', 'flux_min', 'slew_limit')
 # Forms with their own sizes and constants.
-_OF_THEIR_OWN = ('beam', 'dielectric')
+_OF_THEIR_OWN = ('beam',)
 _ARGUMENTS = {'j_lim': 'chain_limit', 'damping': 'damping_coefficient'}
 # The damping coefficient may be given instead of these.
 _DAMPED = ('zeta', 'damping_ratio')
@@ -70,9 +70,6 @@ def add_parser(subparsers: Any) -> None:
         ('--beam',
          'a beam that is clamped at one end, magnetised along its length, in a field across it; '
          'its setpoints are deflections of the tip over the length'),
-        ('--dielectric',
-         'a dielectric elastomer, one layer or a stack, driven by a voltage; its setpoints are '
-         'capacitances over that at rest'),
         *map(_option, (*QUANTITIES, *(x for x in EVERY if x not in QUANTITIES), DAMPING)),
         LAW_OPTION,
         ('--joint', 'NAME', str,
@@ -151,10 +148,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _asked(arguments: argparse.Namespace) -> tuple[str, tuple[Quantity, ...]]:
     """Return form and quantities of the actuator; a hyperelastic model has its own constants."""
-    forms = [x for x in _OF_THEIR_OWN if getattr(arguments, x)]
-    if len(forms) > 1:
-        raise BadInputError('both --beam and --dielectric are given: expected one of them')
-    form = forms[0] if forms else 'block'
+    form = 'beam' if arguments.beam else 'block'
     if arguments.law is None:
         return form, FORMS[form]
     from hmsa_ros.model.laws import LAWS
@@ -261,15 +255,12 @@ def _actuator(form: str, given: Mapping[str, float], law: str | None) -> 'Actuat
         _ARGUMENTS.get(x, x): given[x]
         for x in (*(y.key for y in FORMS[form] if y.key not in (*_COIL, *_DAMPED)), *damping)
         if x in given}
-    if form != 'dielectric':
-        values |= {'flux_density_limits': (given['flux_min'], given['flux_max']),
-                   'slew_limit': given['slew_limit'] or math.inf}
+    values |= {'flux_density_limits': (given['flux_min'], given['flux_max']),
+               'slew_limit': given['slew_limit'] or math.inf}
     if law is not None:
         values['law'], values['constants'] = law_of(law)
-    makers: dict[str, Callable[..., Actuator]] = {
-        'block': Actuator, 'beam': Actuator.beam, 'dielectric': Actuator.dielectric}
     with unquestioned():  # of which `run` prints the doubts
-        return makers[form](**values)
+        return (Actuator.beam if form == 'beam' else Actuator)(**values)
 
 
 def _lines(form: str, parameters: Mapping[str, Any]) -> list[str]:
@@ -282,11 +273,6 @@ def _lines(form: str, parameters: Mapping[str, Any]) -> list[str]:
             for x in FORMS['beam']} | {
             LAW_NAME.name: ('a beam: positions are deflections of the tip over the length', ''),
             DAMPING.parameter: ('damping coefficient of the tip', DAMPING.unit)}
-    if form == 'dielectric':
-        texts |= {x.parameter: (x.text, x.unit) for x in FORMS['dielectric']} | {
-            LAW_NAME.name: (
-                'driven by a voltage: positions are capacitances over that at rest', ''),
-            'flux_density_min': ("amplifier's minimum voltage", 'V')}
     lines = []
     for name, value in parameters.items():
         text, unit = texts[name]
@@ -330,9 +316,7 @@ def _parameters(made: 'Actuator') -> dict[str, Any]:
     """Return the nodes' parameters by name."""
     values = made.parameters
     del values['coil_time_constant']
-    if made.law == 'dielectric':
-        del values['actuator.remanence'], values['slew_limit']
-    elif made.block.law is not None:
+    if made.block.law is not None:
         # They follow from other parameters, or have no effect.
         del values['actuator.shear_modulus'], values['actuator.chain_limit']
     return values

@@ -101,7 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _in_units(arguments: argparse.Namespace) -> int:
-    """Plan in seconds and tesla, or volts."""
+    """Plan in seconds and tesla."""
     from hmsa_ros.api.plan import table_of
 
     check_targets(arguments.out, sources=(arguments.path, arguments.params_file))
@@ -113,10 +113,6 @@ def _in_units(arguments: argparse.Namespace) -> int:
         plan.save(arguments.out)
     group, units, per_ampere = (
         actuator.model.material, actuator.model.units, arguments.tesla_per_ampere)
-    if units.drive.squared and per_ampere is not None:
-        raise BadInputError(
-            f'--tesla-per-ampere is {per_ampere:g} T/A: expected it with a coil alone, the '
-            'actuator of the file is driven by a voltage')
     record: dict[str, Any] = {
         'c1': group.c1, 'zeta': group.zeta, 'j_lim': group.j_lim, 'time_unit': units.time,
         'flux_density_unit': units.load,
@@ -128,18 +124,16 @@ def _in_units(arguments: argparse.Namespace) -> int:
                 arguments.setpoints, shaper=shaper, **_more(arguments),
                 **{x: getattr(arguments, x) for x in _WINDING}))
         record['amplifiers'] = amplifiers[0].records()
-    unit, word = units.load_name.strip(), units.drive.name.replace(' ', '_')
     shown = [
         Column('span', 's', head='duration'),
-        Column('flux_density_p', unit, head=f'{word}_p'), Column('time_p', 's'),
-        Column('flux_density_1', unit, head=f'{word}_1')]
+        Column('flux_density_p', 'T'), Column('time_p', 's'), Column('flux_density_1', 'T')]
     if per_ampere is not None:
         shown += [Column('current_p', 'A'), Column('current_1', 'A')]
     return show(
         arguments, record, table_of(
             plan.segments, (Column(group.coordinate.name), *shown),
             [(x['stretch'], *(x[y.name] for y in shown)) for x in record['segments']],
-            Column('between', f'{unit} at s'), units.time, units.level,
+            Column('between', 'T at s'), units.time, units.level,
             f'c1 {group.c1:.6g}, zeta {group.zeta:.6g}, time unit L sqrt(rho/G) '
             f'{units.time:.6g} s'),
         *([f'{arguments.out} written'] if arguments.out is not None else []),

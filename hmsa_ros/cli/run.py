@@ -220,7 +220,7 @@ def _print(
     from hmsa_ros.report.outcome import level_table
 
     if levels:
-        print(level_table(levels, parts[0].run.plant.coordinate.drive))
+        print(level_table(levels))
     elif not experiment.path and any(x.evaluation.findings for x in parts):
         print(setpoints(parts))
     seconds = [f'{key} {x:.1f} s' for key, x in done.seconds.items()]

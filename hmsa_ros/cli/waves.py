@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments, {
             'bands': bands, 'duration': duration, 'levels': plan.levels, 'notes': notes},
         f'{len(plan.levels)} levels of {plan.flux_densities.min():.4g} to '
-        f'{plan.flux_densities.max():.4g}{actuator.model.units.load_name}, at rest after '
+        f'{plan.flux_densities.max():.4g} T, at rest after '
         f'{duration:.4g} s', *(f'note: {x}' for x in notes),
         written=(arguments.out, arguments.path))
 

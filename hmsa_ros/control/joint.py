@@ -19,7 +19,7 @@ from hmsa_ros.estimation.words import sentence
 from hmsa_ros.identification.known import Known
 from hmsa_ros.judge.records import Sensor
 from hmsa_ros.model.equations import equilibrium_stretch, stretch_limits
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.model.units import flux_text, NANOSECONDS
 from hmsa_ros.planning.planner import Believed, Planner
 from hmsa_ros.planning.timeline import Model, Plan
 
@@ -206,8 +206,7 @@ class Joint:
                 abs(field - wanted) <= max(
                     _OFF * max(abs(field), abs(wanted)), _LEAST * units.load)):
             return ''
-        return (f'the coil has {units.drive.text(field)} where {units.drive.text(wanted)} were '
-                'commanded')
+        return f'the coil has {flux_text(field)} where {flux_text(wanted)} were commanded'
 
     # -- looks at them -------------------------------------------------------------------------
 

@@ -102,12 +102,8 @@ def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, .
     A prefix ``actuator.`` or ``law.`` is dropped, and the modulus may have its name in the model.
     Models other than Gent exclude J_lim, but allow their constants: ``law.c10``, or for all
     elements of a list ``law.mu`` and for its first ``law.mu.1``. Raise `BadInputError` if a name
-    is unknown, none is given, two exclude each other, or the actuator is driven by a voltage.
+    is unknown, none is given, or two exclude each other.
     """
-    if law is not None and law.volts:
-        raise BadInputError(
-            f'the actuator has law {law.law}: expected one that a magnetic field drives, since a '
-            'voltage is planned with but not identified with (feedback: off)')
     constants = constants_of(law)
     whole = {'shear_modulus': ['shear_modulus'], modulus_of(law)[0]: ['shear_modulus']}
     for name in constants:

@@ -233,14 +233,10 @@ SLEW_LIMIT = ParameterSpec(
     'Rate at which the amplifier ramps to a commanded level; 0 for steps.', 'T/s', 0.0, 1e12)
 
 FLUX_DENSITY_MIN = ParameterSpec(
-    'flux_density_min', -0.5,
-    "Lower limit of the coil's flux density; of a voltage (V) with law dielectric.", 'T',
-    -1e5, 1e5)
+    'flux_density_min', -0.5, "Lower limit of the coil's flux density.", 'T', -1e3, 1e3)
 
 FLUX_DENSITY_MAX = ParameterSpec(
-    'flux_density_max', 0.5,
-    "Upper limit of the coil's flux density; of the voltage (V) with law dielectric.", 'T',
-    -1e5, 1e5)
+    'flux_density_max', 0.5, "Upper limit of the coil's flux density.", 'T', -1e3, 1e3)
 
 COIL_TIME_CONSTANT = ParameterSpec(
     'coil_time_constant', 0.0, 'Time constant of the first-order coil lag; 0 for none.', 's',

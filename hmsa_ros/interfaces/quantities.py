@@ -204,29 +204,10 @@ BEAM: tuple[Quantity, ...] = (
         1e3, (0.005, 0.9), 'of silicone strips in air'),
     *(BY_KEY[x] for x in ('flux_max', 'flux_min', 'slew_limit')),
 )
-#: Quantities of a dielectric elastomer; the layers of a stack have the same sides.
-DIELECTRIC: tuple[Quantity, ...] = (
-    replace(BY_KEY['half_length'], text='half length L, along the electrodes'),
-    replace(BY_KEY['half_thickness'], text='half thickness H of the layer or of the whole stack'),
-    Quantity(
-        'layer_thickness', 'law.layer_thickness',
-        'thickness of the elastomer between two electrodes', 'm', 5e-5, 1e-9, 1e3, (1e-6, 2e-3),
-        'from printed stacks to membranes of acrylic tape', ((0.01, 1e3, 'did you mean um?'),)),
-    Quantity(
-        'permittivity', 'law.permittivity', 'relative permittivity', '', 3.0, 1e-3, 1e4,
-        (2.0, 20.0), 'from silicones, some 3, to filled ones; 4.7 of acrylic tape'),
-    BY_KEY['shear_modulus'], BY_KEY['density'], BY_KEY['j_lim'],
-    next(replace(x, source='of silicones in air') for x in BEAM if x.key == 'damping_ratio'),
-    Quantity(
-        'voltage_max', FLUX_DENSITY_MAX.name, "amplifier's maximum voltage", 'V', 5e3, 1e-3, 1e5,
-        (10.0, 2e4), 'of amplifiers for dielectric elastomers',
-        ((0.0, 10.0, 'did you mean kV?'),)),
-)
 #: Quantities by form of the actuator, by default a block.
-FORMS: Mapping[str, tuple[Quantity, ...]] = {
-    'beam': BEAM, 'dielectric': DIELECTRIC, 'block': QUANTITIES}
+FORMS: Mapping[str, tuple[Quantity, ...]] = {'beam': BEAM, 'block': QUANTITIES}
 #: All quantities, each once.
-EVERY = tuple({x.key: x for form in (DIELECTRIC, BEAM, QUANTITIES) for x in form}.values())
+EVERY = tuple({x.key: x for form in (BEAM, QUANTITIES) for x in form}.values())
 #: Alternative to zeta.
 DAMPING = Quantity.of(
     'damping', _BLOCK['damping_coefficient'], 'damping coefficient c', (0.0, math.inf), '',

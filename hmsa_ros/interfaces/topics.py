@@ -116,7 +116,7 @@ ESTIMATE = Topic(
 FLUX_DENSITY_COMMAND = Topic(
     'flux_density_command', _FIELD, COMMAND,
     'The shaped command: from its timestamp on, which may be in the future, z is the flux density '
-    'in tesla, or a voltage in volts with law dielectric; x and y are 0. A message replaces all '
+    'in tesla; x and y are 0. A message replaces all '
     'earlier ones with the same or a later timestamp.',
     publishers=(PLANNER,), subscribers=(PLANT, DRIVER))
 FLUX_DENSITY_APPLIED = Topic(

@@ -40,25 +40,15 @@ def check_stretch(
             else f'law {material.law.law}'
         # Parameter names stay unchanged.
         called = re.sub(r'\bstretch\b', coordinate, name)
-        why = f'; {more}' if (more := pulls_in(material)) else ''
         raise BadInputError(
             f'{called} is {stretch:g}: expected a {coordinate} '
-            f'between the limits {lower:.4f} and {upper:.4f} of {whose}{why}')
-
-
-def pulls_in(material: NondimensionalParameters) -> str:
-    """Return a sentence on where no voltage has a stable equilibrium; empty if there always is."""
-    upper = stretch_limits(material)[1]
-    if material.law is None or not material.law.volts or upper == material.law.limits[1]:
-        return ''
-    return (f'above {upper:.4f}, a stretch of {upper ** 0.25:.4f} in the plane, the actuator '
-            'pulls in: no constant voltage holds it there')
+            f'between the limits {lower:.4f} and {upper:.4f} of {whose}')
 
 
 def unheld(material: NondimensionalParameters) -> str:
     """Return a sentence on stretches that cannot be held, as the force falls; empty if none."""
-    if material.law is None or material.law.volts:
-        return pulls_in(material)
+    if material.law is None:
+        return ''
     sides = [
         f'{words} {limit:.4f}' for words, limit, end in zip(
             ('below', 'above'), stretch_limits(material), material.law.limits, strict=True)
@@ -92,7 +82,6 @@ class Setup:
             raise BadInputError(
                 f'time constant of the coil is {self.coil_time_constant:g} s: expected a '
                 'finite number of at least 0')
-        self.actuator.check_drive(self.slew_limit, self.coil_time_constant)
 
     def holding(self, stretch: float) -> float:
         """Return the flux density in T that holds a stretch."""
@@ -103,14 +92,10 @@ class Setup:
     def check_level(self, flux_density: float) -> None:
         """Raise `BadInputError` for a level in T that is too large to simulate."""
         units = self.actuator.units
-        _check_load(units.drive.name, flux_density, units.load_name.strip(), units.load)
+        _check_load('flux density', flux_density, units.load_name.strip(), units.load)
 
     def check_force(self, force: float) -> None:
         """Raise `BadInputError` for a disturbing force in N that is too large to simulate."""
-        if self.actuator.units.drive.squared and force:
-            raise BadInputError(
-                f'disturbing force is {force:g} N: expected 0 for law dielectric, whose load is '
-                'no force along the thickness')
         _check_load('disturbing force', force, 'N', 1.0 / self.actuator.load_per_newton)
 
 
@@ -269,8 +254,7 @@ class Actuators:
     def _set_drive(self, i: int, slope: float, level: float | None = None) -> None:
         """Update the load for amplifier, coil and force; the field does not jump."""
         lag = self._lags[i]
-        # A voltage has no lag.
-        flux = self.flux_density[i] / self._units[i] if lag > 0.0 else 0.0
+        flux = self.flux_density[i] / self._units[i]
         if level is not None:
             self._levels[i] = level
         load = self._scales[i].of_level(self._levels[i])

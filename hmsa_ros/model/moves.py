@@ -75,6 +75,6 @@ class Limits:
         if not self.minimum <= load <= self.maximum:
             raise RefusedError(
                 Code.FLUX_LIMIT,
-                f'{units.coordinate} {target:g} needs a {units.drive.name} of '
+                f'{units.coordinate} {target:g} needs a flux density of '
                 f'{units.load_text(load)}: expected {units.load_text(self.minimum)} to '
                 f'{units.load_text(self.maximum)}')

@@ -196,17 +196,6 @@ class ActuatorParameters:
                 f'density of {scales[1]:g} T and c1 of {scales[2]:g}: expected values of a block, '
                 'in SI units')
         self.creep.check(scales[0])
-        self.check_drive(creep=self.creep)
-
-    def check_drive(
-            self, slew_limit: float = math.inf, lag: float = 0.0, creep: Creep | None = None,
-            ) -> None:
-        """Raise `BadInputError` for ramps, a lag in s or creep if a voltage is the drive."""
-        if self.units.drive.squared and (slew_limit < math.inf or lag or creep):
-            raise BadInputError(
-                f'slew limit {slew_limit:g} V/s, time constant {lag:g} s and '
-                f'{len(creep.ratios) if creep else 0} viscoelastic branches are given: expected '
-                'inf, 0 and 0 for law dielectric, which is driven by steps of the voltage alone')
 
     @classmethod
     def from_nondimensional(
@@ -277,18 +266,14 @@ class ActuatorParameters:
 
     @property
     def flux_density_unit(self) -> float:
-        """Level of load 1: flux density mu0 G/Br in T, or voltage h sqrt(2 G/eps) in V."""
-        if self.law is not None and self.law.volts:
-            return self.law.volts * math.sqrt(self.shear_modulus)
+        """Flux density of load 1, mu0 G/Br in T."""
         return MU_0 * self.shear_modulus / self.remanence
 
     @cached_property
     def units(self) -> Units:
-        """Scales of time in s, and of the level in T or V."""
-        coordinate = self.coordinate
+        """Scales of time in s, and of the flux density in T."""
         return Units(
-            self.time_unit, self.flux_density_unit, ' s', f' {coordinate.drive.unit}',
-            coordinate.name, coordinate.drive)
+            self.time_unit, self.flux_density_unit, ' s', ' T', self.coordinate.name)
 
     @property
     def damping_unit(self) -> float:

@@ -7,29 +7,11 @@ from typing import Any
 NANOSECONDS = 1_000_000_000
 #: Vacuum permeability in H/m (CODATA 2022); SciPy's table of constants takes 0.2 s to load.
 MU_0 = 1.25663706127e-6
-#: Vacuum permittivity in F/m, of the same table.
-EPSILON_0 = 8.8541878188e-12
 
 
-@dataclass(frozen=True)
-class Drive:
-    """Drive of an actuator, a field or a voltage, and its relation to the load."""
-
-    name: str
-    plural: str
-    symbol: str
-    unit: str
-    shown: str  #: unit in tables and figures
-    per: float  #: number of shown units in one unit
-    squared: bool = False  #: whether the load increases as the square of the level
-
-    def text(self, level: float, form: str = '.3g') -> str:
-        """Format a level in the shown unit."""
-        return f'{self.per * level:{form}} {self.shown}'
-
-
-FLUX = Drive('flux density', 'flux densities', 'B', 'T', 'mT', 1e3)
-VOLTAGE = Drive('voltage', 'voltages', 'U', 'V', 'V', 1.0, squared=True)
+def flux_text(flux_density: float, form: str = '.3g') -> str:
+    """Format a flux density in T, as in ``'20 mT'``."""
+    return f'{1e3 * flux_density:{form}} mT'
 
 
 @dataclass(frozen=True)
@@ -37,32 +19,18 @@ class Units:
     """Units for times and loads in messages."""
 
     time: float = 1.0  #: time scale, in the named unit
-    load: float = 1.0  #: level of the load 1
+    load: float = 1.0  #: flux density of the load 1
     time_name: str = ''  #: with a leading space; empty for dimensionless values, as load_name
     load_name: str = ''
     coordinate: str = 'stretch'  #: name of a position
-    drive: Drive = FLUX
 
     def level(self, load: Any) -> Any:
-        """Return the level of a load or array; negative for a load that no voltage has."""
-        if self.drive.squared:
-            return abs(load) ** 0.5 * ((load >= 0.0) * 2.0 - 1.0) * self.load
+        """Return the flux density of a load or array."""
         return load * self.load
 
     def of_level(self, level: Any) -> Any:
-        """Return the load of a level or array; voltages of either sign attract."""
-        load = level / self.load
-        return load * load if self.drive.squared else load
-
-    def change(self, level: float, by: float) -> float:
-        """Return the maximum change of the load when a level changes by an amount."""
-        more = (2.0 * abs(level) + abs(by)) / self.load if self.drive.squared else 1.0
-        return by / self.load * more
-
-    def range(self, least: float, largest: float) -> tuple[float, float]:
-        """Return the minimum and maximum load in a range of levels."""
-        least = max(least, 0.0) if self.drive.squared else least
-        return self.of_level(least), self.of_level(largest)
+        """Return the load of a flux density or array."""
+        return level / self.load
 
     def time_text(self, value: float) -> str:
         """Format a dimensionless time with four significant digits."""

@@ -32,7 +32,6 @@ from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.actuator import actuator_from
 from hmsa_ros.interfaces.parameters import ParameterSpec
 from hmsa_ros.model.laws.bending import centreline, tangent
-from hmsa_ros.model.laws.coordinate import CAPACITANCE
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
@@ -79,9 +78,8 @@ class Block:
     half_length: float
     half_thickness: float
     remanence: float  #: Br in T, greater than 0
-    per_tesla: float = 1.0  #: arrow length of the field in m/T, or of a voltage in m/V
+    per_tesla: float = 1.0  #: arrow length of the field in m/T
     width: float = 0.0  #: width of a beam in m; 0 for a block
-    capacitance: bool = False  #: whether positions are capacitance ratios, without magnetisation
 
     def __post_init__(self) -> None:
         if not self.joint:
@@ -92,12 +90,11 @@ class Block:
         """Return the block of a joint's parameters."""
         length, thickness = actuator.half_length, actuator.half_thickness
         section = 0.0 if actuator.law is None else actuator.law.section
-        capacitance = actuator.coordinate is CAPACITANCE
         return cls(
             joint, length, thickness, actuator.remanence,
             per_tesla=2.0 * length / (3.0 * actuator.flux_density_unit)
-            if section or capacitance else thickness / actuator.remanence,
-            width=2.0 * section * length ** 2 / thickness, capacitance=capacitance)
+            if section else thickness / actuator.remanence,
+            width=2.0 * section * length ** 2 / thickness)
 
     def bent(self, deflection: float) -> list[tuple[float, float, float]]:
         """
@@ -123,13 +120,8 @@ class Block:
             points += [ring[0], ring[1], ring[2], ring[0], ring[2], ring[3]]
         return points
 
-    def thickness(self, position: float) -> float:
-        """Return the stretch along z at a position, which may be a capacitance ratio."""
-        return position ** -0.5 if self.capacitance else position
-
-    def size(self, position: float) -> tuple[float, float, float]:
-        """Return 2 l, 2 l and 2 h in m at a position; the volume is constant."""
-        stretch = self.thickness(position)
+    def size(self, stretch: float) -> tuple[float, float, float]:
+        """Return 2 l, 2 l and 2 h in m at a stretch; the volume is constant."""
         side = 2.0 * self.half_length / math.sqrt(stretch)
         return side, side, 2.0 * self.half_thickness * stretch
 
@@ -195,10 +187,9 @@ class _Drawing:
             height = block.half_length
             yield self._along(state.stretch)
         else:
-            stretch = block.thickness(state.stretch)
-            height = block.half_thickness * stretch
-            if not block.capacitance:
-                yield self._arrow(MAGNETISATION, block.per_tesla * block.remanence * stretch)
+            height = block.half_thickness * state.stretch
+            yield self._arrow(
+                MAGNETISATION, block.per_tesla * block.remanence * state.stretch)
         yield self._arrow(FIELD, block.per_tesla * state.flux_density, BESIDE * block.half_length)
         yield self._marker(
             LABEL, pose=self._pose(height + 0.8 * block.half_thickness),

@@ -1,7 +1,6 @@
 """The panel's access to ROS, in one thread that never blocks."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 import json
 import math
 from pathlib import Path
@@ -254,7 +253,7 @@ class Desk:
             'slot': math.floor(scene.now / (self._span / SLOTS)),
             'span': self._span, 'slots': SLOTS, 'charts': {
                 x.name: {
-                    'coordinate': x.coordinate, 'drive': asdict(x.drive),
+                    'coordinate': x.coordinate,
                     'stretch': _tail(x.stretches, scene.now, tail),
                     'target': _tail(x.targets, scene.now, tail),
                     'flux': _tail(x.fluxes, scene.now, tail)} for x in scene.joints},

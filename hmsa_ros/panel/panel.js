@@ -102,21 +102,20 @@ function status() {
 }
 
 function joint(card, seen) {
-  const chart = frame.charts[seen.name], name = chart.coordinate, drive = chart.drive;
+  const chart = frame.charts[seen.name], name = chart.coordinate;
   put(card.querySelector('h2'), seen.name);
   const texts = {
     name, label: name, stretch: number(seen.stretch, 5), target: number(seen.target, 5),
     error: seen.stretch === null || seen.target === null ? '?'
       : (seen.stretch - seen.target).toExponential(1).replaceAll('-', '\u2212'),
-    drive: drive.name, level: `${drive.name} in ${drive.shown}`,
     flux: seen.flux_density === null ? '?'
-      : `${number(drive.per * seen.flux_density, 2)} ${drive.shown}`};
+      : `${number(1e3 * seen.flux_density, 2)} mT`};
   for (const place of card.querySelectorAll('[data-of]')) put(place, texts[place.dataset.of]);
   const kept = charts[seen.name];
   draw(card.querySelector('[data-chart=stretch]'), [['--target', kept.target, [6, 4]],
     ['--accent', kept.stretch, []]], 1, 2e-3, `${name} of ${seen.name}`);
-  draw(card.querySelector('[data-chart=flux]'), [['--flux', kept.flux, []]], drive.per, 1,
-    `${drive.name} of ${seen.name}`);
+  draw(card.querySelector('[data-chart=flux]'), [['--flux', kept.flux, []]], 1e3, 1,
+    `flux density of ${seen.name}`);
 }
 
 // The distance of ticks: 1, 2 or 5 times a power of ten.

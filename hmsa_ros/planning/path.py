@@ -379,7 +379,7 @@ class _Follower:
             return ''
         request = self._request
         units, limits = request.units, request.limits
-        why = [f'{units.drive.plural} of {units.load_text(limits.minimum)} to '
+        why = [f'flux densities of {units.load_text(limits.minimum)} to '
                f'{units.load_text(limits.maximum)}'] * (Code.FLUX_LIMIT in self._limited)
         why += [f'ramps of {units.slew_text(request.delivery.slew)}'] * (
             Code.SLEW_LIMIT in self._limited)

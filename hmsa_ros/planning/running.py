@@ -86,7 +86,7 @@ class RunningPlan:
         level = in_force if flux_density is None else flux_density
         if not math.isfinite(rate + in_force + level):
             raise BadInputError(
-                f'state in force is rate {rate:g} 1/s, {units.drive.name} {in_force:g}'
+                f'state in force is rate {rate:g} 1/s, flux density {in_force:g}'
                 f'{units.load_name}: expected finite numbers')
         begin = PlannedLevel(stamp, level, State(
             stretch, rate * units.time, model.load(in_force)), model)
@@ -99,7 +99,7 @@ class RunningPlan:
         if not _can_be_followed(begin):
             raise BadInputError(
                 f'state in force is {units.coordinate} {stretch:g}, rate {rate:g} 1/s, '
-                f'{units.drive.name} {in_force:g}{units.load_name}: expected one that the model '
+                f'flux density {in_force:g}{units.load_name}: expected one that the model '
                 'can follow')
         self._begin_with(begin, keep=keep)
 
@@ -239,7 +239,7 @@ class RunningPlan:
         stretch = equilibrium_stretch(level.load, model.material)
         stiffness = elastic_stiffness(stretch, model.material)
         return float(
-            abs(model.time(late) * model.units.change(level.flux_density, change) / stiffness)
+            abs(model.time(late) * model.units.of_level(change) / stiffness)
             * model.frequency(float(stretch)))
 
     @property

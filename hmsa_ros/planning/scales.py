@@ -40,7 +40,7 @@ class Scales:
     critical_zeta: float  #: above it, small motion about rest does not oscillate
     damping: float  #: zeta as a coefficient in N s/m
     critical_damping: float
-    flux_density_unit: float  #: level of the dimensionless load 1, mu0 G/Br in T, or in V
+    flux_density_unit: float  #: level of the dimensionless load 1, mu0 G/Br in T
     #: Stretches within reach of the coil, and the levels that hold them.
     flux_densities: tuple[tuple[float, float], ...]
     stretch_limits: tuple[float, float]  #: between which the force increases
@@ -63,7 +63,7 @@ def scales(actuator: ActuatorParameters, least: float, most: float) -> Scales:
     material = actuator.nondimensional
     home = material.rest
     units = actuator.units
-    loads = units.range(least, most)
+    loads = units.of_level(least), units.of_level(most)
     lower, upper = stretch_limits(material)
     held = tuple(float(equilibrium_stretch(x, material)) for x in loads)
 

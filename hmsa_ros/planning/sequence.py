@@ -24,8 +24,6 @@ from hmsa_ros.planning.shapers.request import Request, Shaper, Work
 SHORT_SPELL = ('refuse', 'continue')
 # Samples of a motion, and their tolerance, for the check against the limits of its model.
 _LOOK, _LOOK_RTOL = 300, 1e-7
-# Periods of small motion that a motion towards pull-in may take.
-_LINGERS = 5.0
 
 
 @dataclass(frozen=True)
@@ -195,7 +193,7 @@ def _follow(request: Request, move: Move, span: float) -> State:
 
 def _check_known(request: Request, levels: Sequence[Level], ends: tuple[float, float]) -> None:
     """
-    Refuse a move that leaves the range of the elastic model, pulls in, or collapses.
+    Refuse a move that leaves the range of the elastic model, or collapses.
 
     ``ends`` are the times of the last ramp and of the end of the check.
     """
@@ -209,9 +207,6 @@ def _check_known(request: Request, levels: Sequence[Level], ends: tuple[float, f
     where = f'{material.coordinate.name} {request.state.stretch:.6g}'
     # The first swing about the last level is the widest.
     swing = 2.0 * math.pi / float(natural_frequency(target, material))
-    if elastic.volts:
-        # Just below pull-in the motion lingers.
-        swing *= _LINGERS
     times = np.linspace(
         levels[0].time, min(ends[1], ends[0] + swing), _LOOK, dtype=np.float64)
     try:
@@ -228,10 +223,8 @@ def _check_known(request: Request, levels: Sequence[Level], ends: tuple[float, f
     if lost:
         raise RefusedError(
             Code.OUT_OF_RANGE,
-            f'the move from {where} to {target:g} overshoots and '
-            + ('pulls in: expected a target of less' if elastic.volts
-               else 'cannot be followed: expected a smaller move')
-            + ', or a shaper that does not overshoot, such as two_step')
+            f'the move from {where} to {target:g} overshoots and cannot be followed: '
+            'expected a smaller move, or a shaper that does not overshoot, such as two_step')
     for widest, beyond in ((np.min(stretch), -1.0), (np.max(stretch), 1.0)):
         limit = elastic.limits[beyond > 0.0]
         if beyond * (widest - limit) > 0.0:

@@ -83,10 +83,9 @@ class Model:
         if options.lead_time < 0:
             raise BadInputError(
                 f'lead_time is {options.lead_time / NANOSECONDS:g} s: expected at least 0 s')
-        actuator.check_drive(options.slew_limit, options.coil_time_constant)
         units, pull = actuator.units, options.constant_force * actuator.load_per_newton
         time, load = units.time, units.load
-        least, largest = units.range(options.flux_density_min, options.flux_density_max)
+        least, largest = map(units.of_level, (options.flux_density_min, options.flux_density_max))
         worked_out = {
             'material': actuator.nondimensional,
             'units': units,

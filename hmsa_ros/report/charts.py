@@ -121,7 +121,6 @@ _SIMULATED = ('unshaped steps', 'plan')
 _KINDS: dict[str, dict[str, Any]] = {
     'recorded': looks.RECORDED.plotly(), 'unshaped steps': looks.PLAIN.plotly(),
     'plan': looks.PLAN.plotly(), 'field in force': looks.FIELD.plotly(),
-    'voltage in force': looks.FIELD.plotly(),
     'command': {**looks.RECORDED.plotly(), 'shape': 'hv'}, 'target': looks.TARGET.plotly()}
 
 
@@ -169,12 +168,12 @@ def response(parts: Sequence[Part], unit: TimeUnit) -> Figure:
         data += _commands(part, unit)
     what = parts[0].run.plant.coordinate
     return Figure(
-        'response', f'{what.drive.name.capitalize()} command and {what.name} over time', 560,
+        'response', f'Flux density command and {what.name} over time', 560,
         _grouped(data), {
             'xaxis': axis(label('time', 't', unit.name), anchor='y'),
             'yaxis': axis(label(what.name, what.symbol), domain=[0.0, 0.6]),
             'yaxis2': axis(
-                label(what.drive.name, what.drive.symbol, what.drive.shown),
+                label('flux density', 'B', 'mT'),
                 domain=[0.68, 1.0], anchor='x')})
 
 
@@ -187,8 +186,7 @@ def commanded(part: Part) -> tuple[list[float], list[float]]:
     """
     run, found = part.run, part.evaluation
     times = [found.seconds(x.stamp) for x in found.levels]
-    per = run.plant.coordinate.drive.per
-    values = [x.flux_density * per for x in found.levels]
+    values = [x.flux_density * 1e3 for x in found.levels]
     # Extend the last level to the end of the recording.
     times.append(max(times[-1], float(found.time[-1])))
     values.append(values[-1])
@@ -200,15 +198,14 @@ def commanded(part: Part) -> tuple[list[float], list[float]]:
             elastic_force(found.start, run.plant.nondimensional)))
     if math.isfinite(held):
         times.insert(0, min(float(found.time[0]), times[0] - 0.02 * (times[-1] - times[0])))
-        values.insert(0, held * per)
+        values.insert(0, held * 1e3)
     return times, values
 
 
 def _commands(part: Part, unit: TimeUnit) -> list[dict[str, Any]]:
     """Return the traces of the flux density."""
     run, found = part.run, part.evaluation
-    drive, data = run.plant.coordinate.drive, []
-    in_force = f'{"voltage" if drive.squared else "field"} in force'
+    data = []
     if found.levels:
         times, values = commanded(part)
         switches = {x.stamp for x in found.levels}
@@ -224,14 +221,14 @@ def _commands(part: Part, unit: TimeUnit) -> list[dict[str, Any]]:
             return data
     if np.isfinite(run.flux_density).any():
         data.append(_curve(
-            part, in_force, *decimate(unit.of(found.time), run.flux_density * drive.per),
+            part, 'field in force', *decimate(unit.of(found.time), run.flux_density * 1e3),
             yaxis='y2'))
     elif run.applied:
         applied = sorted(run.applied, key=lambda x: x.stamp)
         x = unit.of([*(found.seconds(x.stamp) for x in applied), max(
             found.seconds(applied[-1].stamp), float(found.time[-1]))])
-        y = np.array([x.flux_density for x in (*applied, applied[-1])]) * drive.per
-        data.append(_curve(part, in_force, x, y, yaxis='y2', line={'shape': 'hv'}))
+        y = np.array([x.flux_density for x in (*applied, applied[-1])]) * 1e3
+        data.append(_curve(part, 'field in force', x, y, yaxis='y2', line={'shape': 'hv'}))
     return data
 
 

@@ -11,7 +11,7 @@ from hmsa_ros.interfaces.parameters import number_of
 from hmsa_ros.judge.records import Finding, Sensor, Tolerances, unobserved
 from hmsa_ros.model.equations import equilibrium_stretch
 from hmsa_ros.model.status import Code
-from hmsa_ros.model.units import Drive, FLUX, NANOSECONDS
+from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.parameters import of_joint
 from hmsa_ros.recordings.record import Run
 from hmsa_ros.recordings.setpoints import Requested, setpoints_of
@@ -125,18 +125,18 @@ def level_results(run: Run) -> list[LevelResult]:
     return results
 
 
-def level_table(levels: Sequence[LevelResult], drive: Drive = FLUX) -> Table:
+def level_table(levels: Sequence[LevelResult]) -> Table:
     """Return the table of the levels with the longest durations."""
     longest = sorted(levels, key=lambda x: -x.duration)[:_MOST_LEVELS]
     chosen = [x for x in levels if x in longest or x is levels[-1]]
     short = len(levels) - len(chosen)
     several = len({x.joint for x in levels}) > 1
     return Table((
-        *([Column('joint')] if several else []), Column('level', drive.shown, '.4g'),
+        *([Column('joint')] if several else []), Column('level', 'mT', '.4g'),
         Column('times'),
         Column('in all', 'ms', '.4g'), *(
             Column(x, '', '.5f') for x in ('rest', 'mean', 'least', 'greatest'))), tuple(
-        (*([x.joint] if several else []), x.flux_density * drive.per, x.times, x.duration * 1e3,
+        (*([x.joint] if several else []), x.flux_density * 1e3, x.times, x.duration * 1e3,
          x.rest, x.mean, x.least, x.greatest) for x in chosen),
         'rest: the stretch that the level holds by the parameters; mean, least and greatest: '
         'while it was in force; the last row is the end' + (

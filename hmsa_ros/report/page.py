@@ -64,7 +64,6 @@ def page(parts: Sequence[Part]) -> str:
         **{'prediction': None, **drawn}, arrivals=arrivals, names=names, single=len(parts) == 1,
         sources=[_source(x.run) for x in parts], summary=_summary(parts), remarks=_notes(parts),
         what=parts[0].run.plant.coordinate.name, shown=shown,
-        level=parts[0].run.plant.coordinate.drive.name,
         count=max(len(x.evaluation.results) for x in parts),
         colours=[(x.run.label, x.colour, looks.DARK.get(x.colour, '')) for x in parts],
         lateness=any(len(x.timing.lateness) for x in parts),
@@ -253,15 +252,14 @@ def _requests(parts: Sequence[Part], unit: TimeUnit) -> Table:
 def _plan(parts: Sequence[Part], unit: TimeUnit) -> Table:
     """Return the table of planned changes of level."""
     what = parts[0].run.plant.coordinate
-    symbol, drive = what.symbol, what.drive
+    symbol = what.symbol
     rows = [
-        (part.run.label, x.time / unit.size, x.planned * drive.per, x.commanded * drive.per,
+        (part.run.label, x.time / unit.size, x.planned * 1e3, x.commanded * 1e3,
          x.stretch, x.recorded_stretch, x.rate, x.recorded_rate, x.deviation)
         for part in parts for x in plan_points(part.run, part.evaluation)]
-    shown = f'[{drive.shown}]'
     return _table({
-            'run': '', f'time [{unit.name}]': '.4f', f'{drive.symbol} planned {shown}': '.4f',
-            f'{drive.symbol} commanded {shown}': '.4f', f'{symbol} planned [1]': '.7f',
+            'run': '', f'time [{unit.name}]': '.4f', 'B planned [mT]': '.4f',
+            'B commanded [mT]': '.4f', f'{symbol} planned [1]': '.7f',
             f'{symbol} recorded [1]': '.7f', 'rate planned [1/s]': '.4g',
             'rate recorded [1/s]': '.4g', f'largest |Δ{symbol}| [1]': '.2e'}, rows[:_MOST_ROWS])
 
@@ -316,7 +314,7 @@ def _parameters(parts: Sequence[Part]) -> Table:
     gent = any(x.law is None for x in blocks)
     groups, laws = [x.nondimensional for x in blocks], [parameters_of(x) for x in blocks]
     limits = [stretch_limits(x) for x in groups]
-    name, drive = blocks[0].coordinate.name, blocks[0].coordinate.drive
+    name = blocks[0].coordinate.name
     rows = [
         *((field.replace('_', ' '), (spec.unit or '1').replace('^3', '³'),
            *(getattr(x, field) for x in blocks))
@@ -330,8 +328,7 @@ def _parameters(parts: Sequence[Part]) -> Table:
         *([('J_lim', '1', *(x.j_lim for x in groups))] if gent else []),
         ('c1', '1', *(x.c1 for x in groups)),
         ('time unit', 'ms', *(x.time_unit * 1e3 for x in blocks)),
-        (f'{drive.name} of load 1', drive.shown, *(
-            x.flux_density_unit * drive.per for x in blocks)),
+        ('flux density of load 1', 'mT', *(x.flux_density_unit * 1e3 for x in blocks)),
         (f'least {name}', '1', *(x for x, _ in limits)),
         (f'largest {name}', '1', *(x for _, x in limits))]
     return Table(

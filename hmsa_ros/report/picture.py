@@ -62,7 +62,7 @@ def draw(
             axes[key].set_xlim(*unit.of(times))
         time = style.axis('time', 't', unit.name)
         what = parts[0].run.plant.coordinate
-        level = style.axis(what.drive.name, what.drive.symbol, what.drive.shown)
+        level = style.axis('flux density', 'B', 'mT')
         style.finish(axes['command'], time, level, 'a')
         axes['command'].tick_params(labelbottom=False)
         axes['command'].xaxis.label.set_visible(False)

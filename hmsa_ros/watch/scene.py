@@ -11,8 +11,8 @@ import numpy as np
 from hmsa_ros.files import finite
 from hmsa_ros.interfaces.status import Verdict
 from hmsa_ros.model.equations import Array
-from hmsa_ros.model.laws.coordinate import drive_of, POSITION
-from hmsa_ros.model.units import Drive
+from hmsa_ros.model.laws.coordinate import POSITION
+from hmsa_ros.model.units import flux_text
 
 #: Number of slots of a chart.
 SLOTS = 480
@@ -81,11 +81,6 @@ class Joint:
     coordinate: str = POSITION
     fluxes: History = field(default_factory=lambda: History(10.0))
 
-    @property
-    def drive(self) -> Drive:
-        """The quantity that drives it, as far as known."""
-        return drive_of(self.coordinate)
-
 
 @dataclass
 class Report:
@@ -152,7 +147,7 @@ def _number(value: float) -> str:
 
 def _level(joint: Joint) -> str:
     value = joint.flux_density
-    return joint.drive.text(value, '+.3f') if math.isfinite(value) else '?'
+    return flux_text(value, '+.3f') if math.isfinite(value) else '?'
 
 
 def _time(stamp: float) -> str:

@@ -7,7 +7,6 @@ These modules are not compiled; forces and energies are in `hmsa_ros/motion/hmsa
 from hmsa_ros.model.laws import (
     arruda_boyce,
     beam,
-    dielectric,
     gent,
     mooney_rivlin,
     ogden,
@@ -19,4 +18,4 @@ from hmsa_ros.model.laws.record import Law
 #: Models by name; the first is the default.
 LAWS: dict[str, Law] = {x.name: x for x in (
     gent.GENT, gent.NEO_HOOKEAN, mooney_rivlin.LAW, yeoh.LAW, ogden.LAW, arruda_boyce.LAW,
-    table.LAW, beam.LAW, dielectric.LAW)}
+    table.LAW, beam.LAW)}

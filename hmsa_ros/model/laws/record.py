@@ -14,8 +14,6 @@ OGDEN = 3.0  # number of terms, then mu and alpha of each
 TABLE = 4.0  # number of pieces, then the result of `hmsa_ros.model.laws.curve.Curve.packed`
 BEAM = 5.0  # result of `hmsa_ros.model.laws.bending.packed`
 ARRUDA_BOYCE = 6.0  # mu, lambda_m
-DIELECTRIC = 7.0  # 1/J_lim
-_COORDINATES = {BEAM: 'deflection', DIELECTRIC: 'capacitance ratio'}
 
 #: Index of the first constant in a packed material.
 CONSTANTS = 6
@@ -55,8 +53,6 @@ class Elastic:
     limits: tuple[float, float] = ENDLESS  #: range in which the energy is known
     shape: float | None = None  #: c1, if not that of a block
     section: float = 0.0  #: width times thickness of a beam over its length squared; 0 for a block
-    #: Voltage of load 1 over the root of G, in V/sqrt(Pa); 0 for actuators driven by a field.
-    volts: float = 0.0
 
     @property
     def rest(self) -> float:
@@ -66,7 +62,7 @@ class Elastic:
     @property
     def coordinate(self) -> str:
         """Name of the coordinate."""
-        return _COORDINATES.get(self.family, 'stretch')
+        return 'deflection' if self.family == BEAM else 'stretch'
 
 
 @dataclass(frozen=True)
@@ -80,7 +76,6 @@ class Law:
     #: Maps the values of the constants, and of the actuator, to the shear modulus at small strain
     #: and the energy in units of it; None for Gent and neo-Hookean.
     scaled: Callable[[Mapping[str, Any]], tuple[float, Elastic]] | None = None
-    own_modulus: bool = True  #: whether the constants of a scaled model determine G
     endless: bool = False  #: whether J_lim is infinite, regardless of the parameter
     #: Maps the values of the constants to those read from a file that they name.
     completed: Callable[[Mapping[str, Any]], dict[str, Any]] | None = None

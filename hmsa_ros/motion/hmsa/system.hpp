@@ -2,7 +2,6 @@
 //     m(l) l'' + m'(l) l'^2 / 2 + d l' + psi'(l) = beta
 // with stretch l, time in L sqrt(rho/G) and the load beta = Br B/(mu0 G).
 #pragma once
-#include "dielectric.hpp"
 #include "dop853.hpp"
 #include "flow.hpp"
 #include "law.hpp"
@@ -10,7 +9,7 @@
 namespace hmsa {
 // Indices in a packed material, and families of models (hmsa_ros/model/law.py, laws/record.py).
 enum Place { kind_at, zeta_at, c1_at, damping_at, lower_at, upper_at, constants_at };
-enum Family { gent, neo_hookean, polynomial, ogden, table, beam, arruda_boyce, dielectric };
+enum Family { gent, neo_hookean, polynomial, ogden, table, beam, arruda_boyce };
 
 // Functions of the stretch alone are differentiated by it, and then by the chain rule, unless the
 // constants of the model have derivatives, too.
@@ -127,7 +126,6 @@ template <class C> struct AnyOf {
     Ogden<C> ogden_law;
     Table<double> table_law;
     Beam beam_law;
-    Dielectric dielectric_law;
 
     void read(int, const double *m)
     {
@@ -138,7 +136,6 @@ template <class C> struct AnyOf {
         case arruda_boyce: return polynomial_law.read(0, m + constants_at);
         case ogden: return ogden_law.read(0, m + constants_at);
         case table: return table_law.read(0, m + constants_at);
-        case dielectric: dielectric_law = {c1, {m[constants_at]}}; return;
         default: beam_law = {drag, m + constants_at};
         }
     }
@@ -157,7 +154,6 @@ template <class C> struct AnyOf {
         case arruda_boyce: return f(polynomial_law);
         case ogden: return f(ogden_law);
         case table: return f(table_law);
-        case dielectric: return f(dielectric_law);
         default: return f(beam_law);
         }
     }
@@ -174,8 +170,6 @@ template <class C> struct AnyOf {
     {
         if (kind == beam)
             return beam_law.inertia(l, i_mass, falls, damps);
-        if (kind == dielectric)
-            return dielectric_law.inertia(l, i_mass, falls, damps);
         const L l2 = l * l, l4 = l2 * l2, q = inverse(l + l4 * c1);
         i_mass = 6.0 * l4 * q;
         falls = -1.5 * q;

@@ -70,13 +70,13 @@ def _advice(
     there, units = eased(request, names, factor), request.units
     limits, delivery = there.limits, there.delivery
     words = {
-        'flux': f'{units.drive.name} limits of ' + ' to '.join(
+        'flux': 'flux density limits of ' + ' to '.join(
             map(units.load_text, (limits.minimum, limits.maximum))),
         'slew': f'a slew limit of {units.slew_text(delivery.slew)}',
         'period': f'a command period of {units.time_text(delivery.period)}',
         'lag': f'a coil time constant of {units.time_text(delivery.lag)}'}
     if factor == math.inf:
-        words |= {'flux': f'no {units.drive.name} limits', 'slew': 'no slew limit'}
+        words |= {'flux': 'no flux density limits', 'slew': 'no slew limit'}
     return ' and '.join(words[x] for x in names)
 
 
@@ -87,8 +87,7 @@ def eased(request: Request, names: Sequence[str], factor: float) -> Request:
         width = limits.maximum - limits.minimum
         more = (factor - 1.0) * (width if width < math.inf else max(
             abs(x) for x in (limits.minimum, limits.maximum) if math.isfinite(x)))
-        least = limits.minimum - (0.0 if request.units.drive.squared else more)
-        limits = Limits(least, limits.maximum + more)
+        limits = Limits(limits.minimum - more, limits.maximum + more)
     return replace(request, limits=limits, delivery=replace(
         delivery, slew=delivery.slew * (factor if 'slew' in names else 1.0),
         period=delivery.period / (factor if 'period' in names else 1.0),

@@ -85,8 +85,7 @@ def through(request: Request, duration: float) -> Move:
 def no_single(request: Request) -> str:
     """Return the reason why levels of free heights are used."""
     settled = ' and a push that settles the field' if request.delivery.lag > 0.0 else ''
-    level = request.units.drive.name
-    return (f'no single intermediate {level}{settled} within the limits leads as soon from '
+    return (f'no single intermediate flux density{settled} within the limits leads as soon from '
             f'{request.named_state} to rest at {request.target:g}: '
             f'{_NUMBERS[request.unknowns]} are used')
 
@@ -131,7 +130,7 @@ def _refusal(request: Request) -> tuple[Code, str]:
             f'no command for a coil time constant of {units.time_text(delivery.lag)} brings '
             f'{request.named_target} and the field to rest together within '
             + (f'{ramps} and ' if slow else '')
-            + f'{units.drive.plural} of {units.load_text(limits.minimum)} to '
+            + f'flux densities of {units.load_text(limits.minimum)} to '
             f'{units.load_text(limits.maximum)}')
     if request.material.creep:
         return Code.NO_TWO_STEP, (

@@ -234,6 +234,6 @@ def _durations(request: Request, push: float, brake: float) -> tuple[float, floa
         raise RefusedError(
             Code.FLUX_LIMIT,
             f'{request.named_target} is not reached under {request.units.load_text(push)}: '
-            f'expected wider {request.units.drive.name} limits')
+            'expected wider flux density limits')
     # Interpolate in the last stride.
     return begin + pushing - stride * beyond / (beyond - before), braking

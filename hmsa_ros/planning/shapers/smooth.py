@@ -68,7 +68,7 @@ def smooth(request: Request) -> Move:
     ramps = '' if math.isinf(slew) else f', ramps of {units.slew_text(slew)}'
     raise RefusedError(code, (
         f'no smooth path of up to {MOST_PERIODS:g} natural periods leads to rest at '
-        f'{request.named_target} within {units.drive.plural} of '
+        f'{request.named_target} within flux densities of '
         f'{units.load_text(limits.minimum)} to '
         f'{units.load_text(limits.maximum)}{ramps} and the largest rate'))
 
