@@ -88,9 +88,9 @@ def test_a_sweep_goes_through_the_resonance_at_one_amplitude():
 def test_what_the_limits_allow_is_told_and_holds():
     block = Actuator(slew_limit=100.0)
     (_, highest), = block.wave_bands('sine', AMPLITUDE)
-    assert block.wave('sine', 0.93 * highest, AMPLITUDE).segments[0].notes() == []
-    with pytest.raises(RefusedError, match=f'expected .* to {highest:.4g} Hz'):
-        block.wave('sine', 1.05 * highest, AMPLITUDE)
+    assert block.wave('sine', 0.999 * highest, AMPLITUDE).segments[0].notes() == []
+    with pytest.raises(RefusedError, match=f'expected a frequency below {highest:.4g} Hz'):
+        block.wave('sine', 1.001 * highest, AMPLITUDE)
     (_, highest), = Actuator().wave_bands('square', AMPLITUDE)
     assert {str(x.move.code) for x in Actuator().wave(
         'square', 0.99 * highest, AMPLITUDE, cycles=2).segments} == {'two_step'}
@@ -102,6 +102,26 @@ def test_what_the_limits_allow_is_told_and_holds():
     with pytest.warns(UnusualWarning):
         weak = Actuator(flux_density_limits=1e-4)
     assert len(weak.wave_bands('sine', AMPLITUDE)) == 0
+
+
+def test_the_bands_end_where_the_limits_do_and_not_where_the_search_does():
+    # A strong coil moves a soft block far above 30 natural frequencies.
+    strong = Actuator(flux_density_limits=5.0, remanence=0.2, shear_modulus=2e3)
+    (lowest, highest), = strong.wave_bands('sine', 0.01)
+    assert lowest == 0.0
+    assert highest > 40.0 * NATURAL
+    strong.wave('sine', 0.999 * highest, 0.01, cycles=1)
+    with pytest.raises(RefusedError, match=f'expected a frequency below {highest:.4g} Hz'):
+        strong.wave('sine', 1.001 * highest, 0.01, cycles=1)
+
+
+def test_a_wave_that_is_only_possible_about_the_resonance_has_both_limits():
+    # About the resonance, inertia carries what the coil cannot hold.
+    block = Actuator(flux_density_limits=2e-3, zeta=0.01)
+    (lowest, highest), = block.wave_bands('sine', 0.02)
+    assert 0.5 * NATURAL < lowest < NATURAL < highest < 1.5 * NATURAL
+    with pytest.raises(RefusedError, match=f'frequency at {lowest:.4g} to {highest:.4g} Hz'):
+        block.wave('sine', 0.99 * lowest, 0.02)
 
 
 @pytest.mark.parametrize(('shape', 'values', 'words'), [
@@ -127,7 +147,7 @@ def test_the_command_tells_the_reach_first_and_writes_levels(tmp_path, capsys):
     wave = ['wave', 'sine', '--frequency', '30', '--amplitude', '0.05']
     assert main([*wave, '--mean', '1.1', '--out', str(out)]) == 0
     first, second, _ = capsys.readouterr().out.splitlines()
-    assert first.startswith('an amplitude of 0.05 is possible at 0.')
+    assert first.startswith('an amplitude of 0.05 is possible below ')
     assert second.endswith('T, at rest after 0.4 s')
     written = np.loadtxt(out, delimiter=',', skiprows=1)
     assert main([*wave, '--offset', '1.1', '--json']) == 0
@@ -143,6 +163,6 @@ def test_the_command_tells_the_reach_first_and_writes_levels(tmp_path, capsys):
     assert 'cannot be read (Is a directory): expected a CSV' in capsys.readouterr().err
     for extra, words in ((['--to', '40'], 'expected --to HZ with sweep'),
                          (['--amplitude', '3'], 'an extreme of the wave is -2'),
-                         (['--frequency', '900'], 'Hz: expected 0.08')):
+                         (['--frequency', '900'], 'Hz: expected a frequency below ')):
         assert main([*wave, *extra]) == 2
         assert words in capsys.readouterr().err

@@ -560,7 +560,7 @@ class Actuator:
         >>> from hmsa_ros import Actuator
         >>> block = Actuator()
         >>> block.wave_bands('sine', 0.05).round(1).tolist()
-        [[0.1, 451.2]]
+        [[0.0, 457.1]]
         >>> block.wave('sine', 30.0, 0.05).simulate().report()['verdict']
         ['arrived']
 
@@ -581,8 +581,8 @@ class Actuator:
         """
         Return the frequency bands in Hz that the limits of the coil allow, shape (n, 2).
 
-        The arguments are those of `wave`. Bands lie within 0.001 to 30 natural frequencies; the
-        band of a square wave starts at 0. Raise `BadInputError` if the arguments describe no wave.
+        The arguments are those of `wave`. A band that starts at 0 has no lower limit. Raise
+        `BadInputError` if the arguments describe no wave.
         """
         from hmsa_ros.api.paths import bands
 

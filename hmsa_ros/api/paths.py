@@ -1,6 +1,7 @@
 """Paths for an actuator to follow, from arrays or files, with times in seconds."""
 
 from dataclasses import replace
+import math
 from pathlib import Path as File
 from typing import Any, TYPE_CHECKING
 
@@ -119,6 +120,13 @@ def bands(actuator: 'Actuator', shape: Any, amplitude: float, offset: float | No
     return found
 
 
+def bands_text(found: Array) -> str:
+    """Return frequency bands in Hz in words, which are empty if there are none."""
+    return ', '.join(
+        f'above {low:.4g} Hz' if math.isinf(high) else f'at {low:.4g} to {high:.4g} Hz' if low
+        else f'below {high:.4g} Hz' for low, high in found.tolist())
+
+
 def wave_path(
         actuator: 'Actuator', wave: Wave, sweep: tuple[float, float], cycles: float) -> Path:
     """
@@ -133,12 +141,13 @@ def wave_path(
     cycles = number(cycles, 'cycles', least=1.0, most=1e6)
     if not all(wave.within(frame, x) for x in np.geomspace(
             first, last, _SWEPT if last != first else 1)):
-        reach = ', '.join(f'{a / unit:.4g} to {b / unit:.4g} Hz' for a, b in wave.reach(frame))
+        reach = bands_text(np.array(wave.reach(frame)).reshape(-1, 2) / unit)
         raise RefusedError(
             Code.FLUX_LIMIT,
             f'an amplitude of {wave.amplitude:g} about {wave.mean:g} needs more than '
             f'flux density and slew limits allow at {sweep[0]:g}'
-            + (f' to {sweep[1]:g}' if last != first else '') + f' Hz: expected {reach or "less"}')
+            + (f' to {sweep[1]:g}' if last != first else '') + ' Hz: expected '
+            + (f'a frequency {reach}' if reach else 'less'))
     return wave.path(frame, first, last, cycles)
 
 

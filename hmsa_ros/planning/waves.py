@@ -28,9 +28,12 @@ _FADE_CYCLES, _FADE_PERIODS = 1, 2.0
 # Knots of a path per cycle, and phases at which limits are checked.
 _BREAKS, _PHASES = 8, 128
 # Fraction of the slew limit that ramps between levels may use.
-_SLEW_SHARE = 0.75
-# Frequencies to check, relative to the natural frequency.
+_SLEW_SHARE = 0.55
+# Frequencies to check, relative to the natural frequency, and ratio of the highest to the lowest.
 _LOOK: Array = np.geomspace(1e-3, 30.0, 400).astype(np.float64)
+_MOST = 1e12
+# Precision of the ends of bands.
+_EDGE = 1e-4
 
 
 def sine(phase: Array) -> tuple[Array, Array, Array]:
@@ -157,13 +160,31 @@ class Wave:
                     and np.max(np.abs(_growth(found, step))) <= _SLEW_SHARE * delivery.slew)
 
     def reach(self, request: Request) -> list[tuple[float, float]]:
-        """Return the frequency bands that limits allow, within 0.001 to 30 natural frequencies."""
+        """Return the frequency bands that limits allow; the first may start at 0."""
         natural = float(law.natural_frequency(self.mean, request.material.packed))
-        looked = _LOOK * natural / (2.0 * math.pi)
-        held = np.array([self.within(request, x) for x in looked.tolist()], dtype=int)
-        turns = np.diff(np.concatenate([[0], held, [0]]))
-        return [(float(looked[i]), float(looked[j - 1])) for i, j in zip(
-            np.flatnonzero(turns > 0), np.flatnonzero(turns < 0), strict=True)]
+        looked = (_LOOK * natural / (2.0 * math.pi)).tolist()
+        held = [self.within(request, x) for x in looked]
+        # Above the resonance, the load grows with the square of the frequency.
+        while held[-1] and looked[-1] < _MOST * looked[0]:
+            looked.append(2.0 * looked[-1])
+            held.append(self.within(request, looked[-1]))
+        # At the lowest of these frequencies the motion is static to a millionth.
+        edges = [0.0] if held[0] else []
+        edges += [self._edge(request, looked[i], looked[i + 1])
+                  for i in range(len(held) - 1) if held[i] != held[i + 1]]
+        edges += [math.inf] if held[-1] else []
+        return list(zip(edges[::2], edges[1::2], strict=True))
+
+    def _edge(self, request: Request, low: float, high: float) -> float:
+        """Return the frequency between two at which limits begin or cease to allow the wave."""
+        allowed = self.within(request, low)
+        while high - low > _EDGE * high:
+            middle = math.sqrt(low * high)
+            if self.within(request, middle) is allowed:
+                low = middle
+            else:
+                high = middle
+        return low if allowed else high
 
 
 def _growth(values: Array, step: float) -> Array:
