@@ -63,9 +63,14 @@ def assume(text: str, kind: type[Warning] = AssumedWarning) -> None:
     warnings.warn(text, kind, stacklevel=level)
 
 
-def complain(error: Exception, status: int | None = None) -> int:
-    """Print an error as one line; return the exit status, by default 2 for bad input, else 1."""
-    line = ' '.join(str(error).split())
+def complain(
+        error: Exception, status: int | None = None, *, notes: Iterable[str] = ()) -> int:
+    """
+    Print an error, with notes, as one line.
+
+    Return the exit status, by default 2 for bad input, else 1.
+    """
+    line = ' '.join('; note: '.join((str(error), *notes)).split())
     print(f'hmsa: error: {printable(line)}', file=sys.stderr)
     if status is None:
         return 2 if isinstance(error, BadInputError) else 1

@@ -315,7 +315,8 @@ def test_even_stamps_that_jitter_are_weighed_and_said():
 @pytest.mark.timeout(900)
 def test_foreign_motion_is_rejected_without_a_number():
     recording = recorded()
-    found = identify(replace(recording, stretch=recording.stretch[::-1].copy()))
+    found = identify(
+        replace(recording, stretch=recording.stretch[::-1].copy()), actuator=BLOCK)
     assert found.verdict == 'model_rejected'
     assert all(np.isnan(found.parameters[x].value) for x in found.names)
     assert not found.warnings

@@ -188,7 +188,8 @@ def identify(
     names = [] if free is None else names_of(free, 'free')
     result = find(
         recording, free=free_of(','.join(names), base.block.law, others), known=others,
-        actuator=block, uncertain=uncertain)
+        actuator=None if actuator is None and not isinstance(samples, Motion) else block,
+        uncertain=uncertain)
     text = file_text(
         result, Belief(result.actuator, others, base.parameters, Known()),
         recording.label, datetime.now().astimezone())

@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 
 from hmsa_ros import __version__
 from hmsa_ros.cli.node import NODES
-from hmsa_ros.cli.notes import notes_shown
+from hmsa_ros.cli.notes import collecting, show_notes, unshown
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import complain, HmsaError
 
@@ -94,12 +94,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.ros_args = words[len(split_ros_args(words)):]
     ENDING.interrupt()
     try:
-        with notes_shown():
+        with collecting(at_once=name == 'node'):
             status: int = arguments.run(arguments)
+        show_notes()
         print(end='', flush=True)  # also where standard output is closed
         return status
     except HmsaError as error:
-        return complain(error)
+        # Another actuator than the assumed one may not have been refused.
+        return complain(error, notes=unshown() if hasattr(error, 'code') else ())
     except ImportError as error:
         if not of_ros(error):
             raise

@@ -15,7 +15,7 @@ import sys
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.check_driver import settings_of
-from hmsa_ros.cli.options import add_command, JSON, Row, show
+from hmsa_ros.cli.options import add_command, assume_example, JSON, Row, show
 from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError, HmsaError
@@ -325,6 +325,8 @@ def _latency(arguments: argparse.Namespace) -> int:
     from hmsa_ros.lab.calibrating import measure_delays, steps_of
 
     actuator = read_belief(arguments.params_file).actuator
+    if arguments.params_file is None and not arguments.simulate:
+        assume_example()
     probe = _made(f'{_SIMULATED}SimulatedProbe', '--simulate') if arguments.simulate else (
         None if arguments.probe is None else _made(arguments.probe, '--probe'))
     with _bench(name, arguments) as bench, progress() as update:

@@ -13,7 +13,7 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, JSON, show
+from hmsa_ros.cli.options import add_command, assume_example, JSON, show
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.files import check_targets, write_text
 from hmsa_ros.table import Column, Table
@@ -29,7 +29,7 @@ def add_parser(subparsers: Any) -> None:
         subparsers, __name__, __doc__,
         ('--params-file', 'YAML', Path,
          'parameter file with estimates of the block, flux_density_min, flux_density_max and '
-         'slew_limit (default: the defaults of the nodes)'),
+         'slew_limit (default: the example block)'),
         ('--duration', 'S', float, 'duration in s (default 180 periods of the block)'),
         ('--free', 'NAME,...', str, 'parameters to identify, as in hmsa identify',
          {'default': ''}),
@@ -54,6 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     check_targets(arguments.out, sources=[arguments.params_file])
     belief = read_belief(arguments.params_file)
+    if arguments.params_file is None:
+        assume_example()
     with progress('designing the sequence'):
         found = excite(
             belief.actuator, Bounds.of(belief, arguments.stretch_min, arguments.stretch_max),

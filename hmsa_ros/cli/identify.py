@@ -87,12 +87,13 @@ def run(arguments: argparse.Namespace) -> int:
     if both := [x for x in known if x in named]:
         raise BadInputError(f'{both[0]} is free and known: expected it in --free or in --known')
     with progress('reading') as update:
-        recording, belief = _read(arguments, belief)
+        recording, belief, given = _read(arguments, belief)
         belief = replace(belief, others={**belief.others, **known})
         update('fitting', None)
         found = identify(
             recording, free=free_of(arguments.free, belief.actuator.law, known),
-            actuator=belief.actuator, known=belief.others, uncertain=uncertain)
+            actuator=belief.actuator if given else None, known=belief.others,
+            uncertain=uncertain)
         curve = profile(found, arguments.profile) if arguments.profile else []
     identified = found.verdict == 'identified'
     good = identified or arguments.accept and found.acceptable
@@ -145,8 +146,8 @@ def known_of(text: str) -> tuple[dict[str, float], dict[str, float]]:
 
 
 def _read(
-        arguments: argparse.Namespace, belief: 'Belief') -> 'tuple[Recording, Belief]':
-    """Return the recording, and the prior knowledge with values from the bag."""
+        arguments: argparse.Namespace, belief: 'Belief') -> 'tuple[Recording, Belief, bool]':
+    """Return the recording, prior knowledge with values of a bag, and whether there is any."""
     path: Path = arguments.recording
     if path.is_dir() or path.suffix == '.mcap':
         from hmsa_ros.identification.runs import read_bag
@@ -162,10 +163,11 @@ def _read(
         given = belief.actuator if arguments.params_file is not None else None
         recording, actuator, known = read_bag(path, joint=arguments.joint, actuator=given)
         return recording, replace(
-            belief, actuator=actuator, others={**known, **belief.others})
+            belief, actuator=actuator, others={**known, **belief.others}), True
     from hmsa_ros.identification.tables import read_csv
 
     slew = belief.number('slew_limit', 0.0) or math.inf
     return read_csv(
         path, arguments.commands, slew_limit=slew,
-        coordinate=belief.actuator.coordinate, rest_length=arguments.rest_length), belief
+        coordinate=belief.actuator.coordinate, rest_length=arguments.rest_length
+    ), belief, arguments.params_file is not None

@@ -8,30 +8,46 @@ import warnings
 
 from hmsa_ros.errors import AssumedWarning, printable
 
+_said: list[str] = []
 _shown: list[str] = []
 
 
 @contextmanager
-def notes_shown() -> Iterator[None]:
-    """Show each assumption of the commands within as a line."""
+def collecting(*, at_once: bool) -> Iterator[None]:
+    """Collect the assumptions of a command, to show each as a line, at once or by `show_notes`."""
+    _said.clear()
     _shown.clear()
     with warnings.catch_warnings():
         warnings.simplefilter('always', AssumedWarning)
         other = warnings.showwarning
 
-        def show(
+        def collect(
                 message: Warning | str, category: type[Warning], filename: str, lineno: int,
                 file: TextIO | None = None, line: str | None = None) -> None:
             if not issubclass(category, AssumedWarning):
                 other(message, category, filename, lineno, file, line)
-            elif str(message) not in _shown:
-                _shown.append(str(message))
-                print(f'hmsa: note: {printable(str(message))}', file=sys.stderr)
+                return
+            if str(message) not in _said:
+                _said.append(str(message))
+            if at_once:
+                show_notes()
 
-        warnings.showwarning = show
+        warnings.showwarning = collect
         yield
+
+
+def show_notes() -> None:
+    """Print the assumptions so far: before a run begins, and before results are printed."""
+    for text in _said[len(_shown):]:
+        _shown.append(text)
+        print(f'hmsa: note: {printable(text)}', file=sys.stderr)
+
+
+def unshown() -> list[str]:
+    """Return the assumptions that were not shown."""
+    return _said[len(_shown):]
 
 
 def with_notes(record: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return a record for JSON with the assumptions so far, if any, added to its notes."""
-    return {**record, 'notes': [*record.get('notes', ()), *_shown]} if _shown else record
+    return {**record, 'notes': [*record.get('notes', ()), *_said]} if _said else record

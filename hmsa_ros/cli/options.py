@@ -4,9 +4,12 @@ import argparse
 from collections.abc import Callable, Iterable
 import inspect
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TYPE_CHECKING, TypeVar
 
-from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.errors import assume, BadInputError, excerpt
+
+if TYPE_CHECKING:
+    from hmsa_ros.api.actuator import Actuator
 
 T = TypeVar('T')
 #: Names, metavar, type, help and any further settings of argparse; for a flag, name and help; for
@@ -87,6 +90,29 @@ def of_unit(option: str, unit: str, text: str) -> Row:
     return option, 'X', argument(read), f'{text} [{unit}]'
 
 
+def actuator_of(path: Path | None) -> 'Actuator':
+    """Return the actuator of a parameter file, or the example block, which is said."""
+    from hmsa_ros.api.actuator import Actuator
+
+    if path is not None:
+        return Actuator.from_yaml(path)
+    assume_example()
+    return Actuator()
+
+
+def assume_example() -> None:
+    """State that a command without a parameter file assumes the example block."""
+    from hmsa_ros.model.parameters import paper_actuator
+
+    block = paper_actuator()
+    assume(
+        'without --params-file the actuator is the example block: '
+        f'{2e3 * block.half_length:g} mm x {2e3 * block.half_length:g} mm x '
+        f'{2e3 * block.half_thickness:g} mm, shear modulus {1e-3 * block.shear_modulus:g} kPa, '
+        f'remanence {1e3 * block.remanence:g} mT, natural frequency about '
+        f'{1.0 / block.period:.3g} Hz')
+
+
 def timeout_of(arguments: argparse.Namespace) -> float:
     """Return the time limit in s; raise `BadInputError` if invalid."""
     timeout: float = arguments.timeout
@@ -140,9 +166,10 @@ def show(
         arguments: argparse.Namespace, record: dict[str, Any], *lines: object,
         written: Iterable[Path | None] = ()) -> int:
     """Print a result as JSON with --json, otherwise as lines with the files written; return 0."""
-    from hmsa_ros.cli.notes import with_notes
+    from hmsa_ros.cli.notes import show_notes, with_notes
     from hmsa_ros.files import json_text
 
+    show_notes()
     for line in [json_text(with_notes(record))] if arguments.json else [
             *lines, *(f'{x} written' for x in written if x is not None)]:
         print(line)

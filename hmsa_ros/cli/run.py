@@ -17,8 +17,8 @@ from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.notes import with_notes
-from hmsa_ros.cli.options import add_command, JOINTS, NAMESPACE
+from hmsa_ros.cli.notes import show_notes, with_notes
+from hmsa_ros.cli.options import add_command, assume_example, JOINTS, NAMESPACE
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import SEQUENCE, sequence_of
 from hmsa_ros.ending import ENDING
@@ -77,6 +77,8 @@ def run(arguments: argparse.Namespace) -> int:
     folder = arguments.out or dated('hmsa_run')
     if arguments.simulate:
         stay_local()
+        if arguments.params_file is None:
+            assume_example()
     from hmsa_ros.lab.experiment import prepare
 
     # Each repeat has its own folder.
@@ -86,6 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
     for x in folders:
         prepare(x)
     ENDING.note()
+    show_notes()
     records, each = [], []
     for experiment in experiments:
         try:

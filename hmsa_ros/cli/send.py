@@ -11,6 +11,7 @@ import argparse
 import sys
 from typing import Any
 
+from hmsa_ros.cli.notes import show_notes
 from hmsa_ros.cli.options import add_command, JOINTS, NAMESPACE, timeout_of
 from hmsa_ros.cli.setpoints import SEQUENCE, sequence_of
 from hmsa_ros.ending import ENDING
@@ -40,6 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     timeout = timeout_of(arguments)
     levels, path = sequence_of(arguments)
     ENDING.note()
+    show_notes()
     with PlannerClient(
             namespace=arguments.namespace, joints=arguments.joint.split(','),
             timeout=timeout) as client:

@@ -13,7 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from hmsa_ros.cli.options import add_command, EXAMPLE, JSON, show
+from hmsa_ros.cli.options import actuator_of, add_command, EXAMPLE, JSON, show
 from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
 
@@ -44,10 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     paper = paper_of(
         arguments, *(() if out is None else (out, levels_beside(out))),
         sources=(arguments.levels, arguments.params_file))
-    from hmsa_ros.api.actuator import Actuator
-
-    actuator = Actuator() if arguments.params_file is None else Actuator.from_yaml(
-        arguments.params_file)
+    actuator = actuator_of(arguments.params_file)
     with progress('simulating'):
         motion = actuator.simulate(arguments.levels, **{
             x: getattr(arguments, x) for x in ('until', 'start', 'rate', 'noise', 'seed')})

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.identify import known_of
-from hmsa_ros.cli.options import add_command, argument, NAMESPACE, show
+from hmsa_ros.cli.notes import show_notes
+from hmsa_ros.cli.options import add_command, argument, assume_example, NAMESPACE, show
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import setpoint_of_joints
 from hmsa_ros.ending import ENDING
@@ -37,7 +38,7 @@ def add_parser(subparsers: Any) -> None:
         ('--simulate', 'start a planner and a plant for each run, in simulated time'),
         ('--params-file', 'YAML', Path,
          'parameter file with known values (default: the parameters of the running planner, or '
-         'the defaults with --simulate)'),
+         'the example block with --simulate)'),
         ('--duration', 'S', float,
          'duration of the excitation in s (default 180 periods of the actuator)'),
         ('--stretch-min', 'X', float,
@@ -75,12 +76,15 @@ def run(arguments: argparse.Namespace) -> int:
     folder = arguments.folder or dated('hmsa_tune')
     if arguments.simulate:
         stay_local()
+        if arguments.params_file is None:
+            assume_example()
     from hmsa_ros.lab.experiment import prepare
     from hmsa_ros.lab.tuning import tune, Tuning
 
     prepare(folder)
     ENDING.note()
     entries, node = _nodes(arguments)
+    show_notes()
     tuning = Tuning(
         folder, tuple(arguments.setpoints), arguments.out or folder / 'actuator.yaml', entries,
         node, arguments.namespace, arguments.duration, arguments.stretch_min,

@@ -13,7 +13,8 @@ import argparse
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, EXAMPLE, JSON, show
+from hmsa_ros.cli.notes import show_notes
+from hmsa_ros.cli.options import actuator_of, add_command, EXAMPLE, JSON, show
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import check_targets
 
@@ -44,8 +45,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the possible range, plan and write; raise `BadInputError` for an invalid wave."""
-    from hmsa_ros.api.actuator import Actuator
-    from hmsa_ros.api.paths import read_path, SHAPES
+    from hmsa_ros.api.paths import bands_text, read_path, SHAPES
 
     if (arguments.shape == 'sweep') != (arguments.to is not None):
         raise BadInputError(
@@ -53,8 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
             'sweep, and with no other shape')
     check_targets(
         arguments.out, arguments.path, sources=(Path(arguments.shape), arguments.params_file))
-    actuator = Actuator() if arguments.params_file is None else Actuator.from_yaml(
-        arguments.params_file)
+    actuator = actuator_of(arguments.params_file)
     shape: Any = arguments.shape
     if shape.lower().endswith('.csv') or (
             shape not in (*SHAPES, 'sweep') and Path(shape).is_dir()):
@@ -66,8 +65,9 @@ def run(arguments: argparse.Namespace) -> int:
         _write_path(arguments, actuator, shape)
     bands = actuator.wave_bands(shape, arguments.amplitude, arguments.offset)
     if not arguments.json:
-        print(f'an amplitude of {arguments.amplitude:g} is possible at '
-              + (', '.join(f'{x:.4g} to {y:.4g} Hz' for x, y in bands) or 'no frequency'))
+        show_notes()
+        print(f'an amplitude of {arguments.amplitude:g} is possible '
+              + (bands_text(bands) or 'at no frequency'))
     plan = actuator.wave(
         shape, arguments.frequency, arguments.amplitude, offset=arguments.offset,
         cycles=arguments.cycles, last=arguments.to)

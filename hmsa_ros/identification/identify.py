@@ -61,6 +61,7 @@ def identify(
         If the data or the names cannot be used, or the motion is that of no elastomer.
 
     """
+    notes = [] if actuator is not None else [_defaults(free, known or {})]
     actuator = actuator or paper_actuator()
     if recording.coordinate != actuator.coordinate:
         raise BadInputError(
@@ -87,8 +88,8 @@ def identify(
         # Infinite J_lim is no start value: the derivative is by its inverse.
         values['chain_limit'] = min(values['chain_limit'], 1e9)
     at_rest = begins_at_rest(recording) and not {'initial_stretch', 'initial_rate'} & set(free)
-    if at_rest != recording.at_rest:
-        recording = replace(recording, at_rest=at_rest)
+    recording = replace(
+        recording, at_rest=at_rest, notes=(*recording.notes, *filter(None, notes)))
     if not at_rest:
         values['initial_stretch'] = float(np.median(recording.stretch[:3]))
         free = tuple(dict.fromkeys((*free, 'initial_stretch', 'initial_rate')))
@@ -101,6 +102,19 @@ def identify(
     return _conclude(
         *_with_errors_of_stamps(best), others, tried, agreed,
         {**dict.fromkeys(known), **uncertain})
+
+
+def _defaults(free: Collection[str], known: Collection[str]) -> str:
+    """Return a sentence about the values that are those of the example block."""
+    own = paper_actuator().numbers
+    taken = [x for x in ('half_length', 'half_thickness', *own) if x not in free and x not in known
+             and not (x == 'density' and 'time_unit' in {*free, *known})]
+    taken = list(dict.fromkeys(taken))
+    return taken and (
+        f'{", ".join(taken)} {"are" if len(taken) > 1 else "is"} not given: '
+        + ', '.join(f'{own[x]:g} {quantities.QUANTITIES[x].unit}'.rstrip() for x in taken)
+        + ' of the example block; a parameter file (--params-file) or known values (--known) '
+        'give those of yours') or ''
 
 
 def _check_uncertain(uncertain: Mapping[str, float], free: Sequence[str]) -> None:

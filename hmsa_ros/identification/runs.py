@@ -50,6 +50,10 @@ def recording_of(
     keep = np.append(np.diff(stamps) > 0.0, True)
     notes = () if actuator is not None else tuple(
         x.rstrip('.') for x in run.notes if 'unshaped steps' not in x)
+    if actuator is None and not run.parameters_known:
+        notes += (
+            "the recording does not contain the actuator's parameters: what is not identified is "
+            'that of the example block; name a parameter file (--params-file)',)
     return (
         Recording(
             (run.time - zero) / NANOSECONDS, run.stretch, stamps[keep], fields[keep],

@@ -1,0 +1,73 @@
+"""Assumptions of commands: which actuator stands in for one that was not named."""
+
+import json
+
+import pytest
+
+import hmsa_ros
+from hmsa_ros.cli import main
+
+NOTE = 'hmsa: note: without --params-file the actuator is the example block: 20 mm x 20 mm x 20 mm'
+COMMANDS = {
+    'simulate': ['simulate', 'levels.csv'],
+    'wave': ['wave', 'sine', '--frequency', '30', '--amplitude', '0.05', '--cycles', '1'],
+    'excite': ['excite', '--duration', '0.2']}
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Return a folder with levels and parameters, which is the working directory."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'levels.csv').write_text('time,flux_density\n0,0.01\n0.1,0\n', encoding='utf-8')
+    (tmp_path / 'block.yaml').write_text(
+        '/**: {ros__parameters: {actuator.half_length: 0.01}}\n', encoding='utf-8')
+    return tmp_path
+
+
+@pytest.mark.parametrize('words', COMMANDS.values(), ids=COMMANDS)
+def test_a_command_without_a_file_says_once_that_it_takes_the_example(here, capsys, words):
+    assert main([*words, '--json']) == 0
+    out, err = capsys.readouterr()
+    assert err.startswith(NOTE)
+    assert err.count('\n') == 1
+    assert err.strip().removeprefix('hmsa: note: ') in json.loads(out)['notes']
+    assert main([*words, '--params-file', 'block.yaml']) == 0
+    assert capsys.readouterr().err == ''
+
+
+def test_bad_input_is_one_line_and_a_refusal_names_the_assumption(here, capsys):
+    assert main(['simulate', 'levels.csv', '--noise', '-1']) == 2
+    assert capsys.readouterr().err == (
+        'hmsa: error: noise is -1: expected a finite number of at least 0\n')
+    assert main([*COMMANDS['wave'], '--frequency', '3000', '--json']) == 2
+    err = capsys.readouterr().err
+    assert err.startswith('hmsa: error: an amplitude of 0.05')
+    assert err.count('\n') == 1
+    assert '; note: without --params-file the actuator is the example block' in err
+
+
+def test_a_plan_without_dimensions_assumes_nothing(here, capsys):
+    assert main(['plan', '1.1:10']) == 0
+    assert capsys.readouterr().err == ''
+
+
+def test_an_identification_says_which_values_are_those_of_the_example(here, capsys):
+    assert main(['simulate', 'levels.csv', '--params-file', 'block.yaml', '--until', '0.3',
+                 '--noise', '1e-4', '--out', 'samples.csv']) == 0
+    words = ['identify', 'samples.csv', '--commands', 'levels.csv', '--json']
+    found = []
+    for more in ([], ['--known', 'half_length=1cm,half_thickness=1cm,density=1900'],
+                 ['--params-file', 'block.yaml'], ['--known', 'half_length=1cm']):
+        capsys.readouterr()
+        main([*words, *more])
+        found.append([x for x in json.loads(capsys.readouterr().out)['warnings']
+                      if 'example block' in x])
+    assert [len(x) for x in found] == [1, 0, 0, 1]
+    assert found[0][0].startswith(
+        'half_length, half_thickness, density are not given: 0.01 m, 0.01 m, 1900 kg/m^3 of the '
+        'example block')
+    assert found[3][0].startswith('half_thickness, density are not given')
+    found = hmsa_ros.identify('samples.csv', 'levels.csv')
+    assert any('example block' in x for x in found.result.warnings)
+    found = hmsa_ros.identify('samples.csv', 'levels.csv', actuator=hmsa_ros.Actuator())
+    assert not any('example block' in x for x in found.result.warnings)
