@@ -1,4 +1,4 @@
-"""Assumptions of a command, each shown once: a line on standard error, and a note in its JSON."""
+"""Assumptions and doubts of a command, each once: a line, and a note in its JSON."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -6,8 +6,9 @@ import sys
 from typing import Any, TextIO
 import warnings
 
-from hmsa_ros.errors import AssumedWarning, printable
+from hmsa_ros.errors import AssumedWarning, printable, UnusualWarning
 
+_KINDS = AssumedWarning, UnusualWarning
 _said: list[str] = []
 _shown: list[str] = []
 
@@ -18,13 +19,14 @@ def collecting(*, at_once: bool) -> Iterator[None]:
     _said.clear()
     _shown.clear()
     with warnings.catch_warnings():
-        warnings.simplefilter('always', AssumedWarning)
+        for kind in _KINDS:
+            warnings.simplefilter('always', kind)
         other = warnings.showwarning
 
         def collect(
                 message: Warning | str, category: type[Warning], filename: str, lineno: int,
                 file: TextIO | None = None, line: str | None = None) -> None:
-            if not issubclass(category, AssumedWarning):
+            if not issubclass(category, _KINDS):
                 other(message, category, filename, lineno, file, line)
                 return
             if str(message) not in _said:
