@@ -202,5 +202,5 @@ def test_a_parameter_file_of_a_beam_plans_its_deflection_to_both_sides(tmp_path,
             (['--youngs-modulus', '1MPa'], 'both --shear-modulus and --youngs-modulus')):
         assert main([*words, *wrong, '--force']) == 2
         assert said in capsys.readouterr().err
-    assert main(['init', '--length', '25mm', '--yes', '--out', str(tmp_path / 'x.yaml')]) == 2
+    assert main(['init', '--width', '5mm', '--yes', '--out', str(tmp_path / 'x.yaml')]) == 2
     assert 'expected --beam with it' in capsys.readouterr().err

@@ -178,11 +178,38 @@ def test_json_says_everything_there_is(run, tmp_path):
     # A cube, unless told.
     assert made['parameters']['actuator.half_thickness'] == 2e-3
     assert made['scales']['duration'] == pytest.approx(0.005735 / 5, rel=1e-3)
-    # Nobody said how the elastomer damps.
-    assert [x.split(' are guesses')[0] for x in made['warnings']] == ['zeta 0.2 and j lim 5']
+    assert [x.split(' are guesses')[0] for x in made['warnings']] == [
+        'half thickness 0.002 m, as the half length; shear modulus 10000 Pa; density 1900 '
+        'kg/m^3; remanence 0.1 T; j lim 5; zeta 0.2; flux max 0.5 T']
     text = (tmp_path / 'actuator.yaml').read_text()
     assert parameters(tmp_path / 'actuator.yaml')['joints'] == ['left', 'right']
     assert '# left.actuator.remanence: 0.1\n' in text
+
+
+def test_a_guess_is_marked_in_the_file_and_what_is_given_is_not(run, tmp_path):
+    status, _, err = run('--yes', *(x for i in range(0, len(OWN), 2) if OWN[i] != '--density'
+                                   for x in OWN[i:i + 2]))
+    assert status == 0
+    assert 'warning: density 1900 kg/m^3 is a guess' in err
+    text = (tmp_path / 'actuator.yaml').read_text()
+    assert text.count('a guess') == 1
+    assert '# Density rho [kg/m^3], a guess.\n    actuator.density: 1900.0\n' in text
+
+
+@pytest.mark.parametrize('sizes', [
+    ('--half-length', '10mm', '--thickness', '1mm'), ('--length', '20mm', '--thickness', '1mm'),
+    ('--length', '2cm', '--half-thickness', '0.5mm')])
+def test_full_sizes_of_a_block_are_twice_the_half_ones(run, tmp_path, sizes):
+    assert run('--yes', *sizes)[0] == 0
+    found = parameters(tmp_path / 'actuator.yaml')
+    assert (found['actuator.half_length'], found['actuator.half_thickness']) == (0.01, 0.0005)
+
+
+@pytest.mark.parametrize('size', ['length', 'thickness'])
+def test_a_size_is_given_once(run, size):
+    status, _, err = run('--yes', f'--{size}', '1mm', f'--half-{size}', '1mm')
+    assert status == 2
+    assert f'both --{size} and --half-{size} are given: expected one of them' in err
 
 
 def test_every_number_is_a_float_to_every_reader_of_yaml(run, tmp_path):

@@ -11,7 +11,7 @@ example: hmsa init --half-length 5mm --half-thickness 5mm --density 1.9g/cm3 \
 """
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 import math
 from pathlib import Path
@@ -57,8 +57,8 @@ _ARGUMENTS = {'j_lim': 'chain_limit', 'damping': 'damping_coefficient'}
 _DAMPED = ('zeta', 'damping_ratio')
 _FILE = Path('actuator.yaml')
 _FOLLOWS = {'half_thickness': 'as --half-length', 'flux_min': 'minus --flux-max'}
-# Quantities that vary between elastomers and are missing in data sheets.
-_GUESSES = ('zeta', 'j_lim', 'damping_ratio')
+# Full sizes, of a beam or a block, and the quantities of a block whose doubles they are.
+_FULL = {'length': 'half_length', 'thickness': 'half_thickness'}
 # Sample rate in Hz that one plant sustains, together with its planner, on two cores.
 _KEPT_UP = 4000.0
 
@@ -89,6 +89,8 @@ def _option(quantity: Quantity) -> Row:
         if quantity not in QUANTITIES:
             note += ', with ' + ' or '.join(
                 f'--{x}' for x in _OF_THEIR_OWN if quantity.key in {y.key for y in FORMS[x]})
+        if quantity.key in _FULL:
+            note += f'; of a block, twice --{_FULL[quantity.key].replace("_", "-")}'
     unit = f' [{quantity.unit}]' if quantity.unit else ''
     return quantity.option, 'X', argument(quantity.parse), f'{quantity.text}{unit}{note}'
 
@@ -103,7 +105,7 @@ def run(arguments: argparse.Namespace) -> int:
     given = _given(arguments, form, asked)
     joints = joint_names(arguments.joint)
     missing = [x for x in asked if x.key not in OPTIONAL and not _known(x.key, given)]
-    guessed = [x for key in _GUESSES for x in missing if x.key == key and arguments.yes]
+    guessed = missing if arguments.yes else []
     if missing and not arguments.yes:
         if not sys.stdin.isatty():
             raise BadInputError(
@@ -123,10 +125,11 @@ def run(arguments: argparse.Namespace) -> int:
     given.setdefault('shear_modulus', made.block.shear_modulus)
     doubts = doubts_of(made)
     if guessed:
+        shown = [f'{x.words} {x.show(given[x.key])}' + (
+            ', as the half length' if x.key == 'half_thickness' else '') for x in guessed]
         doubts.append(
-            f'{" and ".join(f"{x.words} {given[x.key]:g}" for x in guessed)} '
-            f'{"is a guess" if len(guessed) == 1 else "are guesses"}: a plan is only as exact '
-            'as its parameters; measure them and pass the values')
+            f'{"; ".join(shown)} {"is a guess" if len(guessed) == 1 else "are guesses"}: a plan '
+            'is only as exact as its parameters; measure them and pass the values')
     joints = joints or [_JOINT]
     parameters = _parameters(made)
     table = [f'{name:<26} {value}' for name, value in facts(found, made.block)]
@@ -135,7 +138,8 @@ def run(arguments: argparse.Namespace) -> int:
         *(f'#   hmsa {x} --ros-args --params-file {quote(path.name)}' for x in _NODES),
         '#', '# What follows from them (computed by hmsa init when it wrote this file):',
         *(f'#   {line}' for line in table), '/**:', '  ros__parameters:',
-        *_lines(form, parameters), *_joints(joints, made.block), *_sampling(made.block)]) + '\n')
+        *_lines(form, parameters, {x.parameter or DAMPING.parameter for x in guessed}),
+        *_joints(joints, made.block), *_sampling(made.block)]) + '\n')
     for doubt in doubts:
         print(f'hmsa: warning: {doubt}', file=sys.stderr)
     return show(
@@ -169,6 +173,12 @@ def _given(
     """Return the values of the options, after checking their combination."""
     given = {x.key: value for x in (*EVERY, DAMPING)
              if (value := getattr(arguments, x.key)) is not None}
+    for full, half in _FULL.items() if form == 'block' else ():
+        if full in given and half in given:
+            raise BadInputError(
+                f'both --{full} and --{half.replace("_", "-")} are given: expected one of them')
+        if full in given:
+            given[half] = 0.5 * given.pop(full)
     for key in _DAMPED:
         if key in given and DAMPING.key in given:
             raise BadInputError(
@@ -263,8 +273,8 @@ def _actuator(form: str, given: Mapping[str, float], law: str | None) -> 'Actuat
         return (Actuator.beam if form == 'beam' else Actuator)(**values)
 
 
-def _lines(form: str, parameters: Mapping[str, Any]) -> list[str]:
-    """Return the nodes' parameters in YAML, each below its description."""
+def _lines(form: str, parameters: Mapping[str, Any], guessed: Collection[str]) -> list[str]:
+    """Return the nodes' parameters in YAML, each below its description, which marks guesses."""
     texts = {x.name: (x.description.rstrip('.'), x.unit) for x in LAW} | {
         x.parameter: (x.text, x.unit) for x in (*QUANTITIES, DAMPING)}
     if form == 'beam':
@@ -276,7 +286,8 @@ def _lines(form: str, parameters: Mapping[str, Any]) -> list[str]:
     lines = []
     for name, value in parameters.items():
         text, unit = texts[name]
-        lines += [f'    # {text[0].upper()}{text[1:]}{f" [{unit}]" if unit else ""}.',
+        lines += [f'    # {text[0].upper()}{text[1:]}{f" [{unit}]" if unit else ""}'
+                  f'{", a guess" if name in guessed else ""}.',
                   f'    {name}: {yaml_text(value)}']
     return lines
 
