@@ -153,7 +153,7 @@ class ManagedNode(LifecycleNode):
     @property
     def simulated(self) -> bool:
         """Whether the node follows simulated time."""
-        return bool(self._time_source.ros_time_is_active)
+        return bool(self.get_clock().ros_time_is_active)
 
     def now(self) -> int:
         """Return the node's time in ns."""

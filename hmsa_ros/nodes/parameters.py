@@ -212,7 +212,7 @@ def unknown(node: Node, name: str, others: Iterable[str] = ()) -> BadInputError:
     """Return the error of an unknown name, with the closest one of the node or ``others``."""
     # The name may come from any participant, and comparing a long one would take seconds.
     name = name[:_LONGEST_NAME]
-    near = difflib.get_close_matches(name, [*node._parameters, *others], 1, 0.0)
+    near = difflib.get_close_matches(name, [*node.get_parameters_by_prefix(''), *others], 1, 0.0)
     return BadInputError(
         f'parameter {name} does not exist: expected one of the {node.get_name()}, such as '
         f'{near[0]}')
