@@ -10,6 +10,7 @@ import subprocess
 import sys
 
 import pytest
+from test_driver_node import TUTORIALS
 from test_package_imports import BLOCKED, run
 
 from hmsa_ros.errors import BadInputError
@@ -70,6 +71,15 @@ def test_who_knows_the_address_gets_the_page_and_nobody_may_read_frame_or_keep_i
         assert 'unsafe' not in policy or 'sandbox' in policy.split()[0]
         assert 'allow-same-origin' not in policy
         assert not [x for x in found if x.lower().startswith('access-control')]
+
+
+def test_the_page_says_what_stop_leaves_on_and_what_the_emergency_stop_is(server):
+    page = ask(server, f'/{server.token}/')[2].decode()
+    assert 'Stop comes to rest without vibration; the field stays on.' in page
+    assert 'id="coil"' in page
+    script = ask(server, f'/{server.token}/panel.js')[2].decode()
+    assert 'The emergency stop is the interlock of a driver (~/interlock)' in script
+    assert 'Coil off opens the interlock of the driver' in script
 
 
 def test_the_page_has_no_script_or_style_of_its_own_and_asks_nobody_else(server):
@@ -155,9 +165,11 @@ def test_garbage_is_passed_over_and_a_flood_does_not_keep_stop_waiting(server, w
         for _ in range(200):
             await page.write_message('{"do": "send", "setpoints": "1.1:1"}')
         assert not server.stop.is_set()
-        await page.write_message('{"do": "stop"}')
-        while not server.stop.is_set():
-            await asyncio.sleep(0.01)
+        assert not server.coil_off.is_set()
+        for word, event in (('stop', server.stop), ('coil_off', server.coil_off)):
+            await page.write_message(json.dumps({'do': word}))
+            while not event.is_set():
+                await asyncio.sleep(0.01)
         await page.write_message('x' * 5000)
         assert await page.read_message() is None
         page.close()
@@ -165,6 +177,7 @@ def test_garbage_is_passed_over_and_a_flood_does_not_keep_stop_waiting(server, w
     asyncio.run(asyncio.wait_for(attack(), WAIT_SECONDS))
     assert server.commands.full()
     server.stop.clear()
+    server.coil_off.clear()
     wait_until(lambda: not server.pages)
 
 
@@ -319,3 +332,61 @@ def test_without_stop_on_close_a_sequence_goes_on_to_its_planned_rest(panel):
 
     play(scenario())
     assert process.stop(signal.SIGTERM) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.ros
+def test_coil_off_opens_the_interlock_of_a_driver_until_the_panel_closes_it(start, tmp_path):
+    start.hmsa('driver', '--ros-args', '-p', 'hardware:=hardware:Bench',
+               '-p', 'publish_rate:=500.0', PYTHONPATH=str(TUTORIALS))
+    start.hmsa('planner', '--ros-args', '-p', 'lead_time:=0.5')
+    process = start.hmsa('panel', '--out', tmp_path)
+    address = re.search(r'http\S+', process.wait_for_output('/\n'))[0]
+
+    def flux(frame):
+        return frame['joints'][0]['flux_density'] if frame['joints'] else None
+
+    async def scenario():
+        page = await opened(address)
+        await page.until(lambda x: x['interlock']['present'])
+        await page.send(do='send', setpoints='1.1:600')
+        await page.until(lambda x: x['request']['state'] == 'at_rest' and flux(x))
+        # A stop holds the field; the interlock does not.
+        await page.send(do='stop')
+        await page.until(lambda x: x['stopping'])
+        await page.until(lambda x: not x['stopping'])
+        seen = await page.state('at_rest')
+        assert flux(seen) > 0.0
+        await page.send(do='coil_off')
+        seen = await page.until(lambda x: flux(x) == 0.0)
+        assert seen['interlock'] == {'present': True, 'closed': False}
+        assert 'interlock opened' in seen['note']['text']
+        await page.send(do='send', setpoints='1.1:1')
+        await page.until(lambda x: x['request']['code'] == 'interlock')
+        # The next panel can close what this one has left open.
+        await page.close()
+
+    play(scenario())
+    assert process.stop(signal.SIGINT) == 0
+    process = start.hmsa('panel', '--out', tmp_path)
+    address = re.search(r'http\S+', process.wait_for_output('/\n'))[0]
+
+    async def again():
+        page = await opened(address)
+        await page.until(lambda x: x['interlock']['present'])
+        await page.send(do='send', setpoints='1.1:1')
+        await page.until(lambda x: x['request']['code'] == 'interlock')
+        await page.send(do='close_interlock')
+        await page.until(lambda x: x['interlock']['closed'])
+        while True:
+            await page.send(do='send', setpoints='1.1:600')
+            seen = await page.until(lambda x: x['note']['text'].startswith('sent'))
+            # Refused for another second, at least.
+            if seen['request']['code'] == 'accepted':
+                break
+            await asyncio.sleep(0.2)
+        await page.until(flux)
+        await page.close()
+
+    play(again())
+    assert process.stop(signal.SIGINT) == 0

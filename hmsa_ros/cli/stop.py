@@ -2,7 +2,8 @@
 Drop the rest of the sequence and come to rest without vibration.
 
 Call the service ~/stop of the running planner: it drops the rest of its sequence and brings the
-actuators to rest without vibration. Return when they are at rest.
+actuators to rest without vibration. Return when they are at rest. The field stays on: in an
+emergency, open the interlock of the driver (topic driver/interlock), or switch the amplifier off.
 
 example: hmsa stop
 """

@@ -24,6 +24,7 @@ from hmsa_ros.interfaces.status import real, texts
 from hmsa_ros.lab.client import PlannerClient
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.service_call import ServiceCall
+from hmsa_ros.panel.interlock import InterlockSwitch
 from hmsa_ros.panel.recording import Recording
 from hmsa_ros.panel.server import Server
 from hmsa_ros.watch.listener import Listener
@@ -72,6 +73,7 @@ class Desk:
             GetParameters.Request(names=['feedback', 'use_sim_time']))
         self._set: ServiceCall | None = None
         endpoints.subscribe(node, topics.ESTIMATE, self._on_estimate, topics.PLANNER)
+        self._interlock = InterlockSwitch(node)
         self._recording = Recording(out, namespace, joints)
         self._estimates: dict[str, dict[str, Any]] = {}
         self._known: Mapping[str, Any] = {}
@@ -105,6 +107,10 @@ class Desk:
             self._received = True
             self._notify('the planner did not reply to the request: send it again', 2)
         self._look_at_pages(now)
+        if self._server.coil_off.is_set():
+            self._server.coil_off.clear()
+            self._open_interlock(now)
+        self._interlock.repeat(now)
         if self._server.stop.is_set():
             self._server.stop.clear()
             self._begin_stop(now)
@@ -165,6 +171,14 @@ class Desk:
             self._stopping = -math.inf
             self._notify('the planner does not answer the stop: check the coil', 2)
 
+    def _open_interlock(self, now: float) -> None:
+        """Have the driver switch the coil off; its status says when."""
+        self._interlock.turn(now, closed=False)
+        self._notify(*(
+            ('interlock opened: the driver switches the coil off and keeps it off until the '
+             'interlock is closed', 1) if self._interlock.present else
+            ('no driver listens to the interlock: switch the amplifier off', 2)))
+
     # -- commands ------------------------------------------------------------------------------
 
     def _carry_out(self, command: Mapping[str, Any], now: float) -> None:
@@ -174,6 +188,9 @@ class Desk:
                     self._send(words, now)
                 case {'do': 'feedback', 'mode': str(mode)} if mode in MODES:
                     self._set_feedback(mode)
+                case {'do': 'close_interlock'}:
+                    self._interlock.turn(now, closed=True)
+                    self._notify('interlock closed by the panel: send a new request')
                 case {'do': 'record', 'on': True}:
                     self._recording.start(bool(self._known.get('use_sim_time')))
                     self._notify('recording')
@@ -263,7 +280,8 @@ class Desk:
                 'state': recording.state, 'bag': str(recording.bag or ''),
                 'seconds': now - recording.since if recording.state == 'on' else None,
                 'reports': list(reports)},
-            'stopping': self._stopping > -math.inf, 'note': self._note}
+            'stopping': self._stopping > -math.inf, 'note': self._note,
+            'interlock': {'present': self._interlock.present, 'closed': self._interlock.closed}}
 
 
 def _tail(history: History, now: float, count: int) -> list[list[float]]:

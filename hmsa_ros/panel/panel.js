@@ -81,11 +81,21 @@ function show() {
     put($('note'), frame.note.text);
   }
   put($('stop'), frame.stopping ? 'Stopping' : 'Stop');
+  interlock();
   $('waiting').hidden = !frame.waiting.length;
   list($('waiting'), frame.waiting, () => make('li'), put);
   status();
   list($('joints'), frame.joints, () => $('joint').content.cloneNode(true).firstElementChild, joint);
   controls();
+}
+
+function interlock() {
+  const {present, closed} = frame.interlock, open = closed === false;
+  $('coil').hidden = !present;
+  $('close').hidden = !(present && (open || frame.request?.code === 'interlock'));
+  put($('emergency'), present
+    ? 'In an emergency, Coil off opens the interlock of the driver; a switch in the supply of the amplifier is safer.'
+    : 'The emergency stop is the interlock of a driver (~/interlock); no driver listens now.');
 }
 
 function status() {
@@ -273,6 +283,8 @@ function fill(item, [name, value, deviation, given]) {
 // Controls ------------------------------------------------------------------------------------
 
 $('stop').onclick = () => send({do: 'stop'});
+$('coil').onclick = () => send({do: 'coil_off'});
+$('close').onclick = () => send({do: 'close_interlock'});
 addEventListener('keydown', event => { if (event.key === 'Escape') send({do: 'stop'}); });
 $('move').onsubmit = event => {
   event.preventDefault();

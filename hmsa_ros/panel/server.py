@@ -52,8 +52,8 @@ class Server:
     A server in a separate thread; a context manager.
 
     ``frame`` is the text sent to the pages when it changes. ``reports`` contains the reports of
-    recordings by name. Commands of the pages wait in ``commands``, except that ``stop`` is set
-    immediately.
+    recordings by name. Commands of the pages wait in ``commands``, except that ``stop`` and
+    ``coil_off`` are set immediately.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class Server:
         self.frame = ''
         self.reports: dict[str, Path] = {}
         self.commands: Queue[Mapping[str, Any]] = Queue(_MOST)
-        self.stop = threading.Event()
+        self.stop, self.coil_off = threading.Event(), threading.Event()
         #: Open pages.
         self.pages: set[object] = set()
         self._ready = threading.Event()
@@ -127,10 +127,13 @@ class Server:
         with suppress(ValueError, RecursionError, Full):
             command = json.loads(message)
             if isinstance(command, dict):
-                if command.get('do') == 'stop':
-                    self.stop.set()
-                else:
-                    self.commands.put_nowait(command)
+                match command.get('do'):
+                    case 'stop':
+                        self.stop.set()
+                    case 'coil_off':
+                        self.coil_off.set()
+                    case _:
+                        self.commands.put_nowait(command)
 
 
 class _Guarded(RequestHandler):
