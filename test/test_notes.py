@@ -6,6 +6,8 @@ import pytest
 
 import hmsa_ros
 from hmsa_ros.cli import main
+from hmsa_ros.errors import AssumedWarning
+from hmsa_ros.identification.files import read_belief
 
 NOTE = 'hmsa: note: without --params-file the actuator is the example block: 20 mm x 20 mm x 20 mm'
 COMMANDS = {
@@ -44,6 +46,21 @@ def test_bad_input_is_one_line_and_a_refusal_names_the_assumption(here, capsys):
     assert err.startswith('hmsa: error: an amplitude of 0.05')
     assert err.count('\n') == 1
     assert '; note: without --params-file the actuator is the example block' in err
+
+
+def test_a_section_for_another_node_is_not_used_and_said(here, capsys):
+    (here / 'it.yaml').write_text(
+        '/**: {ros__parameters: {actuator.remanence: 0.11}}\n'
+        'planr: {ros__parameters: {actuator.remanence: 0.12}}\n'
+        'left: {plant: {ros__parameters: {actuator.half_length: 0.02}}}\n', encoding='utf-8')
+    for words in (COMMANDS['excite'], ['plan', '1.01:1']):
+        assert main([*words, '--params-file', 'it.yaml']) == 0
+        assert capsys.readouterr().err == (
+            "hmsa: note: it.yaml: its section '/planr' is not used: expected /**, planner, plant "
+            'or driver, the nodes that read parameters of an actuator\n')
+    with pytest.warns(AssumedWarning, match='/planr'):
+        belief = read_belief(here / 'it.yaml')
+    assert (belief.actuator.remanence, belief.actuator.half_length) == (0.11, 0.02)
 
 
 def test_a_plan_without_dimensions_assumes_nothing(here, capsys):

@@ -6,6 +6,8 @@ import math
 from pathlib import Path
 import pkgutil
 import re
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -15,14 +17,16 @@ from rclpy.node import Node
 from rclpy.parameter import get_parameter_value, Parameter, parameter_value_to_python
 import yaml
 
+from hmsa_ros import Actuator
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces.actuator import actuator_from
 from hmsa_ros.interfaces.parameters import ACTUATOR, BLOCK, ParameterSpec
+from hmsa_ros.interfaces.sections import is_for, sections_of
 from hmsa_ros.interfaces.topics import NODES
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 import hmsa_ros.nodes
 from hmsa_ros.nodes import planning, plant
-from hmsa_ros.nodes.parameters import check_names, declare, declare_joints, type_of
+from hmsa_ros.nodes.parameters import check_names, declare, declare_joints, type_of, unread_files
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 
@@ -231,6 +235,41 @@ def test_dump_of_a_node_is_a_file_that_it_takes_again(ros, serve, make_ros, tmp_
 
 
 @pytest.mark.ros
+def test_a_section_is_for_the_nodes_that_ros_gives_it_to(make_ros, tmp_path):
+    file = tmp_path / 'it.yaml'
+    keys = ('/**', '/*', 'planner', '/planner', 'left/planner', '/left/planner', '/*/planner',
+            '/**/planner', '/left/*', '/left/**', '/plan', '/right/planner', '/left/plant')
+    for node, space in (('planner', ''), ('planner', '/left')):
+        given = {}
+        for key in keys:
+            file.write_text(f'{key}:\n  ros__parameters:\n    it: 1\n', encoding='utf-8')
+            side = make_ros(cli_args=[
+                '--ros-args', '-r', f'__node:={node}', '-r', f'__ns:={space or "/"}',
+                '--params-file', str(file)])
+            given[key] = 'it' in side.node._parameter_overrides
+        assert {x: is_for(y, f'{space}/{node}') for x in keys
+                for y, _ in sections_of({x: {'ros__parameters': {'it': 1}}})} == given
+
+
+def test_a_file_without_anything_for_a_node_is_told_with_what_to_write(tmp_path):
+    file = tmp_path / 'it.yaml'
+    file.write_text('left: {planner: {ros__parameters: {lead_time: 0.1}}}\n'
+                    'plant: {ros__parameters: {}}\n', encoding='utf-8')
+    words = ['--ros-args', '--params-file', str(file)]
+    sentence, = unread_files(words, ['/planner'])
+    assert sentence == (
+        f'{file} has no parameters for /planner, which keeps its defaults: its sections are '
+        '/left/planner, /plant, expected /planner: or /**:')
+    assert not [*unread_files(words, ['/left/planner'])]
+    # Planner and plant of one process share a file.
+    assert not [*unread_files(words, ['/planner', '/plant'])]
+    for text in ('/**: {ros__parameters: {lead_time: 0.1}}', ': : :', 'a: &a {b: *a}'):
+        file.write_text(text, encoding='utf-8')
+        assert not [*unread_files(words, ['/planner'])]
+    assert not [*unread_files(['--params-file', str(tmp_path)], ['/planner'])]
+
+
+@pytest.mark.ros
 def test_unquoted_word_that_yaml_reads_as_a_truth_value_is_the_choice(ros, serve, tmp_path):
     file = tmp_path / 'off.yaml'
     file.write_text('/**:\n  ros__parameters:\n    feedback: off\n    viscoelastic.ratio: []\n')
@@ -244,6 +283,32 @@ def test_unquoted_word_that_yaml_reads_as_a_truth_value_is_the_choice(ros, serve
         assert result.successful, result.reason
         assert node.get_parameter('feedback').value == expected
     assert not ros.set_parameters('planner', [Parameter('feedback', value=True)])[0].successful
+
+
+@pytest.mark.ros
+def test_whole_numbers_are_taken_for_numbers(ros, serve, make_ros):
+    serve(PlannerNode)
+    result, = ros.set_parameters('planner', [Parameter('lateness_tolerance', value=1)])
+    assert result.successful
+    read = ros.call(
+        GetParameters, 'planner/get_parameters',
+        GetParameters.Request(names=['lateness_tolerance']))
+    assert parameter_value_to_python(read.values[0]) == 1.0
+    side = make_ros(cli_args=['--ros-args', *(
+        x for y in ('actuator.shear_modulus:=30000', 'lead_time:=1', 'slew_limit:=1e3')
+        for x in ('-p', y))])
+    values = declare(side.node, DECLARED['planner'])
+    found = [values[x] for x in ('actuator.shear_modulus', 'lead_time', 'slew_limit')]
+    assert found == [30000.0, 1.0, 1000.0]
+    assert {type(x) for x in found} == {float}
+
+
+@pytest.mark.parametrize('text', ['30000', '3e4', '3E+4', '3.0e4', '.3e5', '30_000'])
+def test_a_file_of_a_command_has_numbers_as_ros_reads_them(tmp_path, text):
+    file = tmp_path / 'it.yaml'
+    file.write_text(
+        f'/**: {{ros__parameters: {{actuator.shear_modulus: {text}}}}}', encoding='utf-8')
+    assert Actuator.from_yaml(file).shear_modulus == 30000.0
 
 
 @pytest.mark.ros
@@ -281,7 +346,7 @@ def test_value_out_of_range_is_refused_while_running_too(ros, serve):
     ('length:=-1.0', 'parameter length is -1.0: expected float, 0 to 10 m'),
     ('length:=11.0', 'parameter length is 11.0: expected float, 0 to 10 m'),
     ('length:=.nan', 'parameter length is nan: expected float, 0 to 10 m'),
-    ('length:=1', 'parameter length is 1: expected float, 0 to 10 m'),
+    ('length:=11', 'parameter length is 11: expected float, 0 to 10 m'),
     ('length:=long', "parameter length is 'long': expected float, 0 to 10 m"),
     ('count:=-1', 'parameter count is -1: expected int, at least 0'),
     ('count:=1.5', 'parameter count is 1.5: expected int, at least 0'),
@@ -368,3 +433,19 @@ def test_planner_and_plant_describe_the_same_block():
               'coil_time_constant'}
     assert common <= planner.keys() & plant.keys()
     assert all(planner[x] == plant[x] for x in common)
+
+
+@pytest.mark.ros
+def test_the_process_of_a_node_warns_of_a_file_for_others(ros_env, tmp_path):
+    file = tmp_path / 'it.yaml'
+    file.write_text('/left/planner: {ros__parameters: {lead_time: 0.1}}\n', encoding='utf-8')
+    code = (
+        'from rclpy.node import Node\n'
+        'from hmsa_ros.nodes.runner import run\n'
+        "Node.finished = True\nrun(lambda: Node('planner'))\n")
+    for space, warnings in (('/', 1), ('/left', 0)):
+        done = subprocess.run(
+            [sys.executable, '-c', code, '--ros-args', '-r', f'__ns:={space}', '--params-file',
+             str(file)], env=ros_env, capture_output=True, text=True, timeout=60, check=True)
+        assert done.stderr.count('[WARN]') == warnings, done.stderr
+        assert done.stderr.count('has no parameters for /planner, which keeps') == warnings

@@ -7,6 +7,7 @@ Parameters shared by nodes, files and reports: name, default, unit, range and de
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
+import re
 from typing import Any
 
 from hmsa_ros.errors import BadInputError, excerpt
@@ -19,8 +20,14 @@ WORDS = {False: ('off', 'no'), True: ('on', 'yes')}
 Value = bool | int | float | str | list[str] | list[float]
 
 
+# Numbers that PyYAML reads as text, and ROS 2 as numbers.
+_POWER = re.compile(r'[+-]?(\d+\.?\d*|\.\d+)[eE][+-]?\d+', re.ASCII)
+
+
 def number_of(value: object) -> float | None:
     """Return a number as a float; None for other types, NaN and numbers that are too large."""
+    if isinstance(value, str) and _POWER.fullmatch(value):
+        value = float(value)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return None
     try:

@@ -7,11 +7,12 @@ for all joints. If the parameter ``joints`` names them, each joint may override 
 override has no value until it is set.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import difflib
 from importlib import import_module
 import math
+from pathlib import Path
 import re
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -21,17 +22,20 @@ from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.bag.limits import load_yaml
+from hmsa_ros.errors import BadInputError, HmsaError, listed
+from hmsa_ros.files import read_at_most
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.actuator import completed
 from hmsa_ros.interfaces.parameters import FIXED, JOINT, LAW, ParameterSpec, present_name
+from hmsa_ros.interfaces.sections import is_for, sections_of
 
+# A parameter file that is larger is not looked at again.
+_LARGEST_FILE = 1 << 20
 # Characters of an unknown name that are compared and reported.
 _LONGEST_NAME = 200
 # Names written by earlier versions of hmsa identify.
 _ONCE = {'identification.verdict', 'identification.noise_std'}
-# Numbers that PyYAML reads as text.
-_POWER = re.compile(r'[+-]?\d+e[+-]\d+')
 _DECLARED: WeakKeyDictionary[Node, dict[str, ParameterSpec]] = WeakKeyDictionary()
 
 
@@ -87,16 +91,13 @@ def typed(spec: ParameterSpec, given: Parameter) -> Parameter:
     Return a given parameter with its declared type, or unchanged if it cannot be converted.
 
     The ROS tools infer the type from the text: an empty list has no type, ``off`` is a boolean,
-    and 5e-05 is a text.
+    2 is no floating-point number, and 5e-05 is a text.
     """
-    value = given.value
-    if type(spec.default) is float and isinstance(value, str) and _POWER.fullmatch(value):
-        return Parameter(spec.name, value=float(value))
     try:
-        value = spec.taken(value)
+        value = spec.taken(given.value)
     except BadInputError:
         return given
-    if isinstance(spec.default, (list, str)):
+    if isinstance(spec.default, (list, str, float)):
         return Parameter(spec.name, type_of(spec), value)
     return given
 
@@ -206,6 +207,26 @@ def check_names(node: Node) -> None:
         if name in others or rest in others and (joints is None or joint in joints):
             continue
         raise unknown(node, name, others)
+
+
+def unread_files(arguments: Sequence[str], nodes: Sequence[str]) -> Iterator[str]:
+    """Yield a sentence for each given parameter file without a section for one of the nodes."""
+    for option, name in zip(arguments, arguments[1:], strict=False):
+        if option != '--params-file':
+            continue
+        path = Path(name)
+        try:
+            if not path.is_file():
+                continue  # a pipe, which is read once
+            text = read_at_most(path, _LARGEST_FILE, 'a parameter file')
+            found = [x for x, _ in sections_of(load_yaml(text.decode('utf-8')))]
+        except (HmsaError, OSError, ValueError):
+            continue  # which ROS 2 has read in its own way
+        if not any(is_for(x, node) for x in found for node in nodes):
+            keys = ' and '.join(f'{x}:' for x in nodes)
+            yield (
+                f'{path} has no parameters for {" and ".join(nodes)}, which keeps its defaults: '
+                f'its sections are {listed(found) or "none"}, expected {keys} or /**:')
 
 
 def unknown(node: Node, name: str, others: Iterable[str] = ()) -> BadInputError:

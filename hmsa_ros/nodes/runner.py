@@ -21,6 +21,7 @@ from rclpy.task import Future
 
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, complain, HmsaError
+from hmsa_ros.nodes.parameters import unread_files
 from hmsa_ros.nodes.visitor import start_ros
 
 # On this rclpy (7.1), EventsExecutor.spin() without a time limit busy-loops and delivers nothing.
@@ -58,6 +59,8 @@ def run(
         _initialise(arguments)
         made = factory()
         nodes = (made,) if isinstance(made, Node) else made
+        for sentence in unread_files(arguments, [x.get_fully_qualified_name() for x in nodes]):
+            nodes[0].get_logger().warning(sentence)
         _avoid_pauses()
         spin(nodes, lambda: ENDING.asked or any(getattr(x, 'finished', False) for x in nodes))
     except (BadInputError, ParameterException) as error:

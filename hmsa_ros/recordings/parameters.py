@@ -7,12 +7,13 @@ from typing import Any
 
 from hmsa_ros.bag.experiment import parameters_of
 from hmsa_ros.bag.limits import load_yaml
-from hmsa_ros.errors import BadInputError, BagError
+from hmsa_ros.errors import assume, BadInputError, BagError, excerpt
 from hmsa_ros.files import read_at_most
 from hmsa_ros.interfaces import parameters as shared
 from hmsa_ros.interfaces.actuator import actuator_from, creep_from
 from hmsa_ros.interfaces.parameters import number_of, ParameterSpec
-from hmsa_ros.interfaces.topics import PLANNER, PLANT
+from hmsa_ros.interfaces.sections import sections_of
+from hmsa_ros.interfaces.topics import NODES, PLANNER, PLANT
 from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 
@@ -138,8 +139,8 @@ def read_parameter_file(
              for key, name, value in entries if key == (node if own else '')}
     if not any(name.partition('.')[2].endswith(x.name) for name in found for x in shared.BLOCK):
         raise BadInputError(
-            f'{path} sets no parameter of the actuator: expected some of '
-            + ', '.join(x.name for x in shared.ACTUATOR))
+            f'{path} sets no parameter of the actuator in a section for planner, plant or all '
+            f'nodes (/**): expected some of {", ".join(x.name for x in shared.ACTUATOR)}')
     return found
 
 
@@ -155,7 +156,12 @@ def values_of(
 
 
 def entries_of(path: Path) -> Entries:
-    """Return the parameters in a file, or raise `BadInputError` if it cannot be read."""
+    """
+    Return the parameters in a file for the nodes of this package.
+
+    Sections for other nodes are not used, which is said. Raise `BadInputError` if the file cannot
+    be read.
+    """
     try:
         document = load_yaml(
             read_at_most(path, _LARGEST_FILE, 'a parameter file of at most that').decode('utf-8'))
@@ -169,15 +175,22 @@ def entries_of(path: Path) -> Entries:
         raise BadInputError(
             f'{path} has no ros__parameters: expected a parameter file as hmsa init writes it')
     entries = []
-    for name, value in _flat(document):
-        whole, _, parameter = name.rpartition('ros__parameters.')
-        node = whole.rstrip('.').rpartition('/')[2]
-        entries.append((
-            '' if node in ('*', '**') else node, shared.present_name(parameter), value))
+    sections = list(sections_of(document)) or [('/**', document)]
+    for section, values in sections:
+        node = section.rpartition('/')[2]
+        if node not in ('*', '**', *NODES):
+            assume(
+                f'{path}: its section {excerpt(section)} is not used: expected /**, '
+                f'{", ".join(NODES[:2])} or {NODES[2]}, the nodes that read parameters of '
+                'an actuator')
+            continue
+        for name, value in _flat(values):
+            entries.append((
+                '' if node.startswith('*') else node, shared.present_name(name), value))
     return entries
 
 
-def _flat(values: Mapping[object, object], before: str = '') -> Iterator[tuple[str, object]]:
+def _flat(values: Mapping[Any, object], before: str = '') -> Iterator[tuple[str, object]]:
     """Yield the values of nested mappings with their dotted names."""
     for key, value in values.items():
         if isinstance(value, dict):
