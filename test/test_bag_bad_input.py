@@ -463,6 +463,15 @@ def test_a_wrong_bit_in_the_header_of_a_record_is_said_or_harmless(tmp_path, kil
     assert count.said
 
 
+def test_a_chunk_that_looks_like_a_record_of_the_summary_is_said(tmp_path):
+    path = flips.make_bag(tmp_path / 'bag', killed=True)
+    data = bytearray(path.read_bytes())
+    chunk = next(offset for opcode, offset, _ in pieces(bytes(data)) if opcode == Opcode.CHUNK)
+    data[chunk] = Opcode.SUMMARY_OFFSET
+    path.write_bytes(data)
+    assert any('summaryoffset record is longer' in x for x in BagReader(path.parent).problems)
+
+
 def test_a_message_lost_from_a_chunk_is_said_by_recover(tmp_path, capsys):
     path = write_bag(tmp_path / 'bag')
     data = bytearray(path.read_bytes())

@@ -28,6 +28,7 @@ from mcap.records import (
     MetadataIndex,
     Schema,
     Statistics,
+    SummaryOffset,
 )
 from mcap.writer import MCAP0_MAGIC
 
@@ -50,7 +51,8 @@ _Record = TypeVar('_Record', bound=McapRecord)
 _CLASSES: dict[int, type[Any]] = {
     Opcode.HEADER: Header, Opcode.FOOTER: Footer, Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel, Opcode.CHUNK_INDEX: ChunkIndex, Opcode.STATISTICS: Statistics,
-    Opcode.METADATA: Metadata, Opcode.METADATA_INDEX: MetadataIndex, Opcode.DATA_END: DataEnd}
+    Opcode.METADATA: Metadata, Opcode.METADATA_INDEX: MetadataIndex, Opcode.DATA_END: DataEnd,
+    Opcode.SUMMARY_OFFSET: SummaryOffset}
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,7 @@ _FOOTER_SIZE = PREFIX.size + 20
 _TAIL_SIZE = _FOOTER_SIZE + len(MAGIC)
 _DATA_END_SIZE = PREFIX.size + 4
 # Valid records that are not used here.
-_PASSED_OVER = frozenset(
-    (Opcode.ATTACHMENT, Opcode.ATTACHMENT_INDEX, Opcode.SUMMARY_OFFSET))
+_PASSED_OVER = frozenset((Opcode.ATTACHMENT, Opcode.ATTACHMENT_INDEX))
 _Declared = TypeVar('_Declared', Schema, Channel)
 
 
