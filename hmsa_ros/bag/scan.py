@@ -273,9 +273,6 @@ class ScannedFile:
                 self.problem(f': {error}, at byte {block.offset}: skipped')
             self._counts.update(channels)
             if channels:
-                if block.end >= 0 and (block.start, block.end) != (start, end):
-                    self.problem(
-                        f': a chunk has other times than it says, at byte {block.offset}')
                 self.blocks.append(replace(block, start=start, end=end))
         found = self._counts.total()
         if said is not None and said != found:
@@ -340,23 +337,15 @@ class ScannedFile:
         return True
 
     def _find_chunk(self, index: ChunkIndex) -> None:
-        """Take in a chunk that the summary names, and hold its head against that."""
-        offset, length = index.chunk_start_offset, index.chunk_length - PREFIX.size
-        head = os.pread(self._descriptor, PREFIX.size + records.CHUNK_HEAD_SIZE, offset)
-        # What the index does not say is taken from the head in any case.
-        crc, = struct.unpack_from('<I', head, PREFIX.size + 24)
-        block = Block(
+        """Take in a chunk as the summary describes it."""
+        offset = index.chunk_start_offset
+        # The index has no checksum.
+        crc, = struct.unpack('<I', records.read_exactly(
+            self._descriptor, 4, offset + PREFIX.size + 24))
+        self._add_block(Block(
             self._number, offset + PREFIX.size + 40 + len(index.compression.encode()),
             index.compressed_size, index.uncompressed_size, index.message_start_time,
-            index.message_end_time, index.compression, crc)
-        try:
-            found = Block.of_chunk(self._number, offset, head[PREFIX.size:], length)
-        except BagError:
-            found = None
-        if block != found or not head.startswith(PREFIX.pack(Opcode.CHUNK, length)):
-            self.problem(f' is damaged at byte {offset}: the chunk there is not as the index '
-                         'says, and is read as that says')
-        self._add_block(block, offset)
+            index.message_end_time, index.compression, crc), offset)
 
     def _find_metadata(self, index: MetadataIndex) -> None:
         """Take in a metadata record that the summary names."""
@@ -366,10 +355,7 @@ class ScannedFile:
             data = records.read_exactly(self._descriptor, index.length, index.offset)
             if PREFIX.unpack_from(data) != (Opcode.METADATA, index.length - PREFIX.size):
                 raise BagError('a metadata record is not where the index says')
-            record = records.parse(Metadata, data[PREFIX.size:])
-            if record.name != index.name:
-                raise BagError('a metadata record is not called as the index says')
-            self._take(record)
+            self._take(records.parse(Metadata, data[PREFIX.size:]))
         except (BagError, OverflowError) as error:
             self.problem(f': {error}, at byte {index.offset}: skipped')
 
