@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 import math
 
+from hmsa_ros.control.device_clock import Offset
 from hmsa_ros.control.environment import Environment
 from hmsa_ros.control.following import Following
 from hmsa_ros.control.receipts import Receipts
@@ -31,8 +32,9 @@ class Devices:
 
     ``fresh`` contains the joints whose device appeared after the last level and has not received
     it. ``cut`` contains those whose device rejects commands from before a cut-off, ``open`` those
-    with an open interlock, and ``locked`` those that only accept 0 T after that. ``since`` is the
-    time at which a plan began to wait for devices, in ns by the steady clock.
+    with an open interlock, and ``locked`` those that only accept 0 T after that. ``apart``
+    contains those whose clock differs so much that no command would apply in time. ``since`` is
+    the time at which a plan began to wait for devices, in ns by the steady clock.
     """
 
     def __init__(
@@ -49,6 +51,7 @@ class Devices:
         self.cut: set[str] = set()
         self.locked: set[str] = set()
         self.open: set[str] = set()
+        self.apart: set[str] = set()
         self.since: int | None = None
         self._acknowledged: dict[str, int] = {}
 
@@ -69,8 +72,8 @@ class Devices:
     def send(self, now: int, *, everything: bool = False) -> None:
         """Send the levels that are due at a time in ns, or all planned levels."""
         for name, planner in self._planners.items():
-            if name in self.receipts.silent:
-                # The command would arrive too late.
+            if name in self.receipts.silent | self.apart:
+                # The command would arrive too late, or apply at another time.
                 continue
             for level in planner.due(_FAR if everything else now):
                 self.fresh.discard(name)
@@ -85,7 +88,7 @@ class Devices:
     def beat(self, now: int) -> None:
         """Send the levels in force again, as a heartbeat of the planner."""
         for name, planner in self._planners.items():
-            if name in self.receipts.silent | self.cut | self.fresh:
+            if name in self.receipts.silent | self.cut | self.fresh | self.apart:
                 # The last level is not meant for this device.
                 continue
             stamp, following = planner.beat_stamp(now), planner.next_stamp
@@ -166,7 +169,8 @@ class Devices:
         if known:
             return None
         self.cut.add(joint)
-        if not self._takeover.engaged:
+        if not self._takeover.engaged or joint in self.apart:
+            # Nothing is planned, or no longer.
             return None
         if settings.after_cut_off == 'resume' and not locked:
             self._takeover.doubt(joint)
@@ -193,18 +197,73 @@ class Devices:
         Raises
         ------
         RefusedError
-            If one is locked, or if the clocks differ so much that every command would be late.
+            If one is locked, or if its clock differs so much that no command applies in time.
 
         """
         for joint in joints:
             if joint in self.open:
                 raise self.interlock(joint)
-        offset = self.receipts.offset
-        if offset is not None and offset.ahead - offset.error > max(
-                x.options.lead_time for x in self._planners.values()):
-            raise RefusedError(
-                Code.CLOCKS_DIFFER,
-                f'every command would come too late, since {offset.words}')
+            if joint in self.apart:
+                raise self.differs(joint)
+
+    def differs(self, joint: str) -> RefusedError:
+        """Return the refusal of a request for a joint of ``apart``."""
+        offset = self.receipts.offset_of(joint)
+        if offset is None:
+            raise ValueError(f'the clock offset of joint {joint} is unknown')
+        when = 'come too late' if offset.ahead > 0 else (
+            f'apply {-offset.ahead / NANOSECONDS:.3f} s after its time')
+        return RefusedError(
+            Code.CLOCKS_DIFFER, f'every command would {when}, since {offset.words}')
+
+    def check_clock(self, joint: str, settings: Settings) -> Verdict | None:
+        """
+        Compare the clock of a joint's device after a receipt; return the verdict on its plan.
+
+        Its plan is dropped if it is so far ahead that all commands come too late, or behind by
+        more than the samples of a start may be; or if it was set in the middle of a move.
+        """
+        offset, step = self.receipts.offset_of(joint), self.receipts.take_step(joint)
+        if offset is None:
+            self.apart.discard(joint)
+            return None
+        planner, before = self._planners[joint], joint in self.apart
+        lead, now = planner.options.lead_time, self._around.clock()
+        apart = offset.least > lead or -offset.most > max(lead, settings.takeover_max_age)
+        spoilt = abs(step) - offset.error > lead and (planner.moves(now) or planner.pending)
+        if before or apart or spoilt:
+            self._restart_times(joint)
+        if not apart:
+            self.apart.discard(joint)
+        elif not before:
+            self.apart.add(joint)
+        if before or not (apart or spoilt):
+            return None
+        if min(step, offset.ahead) < 0:
+            self._withdraw(joint, offset, now)
+        self.fresh.add(joint)
+        planner.abandon()
+        return self._dropped(joint, Code.CLOCKS_DIFFER, (
+            f'{offset.words}; the sequence is dropped, and nothing is sent until a new request'
+            if apart else
+            f'the clock of the plant or driver of joint {joint}, or of the planner, was set '
+            f'{"ahead" if step > 0 else "back"} by {abs(step) / NANOSECONDS:.3f} s in the middle '
+            'of a move: the rest of the sequence is dropped'))
+
+    def _withdraw(self, joint: str, offset: Offset, now: int) -> None:
+        """
+        Withdraw the levels that a device would apply when its clock reaches their timestamps.
+
+        The level in force, from now on by its clock, replaces all later ones.
+        """
+        level = self._following.newest.get(joint)
+        if level is not None and self._takeover.engaged and joint not in self.cut | self.open:
+            self._hand_out(joint, now + offset.ahead, level[1], now)
+
+    def _restart_times(self, joint: str) -> None:
+        """Discard times of a device's clock from before it was set."""
+        self._takeover.forget(joint)
+        self._following.forget_times(joint)
 
     def _dropped(self, joint: str, code: Code, words: str) -> Verdict:
         """Have the next request start from a sample; return the verdict on a dropped plan."""

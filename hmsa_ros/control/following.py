@@ -71,6 +71,15 @@ class Following:
         self._newest_seen = 0
         self.dropped(list(self._group.planners))
 
+    def forget_times(self, joint: str) -> None:
+        """Discard the times of a device whose clock was set, and keep its level."""
+        if joint in self.newest:
+            self.newest[joint] = 0, self.newest[joint][1]
+        self._suspected.pop(joint, None)
+        self._ages.pop(joint, None)
+        self._newest_seen = 0
+        self.dropped([joint])
+
     def dropped(self, joints: Iterable[str]) -> None:
         """Discard the state of joints whose plans are replaced."""
         for name in joints:

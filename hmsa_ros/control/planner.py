@@ -128,6 +128,9 @@ class PlannerRuntime:
         if self._set_back:
             # The clock was set back during planning, so the planned times are invalid.
             return self.request(request)
+        if isinstance(request, Stop) and self.devices.apart:
+            # What was to stop is dropped already, and no command reaches the device in time.
+            return self.planning.refuse(self.devices.differs(min(self.devices.apart)), request)
         return _WAITING if work in self.planning else self._reporting.verdict
 
     def _check(self, request: Request) -> None:
@@ -161,6 +164,7 @@ class PlannerRuntime:
         """
         self.following.seen(time)
         self._drop(self.devices.received(joint, time, command))
+        self._check_clock(joint)
         self.cut_off(joint, in_force=cut_off or locked, locked=locked)
 
     def cut_off(self, joint: str, *, in_force: bool, locked: bool = False) -> None:
@@ -174,6 +178,19 @@ class PlannerRuntime:
             # Before the first request there are no heartbeats: released, the device would be cut
             # off again.
             self.devices.acknowledge(joint)
+
+    def _check_clock(self, joint: str) -> None:
+        """Drop the plan of a joint whose device has another time."""
+        before = joint in self.devices.apart
+        verdict = self.devices.check_clock(joint, self.settings)
+        now = joint in self.devices.apart
+        if before is not now or verdict is not None:
+            # Samples from before and after do not belong to one motion.
+            self.feedback.restart()
+            self._silence.restart()
+        if now and not before:
+            self.planning.refuse_all(self.devices.differs(joint))
+        self._drop(verdict)
 
     def _drop(self, verdict: Verdict | None) -> None:
         """Report that a plan was dropped, if there is a verdict."""
@@ -197,6 +214,10 @@ class PlannerRuntime:
             # The timestamp is of the clock after it was set.
             self._process_clock()
             now = self._clock()
+        if joint in self.devices.apart or not self.devices.receipts.is_past(joint, stamp, now):
+            # The clock of the device was set, and the time is unknown.
+            self.following.newest[joint] = 0, flux_density
+            return
         if joint in self.feedback.joints:
             self.feedback.joints[joint].applied(stamp, flux_density)
         if self._takeover.engaged:
@@ -217,6 +238,8 @@ class PlannerRuntime:
             self._takeover.observe(joint, Seen(
                 stamp, stretch, rate, flux_density,
                 None if self.environment.one_clock() else came - stamp))
+        if joint in self.devices.apart:
+            return
         self._watch.add(joint, stamp, stretch)
         if joint in self.feedback.joints:
             self.feedback.joints[joint].add(stamp, stretch, flux_density, came)
@@ -246,7 +269,7 @@ class PlannerRuntime:
         self.planning.clear()
         self.following.restart()
         self.feedback.restart()
-        self.devices.receipts.clock_set_back()
+        self.devices.receipts.clock_set()
         self._silence.restart()
         if back:
             self.group.restart()

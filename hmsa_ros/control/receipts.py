@@ -1,38 +1,22 @@
 """Receipts of plant or driver: acknowledged commands, and the time of the device's clock."""
 
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
+from hmsa_ros.control.device_clock import DeviceClock, Offset
 from hmsa_ros.model.units import NANOSECONDS
 
 # Receipts arrive five times a second: longest gap between them, in ns by the steady clock.
 _PATIENCE = 800_000_000
 # A longer pause between two looks is a stall of this process, which could not receive any.
 _PAUSE = 300_000_000
-# A receipt that is older than the silence that it ends was delayed in transit.
-_STALE = 300_000_000
+# A receipt that is older than the silence that it ends was delayed in transit, unless further
+# ones follow at the pace of the device's clock for a time in ns: delayed ones arrive at once.
+_STALE, _PACED = 300_000_000, 350_000_000
+# Largest difference in ns between that pace and the steady clock.
+_UNEVEN = 100_000_000
 # Number of looks, five a second, without a publisher until no receipts are expected.
 _MISSING = 25
-# Number of commands per joint whose sending time is stored, and of exchanges compared.
-_REMEMBERED, _COMPARED = 64, 32
-
-
-class Offset(NamedTuple):
-    """Offset of a device's clock from the planner's, and its uncertainty; in ns."""
-
-    ahead: int
-    error: int
-
-    @property
-    def words(self) -> str:
-        """The offset and the remedy, as a clause."""
-        return (
-            f'the clock of the plant or driver is {abs(self.ahead) / NANOSECONDS:.4f} s '
-            f'{"ahead of" if self.ahead > 0 else "behind"} that of the planner (measured to '
-            f'{self.error / NANOSECONDS:.4f} s): set the clocks of both hosts by one source, as '
-            'with chrony')
 
 
 @dataclass
@@ -45,11 +29,22 @@ class _Joint:
     unanswered: int | None = None  # time since which no command is acknowledged
     silent: bool = False
     missing: int = 0  # consecutive looks without a publisher of receipts
-    # Sending time of commands by timestamp, on the planner's clock.
-    sent: dict[int, int] = field(default_factory=dict)
-    exchanges: deque[Offset] = field(default_factory=lambda: deque(maxlen=_COMPARED))
-    # Age of receipts at arrival, by the planner's clock.
-    lags: deque[int] = field(default_factory=lambda: deque(maxlen=_COMPARED))
+    clock: DeviceClock = field(default_factory=DeviceClock)
+    step: int = 0  # ns by which its clock was set ahead since `Receipts.take_step`
+    # During a silence: time of a receipt that seemed delayed, and of its arrival.
+    delayed: tuple[int, int] | None = None
+
+    def is_delayed(self, time: int, steady: int) -> bool:
+        """Return whether a receipt was sent before the silence during which it arrives."""
+        if time - self.time >= steady - self.arrived - _STALE:
+            return False
+        # It was delayed, or the clock of the device was set back.
+        if self.delayed is not None:
+            before, came = self.delayed
+            if abs((time - before) - (steady - came)) <= _UNEVEN:
+                return steady - came < _PACED
+        self.delayed = time, steady
+        return True
 
 
 class Receipts:
@@ -75,9 +70,7 @@ class Receipts:
             return
         if known.unanswered is None:
             known.unanswered = self._steady()
-        known.sent[stamp] = now
-        if len(known.sent) > _REMEMBERED:
-            del known.sent[next(iter(known.sent))]
+        known.clock.sent(stamp, now)
 
     def received(
             self, joint: str, time: int, command: int, now: int, *, comparable: bool) -> bool:
@@ -93,22 +86,18 @@ class Receipts:
         known = self._joints.get(joint)
         if known is None:
             known = self._joints[joint] = _Joint(steady)
-        if known.silent and comparable and (
-                time - known.time < steady - known.arrived - _STALE):
+        if known.silent and comparable and known.is_delayed(time, steady):
             return False
         restarted, known.command = known.command != 0 and command == 0, command
         if restarted:
             # Commands that were sent to the previous device are lost.
-            known.sent.clear()
+            known.clock.lost()
             known.unanswered = None
-        known.arrived, known.time, known.missing = steady, time, 0
-        known.lags.append(now - time)
-        sent = known.sent.pop(command, None)
-        if sent is None:
-            return restarted
-        known.unanswered = None
-        if comparable and now >= sent:
-            known.exchanges.append(Offset(time - (sent + now) // 2, (now - sent) // 2 + 1))
+        known.arrived, known.time, known.missing, known.delayed = steady, time, 0, None
+        if known.clock.awaits(command):
+            known.unanswered = None
+        if comparable:
+            known.step += known.clock.received(time, command, now, steady)
         return restarted
 
     def since(self, joint: str, time: int) -> bool:
@@ -130,12 +119,18 @@ class Receipts:
             del self._joints[joint]
             self.silent.discard(joint)
 
-    def clock_set_back(self) -> None:
-        """Discard times of the planner's clock from before it was set back."""
+    def clock_set(self) -> None:
+        """Record that the planner's clock was set."""
         for known in self._joints.values():
-            known.sent.clear()
-            known.exchanges.clear()
-            known.lags.clear()
+            known.clock.set(self._steady())
+
+    def take_step(self, joint: str) -> int:
+        """Return by how many ns a device's clock was set ahead since the last call."""
+        known = self._joints.get(joint)
+        if known is None:
+            return 0
+        step, known.step = known.step, 0
+        return step
 
     def look(self) -> list[str]:
         """Return the joints whose device has fallen silent, or is received again."""
@@ -177,12 +172,20 @@ class Receipts:
     def lag(self, joint: str) -> int | None:
         """Return the smallest age in ns of a joint's receipts at arrival; None for no receipt."""
         known = self._joints.get(joint)
-        return None if known is None else min(known.lags, key=abs, default=None)
+        return None if known is None else known.clock.lag
+
+    def is_past(self, joint: str, time: int, now: int) -> bool:
+        """Return whether a time of a device can have passed by one of the planner's clock."""
+        known = self._joints.get(joint)
+        return known is None or known.clock.is_past(time, now)
+
+    def offset_of(self, joint: str) -> Offset | None:
+        """Return the clock offset of a joint's device; None if unknown."""
+        known = self._joints.get(joint)
+        return None if known is None else known.clock.offset
 
     @property
     def offset(self) -> Offset | None:
         """Largest clock offset among the devices; None if unknown."""
-        # The quickest exchange determines the offset best.
-        found = [min(x.exchanges, key=lambda y: y.error)
-                 for x in self._joints.values() if x.exchanges]
-        return max(found, key=lambda x: abs(x.ahead), default=None)
+        found = (x.clock.offset for x in self._joints.values())
+        return max((x for x in found if x is not None), key=lambda x: abs(x.ahead), default=None)

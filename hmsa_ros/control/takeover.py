@@ -80,6 +80,10 @@ class Takeover:
         self._unsure.clear()
         self._doubted.clear()
 
+    def forget(self, joint: str) -> None:
+        """Discard the sample of a joint whose clock was set."""
+        self._samples.pop(joint, None)
+
     def clock_set(self, by: int) -> None:
         """Shift samples by the ns that the clock was set ahead, so that they do not age."""
         self._samples = {

@@ -1,0 +1,205 @@
+"""A device whose clock is set: its plan is dropped, and it is obeyed again once clocks agree."""
+
+import random
+import re
+
+import pytest
+from test_runtime_hosts import Bench
+from test_runtime_planner import HOLD, LEAD, MS, START, trajectory
+
+from hmsa_ros.control.device_clock import DeviceClock
+from hmsa_ros.control.receipts import Receipts
+from hmsa_ros.control.records import Severity, Stop, Target
+
+SECOND = 1000 * MS
+
+
+class Apart(Bench):
+    """A bench whose device carries out commands by its own clock, and switches its coil off."""
+
+    TIMEOUT = SECOND
+
+    def __init__(self, **options):
+        super().__init__(**options)
+        self._fed = None
+        self.runtime.applied('a', START - 1, 0.0)
+        self.levels = []  # levels that took effect: time of the planner's clock, and in T
+
+    def deliver(self):
+        if not self.linked:
+            return
+        arrived, self.wire = self.wire, []
+        there = self.now + self.ahead
+        for _, x in arrived:
+            self._newest, self._came = x.stamp, there
+            if self.cut and x.flux_density:
+                self.refused.append(x.flux_density)
+                continue
+            if there - x.stamp > 20 * MS or x.stamp - there > self.TIMEOUT:
+                # It comes too late, or is for a time after the watchdog has tripped.
+                continue
+            self.cut = False
+            self._fed = self.now
+            self.plant.command(max(x.stamp - self.ahead, self.plant.time), x.flux_density)
+        self.give_receipt()
+        if self._fed is not None and self.now - self._fed > self.TIMEOUT and not self.cut:
+            self.plant.command(self.plant.time, 0.0)
+            self.cut = True
+
+    def advance(self):
+        plant = self.plant
+        while (stamp := plant.schedule.next_stamp) is not None and stamp <= self.now:
+            before = plant.schedule.current
+            plant.advance(stamp)
+            if plant.schedule.current != before:
+                self.levels.append((self.now, plant.schedule.current))
+                self.runtime.applied('a', plant.time + self.ahead, plant.schedule.current)
+        plant.advance(self.now)
+
+    def set_device(self, by):
+        """Set the clock of the device: what waits in it applies by the clock as it is now."""
+        self.ahead += by
+        waiting = self.plant.schedule.ahead()
+        if waiting:
+            # Commands at or after a time replace all later ones.
+            self.plant.command(self.plant.time, self.plant.schedule.current)
+        for stamp, level in waiting:
+            self.plant.command(max(stamp - by, self.plant.time), level)
+
+    def settle(self):
+        self.run(self.now + 3 * SECOND)
+
+
+@pytest.mark.parametrize(('when', 'by'), [
+    *((130, sign * x * MS) for x in (100, 500, 1000, 5000, 60_000, 3_600_000)
+      for sign in (1, -1)),
+    (20, -5000 * MS), (20, 100 * MS), (2000, 5000 * MS), (2000, -5000 * MS)])
+def test_a_device_whose_clock_is_set_halts_the_plan_and_is_found_again(when, by):
+    rig = Apart()
+    rig.runtime.request(trajectory(
+        (1.2, HOLD), (1.1, 6 * HOLD), (1.3, 8 * HOLD), (1.4, 10 * HOLD), (1.2, 4 * SECOND)))
+    rig.run(START + when * MS)
+    rig.set_device(by)
+    static = by > LEAD or by < -SECOND / 2
+    rig.run(rig.now + SECOND)
+    assert (rig.status.verdict.code, rig.status.verdict.severity) == (
+        'clocks_differ', Severity.ERROR)
+    assert 'the clock of the plant or driver' in rig.status.verdict.message
+    changes = len(rig.levels)
+    sent = len(rig.sent)
+    rig.settle()
+    # What the watchdog does is all that happens.
+    assert all(level == 0.0 for _, level in rig.levels[changes:])
+    assert not any(x.flux_density for _, x in rig.sent[sent:])
+    again = rig.runtime.request(Target('a', 1.3))
+    assert (again.code == 'clocks_differ') is static
+    if static:
+        found = re.search(
+            r'driver is ([0-9.]+) s (ahead of|behind) .*to ([0-9.]+) s', again.message)
+        assert abs(float(found[1]) - abs(by) / SECOND) < float(found[3]) + 1e-3
+        assert (found[2] == 'behind') is (by < 0)
+        assert rig.runtime.request(Stop()).code == 'clocks_differ'
+    rig.settle()
+    rig.set_device(-by)
+    rig.run(rig.now + 1200 * MS)
+    rig.runtime.request(Target('a', 1.25))
+    rig.run(rig.now + SECOND)
+    assert rig.status.verdict.severity is Severity.OK
+    assert rig.residual(1.25) < 1e-6
+
+
+def test_a_small_delay_of_a_device_at_rest_stops_nothing():
+    rig = Apart()
+    rig.runtime.request(trajectory((1.2, HOLD), (1.3, 4 * SECOND)))
+    rig.run(START + SECOND)
+    rig.set_device(-300 * MS)
+    rig.run(rig.now + 2 * SECOND)
+    assert rig.status.verdict.severity is Severity.OK
+    rig.runtime.request(Target('a', 1.1))
+    rig.run(rig.now + SECOND)
+    assert rig.residual(1.1) < 1e-6
+
+
+@pytest.mark.parametrize(('back', 'outage'), [
+    (500, 1500), (1000, 1500), (2500, 10_000), (5000, 1500)])
+def test_receipts_are_accepted_after_an_outage_in_which_the_clock_was_set_back(back, outage):
+    rig = Apart()
+    rig.runtime.request(Target('a', 1.2))
+    rig.run(START + SECOND)
+    rig.linked = False
+    rig.run(rig.now + outage * MS // 2)
+    rig.set_device(-back * MS)
+    rig.run(rig.now + outage * MS // 2)
+    rig.linked = True
+    rig.run(rig.now + 600 * MS)
+    assert 'no receipt' not in rig.status.unheard
+    rig.set_device(back * MS)
+    rig.run(rig.now + 1200 * MS)
+    rig.runtime.request(Target('a', 1.3))
+    rig.run(rig.now + SECOND)
+    assert rig.status.verdict.severity is Severity.OK
+    assert rig.residual(1.3) < 1e-6
+
+
+def test_receipts_that_were_held_up_by_an_outage_do_not_end_the_silence():
+    time = 0
+    receipts = Receipts(lambda: time)
+
+    def pass_time(span):
+        nonlocal time
+        for _ in range(0, span, 50):
+            time += 50 * MS
+            receipts.look()
+        return receipts.silent
+
+    receipts.received('a', time, 0, time, comparable=True)
+    assert pass_time(5000) == {'a'}
+    for sent in range(200, 1400, 200):
+        receipts.received('a', sent * MS, 0, time, comparable=True)
+    assert pass_time(100) == {'a'}
+    receipts.received('a', time, 0, time, comparable=True)
+    assert pass_time(100) == set()
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_delays_are_never_taken_for_a_clock_that_was_set(seed):
+    chance, clock = random.Random(seed), DeviceClock()
+    now = 0
+    for _ in range(2000):
+        now += chance.randrange(1, 200 * MS)
+        clock.sent(now, now)
+        there, back = (round(chance.expovariate(1 / 50) * MS) for _ in range(2))
+        arrived = now + there + back
+        assert clock.received(now + there - 3 * SECOND, now, arrived, arrived) == 0
+        assert clock.offset.least <= -3 * SECOND <= clock.offset.most
+        now = arrived
+
+
+@pytest.mark.parametrize('by', [-5 * SECOND, 3600 * SECOND])
+def test_a_clock_of_both_that_is_set_is_no_difference(by):
+    clock, now, steady = DeviceClock(), 0, 0
+
+    def exchange():
+        nonlocal now, steady
+        clock.sent(now, now)
+        now, steady = now + 20 * MS, steady + 20 * MS
+        return clock.received(now - 19 * MS, now - 20 * MS, now, steady)
+
+    assert not any(exchange() for _ in range(10))
+    before = now
+    now += by
+    clock.set(steady)
+    # Receipts of before are still in transit.
+    assert not any(clock.received(before, None, now, steady + x * MS) for x in (0, 20, 40))
+    assert not any(exchange() for _ in range(10))
+
+
+def test_a_clock_of_the_planner_alone_that_is_set_halts_the_plan():
+    rig = Apart()
+    rig.runtime.request(trajectory((1.2, HOLD), (1.1, 6 * HOLD), (1.3, 8 * HOLD)))
+    rig.run(START + 130 * MS)
+    # Seen by the planner, its clock was set ahead.
+    rig.runtime.devices.receipts.clock_set()
+    rig.set_device(-5 * SECOND)
+    rig.run(rig.now + SECOND)
+    assert rig.status.verdict.code == 'clocks_differ'
