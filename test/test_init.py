@@ -1,14 +1,10 @@
-"""Parameter file of a new actuator: questions, derived values, implausible values."""
+"""Parameter file of a new actuator: missing, derived values, implausible values."""
 
 from dataclasses import replace
 import json
 import math
-import os
 from pathlib import Path
-import pty
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -253,15 +249,13 @@ def test_bad_input_is_answered_in_one_line_and_writes_nothing(run, tmp_path, wor
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_a_terminal_it_says_what_is_missing(tmp_path):
-    done = subprocess.run(
-        [sys.executable, '-m', 'hmsa_ros', 'init', *OWN[:-2], '--out', tmp_path / 'x.yaml'],
-        cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr == (
-        'hmsa: error: standard input is not a terminal, and --flux-max is not given: give them, '
-        'or add --yes for the defaults\n')
-    assert not (tmp_path / 'x.yaml').exists()
+def test_it_says_what_is_missing(run, tmp_path):
+    assert run(*OWN[:-2]) == (2, '', (
+        'hmsa: error: --flux-max is not given: expected it, or --yes for the defaults\n'))
+    assert run(*OWN[:-4])[2] == (
+        f'hmsa: error: {OWN[-4]}, --flux-max are not given: expected them, or --yes for the '
+        'defaults\n')
+    assert list(tmp_path.iterdir()) == []
 
 
 # What is implausible -------------------------------------------------------------------------
@@ -315,62 +309,6 @@ def test_numbers_are_taken_in_the_range_that_the_nodes_take():
             assert (quantity.least, quantity.largest) == (spec.minimum, spec.maximum)
             assert quantity.unit == spec.unit
     assert set(OPTIONAL) <= set(BY_KEY)
-
-
-# Asking --------------------------------------------------------------------------------------
-
-def ask(folder, answers, *words):
-    """Run it on a separate terminal; return status, terminal output and standard output."""
-    ours, theirs = pty.openpty()
-    with subprocess.Popen(
-            [sys.executable, '-m', 'hmsa_ros', 'init', *words], stdin=theirs,
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder,
-            env={**os.environ, 'PYTHONPATH': str(ROOT)}) as process:
-        os.close(theirs)
-        os.write(ours, answers.encode())
-        out, err = process.communicate(timeout=100)
-    os.close(ours)
-    return process.returncode, out, err
-
-
-def test_it_asks_with_units_and_defaults_and_takes_no_for_an_answer(tmp_path):
-    # A typing error, steel that is thought better of, an odd size that is meant, defaults.
-    answers = '5 mn\n5 mm\n\n79 GPa\n30 kPa\n\n0.08\n20\n0.02 N s/m\n0.2\n\n\nleft right\n'
-    status, out, err = ask(tmp_path, answers)
-    assert status == 0, err
-    assert "unit 'mn': expected one of m, cm, mm" in err
-    assert 'half thickness H of the block, along the field [0.005 m]: ' in err
-    assert 'metals have' in err
-    assert 'shear modulus G [7.9e+10 Pa]: ' in err
-    assert 'time unit' in out
-    found = parameters(tmp_path / 'actuator.yaml')
-    assert found['actuator.half_thickness'] == 0.005
-    assert found['actuator.shear_modulus'] == 30e3
-    assert found['actuator.damping_coefficient'] == 0.02
-    assert found['flux_density_min'] == -0.2
-    assert found['joints'] == ['left', 'right']
-
-
-@pytest.mark.slow
-def test_what_is_given_is_not_asked_for(tmp_path):
-    status, _, err = ask(tmp_path, '', *OWN)
-    assert (status, err) == (0, '')
-    status, _, err = ask(tmp_path, '0.1\n\n\n\n', *OWN[:-2], '--force')
-    assert status == 0
-    questions = [x.rpartition('\n')[2].partition(' [')[0] for x in err.split(']: ')[:-1]]
-    assert questions == [
-        "coil's maximum flux density",
-        "coil's minimum flux density, negative in the other direction",
-        "rate of the amplifier's ramps, 0 for steps",
-        'joint name, or several separated by commas']
-    assert parameters(tmp_path / 'actuator.yaml')['flux_density_max'] == 0.1
-
-
-def test_answers_that_end_early_write_nothing(tmp_path):
-    status, _, err = ask(tmp_path, '5 mm\n\x04')
-    assert status == 2
-    assert 'the input ended before the last question' in err
-    assert list(tmp_path.iterdir()) == []
 
 
 # Used ----------------------------------------------------------------------------------------

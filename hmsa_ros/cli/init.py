@@ -2,8 +2,8 @@ r"""
 Write a parameter file for your own actuator.
 
 Write a parameter file of your own actuator for planner and plant (--params-file), and print the
-resulting times, damping, flux densities and reachable stretches. Asks for each value without an
-option. Numbers are in SI units unless a unit follows: 10mm, "50 kPa".
+resulting times, damping, flux densities and reachable stretches. Numbers are
+in SI units unless a unit follows: 10mm, "50 kPa".
 
 example: hmsa init --half-length 5mm --half-thickness 5mm --density 1.9g/cm3 \
     --shear-modulus 30kPa --j-lim 20 --zeta 0.1 --remanence 80mT \
@@ -77,7 +77,7 @@ def add_parser(subparsers: Any) -> None:
          {'default': ''}),
         ('--out', 'FILE', Path, f'file to write (default {_FILE})', {'default': _FILE}),
         ('--force', 'replace an existing file'),
-        ('--yes', 'do not ask; use the defaults for values without an option'),
+        ('--yes', 'use the defaults for values without an option, as guesses'),
         JSON)
 
 
@@ -96,25 +96,20 @@ def _option(quantity: Quantity) -> Row:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Ask, write and print; raise `BadInputError` for invalid input."""
+    """Write and print; raise `BadInputError` for invalid input."""
     path: Path = arguments.out
     if not arguments.force and path.exists():
         raise BadInputError(f'{path} exists: name another file with --out, or add --force')
     check_targets(path)
-    form, asked = _asked(arguments)
-    given = _given(arguments, form, asked)
-    joints = joint_names(arguments.joint)
-    missing = [x for x in asked if x.key not in OPTIONAL and not _known(x.key, given)]
-    guessed = missing if arguments.yes else []
+    form, wanted = _wanted(arguments)
+    given = _given(arguments, form, wanted)
+    joints = joint_names(arguments.joint) or [_JOINT]
+    missing = [x for x in wanted if x.key not in OPTIONAL and not _known(x.key, given)]
     if missing and not arguments.yes:
-        if not sys.stdin.isatty():
-            raise BadInputError(
-                'standard input is not a terminal, and '
-                f'{", ".join(x.option for x in missing)} '
-                f'{"is" if len(missing) == 1 else "are"} not given: give them, or add --yes for '
-                'the defaults')
-        joints = _ask(asked, given, joints)
-    for quantity in asked:
+        raise BadInputError(
+            f'{", ".join(x.option for x in missing)} {"is" if len(missing) == 1 else "are"} not '
+            f'given: expected {"it" if len(missing) == 1 else "them"}, or --yes for the defaults')
+    for quantity in wanted:
         if not _known(quantity.key, given):
             given[quantity.key] = default_of(quantity, given)
     from hmsa_ros.api.doubts import doubts as doubts_of
@@ -124,13 +119,12 @@ def run(arguments: argparse.Namespace) -> int:
     found = made.scales
     given.setdefault('shear_modulus', made.block.shear_modulus)
     doubts = doubts_of(made)
-    if guessed:
+    if missing:
         shown = [f'{x.words} {x.show(given[x.key])}' + (
-            ', as the half length' if x.key == 'half_thickness' else '') for x in guessed]
+            ', as the half length' if x.key == 'half_thickness' else '') for x in missing]
         doubts.append(
-            f'{"; ".join(shown)} {"is a guess" if len(guessed) == 1 else "are guesses"}: a plan '
+            f'{"; ".join(shown)} {"is a guess" if len(missing) == 1 else "are guesses"}: a plan '
             'is only as exact as its parameters; measure them and pass the values')
-    joints = joints or [_JOINT]
     parameters = _parameters(made)
     table = [f'{name:<26} {value}' for name, value in facts(found, made.block)]
     write_text(path, '\n'.join([
@@ -138,7 +132,7 @@ def run(arguments: argparse.Namespace) -> int:
         *(f'#   hmsa {x} --ros-args --params-file {quote(path.name)}' for x in _NODES),
         '#', '# What follows from them (computed by hmsa init when it wrote this file):',
         *(f'#   {line}' for line in table), '/**:', '  ros__parameters:',
-        *_lines(form, parameters, {x.parameter or DAMPING.parameter for x in guessed}),
+        *_lines(form, parameters, {x.parameter or DAMPING.parameter for x in missing}),
         *_joints(joints, made.block), *_sampling(made.block)]) + '\n')
     for doubt in doubts:
         print(f'hmsa: warning: {doubt}', file=sys.stderr)
@@ -150,7 +144,7 @@ def run(arguments: argparse.Namespace) -> int:
         *(f'  hmsa {x} --ros-args --params-file {quote(str(path))}' for x in _NODES))
 
 
-def _asked(arguments: argparse.Namespace) -> tuple[str, tuple[Quantity, ...]]:
+def _wanted(arguments: argparse.Namespace) -> tuple[str, tuple[Quantity, ...]]:
     """Return form and quantities of the actuator; a hyperelastic model has its own constants."""
     form = 'beam' if arguments.beam else 'block'
     if arguments.law is None:
@@ -169,7 +163,7 @@ def _asked(arguments: argparse.Namespace) -> tuple[str, tuple[Quantity, ...]]:
 
 def _given(
         arguments: argparse.Namespace, form: str,
-        asked: Sequence[Quantity]) -> dict[str, float]:
+        wanted: Sequence[Quantity]) -> dict[str, float]:
     """Return the values of the options, after checking their combination."""
     given = {x.key: value for x in (*EVERY, DAMPING)
              if (value := getattr(arguments, x.key)) is not None}
@@ -189,69 +183,20 @@ def _given(
                 'both --shear-modulus and --youngs-modulus are given: expected one of them, '
                 'since E is 3 G')
         given['youngs_modulus'] = 3.0 * given.pop('shear_modulus')
-    if others := given.keys() - {x.key for x in asked} - {DAMPING.key}:
+    if others := given.keys() - {x.key for x in wanted} - {DAMPING.key}:
         own = [x for x in _OF_THEIR_OWN if others <= {y.key for y in FORMS[x]}]
         raise BadInputError(
             f'{", ".join(sorted("--" + x.replace("_", "-") for x in others))} is given: expected '
             + (f'constants of --law {arguments.law.partition(":")[0]} in its place'
                if arguments.law is not None and others <= {x.key for x in QUANTITIES}
                else f'--{own[0]} with it' if form == 'block' and own
-               else f'sizes of a {form}, or others of {", ".join(x.option for x in asked)}'))
+               else f'sizes of a {form}, or others of {", ".join(x.option for x in wanted)}'))
     return given
 
 
 def _known(key: str, given: Mapping[str, float]) -> bool:
     """Return whether a value is given, or the damping coefficient instead."""
     return key in given or (key in _DAMPED and DAMPING.key in given)
-
-
-def _ask(
-        asked: Sequence[Quantity], answers: dict[str, float], joints: list[str]) -> list[str]:
-    """Add answers to the given values, and return the joints."""
-    print(
-        'Numbers are in the unit shown unless another unit follows: 10 mm, 50 kPa. Press Enter '
-        'for the value in brackets.', file=sys.stderr)
-    for quantity in asked:
-        key = quantity.key
-        default = None
-        while not _known(key, answers):
-            if default is None:
-                default = default_of(quantity, answers)
-            words = quantity.text + (
-                ', or c in N s/m with its unit' if key in _DAMPED else '')
-            text = _answer(f'{words} [{quantity.show(default)}]: ')
-            try:
-                if key in _DAMPED and text.replace(' ', '').endswith('Ns/m'):
-                    answers[DAMPING.key] = DAMPING.parse(text)
-                    break
-                value = quantity.parse(text) if text else default
-            except BadInputError as error:
-                print(f'  {error}', file=sys.stderr)
-                continue
-            doubt = quantity.doubt(value)
-            if doubt and text:
-                # Ask once more, with this number as the default.
-                print(f'  {doubt}', file=sys.stderr)
-                default = value
-            else:
-                answers[key] = value
-    while not joints:
-        text = _answer(f'joint name, or several separated by commas [{_JOINT}]: ')
-        try:
-            joints = joint_names(text) or [_JOINT]
-        except BadInputError as error:
-            print(f'  {error}', file=sys.stderr)
-    return joints
-
-
-def _answer(question: str) -> str:
-    """Ask on the terminal, on standard error, since the question is not a result."""
-    print(question, end='', file=sys.stderr, flush=True)
-    line = sys.stdin.readline()
-    if not line:
-        print(file=sys.stderr)
-        raise BadInputError('the input ended before the last question: nothing was written')
-    return line.strip()
 
 
 def _actuator(form: str, given: Mapping[str, float], law: str | None) -> 'Actuator':

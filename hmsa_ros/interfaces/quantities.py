@@ -1,7 +1,7 @@
 """
 Quantities of an actuator: names, units, defaults, limits, and usual ranges.
 
-``hmsa init`` asks for them, and `hmsa_ros.api` warns of unusual ones.
+``hmsa init`` takes them as options, and `hmsa_ros.api` warns of unusual ones.
 
 The options of the command line depend on this module, so it imports nothing slow.
 """
@@ -212,7 +212,7 @@ EVERY = tuple({x.key: x for form in (BEAM, QUANTITIES) for x in form}.values())
 DAMPING = Quantity.of(
     'damping', _BLOCK['damping_coefficient'], 'damping coefficient c', (0.0, math.inf), '',
     follows=True)
-#: Quantities with a default; all others are given, asked for, or set by --yes.
+#: Quantities with a default; all others are given, or set by --yes.
 OPTIONAL = ('flux_min', 'slew_limit')
 
 
