@@ -415,6 +415,21 @@ def test_a_table_is_printed_where_the_locale_lacks_its_characters():
     assert 'two_step' in shown.stdout
 
 
+def test_the_locale_c_gets_plain_characters_and_file_names_as_they_are(tmp_path):
+    levels = tmp_path / 'lev\u00e9l.csv'
+    levels.write_text('time,flux_density\n0,0.01\n0.1,0\n', encoding='utf-8')
+    # As scripts, cron and containers have it; without it, Python takes UTF-8 by itself.
+    env = {**os.environ, 'LC_ALL': 'C', 'PYTHONUTF8': '0', 'PYTHONCOERCECLOCALE': '0'}
+    for words in (['plan', '1.1:10'], ['init', '--yes', '--out', 'b.yaml'],
+                  ['simulate', str(levels), '--params-file', 'b.yaml', '--out', f'{levels}2.csv']):
+        shown = subprocess.run(
+            [sys.executable, '-m', 'hmsa_ros', *words], cwd=tmp_path, env=env,
+            capture_output=True, check=True)
+        assert b'?' not in shown.stdout
+    assert b'-------  ' in shown.stdout
+    assert f'{levels}2.csv'.encode() in shown.stdout
+
+
 def test_nothing_is_wrong_where_standard_output_is_closed():
     shown = subprocess.run(
         ['sh', '-c', f'{shlex.quote(sys.executable)} -m hmsa_ros plan 1.1:10 >&-'], cwd=ROOT,

@@ -10,7 +10,6 @@ imported within these functions, so that ``hmsa --help`` answers immediately.
 import argparse
 from collections.abc import Sequence
 from importlib import import_module
-from io import TextIOWrapper
 import os
 import re
 import sys
@@ -19,6 +18,7 @@ from typing import Any, NoReturn
 from hmsa_ros import __version__
 from hmsa_ros.cli.node import NODES
 from hmsa_ros.cli.notes import collecting, show_notes, unshown
+from hmsa_ros.cli.output import tolerate
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import complain, HmsaError
 
@@ -82,9 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     0: success, 1: failed run, 2: bad input, 130: interrupted (SIGINT; 143 SIGTERM, 129 SIGHUP).
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == 'strict':
-        # A character that the locale lacks, in a table or a file name, must not end a command.
-        sys.stdout.reconfigure(errors='replace')
+    tolerate()
     # A command is started without importing the modules of the others.
     name = 'node' if words and words[0] in NODES else ''.join(words[:1]).replace('-', '_')
     parser = build_parser([x for x in COMMANDS if x.endswith(f'.{name}')] or COMMANDS)
