@@ -2,7 +2,9 @@
 
 from dataclasses import replace
 from itertools import pairwise
+import json
 import math
+import re
 
 from core_oracle import integrate
 import numpy as np
@@ -286,6 +288,27 @@ def test_arrays_and_files_of_a_path_are_followed_too(tmp_path, capsys):
                  str(tmp_path / 'block.yaml'), '--out', str(tmp_path / 'levels.csv')]) == 0
     written = np.loadtxt(tmp_path / 'levels.csv', delimiter=',', skiprows=1)
     assert written == pytest.approx(plan.levels, abs=1e-12)
-    capsys.readouterr()
+    head, _, row, *rest = capsys.readouterr().out.splitlines()
+    assert head.split()[:3] == ['lowest', 'stretch', 'highest']
+    assert '∞' not in row
+    assert rest[0].startswith('deviation: maximum distance')
+    assert main(['plan', '--path', str(tmp_path / 'path.csv'), '--params-file',
+                 str(tmp_path / 'block.yaml'), '--json']) == 0
+    found = json.loads(capsys.readouterr().out)['path']
+    assert (found['duration'], found['levels']) == (pytest.approx(0.2), len(plan.levels))
+    fine = np.linspace(0.0, 0.2, 20001)
+    course = 1.1 + 0.1 * np.sin(2.0 * np.pi * (fine / 0.2) ** 2 * (3.0 - 2.0 * fine / 0.2))
+    assert (found['low'], found['high']) == (
+        pytest.approx(course.min(), abs=1e-4), pytest.approx(course.max(), abs=1e-4))
+    assert found['peak_rate'] == pytest.approx(np.abs(np.gradient(course, fine)).max(), rel=2e-3)
+    assert found['peak_flux_density'] == np.abs(plan.flux_densities).max()
+    assert 0.0 < found['deviation'] < FOLLOWED * 0.2
+    weak = Actuator(flux_density_limits=0.9 * found['peak_flux_density'])
+    weak.to_yaml(tmp_path / 'weak.yaml')
+    assert main(['plan', '--path', str(tmp_path / 'path.csv'), '--params-file',
+                 str(tmp_path / 'weak.yaml')]) == 0
+    out = ' '.join(capsys.readouterr().out.split())
+    leaves = float(re.search(r'leaves the path by up to (\S+)', out)[1])
+    assert float(out.split(' deviation: ')[0].split()[-1]) == pytest.approx(leaves, rel=0.05)
     assert main(['plan', '--path', str(tmp_path / 'path.csv')]) == 2
     assert '--path CSV with --params-file' in capsys.readouterr().err

@@ -1,6 +1,6 @@
 """Paths for an actuator to follow, from arrays or files, with times in seconds."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import math
 from pathlib import Path as File
 from typing import Any, TYPE_CHECKING
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 SHAPES: dict[str, Shape] = {'square': sine, 'sine': sine, 'triangle': triangle}
 # Points between two spline knots of a wave.
 _OF_EACH = 8
+# Number of samples at which the deviation from a path is determined.
+_FEWEST_LOOKED, _MOST_LOOKED = 2_000, 200_000
 # Number of frequencies at which a sweep is checked against the limits.
 _SWEPT = 50
 
@@ -178,6 +180,35 @@ def _frame(actuator: 'Actuator') -> Request:
     model = actuator.model
     return Request.of(
         model.material, limits=model.limits, units=model.units, delivery=model.delivery)
+
+
+@dataclass(frozen=True)
+class Following:
+    """Demands of a path that a plan follows; all in SI."""
+
+    duration: float
+    levels: int
+    low: float  #: lowest stretch ...
+    high: float  #: ... and highest
+    peak_rate: float  #: of the stretch, in 1/s
+    peak_flux_density: float
+    peak_flux_density_rate: float  #: in T/s, from each level to the next
+    deviation: float  #: maximum distance from the path in a simulation of the plan
+
+
+def following(plan: 'Plan', path: Path) -> Following:
+    """Return the demands of a planned path, with the deviation of a simulation from it."""
+    unit = plan.actuator.model.units.time
+    duration = float(path.breaks[-1] - path.breaks[0]) * unit
+    count = min(max(_OF_EACH * len(path.breaks), _FEWEST_LOOKED), _MOST_LOOKED)
+    motion = plan.simulate(until=duration, rate=count / duration)
+    course, rates, _ = path.course(np.minimum(motion.times, duration) / unit + path.breaks[0])
+    fields, steps = plan.flux_densities, np.diff(plan.times)
+    return Following(
+        duration, len(plan.levels), float(np.min(course)), float(np.max(course)),
+        float(np.max(np.abs(rates))) / unit, float(np.max(np.abs(fields))),
+        float(np.max(np.abs(np.diff(fields)) / steps)) if len(steps) else 0.0,
+        float(np.max(np.abs(motion.stretches - course))))
 
 
 def followed(

@@ -9,6 +9,7 @@ example: hmsa plan 1.10:10 1.20:10 1.40:10 --json
 """
 
 import argparse
+from dataclasses import asdict
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -26,7 +27,7 @@ from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import setpoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import check_targets
-from hmsa_ros.table import Column
+from hmsa_ros.table import Column, Table
 
 if TYPE_CHECKING:
     from hmsa_ros.api.actuator import Actuator
@@ -107,16 +108,14 @@ def _in_units(arguments: argparse.Namespace) -> int:
     check_targets(arguments.out, sources=(arguments.path, arguments.params_file))
     actuator = _actuator(arguments)
     shaper = arguments.shaper or 'two_step'
-    plan = _along(actuator, arguments) if arguments.path else actuator.plan(
-        arguments.setpoints, shaper, **_more(arguments))
+    if arguments.path is not None:
+        return _along(actuator, arguments)
+    plan = actuator.plan(arguments.setpoints, shaper, **_more(arguments))
     if arguments.out is not None:
         plan.save(arguments.out)
     group, units, per_ampere = (
         actuator.model.material, actuator.model.units, arguments.tesla_per_ampere)
-    record: dict[str, Any] = {
-        'c1': group.c1, 'zeta': group.zeta, 'j_lim': group.j_lim, 'time_unit': units.time,
-        'flux_density_unit': units.load,
-        'segments': [_si_row(x, units, per_ampere) for x in plan.segments]}
+    record = _record(plan, per_ampere)
     amplifiers = []
     if arguments.amplifier:
         with progress('planning for amplifiers'):
@@ -133,11 +132,23 @@ def _in_units(arguments: argparse.Namespace) -> int:
         arguments, record, table_of(
             plan.segments, (Column(group.coordinate.name), *shown),
             [(x['stretch'], *(x[y.name] for y in shown)) for x in record['segments']],
-            Column('between', 'T at s'), units.time, units.level,
-            f'c1 {group.c1:.6g}, zeta {group.zeta:.6g}, time unit L sqrt(rho/G) '
-            f'{units.time:.6g} s'),
+            Column('between', 'T at s'), units.time, units.level, _caption(actuator)),
         *([f'{arguments.out} written'] if arguments.out is not None else []),
         *(f'\n{x}' for x in amplifiers))
+
+
+def _record(plan: 'Plan', per_ampere: float | None) -> dict[str, Any]:
+    """Return a plan in seconds and tesla as JSON."""
+    group, units = plan.actuator.model.material, plan.actuator.model.units
+    return {
+        'c1': group.c1, 'zeta': group.zeta, 'j_lim': group.j_lim, 'time_unit': units.time,
+        'flux_density_unit': units.load,
+        'segments': [_si_row(x, units, per_ampere) for x in plan.segments]}
+
+
+def _caption(actuator: 'Actuator') -> str:
+    group, unit = actuator.model.material, actuator.model.units.time
+    return (f'c1 {group.c1:.6g}, zeta {group.zeta:.6g}, time unit L sqrt(rho/G) {unit:.6g} s')
 
 
 def _without_dimension(arguments: argparse.Namespace) -> int:
@@ -212,13 +223,36 @@ def _actuator(arguments: argparse.Namespace) -> 'Actuator':
     return Actuator.from_yaml(arguments.params_file)
 
 
-def _along(actuator: 'Actuator', arguments: argparse.Namespace) -> 'Plan':
-    """Plan a path from a file; raise `BadInputError` for options of moves."""
-    from hmsa_ros.api.paths import read_path
+def _along(actuator: 'Actuator', arguments: argparse.Namespace) -> int:
+    """Plan a path from a file, and print what it demands; raise `BadInputError` for others."""
+    from hmsa_ros.api.paths import following, path_of, read_path
 
     if extra := [f'--{x}' for x in ('shaper', 'start', 'amplifier') if getattr(arguments, x)]:
         raise BadInputError(f'--path and {extra[0]} are given: expected only one of them')
-    return actuator.follow(*read_path(arguments.path))
+    points = read_path(arguments.path)
+    plan, per_ampere = actuator.follow(*points), arguments.tesla_per_ampere
+    if arguments.out is not None:
+        plan.save(arguments.out)
+    found = following(plan, path_of(actuator, (*points, None, None)))
+    record = _record(plan, per_ampere)
+    record['path'] = asdict(found)
+    name = actuator.model.material.coordinate.name
+    columns = [
+        Column('lowest', '', '.6g', f'lowest {name}'), Column('highest'), Column('duration', 's'),
+        Column('peak rate', '1/s', '.4g'), Column('levels'), Column('peak field', 'T', '.4g'),
+        Column('peak field rate', 'T/s', '.4g'), Column('deviation', '', '.2g')]
+    row: list[float] = [
+        found.low, found.high, found.duration, found.peak_rate, found.levels,
+        found.peak_flux_density, found.peak_flux_density_rate, found.deviation]
+    if per_ampere is not None:
+        columns.append(Column('peak current', 'A', '.4g'))
+        row.append(found.peak_flux_density / per_ampere)
+        record['path']['peak_current'] = row[-1]
+    return show(
+        arguments, record, Table(
+            tuple(columns), (tuple(row),),
+            'deviation: maximum distance of a simulation from the path; ' + _caption(actuator),
+            tuple(x for y in plan.segments for x in y.notes())), written=[arguments.out])
 
 
 def _more(arguments: argparse.Namespace) -> dict[str, Any]:
