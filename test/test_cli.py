@@ -81,7 +81,13 @@ def test_too_much_damping_falls_back_to_the_plain_step_and_says_so(capsys):
     (['send', '1.1,nan:1'], 'stretch is nan'),
     (['send', '1.1:1', '--timeout', '0'], 'timeout is 0'),
     (['send', '1.1:1', '--namespace', '9 bad'], "namespace '9 bad': Invalid namespace"),
-    (['nonsense'], 'invalid choice'),
+    (['plot'], "invalid choice: 'plot': did you mean"),
+    (['xyzzy'], "invalid choice: 'xyzzy': expected one of demo, "),
+    (['plann', '1.1:10'], "invalid choice: 'plann': did you mean plan?; see hmsa --help"),
+    (['record'], 'did you mean hmsa recorder?'), (['play', 'bag'], 'did you mean hmsa player?'),
+    (['bag', 'play', 'x'], 'did you mean hmsa player?'),
+    (['bag', 'inof', 'x'], 'did you mean info?'),
+    (['plan', '1.1:10', '--shapre=step'], '--shapre=step; did you mean --shaper?'),
     ([], 'required'),
 ])
 def test_bad_input_is_answered_in_one_line_with_status_2(words, said, capsys):

@@ -9,6 +9,7 @@ imported within these functions, so that ``hmsa --help`` answers immediately.
 
 import argparse
 from collections.abc import Sequence
+from difflib import get_close_matches
 from importlib import import_module
 import os
 import re
@@ -31,6 +32,12 @@ COMMANDS = (
     'hmsa_ros.cli.completion')
 
 
+# Commands of rosbag2 and others, with those for the same purpose.
+_MEANT = {
+    'record': 'hmsa recorder', 'play': 'hmsa player', 'sim': 'hmsa simulate',
+    'calib': 'hmsa calibrate'}
+
+
 class _Help(argparse.HelpFormatter):
     """Keep the line breaks of examples, so that they can be copied."""
 
@@ -50,6 +57,18 @@ class Parser(argparse.ArgumentParser):
         super().__init__(**{'formatter_class': _Help, **settings})
         # A setpoint such as -0.2:1 is not an option.
         self._negative_number_matcher = re.compile(r'-\.?\d')
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Raise `ArgumentError` for a value that is not a choice, with the closest one."""
+        choices = [str(x) for x in action.choices or ()]
+        if not choices or value in choices:
+            return
+        meant = _MEANT.get(value)
+        if meant is None:
+            meant = next(iter(get_close_matches(str(value), choices, 1)), None)
+        raise argparse.ArgumentError(action, f'invalid choice: {value!r}: ' + (
+            f'expected one of {", ".join(choices)}' if meant is None
+            else f'did you mean {meant}?'))
 
     def error(self, message: str) -> NoReturn:
         """Print one line on standard error and exit with status 2."""
@@ -88,7 +107,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = build_parser([x for x in COMMANDS if x.endswith(f'.{name}')] or COMMANDS)
     arguments, unknown = parser.parse_known_args(split_ros_args(words))
     if unknown:
-        arguments.parser.error(f'unrecognized arguments: {" ".join(unknown)}')
+        options = arguments.parser._option_string_actions
+        near = get_close_matches(unknown[0].partition('=')[0], options, 1, 0.75)
+        arguments.parser.error(
+            f'unrecognized arguments: {" ".join(unknown)}'
+            + (f'; did you mean {near[0]}?' if near else ''))
     arguments.ros_args = words[len(split_ros_args(words)):]
     ENDING.interrupt()
     try:

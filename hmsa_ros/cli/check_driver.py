@@ -13,7 +13,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from hmsa_ros.cli.options import add_command, JSON, show
+from hmsa_ros.cli.options import add_command, frequency, JSON, show
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import check_targets, write_text
@@ -30,8 +30,7 @@ def add_parser(subparsers: Any) -> None:
          'be given several times', {'action': 'append', 'default': []}),
         ('--limit', 'T', float, 'maximum flux density (default 0.001 T)',
          {'default': 1e-3}),
-        ('--rate', 'HZ', float, 'sample rate (default 200 Hz)',
-         {'default': 200.0}),
+        frequency('--rate', 'sample rate (default 200 Hz)', default=200.0),
         ('--report', 'HTML', Path, 'page with the checks and histograms of times'),
         JSON)
 

@@ -13,7 +13,7 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, assume_example, JSON, show
+from hmsa_ros.cli.options import add_command, assume_example, frequency, JSON, show
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.files import check_targets, write_text
 from hmsa_ros.table import Column, Table
@@ -37,8 +37,8 @@ def add_parser(subparsers: Any) -> None:
          'minimum stretch (default 0.6; a deflection of -0.6 for a beam)'),
         ('--stretch-max', 'X', float,
          'maximum stretch (default 2; a deflection of 0.6 for a beam)'),
-        ('--rate', 'HZ', float, 'sample rate of the sensor in Hz (default 1000)',
-         {'default': 1000.0}),
+        frequency(
+            '--rate', 'sample rate of the sensor in Hz (default 1000)', default=1000.0),
         ('--noise', 'X', float, 'standard deviation of the stretch samples (default 0.001)',
          {'default': 1e-3}),
         ('--out', 'CSV', Path,

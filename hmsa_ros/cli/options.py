@@ -82,12 +82,22 @@ def of_unit(option: str, unit: str, text: str) -> Row:
     def read(words: str) -> float:
         from hmsa_ros.interfaces.quantities import number_of
 
-        value = number_of(words, unit, option)
+        value = number_of(words, unit, option.removeprefix('--').replace('-', ' '))
         if not value > 0.0:
             raise BadInputError(f'{value:g} {unit}: expected more than 0 {unit}')
         return value
 
     return option, 'X', argument(read), f'{text} [{unit}]'
+
+
+def frequency(option: str, text: str, **settings: Any) -> Row:
+    """Return an option for a frequency in Hz or with a unit."""
+    def read(words: str) -> float:
+        from hmsa_ros.interfaces.quantities import number_of
+
+        return number_of(words, 'Hz', option.removeprefix('--'))
+
+    return option, 'HZ', argument(read), text, settings
 
 
 def actuator_of(path: Path | None) -> 'Actuator':

@@ -13,7 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from hmsa_ros.cli.options import actuator_of, add_command, EXAMPLE, JSON, show
+from hmsa_ros.cli.options import actuator_of, add_command, EXAMPLE, frequency, JSON, show
 from hmsa_ros.cli.pictures import paper_of, picture_options
 from hmsa_ros.cli.progress import progress
 
@@ -26,8 +26,9 @@ def add_parser(subparsers: Any) -> None:
         EXAMPLE,
         ('--until', 'S', float, 'end in s (default: when the last level has settled)'),
         ('--start', 'X', float, 'initial stretch, at rest (default 1; 0 for a beam)'),
-        ('--rate', 'HZ', float,
-         'sample rate in Hz (default 1000, or 40 samples per period of the actuator)'),
+        frequency(
+            '--rate',
+            'sample rate in Hz (default 1000, or 40 samples per period of the actuator)'),
         ('--noise', 'X', float, 'standard deviation of the stretch samples (default 0)',
          {'default': 0.0}),
         ('--seed', 'N', int, 'of the noise (default 0)', {'default': 0}),

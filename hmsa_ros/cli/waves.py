@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.notes import show_notes
-from hmsa_ros.cli.options import actuator_of, add_command, EXAMPLE, JSON, show
+from hmsa_ros.cli.options import actuator_of, add_command, EXAMPLE, frequency, JSON, show
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import check_targets
 
@@ -28,12 +28,12 @@ def add_parser(subparsers: Any) -> None:
         subparsers, 'wave', __doc__,
         ('shape', 'SHAPE', str, 'sine, triangle, square, sweep or CSV'),
         ('--offset --mean', 'STRETCH', float, 'mean stretch (default: that without a field)'),
-        ('--frequency', 'HZ', float, 'frequency', {'required': True}),
+        frequency('--frequency', 'frequency', required=True),
         ('--amplitude', 'STRETCH', float, 'amplitude of the stretch', {'required': True}),
         ('--cycles', 'N', float,
          'cycles at full amplitude, besides those in which the wave fades in and out (default 10)',
          {'default': 10.0}),
-        ('--to', 'HZ', float, 'last frequency of a sweep'),
+        frequency('--to', 'last frequency of a sweep'),
         EXAMPLE,
         ('--out', 'FILE', Path,
          'levels to write, ending in .csv, .parquet or .mat; an existing file is replaced'),

@@ -36,6 +36,7 @@ _UNITS: dict[str, dict[str, float]] = {
     'H': {'H': 1.0, 'mH': 1e-3, 'uH': 1e-6, 'µH': 1e-6},
     'ohm': {'ohm': 1.0, 'mohm': 1e-3, 'Ω': 1.0},
     'T/A': {'T/A': 1.0, 'mT/A': 1e-3},
+    'Hz': {'Hz': 1.0, 'kHz': 1e3},
 }
 _NUMBER = re.compile(r'\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*')
 _NAME = re.compile(r'[A-Za-z](?:_?[A-Za-z0-9])*')
@@ -57,6 +58,10 @@ def number_of(text: str, unit: str, words: str) -> float:
         example = f' with or without a unit ({", ".join(units)})' if units else ''
         raise BadInputError(f'{words} is {text!r}: expected a number{example}')
     number, own = found[1], found[2].replace('\u03bc', 'µ')
+    if own not in units:
+        # In another case, but not across the prefixes m (milli) and M (mega).
+        own = next((x for x in units if x.lower() == own.lower() and not (
+            x[0] in 'mM' and x[0] != own[0])), own)
     if own and own not in units:
         raise BadInputError(
             f'{words} has the unit {own!r}: expected '
