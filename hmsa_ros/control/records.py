@@ -75,7 +75,8 @@ class Trajectory:
     If ``raw``, it contains the flux density in T of each joint and the time from which it applies.
     Points are read in pieces, and again for each replanning; iterating them may raise
     `RefusedError`. Points of a ``path`` contain stretch, rate (1/s) and acceleration (1/s^2, or
-    NaN) of each joint. The path is followed if the settings or ``follows`` request it.
+    NaN) of each joint. The path is followed if the settings or ``follows`` request it. Without
+    points, it is a stop.
     """
 
     joints: tuple[str, ...]
@@ -171,6 +172,8 @@ class StatusChanged:
     measuring: bool = False  # whether there are recent samples
     # Name of each joint's position coordinate.
     coordinates: Mapping[str, str] = field(default_factory=dict)
+    # Newest verdicts on recent requests by name, each with the number of plans then.
+    answers: Mapping[str, tuple[Verdict, int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

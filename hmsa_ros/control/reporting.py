@@ -17,6 +17,7 @@ from hmsa_ros.control.records import (
 from hmsa_ros.control.watching import Watch
 from hmsa_ros.judge.records import Finding, VERDICTS
 from hmsa_ros.model.status import Code
+from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import PlannerGroup, Progress
 from hmsa_ros.planning.timeline import PlannedSegment
 
@@ -25,6 +26,9 @@ from hmsa_ros.planning.timeline import PlannedSegment
 _PREVIEW, _SOON = 500, 50_000_000
 #: Interval in ns at which subscribers are looked up.
 LOOK = 200_000_000
+# Number of requests whose verdicts are repeated, and time in ns by the steady clock: many requests
+# at once replace each other's status before their senders have read it.
+_ANSWERS, _REPEATED = 64, 30 * NANOSECONDS
 
 
 class Reporting:
@@ -42,6 +46,8 @@ class Reporting:
         self.unheard = ''  # why commands are not carried out; empty if they are
         self.unseen = ''  # joint whose samples have stopped; empty for none
         self.verdict = Verdict(Severity.OK, Code.NONE, 'no request yet')
+        # By name of request: the newest verdict, the number of plans then, and the steady time.
+        self._answers: dict[str, tuple[Verdict, int, int]] = {}
         self.preview_again: int | None = None  # time in ns of the next part of a long plan
         self._reported: tuple[Progress, Mapping[str, Progress], bool] | None = None
         # The plans that progress was computed from, valid until `next_change`.
@@ -53,6 +59,10 @@ class Reporting:
         """Set the verdict; a correction does not replace a warning."""
         if verdict.code is not Code.CORRECTED or not self._warned:
             self.verdict = verdict
+            if verdict.request:
+                self._answers.pop(verdict.request, None)
+                self._answers[verdict.request] = (
+                    verdict, self._group.number, self._around.steady())
         if log:
             self.note(verdict.message)
         self.report()
@@ -70,11 +80,15 @@ class Reporting:
         """Report verdict and progress."""
         self._reported = self._state()
         progress, each, watching = self._reported
+        old = self._around.steady() - _REPEATED
+        self._answers = {
+            name: x for name, x in [*self._answers.items()][-_ANSWERS:] if x[-1] >= old}
         self.outputs.append(StatusChanged(
             self.verdict, progress, each, self._group.number, self._following.lateness.count,
             self._following.replanned, self._watch.findings, self._watch.worst, watching,
             self.unheard, self.unseen, self._watch.measuring,
-            {name: x.model.units.coordinate for name, x in self._group.planners.items()}))
+            {name: x.model.units.coordinate for name, x in self._group.planners.items()},
+            {name: x[:2] for name, x in self._answers.items()}))
 
     def report_progress(self, now: int) -> None:
         """Report the progress if it has changed by a time in ns."""
@@ -102,11 +116,11 @@ class Reporting:
         self.preview_again = stamps[_PREVIEW // 2] if len(stamps) == _PREVIEW else None
         self.outputs.append(PlanChanged(tuple(stamps), samples))
 
-    def found(self, finding: Finding | None) -> None:
-        """Report a finding; the verdict is the worst finding of the request."""
+    def found(self, finding: Finding | None, *, judged: bool = False) -> None:
+        """Report a finding; the worst one of the request is the verdict, unless it is judged."""
         worst = self._watch.worst
-        if worst is None or self.verdict.severity is Severity.ERROR or not worst.failed and (
-                self._warned or not self._watch.finished):
+        if judged or worst is None or self.verdict.severity is Severity.ERROR or (
+                not worst.failed and (self._warned or not self._watch.finished)):
             self.report()
             return
         fine = worst.arrived or worst.verdict is Code.UNOBSERVED and not self._watch.measuring

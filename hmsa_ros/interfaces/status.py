@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import json
 import math
 import re
@@ -56,7 +56,8 @@ class Verdict:
     judged by samples. ``measured`` is the code of the worst finding, ``finding`` its message and
     ``figures`` its values. ``measuring`` indicates recent samples, and ``late`` is the number of
     late commands since the planner started. ``unheard`` is the reason why commands are not carried
-    out.
+    out. ``plan`` is the number of plans until then, and ``answers`` contains the verdicts on
+    recent requests by name.
     """
 
     level: int
@@ -73,6 +74,19 @@ class Verdict:
     measuring: bool = False
     late: int = 0
     figures: Mapping[str, object] = field(default_factory=dict)
+    plan: int = 0
+    answers: Mapping[str, object] = field(default_factory=dict)
+
+    def on(self, request: str) -> 'Verdict | None':
+        """Return the verdict on a recent request by its name, None if it is not known."""
+        if self.request == request:
+            return self
+        match self.answers.get(request):
+            case [int(level), str(code), str(message), int(plan)]:
+                return replace(
+                    self, level=level, code=printable(code), message=printable(message),
+                    request=request, plan=plan)
+        return None
 
     @property
     def failure(self) -> str:
@@ -106,4 +120,5 @@ class Verdict:
             values.get('watching') == 'True', values.get('worst', ''),
             values.get('worst_message', ''), values.get('unheard', ''),
             values.get('measuring') == 'True', whole(values.get('late')),
-            _object(values.get('finding', '')))
+            _object(values.get('finding', '')), whole(values.get('plan')),
+            _object(values.get('answers', '')))

@@ -134,6 +134,10 @@ def to_planner_status(status: 'StatusChanged') -> DiagnosticStatus:
         'code': verdict.code, 'request': verdict.request, 'plan': status.plan,
         **vars(progress), 'late': status.late, 'replanned': status.replanned, **verdict.figures,
         'watching': status.watching, 'measuring': status.measuring}
+    if status.answers:
+        values['answers'] = json.dumps({
+            name: (int(x.severity), x.code, x.message, plan)
+            for name, (x, plan) in status.answers.items()})
     if status.worst is not None:
         values |= {
             'worst': str(status.worst.verdict), 'worst_message': status.worst.message,
