@@ -410,7 +410,7 @@ def test_long_trajectory_leaves_room_for_signs_of_life_and_for_a_stop(rig, ros):
     before = planner.runtime.devices.heartbeats
     planner.run(planner.now + 60 * MS)
     assert planner.runtime.devices.heartbeats > before
-    assert ros.call(Trigger, 'planner/stop').message == 'accepted'
+    assert ros.call(Trigger, 'planner/stop').message.startswith('stopping: ')
     planner.verdict(code='accepted', request='', plan=2)
     assert planner.runtime.wake != 0
 
@@ -440,7 +440,7 @@ def test_deactivated_it_comes_to_rest_and_activated_again_it_takes_over(rig, ros
     planner.send(to_trajectory(SEQUENCE, 'actuator'))
     planner.at(START + 3 * MS)
     change(Transition.TRANSITION_DEACTIVATE)
-    planner.verdict(code='stopped')
+    planner.verdict(code='inactive')
     assert planner.send(to_trajectory(SEQUENCE, 'actuator'), 'inactive').level == ERROR
     sent = planner.runtime.devices.sent + planner.runtime.devices.heartbeats
     planner.spin(lambda: len(driver.arrived) == sent, 'the last commands')

@@ -388,7 +388,8 @@ def test_stop_comes_to_rest_without_vibration(bench):
     planner.at(START + 3 * MS)
     planner.core.stop(planner.now)
     answer = planner.ros.call(Trigger, planner.name(topics.STOP))
-    assert (answer.success, answer.message) == (True, 'accepted')
+    assert answer.success
+    assert answer.message.startswith('stopping: ')
     planner.take()
     # The first move is cut off by two levels: one that brakes, one that holds.
     assert len([x for x in planner.core.plan.levels if x.stamp > START]) == 3
@@ -396,7 +397,21 @@ def test_stop_comes_to_rest_without_vibration(bench):
     assert abs(rest.rate) < 1e-12
     assert 1.0 < rest.stretch < 1.1
     planner.run(END)
-    planner.verdict('unobserved', state='at_rest')
+    # Nobody has acknowledged it.
+    planner.verdict('accepted', state='at_rest', worst='unobserved')
+    planner.check()
+
+
+@pytest.mark.parametrize('joints', [(), ('actuator',)])
+def test_trajectory_without_points_is_a_stop(bench, joints):
+    planner = bench()
+    planner.request(*SEQUENCE)
+    planner.at(START + 3 * MS)
+    planner.core.stop(planner.now)
+    status = planner.send(JointTrajectory(joint_names=joints))
+    assert (status.level, status.message[:10]) == (OK, 'stopping: ')
+    planner.run(END)
+    planner.verdict('accepted', state='at_rest')
     planner.check()
 
 
@@ -407,7 +422,9 @@ BAD = {
         trajectory((math.inf, SPELL)), 'bad_input', 'stretch is inf: expected a finite number'),
     'nan_in_second_point': (
         trajectory((1.1, SPELL), (math.nan, 2 * SPELL)), 'bad_input', 'stretch is nan'),
-    'no_points': (trajectory(), 'bad_input', 'has no points: expected at least one'),
+    'no_points_of_another_joint': (
+        trajectory(joint='knee'), 'unknown_joint',
+        "joint_names has 'knee': expected names among actuator"),
     'no_positions': (trajectory((1.1, SPELL)), 'bad_input', 'point 0 has 0 positions'),
     'two_positions': (trajectory((1.1, SPELL)), 'bad_input', 'point 0 has 2 positions'),
     'rate_at_the_end': (trajectory((1.1, SPELL)), 'bad_input', 'point 0 has velocities [0.5]'),
@@ -640,7 +657,7 @@ def test_diagnostics_count_what_was_sent_and_refused(bench):
     arrays = planner.collect(topics.DIAGNOSTICS)
     planner.request(*SEQUENCE)
     planner.run(END)
-    planner.send(trajectory(), 'bad_input')
+    planner.send(trajectory((math.nan, SPELL)), 'bad_input')
 
     def counted() -> bool:
         return bool(arrays) and {

@@ -610,7 +610,7 @@ def test_deactivated_it_comes_to_rest_and_then_sends_nothing():
     rig.run(START + 3 * MS)
     rig.runtime.deactivate()
     rig.tick()
-    assert rig.status.verdict.code == 'stopped'
+    assert rig.status.verdict.code == 'inactive'
     sent = len(rig.sent)
     rig.run(START + 500 * MS)
     assert len(rig.sent) == sent

@@ -33,6 +33,11 @@ def check_joints(request: Request, joints: Sequence[str], settings: Settings) ->
     if not isinstance(request, Trajectory):
         return
     names = request.joints
+    if not request.count:
+        # A stop of all joints.
+        if unknown := [x for x in names if x not in joints]:
+            raise _unknown(f'has {excerpt(unknown[0])}: expected names among {", ".join(joints)}')
+        return
     if len(joints) == 1 and names != tuple(joints):
         raise _unknown(f'is {excerpt(list(names))}: expected {list(joints)}')
     if twice := sorted({x for x in names if names.count(x) > 1}):

@@ -103,6 +103,11 @@ class Goals:
                 raise RefusedError(
                     Code.BAD_INPUT,
                     'the points of the goal have effort alone: expected positions')
+            if not request.count:
+                raise RefusedError(
+                    Code.BAD_INPUT,
+                    'the goal has no points: expected some; to stop, cancel the goal, or call '
+                    '~/stop')
             if goal_time_tolerance < 0:
                 raise RefusedError(
                     Code.BAD_INPUT, f'goal_time_tolerance is '
@@ -146,6 +151,10 @@ class Goals:
         if answered and (goal.plan is None or goal.canceled):
             if verdict.code is Code.SUPERSEDED and goal.canceled:
                 return None
+            if goal.canceled and verdict.code in (Code.STOPPED, Code.VIBRATING):
+                return goal.dropped(verdict.message)
+            if goal.canceled and verdict.code is Code.UNHEARD:
+                return Outcome('aborted', ErrorCode.INVALID_GOAL, verdict.message)
             if verdict.severity is Severity.ERROR or verdict.code is Code.SUPERSEDED:
                 return goal.dropped(verdict.message, ErrorCode.of(verdict.code))
             if not goal.canceled:
@@ -157,9 +166,8 @@ class Goals:
             return goal.dropped(verdict.message) if back else None
         if status.plan > goal.plan:
             return goal.dropped(_REPLACED)
-        if goal.canceled:
-            rests = state in ('at_rest', 'settling', 'idle')
-            return goal.dropped('came to rest') if rests else None
+        if goal.canceled and state != 'idle':
+            return None
         if state == 'idle':
             return goal.dropped(verdict.message)
         done = (status.progress.setpoint == status.progress.setpoints

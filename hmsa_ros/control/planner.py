@@ -31,6 +31,7 @@ from hmsa_ros.control.records import (
 from hmsa_ros.control.reporting import LOOK, Reporting
 from hmsa_ros.control.silence import Silence
 from hmsa_ros.control.slices import SLICE
+from hmsa_ros.control.stops import Stops
 from hmsa_ros.control.takeover import Takeover
 from hmsa_ros.control.throttle import Throttle
 from hmsa_ros.control.watching import Watch
@@ -81,9 +82,12 @@ class PlannerRuntime:
         self._reporting = Reporting(
             group, self.following, self._watch, around, self._outputs, self._note,
             lambda: around.unheard() or receipts.words, self._unseen)
+        self._stops = Stops(
+            group, self.devices, self.following.newest, self._watch, around, around.unheard,
+            lambda: self.settings.tolerances)
         self.planning = Planning(
             group, self.following, Corrections(self.feedback, clock), self._reporting,
-            around, lambda: self.devices.send(clock()))
+            around, lambda: self.devices.send(clock()), self._stops.begin)
         self._next_beat = 0  # time in ns of the next heartbeat
         self._last_jump: int | None = None
         self._set_back = 0
@@ -101,11 +105,14 @@ class PlannerRuntime:
 
         A request that replaces all others from now on is planned before those that wait, which are
         dropped if it can be carried out. The verdict is ``waiting`` until there is one for this
-        request.
+        request. A trajectory without points is a stop.
         """
         try:
             check_ready(self._clock(), active=self.active)
             check_joints(request, tuple(self.group.planners), self.settings)
+            if isinstance(request, Trajectory) and not request.count:
+                # As for a joint_trajectory_controller; goals are checked before.
+                request = Stop(request.name)
             if not isinstance(request, Stop):
                 if self.crowded is not None:
                     raise self.crowded
@@ -275,6 +282,7 @@ class PlannerRuntime:
             self.group.restart()
             self._watch.restart()
             self._takeover.drop()
+            self._stops.drop()
             self._takeover.engaged = False
         else:
             # All plans continue as if the clock had not been set.
@@ -311,7 +319,9 @@ class PlannerRuntime:
             self.planning.clear()
             self.devices.send(now, everything=True)
             self._watch.restart()
-            self._reporting.give(Verdict(Severity.OK, Code.STOPPED, 'deactivated: coming to rest'))
+            self._reporting.give(Verdict(
+                Severity.OK, Code.INACTIVE, 'deactivated: coming to rest, if its commands arrive'))
+        self._stops.drop()
         self._takeover.engaged = False
 
     def change(
@@ -361,7 +371,7 @@ class PlannerRuntime:
             times.append(self._next_beat)
         if self.following.astray or self.following.verdicts:
             times.append(0)
-        if self.devices.receipts:
+        if self.devices.receipts or self._stops.open:
             times.append(now + LOOK)
         return min((x for x in times if x is not None), default=None)
 
@@ -387,6 +397,8 @@ class PlannerRuntime:
             self._reporting.look_for_listeners()
             if not estimated:
                 self._judge(now)
+        if (verdict := self._stops.look(now)) is not None:
+            self._reporting.give(verdict, log=verdict.severity > Severity.OK)
         self._process_clock()
         return self._taken()
 
@@ -466,7 +478,8 @@ class PlannerRuntime:
             finding = self._watch.judge(
                 now, self.settings.tolerances, end, observable=observable)
             if finding is not None or not self._watch.open:
-                self._reporting.found(finding)
+                # A rest beside the predicted one is no failure of a stop.
+                self._reporting.found(finding, judged=self._stops.judges)
             if finding is None:
                 break
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from hmsa_ros.control.corrections import Corrections
 from hmsa_ros.control.environment import Environment
 from hmsa_ros.control.following import Following
-from hmsa_ros.control.records import Note, Request, Severity, Verdict
+from hmsa_ros.control.records import Note, Request, Severity, Stop, Verdict
 from hmsa_ros.control.reporting import Reporting
 from hmsa_ros.control.slices import SLICE, Work, work_on
 from hmsa_ros.errors import BadInputError, HmsaError
@@ -23,10 +23,12 @@ class Planning:
 
     def __init__(
             self, group: PlannerGroup, following: Following, corrections: Corrections,
-            reporting: Reporting, environment: Environment, send: Callable[[], None]) -> None:
+            reporting: Reporting, environment: Environment, send: Callable[[], None],
+            stopping: Callable[[str], None]) -> None:
+        """Begin without requests; ``stopping`` is called with the name of an adopted stop."""
         self._group, self._following, self._reporting = group, following, reporting
         self._corrections = corrections
-        self._around, self._send = environment, send
+        self._around, self._send, self._stopping = environment, send, stopping
         self._queue: deque[Work] = deque()
         # Parts of replaced plans: freeing all at once takes tens of ms.
         self._leftovers: list[object] = []
@@ -134,6 +136,11 @@ class Planning:
             self._reporting.show()
         self._reporting.look_for_listeners()
         severity, code, words = Severity.OK, Code.ACCEPTED, _accepted(drafts)
+        if isinstance(request, Stop):
+            self._stopping(request.name)
+            words = (
+                'stopping: comes to rest without vibration; ~/status says once plant or driver '
+                'has acknowledged it')
         if warnings:
             severity, code, words = Severity.WARN, warnings[0].code, warnings[0].reason
         elif not changed:

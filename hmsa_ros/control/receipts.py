@@ -27,6 +27,7 @@ class _Joint:
     time: int = 0  # its time by the clock of the device
     command: int = 0  # timestamp that it acknowledged; 0 for none
     unanswered: int | None = None  # time since which no command is acknowledged
+    acknowledged: int = 0  # newest timestamp sent that was acknowledged; 0 for none
     silent: bool = False
     missing: int = 0  # consecutive looks without a publisher of receipts
     clock: DeviceClock = field(default_factory=DeviceClock)
@@ -93,9 +94,10 @@ class Receipts:
             # Commands that were sent to the previous device are lost.
             known.clock.lost()
             known.unanswered = None
+            known.acknowledged = 0
         known.arrived, known.time, known.missing, known.delayed = steady, time, 0, None
         if known.clock.awaits(command):
-            known.unanswered = None
+            known.unanswered, known.acknowledged = None, command
         if comparable:
             known.step += known.clock.received(time, command, now, steady)
         return restarted
@@ -104,6 +106,23 @@ class Receipts:
         """Return whether a joint's newest receipt is no older than a time of its device."""
         known = self._joints.get(joint)
         return known is None or known.silent or known.time >= time
+
+    def carried_out(self, joint: str, stamp: int) -> bool | None:
+        """
+        Return whether a joint's device has acknowledged a command and reached its timestamp in ns.
+
+        A newer command acknowledges it too. None if the device sends no receipts.
+        """
+        known = self._joints.get(joint)
+        return None if known is None else (
+            not known.silent and known.acknowledged >= stamp and known.time >= stamp)
+
+    def behind(self, joint: str, stamp: int) -> int:
+        """Return the ns until an acknowledged command applies, by a joint's device; else 0."""
+        known = self._joints.get(joint)
+        if known is None or known.silent or known.acknowledged < stamp:
+            return 0
+        return max(stamp - known.time, 0)
 
     def forget(self, joint: str) -> None:
         """
@@ -123,6 +142,7 @@ class Receipts:
         """Record that the planner's clock was set."""
         for known in self._joints.values():
             known.clock.set(self._steady())
+            known.acknowledged = 0
 
     def take_step(self, joint: str) -> int:
         """Return by how many ns a device's clock was set ahead since the last call."""
