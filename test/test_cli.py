@@ -226,8 +226,10 @@ def test_send_passes_on_why_the_planner_refuses(start):
     start.hmsa('planner')
     send = start.hmsa('send', '9:1')
     assert send.wait(30.0) == 2
-    assert 'the planner refused: target stretch is 9' in send.stderr
-    assert len(send.stderr.strip().splitlines()) == 1
+    *notes, error = send.stderr.strip().splitlines()
+    assert 'the planner refused: target stretch is 9' in error
+    # The planner may still be starting.
+    assert all(x.startswith('hmsa: note: waiting') for x in notes)
 
 
 @pytest.mark.ros

@@ -2,20 +2,23 @@
 Publish a sequence of setpoints to the running planner.
 
 Publish a sequence of setpoints or levels to the running planner, starting now, and print the
-status.
+status. With --wait, Ctrl-C brings the actuator to rest.
 
 example: hmsa send 1.10:2 1.20:2 --wait
 """
 
 import argparse
 import sys
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.notes import show_notes
 from hmsa_ros.cli.options import add_command, JOINTS, NAMESPACE, timeout_of
 from hmsa_ros.cli.setpoints import SEQUENCE, sequence_of
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import HmsaError
+
+if TYPE_CHECKING:
+    from hmsa_ros.lab.client import PlannerClient
 
 
 def add_parser(subparsers: Any) -> None:
@@ -50,23 +53,36 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.recorded:
             client.find_recorder()
         client.find_plant()
-        verdict = client.send(arguments.setpoints, levels, path)
-        print(verdict.message)
-        if not arguments.wait:
-            return 0
-        seen = ''
-
-        def report(now: object) -> None:
-            nonlocal seen
-            line = f'setpoint {now.setpoint} of {now.setpoints}: {now.state}'  # type: ignore
-            if line != seen and now.setpoint:  # type: ignore[attr-defined]
-                seen = line
-                print(line, file=sys.stderr, flush=True)
-
-        length = sum(span for _, span in arguments.setpoints) + sum(
-            x[-1][0] for x in (levels, path) if x)
-        verdict = client.follow(verdict, each=report, timeout=length + timeout)
-        if verdict.failure:
-            raise HmsaError(verdict.failure)
-        print(f'done: {verdict.state}, {verdict.basis}')
+        try:
+            _carry_out(client, arguments, levels, path)
+        except KeyboardInterrupt:
+            if not (arguments.wait and client.requested):
+                raise
+            print('interrupted: stopping', file=sys.stderr, flush=True)
+            print(client.stop().message, file=sys.stderr)
+            return ENDING.status
     return 0
+
+
+def _carry_out(
+        client: 'PlannerClient', arguments: argparse.Namespace, levels: Any, path: Any) -> None:
+    """Send, and report progress until the end if requested."""
+    verdict = client.send(arguments.setpoints, levels, path)
+    print(verdict.message, flush=True)
+    if not arguments.wait:
+        return
+    seen = ''
+
+    def report(now: object) -> None:
+        nonlocal seen
+        line = f'setpoint {now.setpoint} of {now.setpoints}: {now.state}'  # type: ignore
+        if line != seen and now.setpoint:  # type: ignore[attr-defined]
+            seen = line
+            print(line, file=sys.stderr, flush=True)
+
+    length = sum(span for _, span in arguments.setpoints) + sum(
+        x[-1][0] for x in (levels, path) if x)
+    verdict = client.follow(verdict, each=report, timeout=length + arguments.timeout)
+    if verdict.failure:
+        raise HmsaError(verdict.failure)
+    print(f'done: {verdict.state}, {verdict.basis}')

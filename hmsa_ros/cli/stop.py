@@ -1,8 +1,9 @@
 """
 Drop the rest of the sequence and come to rest without vibration.
 
-Call the service ~/stop of the running planner: it drops the rest of its sequence and brings the
-actuators to rest without vibration. Return when they are at rest. The field stays on: in an
+Have the running planner drop the rest of its sequence and bring the actuators to rest without
+vibration. Return once plant or driver has acknowledged that, and its samples, if any, do not
+contradict it; otherwise fail, and say what is known and what to do. The field stays on: in an
 emergency, open the interlock of the driver (topic driver/interlock), or switch the amplifier off.
 
 example: hmsa stop
@@ -13,7 +14,6 @@ from typing import Any
 
 from hmsa_ros.cli.options import add_command, NAMESPACE, TIMEOUT, timeout_of
 from hmsa_ros.ending import ENDING
-from hmsa_ros.errors import HmsaError
 
 
 def add_parser(subparsers: Any) -> None:
@@ -22,16 +22,11 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Stop and wait; raise `HmsaError` if there is no planner, or it does not come to rest."""
+    """Stop and wait; raise `HmsaError` if that is not acknowledged."""
     timeout = timeout_of(arguments)
-    from hmsa_ros.lab.client import PlannerClient
+    from hmsa_ros.lab.link import Link
 
     ENDING.note()
-    with PlannerClient(namespace=arguments.namespace, timeout=timeout) as client:
-        client.find_planner()
-        if not client.stop():
-            raise HmsaError(
-                f'the planner has not come to rest ({client.verdict.state}: '
-                f'{client.verdict.message}): expected rest; hmsa watch shows the motion')
-        print(f'stopped: {client.verdict.state.replace("_", " ")}')
+    with Link(arguments.namespace, timeout) as link:
+        print(link.stop().message)
     return 0

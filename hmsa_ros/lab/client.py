@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from itertools import accumulate
 import math
 from time import monotonic, sleep
@@ -12,7 +13,6 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.srv import GetState
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
-from std_srvs.srv import Trigger
 
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, HmsaError
@@ -20,6 +20,7 @@ from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.status import Verdict
 from hmsa_ros.lab import graph
 from hmsa_ros.lab.experiment import check_stretches
+from hmsa_ros.lab.link import Link, SILENCE
 from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
@@ -27,14 +28,13 @@ from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
 from hmsa_ros.nodes.presence import LATELY_SECONDS, Presence
 from hmsa_ros.nodes.service_call import ServiceCall
-from hmsa_ros.nodes.visitor import SLICE_SECONDS, Visitor
+from hmsa_ros.nodes.visitor import SLICE_SECONDS
 
 # Time in s for an existing planner node to subscribe: configuration takes a fraction of a second,
 # much longer on a busy machine.
 _LISTENS_SECONDS = 60.0
-# Time limits in s for coming to rest, perhaps in slow motion, and for a planner without answer.
-_STOP_SECONDS = 15.0
-_GONE_SECONDS = 3.0
+# Time in s until a subscriber that is in the graph but not matched counts as unreachable.
+_MATCHED_SECONDS = 3.0
 # Time in s from discovery of a recorder until it is assumed to receive.
 _SETTLED_SECONDS = 1.0
 # Time in s until all nodes of the host are discovered.
@@ -44,14 +44,11 @@ _OTHERS = (
     'it, or set another ROS_DOMAIN_ID')
 # Time in s after which killed nodes have left the graph.
 _FORGOTTEN_SECONDS = 22.0
-# Time in s to discover the subscriber of the commands.
-_UNHEARD_SECONDS = 3.0
+# Time in s to discover the subscriber of the commands, and until they count as not carried out.
+_DEVICE_SECONDS, _UNHEARD_SECONDS = 1.5, 3.0
 
 
-_SILENCE = Verdict(0, 'no reply from the planner yet', '', '', '', 0, 0)
-
-
-class PlannerClient(Visitor):
+class PlannerClient(Link):
     """
     A client of one planner; a context manager.
 
@@ -69,34 +66,24 @@ class PlannerClient(Visitor):
     def __init__(
             self, *, namespace: str = '', joints: Sequence[str] = ('actuator',),
             timeout: float = 10.0) -> None:
-        super().__init__('client', namespace, timeout)
+        super().__init__(namespace, timeout)
         self._begin = monotonic()
         self._joints = tuple(joints)
-        self._namespace = namespace
-        #: Last verdict of the planner.
-        self.verdict: Verdict = _SILENCE
+        self._begun: float | None = None  # time at which the planner's subscription was found
         #: Name of the last request.
         self.requested = ''
-        endpoints.subscribe(self.node, topics.STATUS, self._on_status, topics.PLANNER)
-        self._publisher = endpoints.publisher(
-            self.node, topics.JOINT_TRAJECTORY, topics.PLANNER)
-
-    def _on_status(self, message: DiagnosticStatus) -> None:
-        self.verdict = Verdict.read(message)
 
     def find_planner(self, each: Callable[[], None] | None = None) -> None:
         """Wait until a planner subscribes and its status has arrived; call ``each`` meanwhile."""
-        where = self._namespace or '/'
-        failure = (
-            f'no planner in namespace {where}; start one with hmsa planner, with the same '
-            'ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here')
+        where, failure = self._namespace or '/', self.no_planner
 
         def found() -> bool:
-            return (self.verdict is not _SILENCE
-                    and self._publisher.get_subscription_count() > 0)
+            return self.verdict is not SILENCE and self._reached()
 
         # A node that does not subscribe yet is still starting.
-        self.spin_until(lambda: found() or self._is_there(topics.PLANNER), failure, each)
+        self.spin_until(
+            lambda: found() or self._is_there(topics.PLANNER), failure, each,
+            awaited=f'a planner in namespace {where}: start one with hmsa planner')
         state = ServiceCall(
             self.node, GetState, f'{topics.PLANNER}/get_state', GetState.Request())
 
@@ -114,9 +101,21 @@ class PlannerClient(Visitor):
 
         self.spin_until(
             settled, 'the planner does not subscribe to requests', each,
-            max(self._timeout, _LISTENS_SECONDS))
+            max(self._timeout, _LISTENS_SECONDS),
+            awaited='the planner, which is starting or cannot be reached')
         state.close()
-        self.spin_until(found, failure, each)
+        self.spin_until(found, failure, each, awaited='the planner to take requests')
+
+    def _reached(self) -> bool:
+        """Return whether a request reaches the planner, rather than only other subscribers."""
+        if not self.listened:
+            self._begun = None
+            return False
+        if self._begun is None:
+            self._begun = monotonic()
+        # A subscriber that cannot be reached holds nobody up.
+        return (endpoints.matched(self.node, self._publisher, self._planner)
+                or monotonic() - self._begun > _MATCHED_SECONDS)
 
     def _is_there(self, name: str) -> bool:
         return (name, f'/{self._namespace.strip("/")}') in (
@@ -144,6 +143,7 @@ class PlannerClient(Visitor):
             end = monotonic() + (_FORGOTTEN_SECONDS if own else LATELY_SECONDS)
             # Killed nodes are still discovered, but inactive.
             while presence.crowded(self._joints, topics.PLANNER) and monotonic() < end:
+                self.say('waiting to see whether a second planner, plant or driver has ended')
                 presence.look()
                 if found := presence.planners(topics.PLANNER) or presence.devices(self._joints):
                     raise HmsaError(_OTHERS if own else found)
@@ -177,12 +177,13 @@ class PlannerClient(Visitor):
                 self._publisher.get_subscription_count() >= len(heard))
 
         self.spin_until(
-            recorded, f'no recorder of {self._publisher.topic_name}; start one with hmsa recorder')
+            recorded, f'no recorder of {self._publisher.topic_name}; start one with hmsa recorder',
+            awaited='a recorder: start one with hmsa recorder')
 
     def find_plant(self) -> None:
         """Wait briefly until the commands have a subscriber; the planner reports failure."""
         with suppress(HmsaError):
-            self.spin_until(lambda: not self.unheard(), 'no plant', timeout=_UNHEARD_SECONDS)
+            self.spin_until(lambda: not self.unheard(), 'no plant', timeout=_DEVICE_SECONDS)
 
     def unheard(self) -> list[str]:
         """Return the command topics without subscribers other than recorders."""
@@ -224,13 +225,16 @@ class PlannerClient(Visitor):
         while True:
             request = self.publish(setpoints, levels, path)
             self.spin_until(
-                lambda request=request: self.verdict.request == request,  # type: ignore[misc]
-                'the planner did not reply with a verdict')
-            if self.verdict.level < DiagnosticStatus.ERROR[0]:
-                return self.verdict
+                lambda request=request: self.verdict.on(request) is not None,  # type: ignore[misc]
+                'the planner did not reply with a verdict',
+                awaited="the planner's verdict: it plans, or waits for plant, driver or samples")
+            verdict = self.verdict.on(request)
+            assert verdict is not None
+            if verdict.level < DiagnosticStatus.ERROR[0]:
+                return verdict
             # A planner that has just started may not have received the time yet.
-            if self.verdict.code != 'no_time' or monotonic() > deadline:
-                raise BadInputError(f'the planner refused: {self.verdict.message}')
+            if verdict.code != 'no_time' or monotonic() > deadline:
+                raise BadInputError(f'the planner refused: {verdict.message}')
             self._executor.spin_once(timeout_sec=SLICE_SECONDS)
             sleep(SLICE_SECONDS)
 
@@ -259,11 +263,6 @@ class PlannerClient(Visitor):
             [(x, round(time * NANOSECONDS)) for time, x in points], self._joints,
             frame=self.requested, raw=bool(levels), path=bool(path)))
         return self.requested
-
-    @property
-    def listened(self) -> bool:
-        """Whether the requests have a subscriber."""
-        return bool(self._publisher.get_subscription_count())
 
     def follow(
             self, verdict: Verdict, *, each: Callable[[Verdict], None] | None = None,
@@ -296,7 +295,7 @@ class PlannerClient(Visitor):
 
         def done() -> bool:
             now = self.verdict
-            if now.request != verdict.request:
+            if now.plan != verdict.plan:
                 raise HmsaError(
                     'the sequence was not followed to its end: a newer request came, for its '
                     f'joints or others ({now.message})')
@@ -317,29 +316,17 @@ class PlannerClient(Visitor):
             self.spin_until(
                 done, 'the sequence has not finished',
                 None if each is None else lambda: each(self.verdict), timeout, time)
-        late = self.verdict.late - verdict.late
-        if late > 0 and not self.verdict.failure and self.verdict.measured != Code.ARRIVED:
+        end = self.verdict
+        if end.state != 'idle':
+            # A refused request leaves the sequence alone, and is the last one in the status.
+            end = end.on(verdict.request) or replace(
+                end, level=verdict.level, message=verdict.message, code=verdict.code)
+        late = end.late - verdict.late
+        if late > 0 and not end.failure and end.measured != Code.ARRIVED:
             raise HmsaError(
                 f'{late} commands came late, and the result is not measured: expected '
                 'commands in time (lead_time), or samples (joint_states)')
-        return self.verdict
-
-    def stop(self) -> bool:
-        """Stop the planner, ignoring signals; return whether it reports rest."""
-        stop = endpoints.call(self.node, topics.STOP, topics.PLANNER, Trigger.Request())
-        begin = monotonic()
-        answer = None
-        while monotonic() - begin < _STOP_SECONDS:
-            self._executor.spin_once(timeout_sec=SLICE_SECONDS)
-            # The last request may still be in transit, and the stop must follow it.
-            patient = monotonic() - begin < _GONE_SECONDS
-            if answer is None and (self.verdict.request == self.requested or not patient):
-                answer = stop.answer()
-                if answer is None and not patient and not stop.ready:
-                    return False
-            if answer is not None and self.verdict.state in ('at_rest', 'settling', 'idle'):
-                return bool(answer.success)
-        return False
+        return end
 
 
 def newest_time(clock: RawSubscription) -> float | None:

@@ -170,16 +170,14 @@ def conduct(experiment: Experiment, progress: Progress) -> Conducted:
                 measured = watch.measured
                 watch.wait_for_parameters()
             except BaseException as error:
-                resting = True
+                failure = ''
                 if watch.requested:
                     progress('coming to rest', 1.0)
-                    resting = watch.stop()
+                    failure = watch.try_to_stop()
                 session.stop()
-                if resting:
+                if not failure:
                     raise
-                raise HmsaError(
-                    f'{str(error) or "interrupted"}; the planner does not report that the '
-                    'actuator rests: check the coil') from error
+                raise HmsaError(f'{str(error) or "interrupted"}; {failure}') from error
             progress('closing the bag', 1.0)
             exits = session.stop()
             for name, status in exits.items():

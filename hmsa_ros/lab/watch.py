@@ -137,7 +137,8 @@ class Watch(PlannerClient):
             lambda: not self.unheard(),
             'no node receives the commands on '
             f'{", ".join(self.unheard()) or "their topics"}: '
-            'expected a plant or a driver of the coil (hmsa plant)')
+            'expected a plant or a driver of the coil (hmsa plant)',
+            awaited='a plant or driver that takes the commands')
         joints = self._experiment.joints
         if not self.node.count_publishers(
                 topics.of_joint(topics.FLUX_DENSITY_APPLIED, joints[0], joints).name):

@@ -6,7 +6,14 @@ from typing import Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    qos_check_compatible,
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+)
 from rclpy.subscription import Subscription
 
 from hmsa_ros.bag.definitions import is_interface_package
@@ -58,6 +65,25 @@ def publishers_of(node: Node, topic: str) -> dict[bytes, str]:
 def subscribers_of(node: Node, topic: str) -> dict[bytes, str]:
     """Return the subscribers of a topic, in the form of `publishers_of`."""
     return _names(node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic)))
+
+
+def matched(node: Node, publisher: Publisher, *owners: str) -> bool:
+    """
+    Return whether a publisher reaches all its subscribers in the graph, those of the owners too.
+
+    Owners are full node names. A publisher only counts its subscribers, so that it may have
+    matched a recorder and not the node that is meant. Those that its quality of service excludes
+    do not count.
+    """
+    types = {
+        x.topic_type for x in node.get_publishers_info_by_topic(publisher.topic_name)
+        if (x.node_name, x.node_namespace) == (node.get_name(), node.get_namespace())}
+    found = [
+        x for x in node.get_subscriptions_info_by_topic(publisher.topic_name)
+        if x.topic_type in types and qos_check_compatible(
+            publisher.qos_profile, x.qos_profile)[0] is not QoSCompatibility.ERROR]
+    return {*owners} <= {*_names(found).values()} and (
+        0 < len(found) <= publisher.get_subscription_count())
 
 
 def _names(endpoints: Iterable[Any]) -> dict[bytes, str]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 import os
 import re
+import sys
 from time import monotonic
 from typing import Any, TypeVar
 from uuid import uuid4
@@ -23,6 +24,9 @@ T = TypeVar('T')
 #: Maximum time in s of one wait for callbacks.
 SLICE_SECONDS = 0.05
 _LAST_DOMAIN = 232
+# Time in s of waiting after which it is said what is awaited, with the start of the process below
+# 2 s.
+_QUIET_SECONDS = 1.0
 
 
 def start_ros(
@@ -78,7 +82,7 @@ class Visitor:
     """A node of `visit` with a default timeout in s; a context manager."""
 
     def __init__(self, name: str, namespace: str, timeout: float) -> None:
-        self._timeout = timeout
+        self._timeout, self._said = timeout, ''
         self.node = visit(name, namespace)
         self._executor = EventsExecutor(context=self.node.context)
         self._executor.add_node(self.node)
@@ -93,9 +97,11 @@ class Visitor:
     def spin_until(
             self, condition: Callable[[], bool], failure: str,
             each: Callable[[], None] | None = None, timeout: float | None = None,
-            time: Callable[[], float] = monotonic) -> None:
+            time: Callable[[], float] = monotonic, awaited: str = '') -> None:
         """
         Serve callbacks, and call ``each`` about 20 times a second, until a condition is true.
+
+        If it takes long, a line on standard error says what is ``awaited``, if that is given.
 
         Raises
         ------
@@ -106,8 +112,11 @@ class Visitor:
 
         """
         timeout = self._timeout if timeout is None else timeout
-        deadline = time() + timeout
+        deadline, quiet = time() + timeout, monotonic() + _QUIET_SECONDS
         while not condition():
+            if awaited and monotonic() > quiet:
+                self.say(f'waiting up to {timeout:g} s for {awaited}')
+                awaited = ''
             if time() > deadline:
                 raise HmsaError(f'waited {timeout:g} s: {failure}')
             ENDING.check()
@@ -115,8 +124,15 @@ class Visitor:
             if each is not None:
                 each()
 
+    def say(self, words: str) -> None:
+        """Print a note on standard error, once in a row."""
+        if words != self._said:
+            print(f'hmsa: note: {words}', file=sys.stderr, flush=True)
+        self._said = words
+
     def ask(
-            self, call: ServiceCall, failure: str, each: Callable[[], None] | None = None) -> Any:
+            self, call: ServiceCall, failure: str, each: Callable[[], None] | None = None,
+            awaited: str = '') -> Any:
         """Return the response to a call; raise `HmsaError` after a timeout (see `spin_until`)."""
         answers: list[Any] = []
 
@@ -125,7 +141,7 @@ class Visitor:
             return bool(answers)
 
         try:
-            self.spin_until(answered, failure, each)
+            self.spin_until(answered, failure, each, awaited=awaited)
         finally:
             call.close()
         return answers[0]

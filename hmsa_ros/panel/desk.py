@@ -13,7 +13,6 @@ import numpy as np
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import parameter_value_to_python
-from std_srvs.srv import Trigger
 
 from hmsa_ros.control.feedback import MODES
 from hmsa_ros.ending import ENDING
@@ -22,6 +21,7 @@ from hmsa_ros.files import finite
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.status import real, texts
 from hmsa_ros.lab.client import PlannerClient
+from hmsa_ros.lab.link import Stopping
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.service_call import ServiceCall
 from hmsa_ros.panel.interlock import InterlockSwitch
@@ -36,6 +36,7 @@ _PERIOD, _TAIL, _NEW_SECONDS = 0.02, 24, 1.0
 _RELOAD_SECONDS, _GONE_SECONDS = 1.0, 10.0
 _ASK_SECONDS = 1.0
 _RESTING = ('at_rest', 'idle')
+_WARN = 1
 
 
 class Desk:
@@ -67,7 +68,7 @@ class Desk:
         self._client = PlannerClient(namespace=namespace, joints=joints)
         self._listener = Listener(namespace=namespace, joints=joints, span=span)
         node = self._client.node
-        self._stop = endpoints.call(node, topics.STOP, topics.PLANNER, Trigger.Request())
+        self._stopping: Stopping | None = None
         self._get = ServiceCall(
             node, GetParameters, f'{topics.PLANNER}/get_parameters',
             GetParameters.Request(names=['feedback', 'use_sim_time']))
@@ -80,8 +81,7 @@ class Desk:
         self._next_ask = 0.0
         # The last request, its time, and whether the planner has received it or never will.
         self._request, self._sent, self._received = '', -math.inf, True
-        # Time of a stop, and whether the last request had arrived before it.
-        self._stopping, self._sure = -math.inf, False
+        self._plan: int | None = None  # number of its plan, if it was accepted
         self._pages, self._news, self._left = 0, -math.inf, math.inf
         self._note: dict[str, Any] = {'number': 0, 'level': 'OK', 'text': ''}
 
@@ -94,15 +94,19 @@ class Desk:
         except KeyboardInterrupt:
             pass
         finally:
-            if self._stop_on_close and self._moves:
-                self._client.stop()
+            if self._stop_on_close and self._moves and (
+                    failure := self._client.try_to_stop()):
+                self._client.say(failure)
             self._recording.close()
             self._listener.__exit__()
             self._client.__exit__()
 
     def _step(self) -> None:
         scene, now = self._listener.look(), monotonic()
-        self._received = self._received or self._client.verdict.request == self._request
+        if not self._received and (answer := self._client.verdict.on(self._request)) is not None:
+            self._received, self._plan = True, answer.plan
+            if answer.level > _WARN:
+                self._plan = None
         if not self._received and now - self._sent > _GONE_SECONDS:
             self._received = True
             self._notify('the planner did not reply to the request: send it again', 2)
@@ -113,8 +117,8 @@ class Desk:
         self._interlock.repeat(now)
         if self._server.stop.is_set():
             self._server.stop.clear()
-            self._begin_stop(now)
-        self._follow_stop(now)
+            self._begin_stop()
+        self._follow_stop()
         try:
             while True:
                 self._carry_out(self._server.commands.get_nowait(), now)
@@ -134,7 +138,7 @@ class Desk:
         """Whether a request of the panel is being carried out, as far as known."""
         verdict = self._client.verdict
         return not self._received or (
-            verdict.request == self._request != '' and verdict.state not in _RESTING)
+            verdict.plan == self._plan and verdict.state not in _RESTING)
 
     def _look_at_pages(self, now: float) -> None:
         """Detect new pages, and that the last one was closed."""
@@ -149,27 +153,22 @@ class Desk:
         if now - self._left > _RELOAD_SECONDS:
             self._left = math.inf
             if self._stop_on_close and self._moves:
-                self._begin_stop(now)
+                self._begin_stop()
 
     # -- stop ----------------------------------------------------------------------------------
 
-    def _begin_stop(self, now: float) -> None:
-        self._stopping, self._sure = now, self._received
+    def _begin_stop(self) -> None:
+        self._stopping = Stopping(self._client)
         self._notify('stopping', 1)
 
-    def _follow_stop(self, now: float) -> None:
-        """Repeat the stop until a call made after the arrival of the last request is answered."""
-        if self._stopping == -math.inf:
-            # Discovers the server of the stop in advance.
-            self._stop.ready  # noqa: B018
-        elif (answer := self._stop.answer()) is not None and self._sure:
-            self._stopping = -math.inf
-            self._notify(answer.message, 0 if answer.success else 2)
-        elif answer is not None:
-            self._sure = self._received
-        elif now - self._stopping > _GONE_SECONDS:
-            self._stopping = -math.inf
-            self._notify('the planner does not answer the stop: check the coil', 2)
+    def _follow_stop(self) -> None:
+        """Report the result of a stop."""
+        if self._stopping is None:
+            return
+        self._stopping.go_on()
+        if self._stopping.done is not None or self._stopping.failure is not None:
+            self._notify(self._stopping.words, 0 if self._stopping.done is not None else 2)
+            self._stopping = None
 
     def _open_interlock(self, now: float) -> None:
         """Have the driver switch the coil off; its status says when."""
@@ -203,7 +202,7 @@ class Desk:
             self._notify(str(error), 2)
 
     def _send(self, words: str, now: float) -> None:
-        if self._stopping > -math.inf:
+        if self._stopping is not None and not self._stopping.answered:
             raise HmsaError('not sent, since the actuator is being stopped: send it again')
         setpoints = [self._parse(x) for x in words.split()]
         if not setpoints:
@@ -211,6 +210,8 @@ class Desk:
         if not self._client.listened:
             raise HmsaError('no planner listens: start one with hmsa planner')
         self._request, self._sent, self._received = self._client.publish(setpoints), now, False
+        # What a stop has come to does not matter any more.
+        self._stopping = None
         self._notify(f'sent {" ".join(words.split())}')
 
     def _set_feedback(self, mode: str) -> None:
@@ -280,7 +281,7 @@ class Desk:
                 'state': recording.state, 'bag': str(recording.bag or ''),
                 'seconds': now - recording.since if recording.state == 'on' else None,
                 'reports': list(reports)},
-            'stopping': self._stopping > -math.inf, 'note': self._note,
+            'stopping': self._stopping is not None, 'note': self._note,
             'interlock': {'present': self._interlock.present, 'closed': self._interlock.closed}}
 
 
