@@ -117,13 +117,6 @@ class Receipts:
         return None if known is None else (
             not known.silent and known.acknowledged >= stamp and known.time >= stamp)
 
-    def behind(self, joint: str, stamp: int) -> int:
-        """Return the ns until an acknowledged command applies, by a joint's device; else 0."""
-        known = self._joints.get(joint)
-        if known is None or known.silent or known.acknowledged < stamp:
-            return 0
-        return max(stamp - known.time, 0)
-
     def forget(self, joint: str) -> None:
         """
         Expect no more receipts of a joint, since its current subscriber publishes none.

@@ -173,13 +173,8 @@ class Stops:
                 f'stop sent, but {passed:.1f} s later the newest applied level of joint {joint} '
                 f'is {self._newest[joint][1]:.4g} T, where {level.flux_density:.4g} T was '
                 f'commanded: {_SWITCH_OFF}')
-        behind = receipts.behind(joint, level.due)
-        if behind:
-            return (
-                f'stop sent and received, but the clock of the plant or driver of joint {joint} '
-                f'is {behind / NANOSECONDS:.1f} s before the time from which it applies, and what '
-                f'came before stays in force until then: {_SWITCH_OFF}, and set the clocks of '
-                'both hosts by one source')
+        if joint in self._devices.apart:
+            return f'stop not carried out: {self._devices.differs(joint)}; {_SWITCH_OFF}'
         return (
             f'stop sent, but the plant or driver of joint {joint} has not acknowledged it for '
             f'{passed:.1f} s: {_SWITCH_OFF}')

@@ -30,6 +30,8 @@ _QUIET_SECONDS = 1.0
 
 # Codes of warnings that a stop has failed; others, as of a plan made anew, are not its end.
 _FAILED = (Code.SUPERSEDED, Code.VIBRATING)
+# Codes of errors that say whether the coil is off, or what to do.
+_KNOWN = (*_FAILED, Code.UNHEARD, Code.CUT_OFF, Code.INTERLOCK)
 #: Verdict before the first status.
 SILENCE = Verdict(0, 'no reply from the planner yet', '', '', '', 0, 0)
 
@@ -181,7 +183,9 @@ class Stopping:
         elif verdict.code == Code.STOPPED and verdict.level < DiagnosticStatus.ERROR[0]:
             self.done = verdict
         elif verdict.level >= DiagnosticStatus.ERROR[0] or verdict.code in _FAILED:
-            self.failure = verdict.message
+            self.failure = verdict.message + (
+                '' if verdict.code in _KNOWN else
+                '; plant or driver has not acknowledged the stop: switch the coil off there')
         elif link.verdict.plan != verdict.plan:
             self.failure = (
                 'the stop was sent, but a newer request came, for its joints or others '
