@@ -242,7 +242,9 @@ def test_what_is_not_verified_whole_is_no_success(tmp_path, monkeypatch, capsys,
     problems = ('run_0.mcap: a chunk is damaged and passed over',) if fault == 'chunk' else ()
     run = replace(run, summary=BagSummary('run', (), None, None, (), {}, {}, True, problems))
     if fault == 'nan':
-        run.stretch[50] = math.nan
+        stretch = run.stretch.copy()
+        stretch[50] = math.nan
+        run = replace(run, stretch=stretch)
     monkeypatch.setattr(bags, 'read_runs', lambda *_, **__: [run])
     assert main(['bag', 'verify', 'run', '--json']) == 1
     said = capsys.readouterr()
