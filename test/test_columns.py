@@ -4,6 +4,8 @@ import json
 import math
 import warnings
 
+from hypothesis import given
+from hypothesis import strategies as st
 import pytest
 
 import hmsa_ros
@@ -105,6 +107,25 @@ def test_a_missing_value_is_missing_in_any_column(csv, cell):
     table = read_table(csv(f'time,flux_density\n{cell},0.1\n1,{cell}\n'), WANTED)
     assert math.isnan(table.columns['time'][0])
     assert math.isnan(table.columns['flux_density'][1])
+
+
+CELLS = st.sampled_from((
+    'time', 't', 'field', 'b', 'flux_density', 'flux density [mT]', 'stretch', 'length [mm]', 's',
+    'mT', '-', '#N/A', '', '0', '1', '2.5', '-0,5', '\u22121', 'inf', '1e999', '"', '\0',
+    '\u03bbx'))
+
+
+@given(st.lists(st.lists(CELLS, max_size=4), max_size=5), st.sampled_from(',;\t|'),
+       st.sampled_from(('', 'sep=;\n', 'sep=')), st.sampled_from(('utf-8', 'utf-16', 'cp1253')))
+def test_any_file_is_columns_of_numbers_or_one_sentence(tmp_path_factory, rows, by, first, code):
+    path = tmp_path_factory.getbasetemp() / 'any.csv'
+    path.write_bytes((first + '\n'.join(map(by.join, rows))).encode(code, 'replace'))
+    for wanted, length in ((WANTED, None), (('time', 'stretch'), 0.02)):
+        try:
+            table = read_table(path, wanted, rest_length=length, notes=[])
+        except BadInputError:
+            continue
+        assert {len(x) for x in table.columns.values()} == {len(table.lines)}
 
 
 @pytest.mark.parametrize(('text', 'message'), [

@@ -13,7 +13,6 @@ import argparse
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.notes import show_notes
 from hmsa_ros.cli.options import actuator_of, add_command, EXAMPLE, frequency, JSON, show
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import check_targets
@@ -65,7 +64,6 @@ def run(arguments: argparse.Namespace) -> int:
         _write_path(arguments, actuator, shape)
     bands = actuator.wave_bands(shape, arguments.amplitude, arguments.offset)
     if not arguments.json:
-        show_notes()
         print(f'an amplitude of {arguments.amplitude:g} is possible '
               + (bands_text(bands) or 'at no frequency'))
     plan = actuator.wave(
