@@ -16,7 +16,7 @@ class Seen(NamedTuple):
     rate: float  # in 1/s
     flux_density: float  # in T
     lag: int | None = None  # age at arrival in ns; None if all nodes share a clock
-    came: int = 0  # time of arrival, in ns by the steady clock
+    came: int = 0  # time of arrival, in ns by the steady clock; 0 for now
 
 
 @dataclass

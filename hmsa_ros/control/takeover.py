@@ -11,8 +11,9 @@ from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.planner import Planner
 
-# Largest age of a sample that shows where a joint is, in ns by the steady clock.
-_RECENT = 2 * NANOSECONDS
+# Largest age of a sample that shows where a joint is, in ns by the steady clock; and of one that
+# does although its level has changed since, as it does all the time along a path.
+_RECENT, _FRESH = 2 * NANOSECONDS, 100_000_000
 # Samples older than this, in ns, are not the newest available.
 _OLDEST = 60 * NANOSECONDS
 # Times that differ by more, in ns, come from clocks with different epochs.
@@ -71,7 +72,7 @@ class Takeover:
             return
         last, steady = self._samples.get(joint), self._around.steady()
         if last is None or seen.stamp >= last.stamp or steady - last.came > _RECENT:
-            self._samples[joint] = seen._replace(came=steady)
+            self._samples[joint] = seen._replace(came=seen.came or steady)
 
     def drop(self) -> None:
         """Stop waiting, and discard the samples."""
@@ -195,11 +196,12 @@ class Takeover:
                 continue
             new = self._look_until is not None and (
                 seen.came > self._look_until - settings.takeover_timeout)
-            if not self._is_current(seen, settings) or (
+            outdated = self._contradicts(name, seen) and self._is_outdated(name, seen)
+            if not self._is_current(seen, settings) or outdated or (
                     name in self._doubted and not new):
                 if not settings.takeover_timeout:
                     continue
-                if not self._is_over(name, seen, settings):
+                if not self._is_over(name, seen, settings, outdated=outdated):
                     return False
             self._compare(name, seen, settings, keep=keep)
         self._settle()
@@ -210,7 +212,14 @@ class Takeover:
         return self._around.steady() - seen.came <= _RECENT or self._around.one_clock() and (
             abs(self._around.clock() - seen.stamp) <= settings.takeover_max_age)
 
-    def _is_over(self, name: str, seen: Seen, settings: Settings) -> bool:
+    def _is_outdated(self, name: str, seen: Seen) -> bool:
+        """Return whether the level of a joint has changed since a sample that can be."""
+        planner, level = self._planners[name], self._newest.get(name)
+        return planner.follows(seen.flux_density) and seen.stamp < max(
+            planner.changed(self._around.clock()), 0 if level is None else level[0])
+
+    def _is_over(
+            self, name: str, seen: Seen, settings: Settings, *, outdated: bool = False) -> bool:
         """Wait for a new sample; return True after a vain wait, or refuse to continue without."""
         steady = self._around.steady()
         if self._look_until is None:
@@ -218,7 +227,8 @@ class Takeover:
         if steady <= self._look_until:
             return False
         self._settle(keep=name)
-        if self._is_current(seen, settings):
+        if self._is_current(seen, settings) and not (
+                outdated and steady - seen.came > _FRESH):
             return True
         silence = (steady - seen.came) / NANOSECONDS
         raise RefusedError(
@@ -237,14 +247,7 @@ class Takeover:
         """Continue from a sample if it contradicts the prediction for its time."""
         self._check_age(name, seen, settings)
         self._check_ahead(name, seen)
-        planner = self._planners[name]
-        try:
-            predicted = planner.state(seen.stamp).stretch
-        except HmsaError:
-            # The model of the plan cannot be followed, and may have been set by mistake.
-            predicted = math.nan
-        contradicts = not (
-            abs(seen.stretch - predicted) <= _tolerance(planner, seen.stamp, predicted))
+        predicted, contradicts = self._predicted(name, seen.stamp), self._contradicts(name, seen)
         if not contradicts and name not in self._doubted:
             return
         if self._take(name, seen, keep=keep) and contradicts:
@@ -252,6 +255,20 @@ class Takeover:
             self._note(
                 f'joint {name} is at {seen.stretch:.4g} on joint_states, where {expected} was '
                 'predicted: planning continues from the sample')
+
+    def _predicted(self, name: str, time: int) -> float:
+        """Return the stretch of a joint predicted for a time in ns; NaN for none."""
+        try:
+            return self._planners[name].state(time).stretch
+        except HmsaError:
+            # The model of the plan cannot be followed, and may have been set by mistake.
+            return math.nan
+
+    def _contradicts(self, name: str, seen: Seen) -> bool:
+        """Return whether a sample contradicts the plan that was in force at its time."""
+        predicted = self._predicted(name, seen.stamp)
+        return not abs(seen.stretch - predicted) <= _tolerance(
+            self._planners[name], seen.stamp, predicted)
 
 
 def _tolerance(planner: Planner, time: int, predicted: float) -> float:

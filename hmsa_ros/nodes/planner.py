@@ -231,8 +231,11 @@ class PlannerNode(ManagedNode):
                 for name, stamp, values in conversions.from_samples(taken.data):
                     if name in missing:
                         missing.discard(name)
-                        yield name, Seen(stamp, *values, lag=(
-                            None if self._one_clock() else self.now() - self._ago(taken) - stamp))
+                        ago = self._ago(taken)
+                        yield name, Seen(
+                            stamp, *values,
+                            None if self._one_clock() else self.now() - ago - stamp,
+                            self._runtime.environment.steady() - ago)
 
     def _one_clock(self) -> bool:
         """Return whether all nodes share one clock."""

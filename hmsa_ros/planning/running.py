@@ -12,6 +12,7 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.equations import elastic_stiffness, equilibrium_stretch
 from hmsa_ros.model.moves import State
 from hmsa_ros.model.simulation import check_stretch, longest_motion
+from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.history import Deviation, History
 from hmsa_ros.planning.timeline import ALWAYS, Draft, Model, Plan, PlannedLevel, PlannedSegment
 
@@ -25,6 +26,9 @@ _AGREES, _AGREES_WITHOUT_FIELD = 1e-3, 5e-3
 _LITTLE = 1e-4
 # Number of past levels that are kept, since reports of their effect may still arrive.
 _REMEMBERED = 32
+# Time in ns for which the levels that a plan has forgotten are kept to compare samples with, and
+# their largest number.
+_PAST, _PAST_LEVELS = 3 * NANOSECONDS, 1000
 
 
 class RunningPlan:
@@ -43,6 +47,8 @@ class RunningPlan:
         self._strayed = 0.0
         self._initial = stretch
         self._history = History(Plan(0, (), ()))
+        # Levels before those of the plan, in order.
+        self._past: list[PlannedLevel] = []
         self.revision = 0
         self.restart()
 
@@ -61,12 +67,14 @@ class RunningPlan:
     def clock_set(self, by: int) -> None:
         """Shift the plan by the ns that the clock was set ahead."""
         self._history = replace(self._history, plan=self.plan.shifted(by))
+        self._past = [x.shifted(by) for x in self._past]
         self.revision += 1
 
     def _begin_with(self, level: PlannedLevel, *, keep: bool = False) -> None:
         """Start a new plan from a level, optionally with setpoints and unsent levels kept."""
         old = self.plan if keep else Plan(self.plan.number, (), ())
         ahead = old.levels[self._history.sent:]
+        self._past.clear()
         self._history = History(
             replace(old, levels=(level, *ahead)), stale=1 if ahead else None)
         self.revision += 1
@@ -131,6 +139,9 @@ class RunningPlan:
         over = max(min(history.sent, kept, begun) - 1, 0)
         first = max(min(over, history.known), over - _REMEMBERED)
         new = draft.resumed is None
+        self._past += old.levels[:first]
+        over = bisect_right(self._past, now - _PAST, key=lambda x: x.stamp) - 1
+        del self._past[:max(over, len(self._past) - _PAST_LEVELS, 0)]
         before = _running(old, begin, now) if new else old.segments[:draft.resumed]
         stale = history.stale
         self._history = History(
@@ -260,7 +271,17 @@ class RunningPlan:
         """Predict the nondimensional state at a time in ns, in the units of the next request."""
         self._history = self._history.predicted(self.plan.place(time) + 1)
         level = self.plan.level(time)
+        if time < level.stamp and self._past:
+            before = bisect_right(self._past, time, key=lambda x: x.stamp) - 1
+            level = self._past[max(before, 0)]
         return self.model.taken_from(level.at(time), level.model)
+
+    def changed(self, time: int) -> int:
+        """Return the timestamp in ns of the last change of level by a time in ns."""
+        levels, place = self.plan.levels, self.plan.place(time)
+        while place and levels[place].flux_density == levels[place - 1].flux_density:
+            place -= 1
+        return levels[place].stamp
 
     def _delayed(self, time: int) -> State:
         """Predict the state `delay` after a time in ns, with future levels late by `delay`."""
