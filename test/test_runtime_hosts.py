@@ -234,6 +234,32 @@ def test_a_planner_that_is_asked_for_nothing_leaves_a_device_cut_off():
     assert rig.residual(1.2) < 1e-6
 
 
+def test_a_request_before_the_first_receipt_of_a_device_that_was_cut_off_is_carried_out():
+    rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS))
+    rig.runtime.environment.reports = lambda joint: True
+    rig.cut_off()
+    rig.come_back()
+    rig._next = START + 150 * MS
+    rig.runtime.request(Target('a', 1.2))
+    rig.run(START + 1000 * MS)
+    assert rig.refused == []
+    assert 'cut_off' not in rig.codes()
+    assert rig.residual(1.2) < 1e-6
+
+
+def test_a_cut_off_that_is_never_over_refuses_the_request():
+    rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS))
+    rig.cut_off()
+    rig.linked = True
+    # The coil is never reported off.
+    rig.runtime.applied('a', rig.plant.time - 1, 0.01)
+    rig.run(START + 500 * MS)
+    rig.runtime.request(Target('a', 1.2))
+    rig.run(START + 11_000 * MS)
+    assert (rig.status.verdict.code, rig.refused) == ('cut_off', [])
+    assert 'has not acknowledged 0 T for 10 s' in rig.status.verdict.message
+
+
 @pytest.mark.parametrize('deaf', [3000, 15_000])
 def test_after_a_cut_off_a_request_waits_until_the_device_hears(deaf):
     rig = Bench()

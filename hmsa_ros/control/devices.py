@@ -176,12 +176,15 @@ class Devices:
             self._takeover.doubt(joint)
             self._following.astray.add(joint)
             return None
+        planned = bool(self._planners[joint].plan.segments)
         self._planners[joint].abandon()
-        return self._dropped(
+        dropped = self._dropped(
             joint, Code.INTERLOCK, f'{self.interlock(joint)}: the rest of the sequence is dropped',
         ) if locked else self._dropped(
             joint, Code.CUT_OFF, f'the coil of joint {joint} was cut off by the plant or driver: '
             'the rest of the sequence is dropped')
+        # A request that waits is carried out once the cut-off is acknowledged.
+        return dropped if planned or locked else None
 
     def interlock(self, joint: str) -> RefusedError:
         """Return the refusal of a request for a joint that is locked."""
@@ -277,12 +280,13 @@ class Devices:
         """
         Return whether planning must wait until a cut-off device obeys and commands arrive.
 
-        Cut-offs are acknowledged meanwhile: here, since without a request nothing may be sent.
+        Whether a device is cut off is known from its first receipt on. Cut-offs are acknowledged
+        meanwhile: here, since without a request nothing may be sent.
 
         Raises
         ------
         RefusedError
-            If commands have not arrived for a long time.
+            If commands have not arrived, or a cut-off has lasted, for a long time.
 
         """
         names = self._following.astray
@@ -290,7 +294,9 @@ class Devices:
             self.acknowledge(joint)
         lost = [x for x in self._planners
                 if self.receipts.lost(x, *((0,) if x in self.cut else ()))]
-        if not lost and not self.cut and all(
+        owed = any(
+            self._around.reports(x) and not self.receipts.knows(x) for x in self._planners)
+        if not (lost or self.cut or owed) and all(
                 level[1] != 0.0 or self.receipts.since(name, level[0])
                 for name, level in self._following.newest.items() if name in names):
             self.since = None
@@ -298,10 +304,16 @@ class Devices:
         if self.since is None:
             self.since = self._around.steady()
         passed = self._around.steady() - self.since
-        if not lost:
+        if not (lost or self.cut):
             return passed <= settings.takeover_timeout
         if passed > _PATIENCE:
             self.since = None
+            if not lost:
+                raise RefusedError(
+                    Code.CUT_OFF,
+                    f'the coil of joint {min(self.cut)} was cut off, and the plant or driver has '
+                    f'not acknowledged 0 T for {passed / NANOSECONDS:.0f} s: see its log, and '
+                    'send the request again once the coil is off')
             how = (
                 'and no receipts either: start the plant or driver, or check the network'
                 if lost[0] in self.receipts.silent else

@@ -38,6 +38,8 @@ class Environment:
     unheard: Callable[[], str] = str
     #: Whether a joint has a device that reports.
     found: Callable[[str], bool] = lambda joint: True
+    #: Whether the device of a joint gives receipts.
+    reports: Callable[[str], bool] = lambda joint: False
     #: Identifiers of the publishers of applied levels of a joint.
     reporters: Callable[[str], frozenset[bytes]] = lambda joint: frozenset()
     #: New samples by joint, which requests are checked against.

@@ -102,6 +102,10 @@ class Receipts:
             known.step += known.clock.received(time, command, now, steady)
         return restarted
 
+    def knows(self, joint: str) -> bool:
+        """Return whether there was a receipt of a joint."""
+        return joint in self._joints
+
     def since(self, joint: str, time: int) -> bool:
         """Return whether a joint's newest receipt is no older than a time of its device."""
         known = self._joints.get(joint)

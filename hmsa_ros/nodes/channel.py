@@ -50,6 +50,11 @@ class JointChannel:
                 or self._node.count_publishers(topics.JOINT_STATES.name)))
 
     @property
+    def reports(self) -> bool:
+        """Whether a device gives receipts."""
+        return bool(self._received and self._node.count_publishers(self._received))
+
+    @property
     def reporters(self) -> frozenset[bytes]:
         """Identifiers of the publishers of applied levels."""
         return frozenset(

@@ -89,6 +89,7 @@ class PlannerNode(ManagedNode):
             group_from(self._settings), settings_from(self._settings), Environment(
                 self.now, one_clock=self._one_clock, observable=self._observable,
                 unheard=self._unheard, found=lambda joint: self._channels[joint].found,
+                reports=lambda joint: self._channels[joint].reports,
                 reporters=lambda joint: self._channels[joint].reporters, glance=self._glance))
         runtime.devices.deliver = lambda command: self._take((command,))
         runtime.feedback.doing = self._offload
