@@ -66,6 +66,14 @@ def test_a_section_for_another_node_is_not_used_and_said(here, capsys):
     assert (belief.actuator.remanence, belief.actuator.half_length) == (0.11, 0.02)
 
 
+def test_sections_for_several_namespaces_are_said(here):
+    (here / 'it.yaml').write_text(
+        '/left/planner: {ros__parameters: {actuator.remanence: 0.11}}\n'
+        '/right/planner: {ros__parameters: {actuator.remanence: 0.12}}\n', encoding='utf-8')
+    with pytest.warns(AssumedWarning, match='/left/planner and /right/planner are sections for'):
+        assert read_belief(here / 'it.yaml').actuator.remanence == 0.12
+
+
 def test_a_plan_without_dimensions_assumes_nothing(here, capsys):
     assert main(['plan', '1.1:10']) == 0
     assert capsys.readouterr().err == ''

@@ -175,6 +175,7 @@ def entries_of(path: Path) -> Entries:
         raise BadInputError(
             f'{path} has no ros__parameters: expected a parameter file as hmsa init writes it')
     entries = []
+    spaces: dict[str, list[str]] = {}
     sections = list(sections_of(document)) or [('/**', document)]
     for section, values in sections:
         node = section.rpartition('/')[2]
@@ -184,9 +185,15 @@ def entries_of(path: Path) -> Entries:
                 f'{", ".join(NODES[:2])} or {NODES[2]}, the nodes that read parameters of '
                 'an actuator')
             continue
+        spaces.setdefault(node, []).append(section)
         for name, value in _flat(values):
             entries.append((
                 '' if node.startswith('*') else node, shared.present_name(name), value))
+    for node, several in spaces.items():
+        if node in NODES and len(exact := [x for x in several if '*' not in x]) > 1:
+            assume(
+                f'{path}: {" and ".join(exact)} are sections for nodes {node} in several '
+                'namespaces: values of later ones are taken where both have them')
     return entries
 
 
