@@ -280,6 +280,9 @@ def test_arrays_and_files_of_a_path_are_followed_too(tmp_path, capsys):
     here = moved(plan.levels.tolist(), times, start=1.1)
     assert here == pytest.approx(stretches, abs=FOLLOWED * 0.2)
     assert plan.simulate().report()['verdict'] == ['arrived']
+    report = plan.report()
+    assert report['duration'] == [pytest.approx(0.2)]
+    assert report['peak field'] == [np.abs(plan.flux_densities).max()]
     block.to_yaml(tmp_path / 'block.yaml')
     rows = '\n'.join(f'{x!r},{y!r}' for x, y in zip(
         times.tolist(), stretches.tolist(), strict=True))
@@ -301,6 +304,7 @@ def test_arrays_and_files_of_a_path_are_followed_too(tmp_path, capsys):
     assert (found['low'], found['high']) == (
         pytest.approx(course.min(), abs=1e-4), pytest.approx(course.max(), abs=1e-4))
     assert found['peak_rate'] == pytest.approx(np.abs(np.gradient(course, fine)).max(), rel=2e-3)
+    assert found['peak_flux_density_rate'] == report['peak field rate'][0]
     assert found['peak_flux_density'] == np.abs(plan.flux_densities).max()
     assert 0.0 < found['deviation'] < FOLLOWED * 0.2
     weak = Actuator(flux_density_limits=0.9 * found['peak_flux_density'])

@@ -203,11 +203,10 @@ def following(plan: 'Plan', path: Path) -> Following:
     count = min(max(_OF_EACH * len(path.breaks), _FEWEST_LOOKED), _MOST_LOOKED)
     motion = plan.simulate(until=duration, rate=count / duration)
     course, rates, _ = path.course(np.minimum(motion.times, duration) / unit + path.breaks[0])
-    fields, steps = plan.flux_densities, np.diff(plan.times)
     return Following(
         duration, len(plan.levels), float(np.min(course)), float(np.max(course)),
-        float(np.max(np.abs(rates))) / unit, float(np.max(np.abs(fields))),
-        float(np.max(np.abs(np.diff(fields)) / steps)) if len(steps) else 0.0,
+        float(np.max(np.abs(rates))) / unit, float(np.max(np.abs(plan.flux_densities))),
+        plan.flux_density_rate,
         float(np.max(np.abs(motion.stretches - course))))
 
 

@@ -14,6 +14,7 @@ from hmsa_ros.api.arguments import file_of, number
 from hmsa_ros.api.motion import Motion, simulated
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.equations import Array
+from hmsa_ros.model.status import Code
 from hmsa_ros.planning.sequence import Segment
 from hmsa_ros.recordings.record import read_only
 from hmsa_ros.recordings.tables import write_table
@@ -96,6 +97,12 @@ class Plan:
         return self.levels[:, 1]
 
     @property
+    def flux_density_rate(self) -> float:
+        """Largest change from a level to the next over the time of the former, in T/s."""
+        steps = np.abs(np.diff(self.flux_densities)) / np.diff(self.times)
+        return float(np.max(steps, initial=0.0))
+
+    @property
     def setpoints(self) -> Array:
         """Stretches and durations in s, shape (n, 2)."""
         return read_only(np.array([
@@ -122,9 +129,21 @@ class Plan:
             tesla_per_ampere, 'tesla_per_ampere', 'T/A', above=0.0)
 
     def report(self) -> Table:
-        """Return a table of the levels, move time and status of each setpoint."""
+        """
+        Return a table of the levels, move time and status of each setpoint.
+
+        The table of a path contains its duration, its largest flux density and how fast this
+        changes.
+        """
         units, name = self.actuator.model.units, self.actuator.block.coordinate.name
         unit, level = units.load_name.strip(), units.level
+        if len(self.segments) == 1 and self.segments[0].move.code is Code.PATH:
+            return Table(
+                (Column(f'last {name}'), Column('duration', 's'), Column('levels'),
+                 Column('peak field', unit), Column('peak field rate', f'{unit}/s')),
+                ((self.segments[0].setpoint.stretch, float(self.move_times[0]), len(self.levels),
+                  float(np.max(np.abs(self.flux_densities))), self.flux_density_rate),),
+                notes=tuple(self.segments[0].notes()))
         return table_of(
             self.segments, (
                 Column(name), Column('duration', 's'), Column('first level', unit),
