@@ -14,6 +14,7 @@ import struct
 import subprocess
 import sys
 import termios
+import threading
 import time
 
 import pytest
@@ -240,6 +241,18 @@ def test_send_without_a_planner_says_how_to_start_one(start):
 
 
 # Help ----------------------------------------------------------------------------------------
+
+def test_a_long_operation_says_what_is_under_way_where_no_bar_is_shown(capsys, wait_until):
+    for lines, said in ((0.0, 'starting ...\nworking (1 of 2) ...\nclosing ...\n'), (1e3, '')):
+        with progress(lines=lines) as update:
+            if said:
+                wait_until(lambda: not any(
+                    isinstance(x, threading.Timer) for x in threading.enumerate()))
+            for what in ('starting', 'working (1 of 2)', 'working (2 of 2)', 'closing'):
+                update(what, 0.5)
+        found = capsys.readouterr()
+        assert (found.out, found.err) == ('', said)
+
 
 def parsers(parser, path='hmsa'):
     """Return all parsers by the command's words."""

@@ -17,7 +17,7 @@ from typing import Any, TYPE_CHECKING
 from hmsa_ros.cli.check_driver import settings_of
 from hmsa_ros.cli.options import add_command, assume_example, JSON, Row, show
 from hmsa_ros.cli.pictures import paper_of, picture_options
-from hmsa_ros.cli.progress import progress
+from hmsa_ros.cli.progress import PATIENCE, progress
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.files import check_targets, write_text, yaml_text
 from hmsa_ros.interfaces.quantities import number_of
@@ -329,7 +329,7 @@ def _latency(arguments: argparse.Namespace) -> int:
         assume_example()
     probe = _made(f'{_SIMULATED}SimulatedProbe', '--simulate') if arguments.simulate else (
         None if arguments.probe is None else _made(arguments.probe, '--probe'))
-    with _bench(name, arguments) as bench, progress() as update:
+    with _bench(name, arguments) as bench, progress(lines=PATIENCE) as update:
         scale = _scale(bench)
         found = measure_delays(
             bench, steps_of(actuator, arguments.limit, arguments.steps), probe, actuator,
@@ -380,7 +380,7 @@ def _static(arguments: argparse.Namespace) -> int:
     from hmsa_ros.lab.calibrating import hold_staircase
 
     gauge = None if arguments.gauge is None else _made(arguments.gauge, '--gauge')
-    with _bench(name, arguments) as bench, progress() as update:
+    with _bench(name, arguments) as bench, progress(lines=PATIENCE) as update:
         scale = _scale(bench)
         level, stretch, length, drift = hold_staircase(
             bench, arguments.limit, arguments.steps, arguments.settle,

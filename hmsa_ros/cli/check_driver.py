@@ -14,7 +14,7 @@ import sys
 from typing import Any
 
 from hmsa_ros.cli.options import add_command, frequency, JSON, show
-from hmsa_ros.cli.progress import progress
+from hmsa_ros.cli.progress import PATIENCE, progress
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import check_targets, write_text
 
@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.device.conformance import Trial
 
     check_targets(arguments.report)
-    with progress() as update:
+    with progress(lines=PATIENCE) as update:
         found = Trial(
             arguments.hardware, arguments.joint, settings_of(arguments), level=arguments.limit,
             rate=arguments.rate).run(update)

@@ -15,7 +15,7 @@ import sys
 from typing import Any
 
 from hmsa_ros.cli.options import add_command, show
-from hmsa_ros.cli.progress import progress
+from hmsa_ros.cli.progress import PATIENCE, progress
 from hmsa_ros.ending import ENDING
 from hmsa_ros.table import Column, Table
 
@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     ENDING.note()
     print(f'ROS_DOMAIN_ID {os.environ["ROS_DOMAIN_ID"]}, output in {folder}', file=sys.stderr)
     try:
-        with progress() as update:
+        with progress(lines=PATIENCE) as update:
             result = run_demo(folder, update)
             ENDING.check()
     except KeyboardInterrupt:

@@ -17,7 +17,7 @@ from typing import Any, TYPE_CHECKING
 from hmsa_ros.cli.identify import known_of
 from hmsa_ros.cli.notes import show_notes
 from hmsa_ros.cli.options import add_command, argument, assume_example, NAMESPACE, show
-from hmsa_ros.cli.progress import progress
+from hmsa_ros.cli.progress import PATIENCE, progress
 from hmsa_ros.cli.setpoints import setpoint_of_joints
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
@@ -90,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
         node, arguments.namespace, arguments.duration, arguments.stretch_min,
         arguments.stretch_max, arguments.free, known, uncertain, arguments.accept)
     try:
-        with progress() as update:
+        with progress(lines=PATIENCE) as update:
             found = tune(tuning, update)
     except KeyboardInterrupt:
         return ENDING.status
