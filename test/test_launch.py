@@ -122,6 +122,39 @@ def test_time_is_simulated_if_the_plant_is():
     assert not wall.params_file
 
 
+def test_slow_motion_is_said_with_the_time_that_a_sequence_takes(tmp_path):
+    note = DEMO.evaluate({}, ROOT).note
+    assert note == (
+        f'simulated time runs at 0.0125 of real time (real_time_factor in '
+        f'{ROOT / "config" / "demo.yaml"}): 1 s of a sequence takes 80 s')
+    for real in ({'hardware': 'my_lab:Coil'}, {'plant': 'false'}, {'use_sim_time': 'false'}):
+        assert DEMO.evaluate(real, ROOT).note == ''
+    own = tmp_path / 'own.yaml'
+    for text, said in (
+            ('/**:\n  ros__parameters:\n    real_time_factor: 0.5\n', 'a sequence takes 2 s'),
+            ('plant:\n  ros__parameters:\n    real_time_factor: 1.0\n', ''),
+            ('planner:\n  ros__parameters:\n    real_time_factor: 0.5\n', ''), ('[', '')):
+        own.write_text(text)
+        found = DEMO.evaluate({'params_file': str(own)}, ROOT).note
+        assert said in found
+        assert bool(said) == bool(found)
+
+
+@pytest.mark.ros
+def test_who_sends_to_a_slow_simulation_learns_how_long_it_takes(start):
+    started = DEMO.evaluate({'record': 'false'}, ROOT)
+    for node in started.nodes:
+        start(*node.command())
+    send = start.hmsa('send', '1.1:0.05', '1.0:0.05', '--timeout', str(SECONDS))
+    assert send.wait(SECONDS) == 0, send.output
+    factor, seconds = re.search(
+        r'simulated time runs at (\S+) of real time: the sequence of 0.1 s takes about (\S+) s',
+        send.stderr).groups()
+    # A busy machine is slower still.
+    assert 0.0 < float(factor) <= 0.014
+    assert float(seconds) == pytest.approx(0.1 / float(factor), rel=0.05)
+
+
 def test_a_process_that_fails_ends_everything_and_one_that_is_ended_does_not_fail():
     assert not failure('recorder', 0, ending=False)
     assert not failure('recorder', -signal.SIGINT, ending=True)

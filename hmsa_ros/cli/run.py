@@ -19,7 +19,8 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.notes import show_notes, with_notes
 from hmsa_ros.cli.options import add_command, assume_example, JOINTS, NAMESPACE
-from hmsa_ros.cli.progress import progress
+from hmsa_ros.cli.progress import PATIENCE, progress
+from hmsa_ros.cli.send import SLOW
 from hmsa_ros.cli.setpoints import SEQUENCE, sequence_of
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
     from hmsa_ros.report.outcome import LevelResult
 
 NOT_MEASURED = 'predicted, not measured'
-# Fraction of real time below which simulated time is reported as slow.
-_SLOW = 0.9
 _MOST_REPEATS = 10_000
 
 
@@ -92,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
     records, each = [], []
     for experiment in experiments:
         try:
-            with progress() as update:
+            with progress(lines=PATIENCE) as update:
                 done, parts, report = _carried_out(arguments, experiment, tolerances, update)
         except KeyboardInterrupt:
             so_far = f'; the bag so far: {experiment.bag}' if experiment.bag.exists() else ''
@@ -227,7 +226,7 @@ def _print(
     elif not experiment.path and any(x.evaluation.findings for x in parts):
         print(setpoints(parts))
     seconds = [f'{key} {x:.1f} s' for key, x in done.seconds.items()]
-    if done.pace < _SLOW:
+    if done.pace < SLOW:
         seconds[1] += f' (simulated time at {done.pace:.2g} of real time)'
     for line in (
             *(f'note     {x}' for x in done.notes), f'time     {", ".join(seconds)}',

@@ -20,6 +20,9 @@ from hmsa_ros.errors import HmsaError
 if TYPE_CHECKING:
     from hmsa_ros.lab.client import PlannerClient
 
+# Fraction of real time below which simulated time is reported as slow.
+SLOW = 0.9
+
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
@@ -67,6 +70,12 @@ def run(arguments: argparse.Namespace) -> int:
 def _carry_out(
         client: 'PlannerClient', arguments: argparse.Namespace, levels: Any, path: Any) -> None:
     """Send, and report progress until the end if requested."""
+    length = sum(span for _, span in arguments.setpoints) + sum(
+        x[-1][0] for x in (levels, path) if x)
+    if (pace := client.pace()) < SLOW:
+        print(
+            f'simulated time runs at {pace:.2g} of real time: the sequence of {length:g} s takes '
+            f'about {length / pace:.2g} s', file=sys.stderr, flush=True)
     verdict = client.send(arguments.setpoints, levels, path)
     print(verdict.message, flush=True)
     if not arguments.wait:
@@ -80,8 +89,6 @@ def _carry_out(
             seen = line
             print(line, file=sys.stderr, flush=True)
 
-    length = sum(span for _, span in arguments.setpoints) + sum(
-        x[-1][0] for x in (levels, path) if x)
     verdict = client.follow(verdict, each=report, timeout=length + arguments.timeout)
     if verdict.failure:
         raise HmsaError(verdict.failure)

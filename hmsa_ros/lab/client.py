@@ -37,6 +37,8 @@ _LISTENS_SECONDS = 60.0
 _MATCHED_SECONDS = 3.0
 # Time in s from discovery of a recorder until it is assumed to receive.
 _SETTLED_SECONDS = 1.0
+# Time in s in which the speed of simulated time is measured.
+_PACE_SECONDS = 0.5
 # Time in s until all nodes of the host are discovered.
 _DISCOVERY_SECONDS = 0.6
 _OTHERS = (
@@ -263,6 +265,28 @@ class PlannerClient(Link):
             [(x, round(time * NANOSECONDS)) for time, x in points], self._joints,
             frame=self.requested, raw=bool(levels), path=bool(path)))
         return self.requested
+
+    def pace(self) -> float:
+        """Return the speed of simulated time relative to real time, 1 without simulated time."""
+        if not self.node.count_publishers(topics.CLOCK_TOPIC.name):
+            return 1.0
+        clock = endpoints.listen(self.node, topics.CLOCK_TOPIC)
+        seen: list[tuple[float, float]] = []
+
+        def measured() -> bool:
+            if (now := newest_time(clock)) is not None:
+                seen.append((monotonic(), now))
+            return bool(seen) and seen[-1][0] - seen[0][0] >= _PACE_SECONDS
+
+        try:
+            # Without a message the planner says that it has no time.
+            with suppress(HmsaError):
+                self.spin_until(measured, 'time does not advance', timeout=4.0 * _PACE_SECONDS)
+        finally:
+            clock.destroy()
+        if not seen or seen[-1][1] <= seen[0][1]:
+            return 1.0
+        return (seen[-1][1] - seen[0][1]) / (seen[-1][0] - seen[0][0])
 
     def follow(
             self, verdict: Verdict, *, each: Callable[[Verdict], None] | None = None,

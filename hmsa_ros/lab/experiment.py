@@ -221,9 +221,10 @@ def _carry_out(experiment: Experiment, watch: 'Watch', progress: Progress) -> Ve
     total = experiment.duration + (
         float(lead) if isinstance(lead, (int, float)) else 0.0)
 
-    factor = watch.parameter('plant.real_time_factor') if experiment.nodes else None
-    slow = f' at {factor:.2g} of real time' if isinstance(factor, float) and (
-        0.0 < factor < 1.0) else ''
+    factor = watch.parameter('plant.real_time_factor')
+    slow = f' at {factor:.2g} of real time, for about {total / factor:.2g} s' if (
+        isinstance(factor, float) and 0.0 < factor < 1.0
+        and watch.parameter('plant.publish_clock')) else ''
 
     def report(*_: object) -> None:
         watch.look(begin + total)

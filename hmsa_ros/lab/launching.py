@@ -11,7 +11,10 @@ from pathlib import Path
 import signal
 
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces.parameters import number_of
+from hmsa_ros.interfaces.topics import PLANT
 from hmsa_ros.lab.processes import NodeProcess
+from hmsa_ros.recordings.parameters import entries_of
 
 _YES_OR_NO = ('true', 'false')
 # Time limit for discovery and start of the nodes; a failing plant ends all processes.
@@ -37,6 +40,7 @@ class Started:
     nodes: tuple[NodeProcess, ...]
     rviz: NodeProcess | None
     last: str = ''
+    note: str = ''  #: sentence to log, if any
 
 
 @dataclass(frozen=True)
@@ -122,7 +126,24 @@ def _start_demo(values: Mapping[str, str], share: Path) -> Started:
     if hardware:
         parameters['driver'] = {'hardware': hardware}
     parameters['planner'] = {'use_sim_time': simulated}
-    return Started(_nodes(values, file, parameters), _rviz(values, share, simulated))
+    return Started(
+        _nodes(values, file, parameters), _rviz(values, share, simulated),
+        note=_slow_motion(file) if simulated and plant and file else '')
+
+
+_FACTOR = 'real_time_factor'
+
+
+def _slow_motion(file: str) -> str:
+    """Return how slowly simulated time passes by a parameter file; empty in real time."""
+    try:
+        factor = next((number_of(value) for node, name, value in reversed(entries_of(Path(file)))
+                       if node in ('', PLANT) and name == _FACTOR), None)
+    except BadInputError:
+        return ''  # the plant says what is wrong with it
+    return '' if factor is None or not 0.0 < factor < 1.0 else (
+        f'simulated time runs at {factor:g} of real time ({_FACTOR} in {file}): 1 s of a '
+        f'sequence takes {1.0 / factor:.3g} s')
 
 
 def _start_replay(values: Mapping[str, str], share: Path) -> Started:

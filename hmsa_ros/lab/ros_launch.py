@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
+from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, Shutdown
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
@@ -33,7 +33,8 @@ def description(file: LaunchFile) -> LaunchDescription:
 def _actions(started: Started) -> list[Any]:
     # RViz first: if it is not installed, launch fails before anything is started.
     rviz = [] if started.rviz is None else [_action(started.rviz, 'rviz2', None)]
-    return rviz + [
+    note = [LogInfo(msg=started.note)] if started.note else []
+    return note + rviz + [
         _action(x, 'hmsa_ros', _ended(x.name, x.name == started.last)) for x in started.nodes]
 
 

@@ -28,7 +28,7 @@ class InterlockSwitch:
     @property
     def present(self) -> bool:
         """Whether a driver listens."""
-        return self._publisher.get_subscription_count() > 0
+        return bool(self._publisher.get_subscription_count())
 
     def turn(self, now: float, *, closed: bool) -> None:
         """Open or close it, from a time in s on."""
