@@ -12,6 +12,7 @@ import rclpy
 from rclpy.exceptions import InvalidNamespaceException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_namespace import validate_namespace
 
@@ -83,7 +84,10 @@ class Visitor:
 
     def __init__(self, name: str, namespace: str, timeout: float) -> None:
         self._timeout, self._said = timeout, ''
-        self.node = visit(name, namespace)
+        # Nobody asks it for parameters or types; the services take a third of its start.
+        self.node = visit(
+            name, namespace, start_parameter_services=False, parameter_overrides=[
+                Parameter('start_type_description_service', value=False)])
         self._executor = EventsExecutor(context=self.node.context)
         self._executor.add_node(self.node)
 
