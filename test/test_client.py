@@ -1,0 +1,101 @@
+"""The client of a planner: whom it waits for, verdicts of its own, the stop."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+from trajectory_msgs.msg import JointTrajectory
+
+from hmsa_ros.lab.client import PlannerClient
+from hmsa_ros.lab.link import Link
+from hmsa_ros.nodes.planner import PlannerNode
+
+# Far ahead for a busy machine.
+PLANNER = ('planner', '--ros-args', '-p', 'lead_time:=0.3')
+
+
+@pytest.mark.ros
+def test_another_subscriber_is_not_taken_for_the_planner(ros, ros_env, serve, wait_until):
+    heard = []
+    ros.node.create_subscription(JointTrajectory, 'planner/joint_trajectory', heard.append, 10)
+    with PlannerClient() as client:
+        client.spin_until(
+            lambda: client._publisher.get_subscription_count() == 1, 'the other subscriber')
+        assert not client.listened
+        assert not client._reached()
+        serve(PlannerNode)
+        client.find_planner()
+        assert client.listened
+        assert client._publisher.get_subscription_count() == 2
+
+
+@pytest.mark.ros
+def test_each_of_many_requests_at_once_has_a_verdict_of_its_own(ros_env, serve):
+    serve(PlannerNode)
+    clients = [PlannerClient() for _ in range(6)]
+    try:
+        for client in clients:
+            client.find_planner()
+        # None of them reads its status before all have sent.
+        names = [x.publish([(9.0 if i % 2 else 1.1 + 0.01 * i, 60.0)])
+                 for i, x in enumerate(clients)]
+        for i, (client, name) in enumerate(zip(clients, names, strict=True)):
+            client.spin_until(
+                lambda client=client, name=name: client.verdict.on(name) is not None, 'a verdict')
+            assert client.verdict.on(name).code in (
+                ('out_of_range',) if i % 2 else ('accepted', 'superseded'))
+    finally:
+        for client in clients:
+            client.__exit__()
+
+
+@pytest.mark.ros
+def test_a_command_without_a_planner_soon_says_what_it_waits_for(start):
+    for words in (['stop'], ['param', 'set', 'planner', 'shaper', 'robust']):
+        command = start.hmsa(*words, '--timeout', '2')
+        assert command.wait() == 1
+        note, error = command.stderr.splitlines()
+        assert note.startswith('hmsa: note: waiting')
+        assert 'planner' in note
+        assert error.startswith('hmsa: error: waited 2 s: no ')
+
+
+@pytest.mark.ros
+def test_a_stop_beside_another_client_is_sent_before_anything_else_is_known(
+        ros, ros_env, serve, monkeypatch):
+    node = serve(PlannerNode).nodes[0]
+    requests = []
+    monkeypatch.setattr(node._runtime, 'request', requests.append)
+    with Link() as link:
+        # The planner never answers, and its last status is on the request of another client.
+        monkeypatch.setattr(link, '_timeout', 5.0)
+        failure = link.try_to_stop()
+    assert len(requests) > 1
+    assert len({x.name for x in requests}) == 1
+    assert 'the planner has not answered the stop' in failure
+
+
+@pytest.mark.slow
+@pytest.mark.ros
+def test_ctrl_c_of_a_sequence_that_is_waited_for_stops_it(start):
+    start.hmsa('plant')
+    start.hmsa(*PLANNER)
+    send = start.hmsa('send', '1.1:60', '1.2:60', '--wait')
+    send.wait_for_output('setpoint 1 of 2: holding')
+    assert send.stop(signal.SIGINT) == 130
+    assert 'stopped: at rest' in send.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.ros
+def test_a_stop_without_a_plant_fails_and_says_so(start):
+    start.hmsa(*PLANNER)
+    stop = start.hmsa('stop')
+    assert stop.wait() == 1
+    assert 'no node subscribes to' in stop.stderr
+
+
+def test_the_stop_needs_no_numpy():
+    code = "import sys, hmsa_ros.lab.link; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, '-c', code], check=False).returncode == 0
