@@ -52,6 +52,26 @@ def test_a_stop_has_stopped_once_its_last_level_was_acknowledged_at_its_time():
     assert rig.status.verdict.message == 'stopped: at rest, acknowledged by plant or driver'
 
 
+def test_a_stop_at_rest_is_acknowledged_too():
+    rig = Bench()
+    rig.runtime.request(trajectory(*LONG))
+    rig.run(START + SECOND)
+    rig.runtime.request(Stop('the stop'))
+    rig.run(rig.now + SECOND)
+    assert outcomes(rig) == ['accepted', 'stopped']
+
+
+def test_a_plan_that_goes_on_without_the_lost_levels_of_a_stop_is_no_stop():
+    rig = stopped_in_the_middle(Bench())
+    rig.hears = False
+    # Samples rest where the level from before keeps the actuator.
+    for _ in range(500):
+        rig.run(rig.now + 10 * MS)
+        rig.runtime.looks_at(rig.now)
+        rig.observe()
+    assert 'stopped' not in outcomes(rig)
+
+
 @pytest.mark.parametrize('fault', ['hears', 'linked'])
 def test_a_stop_that_does_not_arrive_has_not_stopped_until_it_does(fault):
     rig = Bench()

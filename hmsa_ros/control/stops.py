@@ -112,9 +112,13 @@ class Stops:
         if joint in self._devices.cut | self._devices.open:
             # The coil is off, and no level is accepted.
             return True
-        level = self._group.planners[joint].plan.level(now)
+        plan = self._group.planners[joint].plan
+        level = plan.level(now)
+        if not plan.segments or level.due < plan.segments[-1].since:
+            # Levels of the stop that took no effect were removed from the plan.
+            return False
         received = self._devices.receipts.carried_out(joint, level.due)
-        if received is False:
+        if received is False or self._devices.receipts.lost(joint):
             return False
         applied = self._differs(joint, now)
         if received:
