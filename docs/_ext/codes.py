@@ -74,7 +74,7 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'The planner follows simulated time, and no message has arrived on /clock yet.',
         'Start the publisher of /clock, or set use_sim_time to false.'),
     Code.INACTIVE: (
-        'The planner is a managed node and is not active.',
+        'The planner is a managed node and is not active, or was just deactivated.',
         'Activate it: ros2 lifecycle set /planner activate.'),
     Code.SEVERAL_PLANNERS: (
         'Several planners of one name run and would command the same joints.',
@@ -94,9 +94,11 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'Repair the sensor, or stop its publisher; without samples moves start as predicted.'),
     Code.UNHEARD: (
         'Commands do not arrive: the plant or driver has ended, or a link works in one direction '
-        'only.',
+        'only. After a stop: it was not acknowledged, and whether the actuator rests is not '
+        'known.',
         'Start the plant or driver, or repair the network from the host of the planner to its '
-        'host; then send the request again.'),
+        'host; then send the request again. After a stop, switch the coil off at the driver '
+        'first.'),
     Code.CUT_OFF: (
         'The watchdog of plant or driver switched the coil off, or the hardware lost its state. '
         'The rest of the sequence was dropped.',
@@ -127,8 +129,9 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'that is commanded, and the rest of the sequence is planned within it.',
         'Set flux_density_max or flux_density_min to the limit of the amplifier.'),
     Code.STOPPED: (
-        'The actuator comes to rest: the planner was deactivated, or the rest of the sequence '
-        'could not be planned anew, for the reason that the message gives.',
+        'With OK: the actuator has come to rest after a stop, which plant or driver has '
+        'acknowledged. With ERROR: it comes to rest, since the rest of the sequence could not be '
+        'planned anew, for the reason that the message gives.',
         'Send the request again.'),
     Code.CLOCK_JUMPED: (
         'The clock was set. If simulated time went back, the plan was dropped; after a step of '

@@ -93,7 +93,8 @@ JOINT_TRAJECTORY = Topic(
     'keeps the current plan until then; a sequence that began in the past is joined in the '
     'middle. With `trajectory_mode` path, points with `velocities` are a path that is followed to '
     'rest at its end. Points without `positions` and with `effort` are raw levels: the flux '
-    'density in tesla from `time_from_start` on; the planner checks them and ends at rest.',
+    'density in tesla from `time_from_start` on; the planner checks them and ends at rest. A '
+    'trajectory without points is a stop.',
     subscribers=(PLANNER, RECORDER))
 SETPOINT = Topic(
     '~/setpoint', _FLOAT, RELIABLE,
@@ -179,7 +180,8 @@ FOLLOW = Action(
         'difference (`error`) and the flux density in tesla (`output`), 20 times a second.'))
 
 STOP = Service('~/stop', _TRIGGER, {
-    PLANNER: 'Drops the rest of the sequence and comes to rest without vibration.',
+    PLANNER: 'Drops the rest of the sequence and comes to rest without vibration. It replies at '
+             'once; `~/status` says once plant or driver has acknowledged the stop.',
     PLAYER: 'Ends playback.'})
 RESET_ESTIMATE = Service('~/reset_estimate', _TRIGGER, {
     PLANNER: 'Discards the estimate: plans and estimates restart from the given parameters.'})
