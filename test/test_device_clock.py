@@ -1,10 +1,11 @@
 """A device whose clock is set: its plan is dropped, and it is obeyed again once clocks agree."""
 
+from dataclasses import replace
 import random
 import re
 
 import pytest
-from test_runtime_hosts import Bench
+from test_runtime_hosts import BEATING, Bench
 from test_runtime_planner import HOLD, LEAD, MS, START, trajectory
 
 from hmsa_ros.control.device_clock import DeviceClock
@@ -203,3 +204,60 @@ def test_a_clock_of_the_planner_alone_that_is_set_halts_the_plan():
     rig.set_device(-5 * SECOND)
     rig.run(rig.now + SECOND)
     assert rig.status.verdict.code == 'clocks_differ'
+
+
+SLOW = ((1.2, HOLD), (1.1, 6 * HOLD), (1.3, 8 * HOLD), (1.4, 10 * HOLD), (1.2, 4 * SECOND))
+
+
+@pytest.mark.parametrize('outage', [320, 416, 700])
+def test_lateness_from_an_outage_is_no_reason_to_raise_lead_time(outage):
+    rig = Bench()
+    rig.runtime.request(trajectory(*SLOW))
+    rig.run(START + 100 * MS)
+    rig.linked = False
+    rig.run(rig.now + outage * MS)
+    rig.linked = True
+    rig.run(rig.now + 2 * SECOND)
+    _, message, values = rig.runtime.report()
+    assert values['late'] > 0
+    said = [x for x in (*rig.notes(), message) if 'late' in x]
+    assert any('receipt of joint a arrived for' in x for x in said)
+    assert not any('raise lead_time' in x for x in said)
+
+
+def test_lateness_from_a_stall_of_the_planner_is_no_reason_to_raise_lead_time():
+    rig = Bench(settings=replace(BEATING, replan_late=False))
+    rig.runtime.request(trajectory(*SLOW))
+    rig.run(START + 100 * MS)
+    rig.now += 500 * MS
+    rig.steady += 500 * MS
+    rig.run(rig.now + 2 * SECOND)
+    message = rig.runtime.report()[1]
+    assert 'the planner stood still for 0.5' in message
+    assert 'raise lead_time' not in message
+
+
+def test_lateness_from_a_clock_is_no_reason_to_raise_lead_time():
+    rig = Bench()
+    rig.runtime.request(trajectory(*SLOW))
+    rig.run(START + 100 * MS)
+    rig.ahead = 41_500 * MS
+    # What it applies has the timestamps of its clock.
+    rig.runtime.applied('a', rig.now + rig.ahead, 0.03)
+    rig.run(rig.now + 2 * SECOND)
+    assert not any('raise lead_time' in x for x in (*rig.notes(), rig.runtime.report()[1]))
+
+
+def test_lateness_of_a_slow_link_is_a_reason_to_raise_lead_time_after_an_outage_too():
+    rig = Bench()
+    rig.transport = 60 * MS
+    rig.runtime.request(trajectory(*SLOW))
+    rig.run(START + 100 * MS)
+    rig.linked = False
+    rig.run(rig.now + 400 * MS)
+    rig.linked = True
+    rig.run(rig.now + 2 * SECOND)
+    rig.runtime.request(trajectory(*SLOW))
+    rig.run(rig.now + SECOND)
+    needed = re.search(r'raise lead_time to more than ([0-9.]+) s', rig.runtime.report()[1])
+    assert 0.05 < float(needed[1]) < 0.075

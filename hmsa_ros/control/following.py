@@ -33,6 +33,8 @@ _PART = 0.25
 _SILENT = 10 * NANOSECONDS
 # Shortest time in ns between two evaluations of a plan that is kept.
 _PAUSE = 20_000_000
+# Time in ns until receipts show why commands are late; there are five a second.
+_CAUSE = 400_000_000
 
 
 class Following:
@@ -61,6 +63,7 @@ class Following:
         self._looked = 0, 0
         self._ages: dict[str, int] = {}
         self._found: dict[str, Resumption] = {}
+        self._advise_at: int | None = None  # steady time in ns at which to advise on lateness
         self._late_due, self._foreign_due, self.replanned_due = Throttle(), Throttle(), Throttle()
 
     def restart(self) -> None:
@@ -106,7 +109,7 @@ class Following:
         """Record that a command was sent."""
         self.lateness.sent(joint, stamp, now)
         if stamp < now:
-            self.lateness.missed(now - stamp)
+            self.lateness.missed(now - stamp, self._receipts.steady)
             self._report_advice()
 
     def applied(
@@ -124,7 +127,7 @@ class Following:
         if not found.foreign:
             self.lateness.note(
                 found.late, joint, stamp - found.late, tolerance,
-                2.0 * planner.vibration(1, found.change) / step)
+                2.0 * planner.vibration(1, found.change) / step, self._receipts.steady)
             for other in self._group.planners.values():
                 other.delay = self.lateness.expected
         self._strayed[joint] = self._strayed.get(joint, 0.0) + cost
@@ -169,7 +172,7 @@ class Following:
             if stamp >= now - late or not self._group.may_resume(name):
                 continue
             for _ in range(planner.drop_missed(now, tolerance)):
-                self.lateness.missed(now - stamp)
+                self.lateness.missed(now - stamp, self._receipts.steady)
             self._report_advice()
             self._leaves(name)
             self._unsent.add(name)
@@ -210,6 +213,18 @@ class Following:
 
     def _report_advice(self) -> None:
         if self._late_due():
+            # The receipts that show the cause may still be under way.
+            self._advise_at = self._receipts.steady + (_CAUSE if self._receipts else 0)
+
+    @property
+    def advises(self) -> bool:
+        """Whether advice on late commands is to be given."""
+        return self._advise_at is not None
+
+    def advise(self) -> None:
+        """Give advice on late commands, if it is due."""
+        if self._advise_at is not None and self._receipts.steady >= self._advise_at:
+            self._advise_at = None
             self._note(self.advice)
 
     @property
@@ -227,6 +242,7 @@ class Following:
     @property
     def advice(self) -> str:
         """What happens to commands, and the remedy."""
+        self.lateness.disturbed(self._receipts.take_disturbances())
         return f'{self.lateness.words()}; ' + (
             self.clocks or self.lateness.advice(self._lead_time))
 

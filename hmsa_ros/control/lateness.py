@@ -1,7 +1,9 @@
 """Lateness of commands and its remedies, for delays of transport and of the driver."""
 
 from collections import deque
+from collections.abc import Iterable
 from statistics import median_low
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,8 @@ _ENOUGH = 3
 _APART, _MOST = 5.0, 0.6
 # Number of commands per joint whose sending time is stored.
 _REMEMBERED = 64
+# Time in ns after a disturbance within which late commands are due to it; number of disturbances.
+_AFTER, _DISTURBANCES = 500_000_000, 16
 # The driver causes the delay if the spread of the lateness is below this fraction of that of the
 # time from sending to effect; the transport causes it in the opposite case.
 _CONSTANT = 0.5
@@ -25,6 +29,22 @@ _NOTHING = 1e-3
 _SHARES = (0.1, 0.5, 0.9)
 # Number of scenarios after an exception, which persists in one of them.
 _RARE = 8
+
+
+class Disturbance(NamedTuple):
+    """An outage, a stall, or a clock that was set: lateness from it is no reason to plan ahead."""
+
+    begin: int  # in ns by the steady clock
+    end: int
+    words: str  # as a clause
+
+
+class _Late(NamedTuple):
+    """A late command; times in ns."""
+
+    time: int  # of the report, by the steady clock
+    late: int
+    ahead: int | None  # from sending to its timestamp; None if unknown
 
 
 class Lateness:
@@ -44,8 +64,9 @@ class Lateness:
         self._sent: dict[str, dict[int, int]] = {}
         # Lateness in ns, and vibration per ns of lateness, as a fraction of the step.
         self._recent: deque[tuple[int, float]] = deque(maxlen=_RECENT)
-        # Of late commands: lateness, and time from sending to the timestamp.
-        self._late: deque[tuple[int, int]] = deque(maxlen=_RECENT)
+        self._late: deque[_Late] = deque(maxlen=_RECENT)
+        self._needed = 0  # largest lateness in ns of forgotten commands, without disturbances
+        self._disturbances: deque[Disturbance] = deque(maxlen=_DISTURBANCES)
 
     def sent(self, joint: str, stamp: int, now: int) -> None:
         """Record when a command was sent; times in ns."""
@@ -57,30 +78,43 @@ class Lateness:
 
     def note(
             self, late: int, joint: str, stamp: int, tolerance: int = 0,
-            cost: float = 0.0) -> None:
+            cost: float = 0.0, time: int = 0) -> None:
         """
         Record that a command of a joint took effect ``late`` ns after its timestamp.
 
-        ``cost`` is the vibration per ns of lateness, as a fraction of the step.
+        ``cost`` is the vibration per ns of lateness, as a fraction of the step; ``time`` that of
+        the steady clock.
         """
         before, self._effects[joint] = self._effects.get(joint), stamp + late
         if late < 0 or before is None or stamp + late > before + tolerance:
             # A command that arrives with the previous one was delayed together with it.
             self._recent.append((late, cost))
         if late > tolerance:
-            self.count += 1
-            self.largest = max(self.largest, late)
             sent = self._sent.get(joint, {}).get(stamp)
-            if sent is not None:
-                self._late.append((late, stamp - sent))
+            self._add(_Late(time, late, None if sent is None else stamp - sent))
         elif late < -tolerance:
             self.earliest = max(self.earliest, -late)
 
-    def missed(self, late: int) -> None:
+    def missed(self, late: int, time: int = 0) -> None:
         """Count a command that is sent ``late`` ns late, or not sent for that reason."""
-        self.count += 1
-        self.largest = max(self.largest, late)
+        self._add(_Late(time, late, None))
         self._missed = True
+
+    def _add(self, one: _Late) -> None:
+        self.count += 1
+        self.largest = max(self.largest, one.late)
+        if len(self._late) == _RECENT and not self._cause(self._late[0]):
+            self._needed = max(self._needed, self._late[0].late)
+        self._late.append(one)
+
+    def disturbed(self, found: Iterable[Disturbance]) -> None:
+        """Record disturbances; lateness that follows one is due to it."""
+        self._disturbances += found
+
+    def _cause(self, one: _Late) -> str:
+        """Return the disturbance that made a command late, as a clause; empty for none."""
+        return next((x.words for x in reversed(self._disturbances)
+                     if x.begin <= one.time <= x.end + _AFTER), '')
 
     # -- prediction ----------------------------------------------------------------------------
 
@@ -138,13 +172,15 @@ class Lateness:
 
     def _by_driver(self) -> bool | None:
         """Return whether the driver delays the last commands; None if that is undetermined."""
-        if self._late and self._late[-1][1] < 0:
+        known = [(x.late, x.ahead) for x in self._late
+                 if x.ahead is not None and not self._cause(x)]
+        if known and known[-1][1] < 0:
             # The commands were sent too late.
             return False
-        if len(self._late) < _ENOUGH:
+        if len(known) < _ENOUGH:
             return None
-        late = [x for x, _ in self._late]
-        under_way = [x + ahead for x, ahead in self._late]
+        late = [x for x, _ in known]
+        under_way = [x + ahead for x, ahead in known]
         spread, explained = max(late) - min(late), max(under_way) - min(under_way)
         if spread < _CONSTANT * explained:
             return True
@@ -168,6 +204,12 @@ class Lateness:
         if not self.largest:
             return 'let the driver apply commands at their timestamps' if self.earliest else (
                 'find out which other node publishes commands, or what drops them')
+        causes = [self._cause(x) for x in self._late]
+        largest = max((x.late for x, cause in zip(self._late, causes, strict=True) if not cause),
+                      default=0)
+        largest = max(largest, self._needed)
+        if not largest:
+            return f'{causes[-1]}: a larger lead_time is no remedy for that'
         by_driver = self._by_driver()
         if by_driver:
             return (
@@ -175,6 +217,6 @@ class Lateness:
                 'sent, so a larger lead_time does not help: ' + (
                     'nothing needs to be done, but it may write that much earlier'
                     if self.cost < _NOTHING else 'have it write at more even times'))
-        needed = (lead_time + self.largest) / NANOSECONDS
+        needed = (lead_time + largest) / NANOSECONDS
         return f'raise lead_time to more than {needed:.3g} s' + (
             ', unless the driver itself is that slow' if by_driver is None else '')

@@ -371,6 +371,8 @@ class PlannerRuntime:
             times.append(self._next_beat)
         if self.following.astray or self.following.verdicts:
             times.append(0)
+        if self.following.advises:
+            times.append(now + LOOK)
         if self.devices.receipts or self._stops.open:
             times.append(now + LOOK)
         return min((x for x in times if x is not None), default=None)
@@ -391,6 +393,7 @@ class PlannerRuntime:
         if self._reporting.preview_again is not None and now >= self._reporting.preview_again:
             self._reporting.show()
         self._reporting.report_progress(now)
+        self.following.advise()
         if self.active and (
                 self._watch.open or self._reporting.unheard or self._reporting.unseen
                 or self.devices.receipts or self._reporting.next_change is not None):

@@ -1,9 +1,11 @@
 """Receipts of plant or driver: acknowledged commands, and the time of the device's clock."""
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from hmsa_ros.control.device_clock import DeviceClock, Offset
+from hmsa_ros.control.lateness import Disturbance
 from hmsa_ros.model.units import NANOSECONDS
 
 # Receipts arrive five times a second: longest gap between them, in ns by the steady clock.
@@ -17,6 +19,8 @@ _STALE, _PACED = 300_000_000, 350_000_000
 _UNEVEN = 100_000_000
 # Number of looks, five a second, without a publisher until no receipts are expected.
 _MISSING = 25
+# Number of disturbances that are stored until they are asked for.
+_REMEMBERED = 16
 
 
 @dataclass
@@ -59,6 +63,7 @@ class Receipts:
         self._steady = steady
         self._joints: dict[str, _Joint] = {}
         self._looked = steady()
+        self._disturbances: deque[Disturbance] = deque(maxlen=_REMEMBERED)
         self.silent: set[str] = set()
 
     def __bool__(self) -> bool:
@@ -89,6 +94,8 @@ class Receipts:
             known = self._joints[joint] = _Joint(steady)
         if known.silent and comparable and known.is_delayed(time, steady):
             return False
+        if steady - known.arrived > _STALE:
+            self._disturbed(known.arrived, _outage(joint, steady - known.arrived))
         restarted, known.command = known.command != 0 and command == 0, command
         if restarted:
             # Commands that were sent to the previous device are lost.
@@ -105,6 +112,18 @@ class Receipts:
     def knows(self, joint: str) -> bool:
         """Return whether there was a receipt of a joint."""
         return joint in self._joints
+
+    def _disturbed(self, begin: int, words: str) -> None:
+        self._disturbances.append(Disturbance(begin, self._steady(), words))
+
+    def take_disturbances(self) -> list[Disturbance]:
+        """Return the disturbances since the last call, and those that last."""
+        for name, known in self._joints.items():
+            if (silence := self._steady() - known.arrived) > _STALE:
+                self._disturbed(known.arrived, _outage(name, silence))
+        found = list(self._disturbances)
+        self._disturbances.clear()
+        return found
 
     def since(self, joint: str, time: int) -> bool:
         """Return whether a joint's newest receipt is no older than a time of its device."""
@@ -137,6 +156,7 @@ class Receipts:
 
     def clock_set(self) -> None:
         """Record that the planner's clock was set."""
+        self._disturbed(self._steady() - _STALE, 'the clock of the planner was set')
         for known in self._joints.values():
             known.clock.set(self._steady())
             known.acknowledged = 0
@@ -154,9 +174,12 @@ class Receipts:
         steady = self._steady()
         absent, self._looked = steady - self._looked, steady
         changed: list[str] = []
+        if absent > _PAUSE:
+            self._disturbed(
+                steady - absent, f'the planner stood still for {absent / NANOSECONDS:.3f} s')
         for name, known in self._joints.items():
             if absent > _PAUSE:
-                known.arrived += absent
+                known.arrived = min(known.arrived + absent, steady)
                 known.unanswered = None
             silent = steady - known.arrived > _PATIENCE
             if silent is not known.silent:
@@ -170,6 +193,11 @@ class Receipts:
         known = self._joints.get(joint)
         return known is not None and known.unanswered is not None and (
             self._steady() - known.unanswered > patience)
+
+    @property
+    def steady(self) -> int:
+        """The steady time in ns."""
+        return self._steady()
 
     @property
     def words(self) -> str:
@@ -206,3 +234,9 @@ class Receipts:
         """Largest clock offset among the devices; None if unknown."""
         found = (x.clock.offset for x in self._joints.values())
         return max((x for x in found if x is not None), key=lambda x: abs(x.ahead), default=None)
+
+
+def _outage(joint: str, silence: int) -> str:
+    """Return a clause that receipts of a joint were missing for some ns."""
+    return (f'no receipt of joint {joint} arrived for {silence / NANOSECONDS:.3f} s, as in an '
+            'outage or a stall')
