@@ -13,7 +13,7 @@ from rosbags.rosbag2.enums import StoragePlugin
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from ruamel.yaml import YAML
 
-from hmsa_ros.bag import metadata, qos
+from hmsa_ros.bag import limits, metadata, qos
 from hmsa_ros.bag.definitions import message_definition, type_hash
 from hmsa_ros.bag.info import summarize
 from hmsa_ros.bag.reader import BagReader, read_messages
@@ -201,6 +201,25 @@ def test_notes_survive_without_a_clean_end(tmp_path):
     assert 'was not closed by its recorder' in bag.problems[-1]
     writer.close()
     assert not BagReader(tmp_path / 'bag').problems
+
+
+def test_notes_that_change_for_hours_take_a_bounded_part_of_a_file(tmp_path, monkeypatch):
+    monkeypatch.setattr('hmsa_ros.bag.writer._NOTES_SIZE', 30_000)
+    # Less than all values that there were, and more than the last ones.
+    monkeypatch.setattr(limits, 'KEPT_SIZE', 12_000)
+    writer = BagWriter(tmp_path / 'bag')
+    writer.add_topic(topic())
+    writer.write([(0, 1, 1, 0, bytes(1_000_000))])
+    writer.flush()
+    for i in range(50):
+        writer.note({'lost': f'{i:01000}'})
+    # A killed recorder leaves this.
+    assert BagReader(tmp_path / 'bag').custom_data['lost'] == f'{49:01000}'
+    writer.close()
+    assert (tmp_path / 'bag' / 'bag_0.mcap').stat().st_size < 1_045_000
+    alone = BagReader(tmp_path / 'bag' / 'bag_0.mcap')
+    assert alone.custom_data['lost'] == f'{49:01000}'
+    assert not alone.problems
 
 
 def test_what_is_flushed_can_be_read_while_writing_goes_on(tmp_path):

@@ -150,10 +150,14 @@ class ScannedFile:
                 self._intake.keep(sum(map(len, record.metadata.values())) + len(record.topic))
                 self.channels[record.id] = record
         elif isinstance(record, Metadata):
+            if record.name not in self.metadata:
+                self._intake.keep(len(record.name) + _ENTRY_BYTES)
             values = self.metadata.setdefault(record.name, {})
-            self._intake.keep(len(record.name) + sum(
-                len(value) + (0 if key in values else len(key) + _ENTRY_BYTES)
-                for key, value in record.metadata.items() if values.get(key) != value))
+            # A new value replaces the old one in memory.
+            self._intake.keep(sum(
+                len(value) - len(values[key]) if key in values
+                else len(value) + len(key) + _ENTRY_BYTES
+                for key, value in record.metadata.items()))
             values.update(record.metadata)
 
     def _is_new(self, known: Mapping[int, _Declared], record: _Declared) -> bool:

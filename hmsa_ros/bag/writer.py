@@ -25,7 +25,8 @@ from hmsa_ros.bag.topics import number_of
 from hmsa_ros.errors import BadInputError, BagError
 
 __all__ = ['BagWriter', 'MIN_FILE_SIZE', 'parse_custom_data', 'PRESETS', 'Topic']
-# Size up to which metadata records are always written to a file.
+# Total size up to which changes of the custom data are written to a file at once. Later ones, of a
+# recording of hours, are in ``metadata.yaml`` at once and in the file at its end.
 _NOTES_SIZE = 2**20
 MIN_FILE_SIZE = 1024
 #: Limit of the MCAP format.
@@ -182,8 +183,7 @@ class BagWriter:
         """Add to the custom data: in ``metadata.yaml``, and in the file at once or at its end."""
         self._add(values)
         if self._file is not None:
-            # Frequent changes would take more space than the messages.
-            if self._file.notes_size <= max(_NOTES_SIZE, self._file.size // 16):
+            if self._file.notes_size <= _NOTES_SIZE:
                 self._file.note(self._notes())
             self._write_metadata()
 
