@@ -6,15 +6,7 @@ name (``/left/plant.actuator.density``), the value as JSON. Bags of version 0.1 
 part of the node's name only (``plant.actuator.density``).
 """
 
-from collections import deque
 from collections.abc import Mapping
-import json
-from typing import Any
-
-#: Setpoints kept for the custom data of a bag.
-MAX_SETPOINTS = 1000
-# Their maximum total length.
-_SETPOINTS_LENGTH = 2**18
 
 
 def parameter_key(node: str, name: str) -> str:
@@ -42,39 +34,3 @@ def parameters_of(custom_data: Mapping[str, str], node: str, space: str) -> dict
         return exact
     alike = [values for name, values in nodes.items() if name.rsplit('/', 1)[-1] == node]
     return alike[0] if len(alike) == 1 else {}
-
-
-class SetpointLog:
-    """The latest setpoints, as stored in the custom data of a bag."""
-
-    def __init__(self) -> None:
-        self._entries: deque[str] = deque(maxlen=MAX_SETPOINTS)
-        self._changed = False
-
-    def add(self, topic: str, received_ns: int, message: Any) -> None:
-        """Add a message with a setpoint (``data``) or a sequence of them (``points``)."""
-        entry: dict[str, Any] = {'topic': topic, 'received': received_ns}
-        if hasattr(message, 'points'):
-            stamp = message.header.stamp
-            entry['stamp'] = stamp.sec * 10**9 + stamp.nanosec
-            entry['points'] = [
-                [list(point.positions),
-                 point.time_from_start.sec + point.time_from_start.nanosec * 1e-9]
-                for point in message.points]
-        else:
-            entry['stretch'] = message.data
-        self._entries.append(json.dumps(entry))
-        self._changed = True
-
-    def news(self) -> dict[str, str]:
-        """Return the custom data if changed, limited to a reasonable length."""
-        if not self._changed:
-            return {}
-        self._changed = False
-        length, latest = 0, deque[str]()
-        for text in reversed(self._entries):
-            length += len(text)
-            if latest and length > _SETPOINTS_LENGTH:
-                break
-            latest.appendleft(text)
-        return {'setpoints': f'[{", ".join(latest)}]'}

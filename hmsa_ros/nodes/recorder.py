@@ -24,7 +24,6 @@ from rcl_interfaces.msg import ParameterEvent
 from rosgraph_msgs.msg import Clock
 
 from hmsa_ros import __version__
-from hmsa_ros.bag.experiment import SetpointLog
 from hmsa_ros.bag.output import PRESETS
 from hmsa_ros.bag.reception import figures, judge, RecordedTopic
 from hmsa_ros.bag.recording import Limits, lost_by_topic, Recording, Status
@@ -102,11 +101,6 @@ _LINGER_SECONDS = 0.1
 # Limit on the number of nodes whose parameters are requested.
 _MAX_NODES = 256
 
-# Topics with setpoints, by the last part of their names.
-_SETPOINTS = {
-    topic.name.rsplit('/', 1)[-1]: topic
-    for topic in (topics.JOINT_TRAJECTORY, topics.SETPOINT)}
-
 
 class Recorder(ManagedNode):
     """ROS 2 node that records to the bag in ``folder``; ``failure`` contains a fatal error."""
@@ -126,8 +120,6 @@ class Recorder(ManagedNode):
         self._paused: bool = values['record.start_paused']
         self._sim_time = SimulatedTime() if self.simulated else None
         self._experiment: dict[str, str] = {'hmsa_ros.version': __version__}
-        self._setpoints = SetpointLog()
-        self._setpoint_topics: set[str] = set()
         # Number of topics with a publisher at the last look, and of nodes whose parameters are
         # stored.
         self._matched = self._known = 0
@@ -157,10 +149,6 @@ class Recorder(ManagedNode):
             self._pausing, 'paused' if self._pausing else 'recording'))
         self.offer(topics.SPLIT_BAGFILE, lambda: (True, self._recording.split()))
         self.offer(topics.SNAPSHOT, lambda: (True, self._recording.snapshot()))
-        for topic in _SETPOINTS.values():
-            # From the start, so that the first setpoint is not missed; further topics when found.
-            self._follow_setpoints(topic, self._full_name(
-                topics.from_outside(topic.name, topics.PLANNER)))
         self._followed: dict[str, RemoteParameters] = {}
         self.create_subscription(
             ParameterEvent, '/parameter_events', self._on_parameter_event, 100)
@@ -187,13 +175,7 @@ class Recorder(ManagedNode):
         if self._sim_time is not None and not self._sim_time.started:
             return
         self._find_nodes()
-        found = self.get_topic_names_and_types()
-        self._recorded.look(found)
-        for name, types in found:
-            topic = _SETPOINTS.get(name.rsplit('/', 1)[-1])
-            if topic is not None and topic.type in types and any(
-                    name.startswith(f'{node}/') for node in self._followed):
-                self._follow_setpoints(topic, name)
+        self._recorded.look(self.get_topic_names_and_types())
         for followed in self._followed.values():
             followed.poll(self._note)
         before = self._matched, self._known
@@ -216,14 +198,6 @@ class Recorder(ManagedNode):
                     node.rpartition('/')[2] in bare or node in full) \
                     and node not in self._followed and len(self._followed) < _MAX_NODES:
                 self._followed[node] = RemoteParameters(self, node)
-
-    def _follow_setpoints(self, topic: topics.Topic, name: str) -> None:
-        """Store the setpoints published on a topic."""
-        if name not in self._setpoint_topics:
-            self._setpoint_topics.add(name)
-            endpoints.subscribe(
-                self, replace(topic, name=name), lambda message: self._setpoints.add(
-                    name, self.now(), message))
 
     def _deliver(self, taken: Sequence[tuple[Any, list[Taken]]]) -> None:
         """Add timestamps to received messages, count them and pass them on."""
@@ -315,7 +289,6 @@ class Recorder(ManagedNode):
     def _status_of_bag(self) -> Iterable[DiagnosticStatus]:
         status = self._recording.status()
         lost = self._lost(status)
-        self._note(self._setpoints.news())
         # Written immediately, so that it is known after a crash too.
         self._note(self._lost_note(lost))
         state = ('inactive' if not self.active else 'paused' if self._paused
@@ -354,7 +327,6 @@ class Recorder(ManagedNode):
         # Meanwhile, lost messages from before are sent again.
         time.sleep(_LINGER_SECONDS)
         self._capture.stop()
-        self._note(self._setpoints.news())
         status = self._recording.close(lambda last: self._lost_note(self._lost(last)))
         lost = self._lost(status)
         written = sum(status.written.values())
