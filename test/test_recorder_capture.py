@@ -7,7 +7,10 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import Float64
 
+from hmsa_ros.bag.reception import RecordedTopic
+from hmsa_ros.nodes import subscribing
 from hmsa_ros.nodes.capture import Capture, RawSubscription, SimulatedTime
+from hmsa_ros.nodes.selection import Selection
 
 TALKER = Path(__file__).parent / 'talker.py'
 
@@ -44,6 +47,49 @@ def test_an_error_in_the_thread_is_kept(ros, start, wait_until):
     wait_until(lambda: capture.error is not None, 'the error')
     capture.stop()
     assert isinstance(capture.error, ValueError)
+
+
+@pytest.mark.ros
+def test_a_subscription_is_replaced_without_a_loss(ros, start, wait_until):
+    topic = RecordedTopic('/a', 'std_msgs/msg/Float64', 0, None, ())
+    got = []
+    capture = Capture(lambda taken: [
+        got.extend(topic.take(messages, None, paused=False)[0]) for _, messages in taken])
+    capture.add(topic, RawSubscription(ros.node, Float64, '/a', QoSProfile(depth=1000)))
+    capture.start()
+    talker = start.python(TALKER, '/a', '1500', '--rate', '1000')
+    for count in (200, 700):
+        wait_until(lambda count=count: len(got) > count, f'{count} messages')
+        capture.replace(topic, RawSubscription(
+            ros.node, Float64, '/a', QoSProfile(depth=1000)))
+    talker.wait_for_output('done')
+    wait_until(lambda: len(got) >= 1500, 'all messages')
+    capture.stop()
+    assert capture.error is None
+    assert topic.missed == 0
+    assert [sequence for *_, sequence, _ in got] == list(range(got[0][3], got[0][3] + 1500))
+
+
+@pytest.mark.parametrize('largest', [
+    (100,) * 50, (60_000,) * 6, (60_000,) * 200, (100, 3_000, 10**7)])
+def test_the_queues_of_all_topics_stay_within_their_share_of_the_memory(largest, monkeypatch):
+    monkeypatch.setattr(subscribing, 'RawSubscription', lambda *_: None)
+    replaced = []
+    capture = Capture(lambda taken: None)
+    monkeypatch.setattr(capture, 'replace', lambda topic, _: replaced.append(topic))
+    found = subscribing.Subscriptions(
+        None, Selection(), None, capture, 10_000, 100 * 2**20)
+    for i in range(len(largest)):
+        qos = QoSProfile(depth=10_000)
+        found.topics[str(i)] = RecordedTopic(str(i), 'std_msgs/msg/String', i, qos, ())
+    for share in (0, 0.1, 0.4, 1, 1):
+        for topic, size in zip(found.topics.values(), largest, strict=True):
+            topic.largest = round(size * share)
+        found.look(())
+    depths = [x.qos.depth for x in found.topics.values()]
+    assert sum(x * y for x, y in zip(largest, depths, strict=True)) <= 50 * 2**20
+    assert all(depth == 10_000 for x, depth in zip(largest, depths, strict=True) if x == 100)
+    assert len(replaced) <= 4 * len(largest)
 
 
 class _Held:

@@ -78,8 +78,9 @@ class OutputFile:
         self._schemas: dict[str, Schema] = {}  # by message type
         self._channels: list[Channel] = []
         self._declared: list[McapRecord] = []  # schemas and channels for the next chunk
-        self._chunks: list[ChunkIndex] = []
-        self._metadata: list[MetadataIndex] = []
+        # Packed, since a recording of a day has 300,000 of them.
+        self._chunks, self._metadata = bytearray(), bytearray()
+        self._chunk_count = self._metadata_count = 0
         self._noted: dict[str, str] = {}
         self._crc = 0
         # Bytes reserved on the disk, and those needed for the end of the file.
@@ -112,9 +113,11 @@ class OutputFile:
             chunk_length=len(parts[0]), message_index_offsets=offsets,
             message_index_length=after - indexes_at, compression=self._compression,
             compressed_size=len(chunk.data), uncompressed_size=len(data))
-        self._add(b''.join(parts), len(_packed([chunk_index])))
+        packed_index = _packed([chunk_index])
+        self._add(b''.join(parts), len(packed_index))
         self._declared.clear()
-        self._chunks.append(chunk_index)
+        self._chunks += packed_index
+        self._chunk_count += 1
         self.message_size += after - chunk_index.chunk_start_offset - len(declared)
         self.counts.update({topic: len(pairs) // 2 for topic, pairs in places.items()})
         self.start = min(self.start, chunk.message_start_time)
@@ -148,13 +151,14 @@ class OutputFile:
         statistics = Statistics(
             attachment_count=0, channel_count=len(self._channels),
             channel_message_counts={topic + 1: x for topic, x in self.counts.items()},
-            chunk_count=len(self._chunks), message_count=count,
+            chunk_count=self._chunk_count, message_count=count,
             message_start_time=self.start if count else 0, message_end_time=self.end,
-            metadata_count=len(self._metadata), schema_count=len(self._schemas))
-        groups = [(code, _packed(records)) for code, records in (
-            (Opcode.SCHEMA, self._schemas.values()), (Opcode.CHANNEL, self._channels),
-            (Opcode.STATISTICS, [statistics]), (Opcode.CHUNK_INDEX, self._chunks),
-            (Opcode.METADATA_INDEX, self._metadata))]
+            metadata_count=self._metadata_count, schema_count=len(self._schemas))
+        groups = [
+            (Opcode.SCHEMA, _packed(self._schemas.values())),
+            (Opcode.CHANNEL, _packed(self._channels)), (Opcode.STATISTICS, _packed([statistics])),
+            (Opcode.CHUNK_INDEX, bytes(self._chunks)),
+            (Opcode.METADATA_INDEX, bytes(self._metadata))]
         data_end = _packed([DataEnd(self._crc if self._has_crc else 0)])
         begin = self.size + len(data_end)
         starts = itertools.accumulate((len(data) for _, data in groups), initial=begin)
@@ -220,8 +224,10 @@ class OutputFile:
         """Store a metadata record."""
         data = _packed([Metadata(name=name, metadata=dict(values))])
         index = MetadataIndex(offset=self.size, length=len(data), name=name)
-        self._add(data, len(_packed([index])))
-        self._metadata.append(index)
+        packed_index = _packed([index])
+        self._add(data, len(packed_index))
+        self._metadata += packed_index
+        self._metadata_count += 1
 
     def _add(self, data: bytes, end_size: int = 0) -> None:
         """Store data completely or not at all, reserving ``end_size`` more bytes for the end."""

@@ -27,6 +27,7 @@ class RecordedTopic:
     publishers: int = 0  #: at the last look
     last: dict[bytes, int] = field(default_factory=dict)  #: sequence number by publisher
     received: int = 0
+    largest: int = 0  #: payload so far, in bytes
     missed: int = 0  #: gaps in the sequence numbers
     before: int = 0  #: sent by publishers before they were matched
 
@@ -42,9 +43,10 @@ class RecordedTopic:
         # A message has source and reception timestamp in ns, sequence number, publisher, payload.
         # at() converts system time to log time. Messages during a pause do not count as missed.
         batch: list[Entry] = []
-        size = 0
+        size, largest = 0, self.largest
         for source, received, sequence, publisher, data in messages:
             before = self.last.get(publisher)
+            largest = max(largest, len(data))
             if before is not None and sequence <= before:
                 continue  # already received by the previous subscription
             if before is not None and not paused:
@@ -60,6 +62,7 @@ class RecordedTopic:
             batch.append((self.number, stamp if at is None else at(stamp), source, sequence, data))
             size += len(data)
         self.received += len(batch)
+        self.largest = largest
         return batch, size
 
 

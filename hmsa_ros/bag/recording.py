@@ -8,6 +8,7 @@ happen in the thread. What cannot be kept is counted by topic, never dropped in 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
+import ctypes
 from dataclasses import dataclass
 from functools import partial
 import threading
@@ -25,6 +26,10 @@ MESSAGE_OVERHEAD = 250
 RETRY_SECONDS = 1.0
 #: Maximum time in s to write the queue at the end; the rest is counted as lost.
 END_SECONDS = 10.0
+# The C library keeps the memory of messages that were written. It is given back to the system
+# after so many bytes of them, at most once in this time in s.
+_TRIM_BYTES = 16 * 2**20
+_TRIM_SECONDS = 5.0
 # Further time in s for a disk that does not answer.
 _GRACE_SECONDS = 5.0
 #: Number of new files that may be opened immediately, and the interval in s after that: each file
@@ -109,6 +114,8 @@ class Recording:
         self._items: deque[_Task | _Batch] = deque()
         self._kept: deque[_Batch] = deque()  # for a snapshot
         self._queued = 0
+        self._used = 0  # bytes of messages since memory was given back
+        self._next_trim = 0.0
         self._topics: list[Topic] = []
         self._overflowed = Counter[int]()
         self._closing = False
@@ -138,6 +145,7 @@ class Recording:
         size = payload_bytes + MESSAGE_OVERHEAD * len(messages)
         batch = _Batch(messages, size, time.monotonic())
         with self._condition:
+            self._used += size
             if self._limits.snapshot_ns:
                 self._keep(batch)
             elif self._queued + size > self._limits.cache_size:
@@ -279,12 +287,20 @@ class Recording:
                 self._fail(error)
             if time.monotonic() >= next_flush:
                 next_flush = time.monotonic() + period
+                self._give_back_memory()
             if closing and self._error:
                 # One last attempt: a new file may succeed.
                 self._retry()
             if closing and (self._error or self._is_late() or not self._items):
                 self._give_up()
                 return
+
+    def _give_back_memory(self) -> None:
+        """Give the memory of written messages back to the system from time to time."""
+        now = time.monotonic()
+        if self._used >= _TRIM_BYTES and now >= self._next_trim:
+            self._used, self._next_trim = 0, now + _TRIM_SECONDS
+            _trim(0)
 
     def _take_items(self) -> None:
         """Process the queue; after a failure, the rest waits for the next attempt."""
@@ -374,6 +390,10 @@ class Recording:
                 elif isinstance(item, _Task):
                     item.answer.set_exception(BagError('the recording has ended'))
             self._items.clear()
+
+
+#: Of the C library of GNU; others give memory back by themselves.
+_trim: Callable[[int], object] = getattr(ctypes.CDLL(None), 'malloc_trim', lambda pad: None)
 
 
 def _not_closed(error: OSError) -> str:

@@ -29,6 +29,9 @@ _BATCH = 2000
 # Sleep times of the thread after messages have arrived, and if none have: at high rates many are
 # taken at once. Timestamps come from the middleware and are not affected.
 _REST_SECONDS, _IDLE_SECONDS = 0.001, 0.005
+# Time in s for which a replaced subscription is still read: on an idle machine, the publishers,
+# which are known already, find the new one within some ms.
+_OVERLAP_SECONDS = 2.0
 # Time in ns without messages after which a publisher of /clock is replaced by another.
 _SILENCE_NS = 1_000_000_000
 
@@ -168,7 +171,8 @@ class Capture:
     def __init__(self, deliver: Callable[[Sequence[tuple[Any, list[Taken]]]], None]) -> None:
         self._deliver = deliver
         self._subscriptions: list[tuple[Any, RawSubscription]] = []
-        self._leaving: list[tuple[Any, RawSubscription]] = []
+        # Replaced subscriptions, and until when they are read.
+        self._leaving: list[tuple[Any, RawSubscription, float]] = []
         self._stopping = False
         self.error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name='capture', daemon=True)
@@ -182,10 +186,15 @@ class Capture:
         self._subscriptions.append((key, subscription))
 
     def replace(self, key: Any, subscription: RawSubscription) -> None:
-        """Read another subscription under a known key; messages of the old one are delivered."""
+        """
+        Read another subscription under a known key.
+
+        Both are read for a while, so that nothing is lost before the publishers have found the new
+        one; messages that both receive are delivered twice.
+        """
         for i, (known, old) in enumerate(self._subscriptions):
             if known is key:
-                self._leaving.append((key, old))
+                self._leaving.append((key, old, time.monotonic() + _OVERLAP_SECONDS))
                 self._subscriptions[i] = key, subscription
 
     def matched(self) -> list[Any]:
@@ -217,7 +226,8 @@ class Capture:
         except BaseException as error:  # reported by the node that owns the thread
             self.error = error
         finally:
-            for _, subscription in self._subscriptions:
+            for subscription in (
+                    *(x for _, x in self._subscriptions), *(x for _, x, _ in self._leaving)):
                 subscription.destroy()
 
     def _round(self, limit: int = _BATCH) -> list[tuple[Any, list[Taken]]]:
@@ -227,15 +237,21 @@ class Capture:
         The first one is read last: if /clock was added first, every tick received before a message
         of this round is known when the message gets its timestamp.
         """
-        # In this order, a subscription that is replaced meanwhile is read to its end before the
-        # new one.
-        known, leaving = [*self._subscriptions], []
-        while self._leaving:
-            key, old = self._leaving.pop(0)
-            leaving.append((key, old.take(sys.maxsize)))
-            old.destroy()
-        taken = [(key, x.take(limit)) for key, x in reversed(known)]
-        return [x for x in (*leaving, *reversed(taken)) if x[1]]
+        now, known = time.monotonic(), [*self._subscriptions]
+        # What is replaced from here on is read as the present one, and then as a replaced one.
+        leaving = [*self._leaving]
+        taken = []
+        for key, subscription in reversed(known):
+            messages = subscription.take(limit)
+            # Read after the new one but delivered before it, so that each message that only one of
+            # them has comes in its order.
+            before = [(x, old.take(sys.maxsize)) for x, old, _ in leaving if x is key]
+            taken += [(key, messages), *reversed(before)]
+        for entry in leaving:
+            if entry[2] < now:
+                self._leaving.remove(entry)
+                entry[1].destroy()
+        return [x for x in reversed(taken) if x[1]]
 
 
 class SimulatedTime:

@@ -84,7 +84,8 @@ PARAMETERS = (
         most=3600, nanoseconds=100_000_000),
     ParameterSpec(
         'record.queue_depth', 10_000,
-        'Queue depth of each subscription in the middleware.', '', 1, 1_000_000),
+        'Longest queue of a subscription in the middleware; large messages get shorter ones, '
+        'which take a quarter of storage.max_cache_size in all.', '', 1, 1_000_000),
     ParameterSpec(
         'record.snapshot_mode', False,
         'Whether to keep messages only in memory until ~/snapshot is called.'),
@@ -137,7 +138,8 @@ class Recorder(ManagedNode):
         self._recording = Recording(writer, limits, self.complain)
         self._capture = Capture(self._deliver)
         self._recorded = Subscriptions(
-            self, selection, self._recording, self._capture, values['record.queue_depth'])
+            self, selection, self._recording, self._capture, values['record.queue_depth'],
+            limits.cache_size)
         self._closed = False
         if self._sim_time is not None:
             self._capture.add(self._sim_time, endpoints.listen(self, replace(

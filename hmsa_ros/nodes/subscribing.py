@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 
 from hmsa_ros.bag.definitions import message_definition, type_hash
 from hmsa_ros.bag.qos import Qos
@@ -16,6 +17,11 @@ from hmsa_ros.nodes.endpoints import interface_class
 from hmsa_ros.nodes.qos import stored, subscription
 from hmsa_ros.nodes.selection import Selection
 
+# Share of the memory for waiting messages that the queues of the middleware may take: these serve
+# while the recorder gets no processor, its own queue while the disk is slow.
+_QUEUES = 1 / 4
+# Smallest queue of a subscription.
+_MIN_DEPTH = 2
 # Every so many looks, all publishers are looked up, even if their number has not changed.
 _FULL_LOOK = 10
 
@@ -24,18 +30,21 @@ class Subscriptions:
     """
     Subscribe to the selected topics, and list them in ``topics``.
 
-    ``depth`` is the queue size of a subscription.
+    ``depth`` is the largest number of messages in the queue of a subscription, and ``cache_size``
+    the memory in bytes for waiting messages. The middleware limits a queue by messages only, and
+    keeps the memory of a queue that was full: large messages get shorter queues.
     """
 
     def __init__(
             self, node: Node, selection: Selection, recording: Recording, capture: Capture,
-            depth: int) -> None:
+            depth: int, cache_size: int) -> None:
         self.topics: dict[str, RecordedTopic] = {}
         self._node = node
         self._selection = selection
         self._recording = recording
         self._capture = capture
         self._depth = depth
+        self._queue_size = cache_size * _QUEUES
         self._refused: set[str] = set()
         self._reported_ready = False
         self._looks = 0
@@ -57,6 +66,7 @@ class Subscriptions:
         for name, types in found:
             if self._selection.wants(name):
                 self._look_at(name, types)
+        self._shorten()
         if not self._reported_ready and self._selection.topics \
                 and self.wanted_count == len(self.topics):
             self._reported_ready = True
@@ -94,7 +104,7 @@ class Subscriptions:
             self._warn(f'topic {name} is not recorded: {error}')
             return
         number = self._recording.add_topic(self._describe(name, type_name, offered, hashes))
-        qos = subscription(offered, self._depth)
+        qos = subscription(offered, self._depth if known is None else known.qos.depth)
         logger = self._node.get_logger()
         if known is None:
             recorded = RecordedTopic(name, type_name, number, qos, offered)
@@ -104,10 +114,27 @@ class Subscriptions:
             return
         known.offered = offered
         if (qos.reliability, qos.durability) != (known.qos.reliability, known.qos.durability):
-            known.qos = qos
-            self._capture.replace(known, RawSubscription(self._node, message_type, name, qos))
+            self._replace(known, qos)
             logger.info(
                 f'subscribed to {name} again, as its publishers offer another quality of service')
+
+    def _shorten(self) -> None:
+        """Shorten the queues that could take more than their share of the memory."""
+        left, count = self._queue_size, len(self.topics)
+        for topic in sorted(self.topics.values(), key=lambda x: x.largest):
+            # What small messages leave is for the large ones.
+            share = min(left / count, self._depth * topic.largest)
+            left, count = left - share, count - 1
+            depth = max(_MIN_DEPTH, int(share / max(topic.largest, 1)))
+            # By half at least, since messages may grow little by little.
+            if topic.largest and depth <= topic.qos.depth // 2:
+                self._replace(topic, subscription(topic.offered, depth))
+
+    def _replace(self, topic: RecordedTopic, qos: QoSProfile) -> None:
+        """Subscribe to a topic again."""
+        topic.qos = qos
+        self._capture.replace(topic, RawSubscription(
+            self._node, interface_class(topic.type), topic.name, qos))
 
     def _describe(
             self, name: str, type_name: str, offered: tuple[Qos, ...],
