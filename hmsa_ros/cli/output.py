@@ -12,7 +12,11 @@ _NAME = 'hmsa_plain'
 
 
 def plain(error: UnicodeError) -> tuple[bytes, int]:
-    """Return what replaces characters that cannot be encoded, for `codecs.register_error`."""
+    """
+    Return what replaces characters that cannot be encoded, for `codecs.register_error`.
+
+    Raise the error itself if it is another one.
+    """
     if not isinstance(error, UnicodeEncodeError):
         raise error
     return b''.join(
