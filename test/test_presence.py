@@ -13,6 +13,7 @@ from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import to_trajectory
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
+from hmsa_ros.nodes.presence import Active
 from hmsa_ros.watch.listener import Listener
 
 pytestmark = pytest.mark.ros
@@ -68,6 +69,19 @@ def test_second_plant_of_a_joint_is_refused_until_it_is_gone(ros, serve, start):
     asking.until(refused=False)
     # The middleware believes for some 20 s that it runs.
     assert ros.node.count_publishers(topics.FLUX_DENSITY_APPLIED.name) == 2
+
+
+@pytest.mark.parametrize(('messages', 'active'), [
+    # One source after the other, at the same time, and after a pause.
+    ({'a': (0, 1, 2), 'b': (2.5, 3)}, {'b'}), ({'a': (0, 1, 2, 3), 'b': (2.5, 3)}, {'a', 'b'}),
+    ({'a': (0, 1), 'b': (0.5, 1.5)}, {'a', 'b'}), ({'a': (0, 3), 'b': (1, 2)}, {'a'}),
+    ({'a': (0,), 'b': (1,)}, {'b'}), ({'a': (3,)}, {'a'}), ({'a': (0,)}, set())])
+def test_a_source_that_ended_before_another_began_was_replaced(messages, active):
+    found = Active()
+    for source, times in messages.items():
+        for time in times:
+            found.note(source, round(time * 1e9))
+    assert found.among(messages, round(3.1e9)) == active
 
 
 def test_second_planner_is_named_before_anything_is_sent(ros, serve, start, capfd):

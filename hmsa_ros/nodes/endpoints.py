@@ -22,6 +22,9 @@ from hmsa_ros.interfaces.topics import from_outside, Quality, Service, Topic
 from hmsa_ros.nodes.capture import RawSubscription
 from hmsa_ros.nodes.service_call import ServiceCall
 
+# Name of a node that has not been discovered yet, or not any more.
+_UNKNOWN = '_NODE_NAME_UNKNOWN_'
+
 
 def interface_class(type_name: str) -> type[Any]:
     """
@@ -58,7 +61,11 @@ def profile(quality: Quality) -> QoSProfile:
 
 
 def publishers_of(node: Node, topic: str) -> dict[bytes, str]:
-    """Return the publishers of a topic in the graph: full node names by identifier."""
+    """
+    Return the publishers of a topic in the graph: full node names by identifier.
+
+    The name is empty as long as the node of a publisher has not been discovered.
+    """
     return _names(node.get_publishers_info_by_topic(node.resolve_topic_name(topic)))
 
 
@@ -87,8 +94,8 @@ def matched(node: Node, publisher: Publisher, *owners: str) -> bool:
 
 
 def _names(endpoints: Iterable[Any]) -> dict[bytes, str]:
-    return {bytes(x.endpoint_gid): f'{x.node_namespace.rstrip("/")}/{x.node_name}'
-            for x in endpoints}
+    return {bytes(x.endpoint_gid): '' if x.node_name == _UNKNOWN else (
+        f'{x.node_namespace.rstrip("/")}/{x.node_name}') for x in endpoints}
 
 
 def publisher(node: Node, topic: Topic, owner: str = '') -> Publisher:

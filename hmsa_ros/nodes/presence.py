@@ -3,11 +3,12 @@ Detect other planners or devices: there must be only one of each.
 
 A process that was killed stays in the graph for about 20 s. A publisher is therefore counted only
 while its process is active: each node of the package publishes on /diagnostics once a second, and
-other processes are detected by their samples. Publishers are distinguished by their identifiers
-(GIDs), whose first part is that of the process.
+other processes are detected by their samples. One that ended before another began to publish was
+replaced by it. Publishers are distinguished by their identifiers (GIDs), whose first part is that
+of the process.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 import math
@@ -25,6 +26,7 @@ from hmsa_ros.nodes.conversions import from_samples
 
 #: Time in s after its last message during which a process counts as running.
 LATELY_SECONDS = 2.5
+_LATELY = round(LATELY_SECONDS * NANOSECONDS)
 _PROCESS_BYTES = 12
 # Samples read per second; the queue also contains some of a publisher with a lower rate.
 _SAMPLES = replace(topics.JOINT_STATES, qos=topics.Quality(100, reliable=False))
@@ -35,7 +37,28 @@ def several(what: str, nodes: Sequence[str]) -> str:
     if len(nodes) < 2:
         return ''
     left = 'one' if len(nodes) == 2 else 'all but one'
-    return f'{len(nodes)} {what} ({" and ".join(sorted(nodes))}): stop {left}'
+    named = sorted(x or 'a node of unknown name' for x in nodes)
+    return f'{len(nodes)} {what} ({" and ".join(named)}): stop {left}'
+
+
+class Active:
+    """Sources of messages that are active at the same time; times in ns of one clock."""
+
+    def __init__(self) -> None:
+        # First and last message since the source was silent.
+        self._heard: dict[Hashable, tuple[int, int]] = {}
+
+    def note(self, source: Hashable, time: int) -> None:
+        """Record the time of a message."""
+        first, last = self._heard.get(source, (time, time))
+        self._heard[source] = (time if time - last > _LATELY else first), max(time, last)
+
+    def among(self, sources: Iterable[Hashable], now: int) -> set[Hashable]:
+        """Return those of some sources that are active, without those that were replaced."""
+        heard = {x: self._heard[x] for x in sources
+                 if x in self._heard and now - self._heard[x][1] < _LATELY}
+        newest = max((first for first, _ in heard.values()), default=0)
+        return {x for x, (_, last) in heard.items() if last >= newest}
 
 
 class Presence:
@@ -49,9 +72,8 @@ class Presence:
         self._node, self._of_samples = node, samples
         self._diagnostics = endpoints.listen(node, topics.DIAGNOSTICS)
         self._samples: RawSubscription | None = None
-        # Last message of processes, and of publishers of samples of a joint, in system time.
-        self._heard: dict[bytes, int] = {}
-        self._sampled: dict[tuple[str, bytes], int] = {}
+        # Processes, and publishers of samples of a joint.
+        self._processes, self._sampling = Active(), Active()
 
     def look(self) -> None:
         """Process the messages that have arrived."""
@@ -68,16 +90,17 @@ class Presence:
                 with suppress(BadInputError):
                     for joint, _, (stretch, *_) in from_samples(one.data):
                         if math.isfinite(stretch):
-                            self._sampled[joint, one.publisher] = one.received_ns
+                            self._sampling.note((joint, one.publisher), one.received_ns)
 
     def devices(self, joints: Sequence[str]) -> str:
         """Return a message if several plants or drivers run for one of the joints; else empty."""
         for joint in joints:
             what = f'plants or drivers of joint {joint}'
             applied = topics.of_joint(topics.FLUX_DENSITY_APPLIED, joint, joints).name
+            sampling = self._publishers(topics.JOINT_STATES.name)
+            active = self._sampling.among([(joint, x) for x in sampling], time_ns())
             if found := several(what, self._running(applied)) or several(what, [
-                    node for gid, node in self._publishers(topics.JOINT_STATES.name).items()
-                    if _lately(self._sampled.get((joint, gid), 0))]):
+                    node for gid, node in sampling.items() if (joint, gid) in active]):
                 return found
         return ''
 
@@ -99,12 +122,14 @@ class Presence:
 
     def _note(self, taken: Iterable[Taken]) -> None:
         for one in taken:
-            self._heard[one.publisher[:_PROCESS_BYTES]] = one.received_ns
+            self._processes.note(one.publisher[:_PROCESS_BYTES], one.received_ns)
 
     def _running(self, topic: str) -> list[str]:
         """Return the nodes that publish a topic and whose processes are active."""
-        return [node for gid, node in self._publishers(topic).items()
-                if _lately(self._heard.get(gid[:_PROCESS_BYTES], 0))]
+        # A node whose name is unknown is just being discovered, or has ended.
+        found = {gid: node for gid, node in self._publishers(topic).items() if node}
+        active = self._processes.among({x[:_PROCESS_BYTES] for x in found}, time_ns())
+        return [node for gid, node in found.items() if gid[:_PROCESS_BYTES] in active]
 
     def _publishers(self, topic: str) -> dict[bytes, str]:
         try:
@@ -112,7 +137,3 @@ class Presence:
         except rclpy_implementation.RCLError:
             # Joint names in messages are arbitrary and may not be valid in a topic.
             return {}
-
-
-def _lately(received_ns: int) -> bool:
-    return time_ns() - received_ns < LATELY_SECONDS * NANOSECONDS
