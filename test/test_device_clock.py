@@ -261,3 +261,21 @@ def test_lateness_of_a_slow_link_is_a_reason_to_raise_lead_time_after_an_outage_
     rig.run(rig.now + SECOND)
     needed = re.search(r'raise lead_time to more than ([0-9.]+) s', rig.runtime.report()[1])
     assert 0.05 < float(needed[1]) < 0.075
+
+
+def test_the_level_of_a_coil_is_known_after_the_clock_of_the_planner_was_set():
+    rig = Bench()
+    rig.runtime.request(Target('a', 1.2))
+    rig.run(START + SECOND)
+    rig.cut_off()
+    rig.come_back()
+    rig.hears = False
+    rig.run(rig.now + 300 * MS)
+    # Without its level, the cut-off would not be acknowledged.
+    rig.runtime.clock_set(MS)
+    rig.run(rig.now + 300 * MS)
+    rig.hears = True
+    rig.runtime.request(Target('a', 1.3))
+    rig.run(rig.now + SECOND)
+    assert rig.refused == []
+    assert rig.residual(1.3) < 1e-6

@@ -66,9 +66,12 @@ class Following:
         self._advise_at: int | None = None  # steady time in ns at which to advise on lateness
         self._late_due, self._foreign_due, self.replanned_due = Throttle(), Throttle(), Throttle()
 
-    def restart(self) -> None:
-        """Discard the state of plans that are dropped."""
+    def restart(self, *, levels: bool = False) -> None:
+        """Discard the state of plans that are dropped, and all times; optionally keep levels."""
+        # Without a level, a cut-off could not be acknowledged until the next report.
+        kept = {x: (0, level) for x, (_, level) in self.newest.items()} if levels else {}
         self.newest.clear()
+        self.newest.update(kept)
         self._suspected.clear()
         self._ages.clear()
         self._newest_seen = 0

@@ -274,7 +274,7 @@ class PlannerRuntime:
             return
         requests = [] if back else self.planning.requests
         self.planning.clear()
-        self.following.restart()
+        self.following.restart(levels=not back)
         self.feedback.restart()
         self.devices.receipts.clock_set()
         self._silence.restart()

@@ -14,6 +14,8 @@ from hmsa_ros.planning.planner import Planner
 # Largest age of a sample that shows where a joint is, in ns by the steady clock; and of one that
 # does although its level has changed since, as it does all the time along a path.
 _RECENT, _FRESH = 2 * NANOSECONDS, 100_000_000
+# Largest age of a sample in ns, compared with the newest one, that arrives after it.
+_DISORDER = NANOSECONDS // 2
 # Samples older than this, in ns, are not the newest available.
 _OLDEST = 60 * NANOSECONDS
 # Times that differ by more, in ns, come from clocks with different epochs.
@@ -71,7 +73,9 @@ class Takeover:
                 seen.stretch + seen.rate + seen.flux_density):
             return
         last, steady = self._samples.get(joint), self._around.steady()
-        if last is None or seen.stamp >= last.stamp or steady - last.came > _RECENT:
+        # Samples are out of order by less than that; else, a clock was set.
+        if last is None or seen.stamp >= last.stamp or last.stamp - seen.stamp > _DISORDER or (
+                steady - last.came > _RECENT):
             self._samples[joint] = seen._replace(came=seen.came or steady)
 
     def drop(self) -> None:

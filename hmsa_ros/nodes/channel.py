@@ -1,6 +1,7 @@
 """Topics of one joint of the planner: outgoing commands, incoming setpoints and reports."""
 
 from collections.abc import Callable, Sequence
+from time import monotonic_ns
 
 from rclpy.node import Node
 from sensor_msgs.msg import MagneticField, TimeReference
@@ -11,7 +12,11 @@ from hmsa_ros.control.records import Send, Target
 from hmsa_ros.control.throttle import Throttle
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces import topics
+from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
+
+# Time in ns after which all topics of a device that runs are discovered.
+_DISCOVERY = 2 * NANOSECONDS
 
 
 class JointChannel:
@@ -28,6 +33,7 @@ class JointChannel:
         endpoints.subscribe(
             node, topics.of_joint(topics.SETPOINT, joint, joints), self._on_setpoint)
         self._applied = self._received = ''
+        self._discovered = monotonic_ns() + _DISCOVERY
         if not linked:
             self._applied, self._received = (
                 endpoints.subscribe(
@@ -51,8 +57,10 @@ class JointChannel:
 
     @property
     def reports(self) -> bool:
-        """Whether a device gives receipts."""
-        return bool(self._received and self._node.count_publishers(self._received))
+        """Whether a device gives receipts, or may, as long as discovery is not complete."""
+        return bool(self._received) and (
+            monotonic_ns() < self._discovered or bool(
+                self._node.count_publishers(self._received)))
 
     @property
     def reporters(self) -> frozenset[bytes]:
