@@ -15,7 +15,7 @@ def plain(error: UnicodeError) -> tuple[bytes, int]:
     """
     Return what replaces characters that cannot be encoded, for `codecs.register_error`.
 
-    Raise the error itself if it is another one.
+    Raise `UnicodeError` unless it is an error of encoding.
     """
     if not isinstance(error, UnicodeEncodeError):
         raise error
