@@ -211,3 +211,13 @@ def test_answers_of_any_content_are_read(text):
     status.values[0].value = text
     status.values[0].key = 'answers'
     assert Verdict.read(status).on('a') is None
+
+
+def test_a_request_of_a_unique_name_that_comes_again_is_carried_out_once():
+    rig = Rig()
+    for name, plans in (('0123456789abcdef' * 2, 1), ('base_link', 3)):
+        for _ in range(2):
+            rig.runtime.request(trajectory(*SEQUENCE, name=name))
+            rig.tick()
+            assert rig.status.verdict.request == name
+        assert rig.group.number == plans

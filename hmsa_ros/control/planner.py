@@ -9,6 +9,7 @@ directly to the coil.
 from collections.abc import Mapping
 from dataclasses import replace
 import math
+import re
 
 from hmsa_ros.control.checks import check_joints, check_ready
 from hmsa_ros.control.corrections import Corrections
@@ -44,6 +45,8 @@ from hmsa_ros.timekeeping import clock_set_words
 
 # Clock jumps that follow each other within this time are reported once.
 _STORM = NANOSECONDS
+# A name that no other request has: 128 random bits.
+_UNIQUE = re.compile('[0-9a-f]{32}')
 _WAITING = Verdict(
     Severity.OK, Code.WAITING, 'accepted: starts as soon as the current state is known')
 
@@ -105,8 +108,14 @@ class PlannerRuntime:
 
         A request that replaces all others from now on is planned before those that wait, which are
         dropped if it can be carried out. The verdict is ``waiting`` until there is one for this
-        request. A trajectory without points is a stop.
+        request. A trajectory without points is a stop. A trajectory with a unique name is carried
+        out once, since a client that has just been discovered may have to send it again.
         """
+        if isinstance(request, Trajectory) and _UNIQUE.fullmatch(request.name) and (
+                self._reporting.answered(request.name)
+                or any(x.name == request.name for x in self.planning.requests)):
+            self._reporting.report()
+            return self._reporting.verdict
         try:
             check_ready(self._clock(), active=self.active)
             check_joints(request, tuple(self.group.planners), self.settings)

@@ -67,6 +67,10 @@ class Reporting:
             self.note(verdict.message)
         self.report()
 
+    def answered(self, name: str) -> bool:
+        """Return whether there is a verdict on a recent request of a name."""
+        return name in self._answers
+
     def go_on(self, verdict: Verdict, *, log: bool = False) -> None:
         """Set a verdict on the same request as the previous one."""
         self.give(replace(verdict, request=self.verdict.request), log=log)

@@ -33,6 +33,9 @@ from hmsa_ros.nodes.visitor import SLICE_SECONDS
 # Time in s for an existing planner node to subscribe: configuration takes a fraction of a second,
 # much longer on a busy machine.
 _LISTENS_SECONDS = 60.0
+# Time in s until a request without an answer is sent again: a planner that has just discovered
+# this client may not have received it.
+_AGAIN_SECONDS = 1.0
 # Time in s until a subscriber that is in the graph but not matched counts as unreachable.
 _MATCHED_SECONDS = 3.0
 # Time in s from discovery of a recorder until it is assumed to receive.
@@ -74,6 +77,9 @@ class PlannerClient(Link):
         self._begun: float | None = None  # time at which the planner's subscription was found
         #: Name of the last request.
         self.requested = ''
+        # The request, and the time in s at which it is sent again without an answer.
+        self._message: Any = None
+        self._again = math.inf
 
     def find_planner(self, each: Callable[[], None] | None = None) -> None:
         """Wait until a planner subscribes and its status has arrived; call ``each`` meanwhile."""
@@ -228,7 +234,7 @@ class PlannerClient(Link):
             request = self.publish(setpoints, levels, path)
             self.spin_until(
                 lambda request=request: self.verdict.on(request) is not None,  # type: ignore[misc]
-                'the planner did not reply with a verdict',
+                'the planner did not reply with a verdict', self.send_again,
                 awaited="the planner's verdict: it plans, or waits for plant, driver or samples")
             verdict = self.verdict.on(request)
             assert verdict is not None
@@ -261,10 +267,18 @@ class PlannerClient(Link):
             raise BadInputError(
                 f'the sequence lasts {points[-1][0]:g} s: expected less than 2^31 s')
         self.requested = uuid4().hex
-        self._publisher.publish(to_trajectory(
+        self._message = to_trajectory(
             [(x, round(time * NANOSECONDS)) for time, x in points], self._joints,
-            frame=self.requested, raw=bool(levels), path=bool(path)))
+            frame=self.requested, raw=bool(levels), path=bool(path))
+        self._publisher.publish(self._message)
+        self._again = monotonic() + _AGAIN_SECONDS
         return self.requested
+
+    def send_again(self) -> None:
+        """Send the last request again when due; the planner carries it out once."""
+        if monotonic() > self._again:
+            self._again = monotonic() + _AGAIN_SECONDS
+            self._publisher.publish(self._message)
 
     def pace(self) -> float:
         """Return the speed of simulated time relative to real time, 1 without simulated time."""

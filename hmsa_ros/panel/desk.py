@@ -107,6 +107,8 @@ class Desk:
             self._received, self._plan = True, answer.plan
             if answer.level > _WARN:
                 self._plan = None
+        if not self._received:
+            self._client.send_again()
         if not self._received and now - self._sent > _GONE_SECONDS:
             self._received = True
             self._notify('the planner did not reply to the request: send it again', 2)
