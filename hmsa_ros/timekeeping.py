@@ -1,9 +1,17 @@
-"""Detection of wall clock steps with a steady clock."""
+"""A steady clock, and detection of wall clock steps with it."""
+
+from functools import partial
+import time
 
 from hmsa_ros.model.units import NANOSECONDS
 
 # Smaller differences may be due to the time between two readings.
 _STEP_NS = 5_000_000
+
+#: Returns the time in ns of a clock that is never set, and that counts the time for which the
+#: computer is suspended: that time is a stall, and no step of the wall clock.
+steady_ns = partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME) if hasattr(
+    time, 'CLOCK_BOOTTIME') else time.monotonic_ns
 
 
 class StepWatch:

@@ -136,6 +136,8 @@ def test_silence_leads_to_the_safe_flux_and_a_command_back(safe, ends):
     assert [(x - 300, y) for x, y in told(device)] == ends
     assert (device.silent, device.trips) == ([0], 1)
     assert [x.kind for x in device.notices()] == [Kind.SILENT]
+    if safe != 'hold':
+        device.receive(0, 0, 0.0)
     device.receive(0, 0, 0.04)
     device.advance(begin + 180 * MS)
     assert device.flux_density[0] == 0.04

@@ -107,6 +107,7 @@ def test_a_driver_switches_the_coil_off_after_a_silence():
     assert [x.kind for x in device.notices()] == [Kind.SILENT]
     # Nothing is left to be done until somebody speaks again.
     assert device.due is None
+    device.receive(0, 0, 0.0)
     device.receive(0, 0, 0.2)
     device.advance(START + 5000 * MS)
     assert bench.writes[-1] == (START + 5000 * MS, 0.2)
@@ -312,8 +313,10 @@ def test_hardware_that_has_lost_its_state_begins_without_a_field():
     (notice,) = device.notices()
     assert 'Bench has lost its state (brown-out) and its coil is off' in notice.text
     # What was ahead is forgotten, and what was in force is not put on again.
-    for level, expected in ((0.1, 0.0), (0.2, 0.0), (0.15, 0.15)):
-        device.receive(0, START + 9 * MS, level)
+    named = device.guards[0].cut_off_time
+    for stamp, level, expected in (
+            (START + 9 * MS, 0.1, 0.0), (0, 0.3, 0.0), (named, 0.0, 0.0), (0, 0.15, 0.15)):
+        device.receive(0, stamp, level)
         device.advance(START + 9 * MS)
         assert bench.levels[-1] == expected
     assert device.counts['state_lost'] == 1
@@ -496,6 +499,7 @@ def test_a_board_whose_clock_begins_anew_has_lost_its_state():
     assert (notice.kind, device.coils[0].level) == (Kind.LOST, 0.0)
     assert 'its clock is another one' in notice.text
     # It goes on by the new clock.
+    device.receive(0, device.guards[0].cut_off_time, 0.0)
     device.receive(0, START + 1300 * MS, 0.1)
     for k in range(1201, 1400):
         step(board, device, START + k * MS)
@@ -551,8 +555,8 @@ def test_when_the_clock_is_set_levels_ahead_and_the_watchdog_go_on(by):
     assert device.silent == []
     device.advance(start + 111 * MS)
     assert (device.silent, bench.levels[-1]) == ([0], 0.0)
-    # What was commanded for before is refused by the new time, and what is for after it obeyed.
     device.receive(0, start + 100 * MS, 0.3)
+    device.receive(0, device.guards[0].cut_off_time, 0.0)
     device.receive(0, start + 120 * MS, 0.4)
     device.advance(start + 120 * MS)
     assert bench.levels[-1] == 0.4
@@ -719,6 +723,7 @@ def test_a_coil_that_is_too_warm_goes_off_and_is_obeyed_again_once_it_has_cooled
     go_on(START + 4 * second)
     # What was ahead is forgotten.
     assert (bench.levels[-1], device.too_warm) == (0.0, '')
+    device.receive(0, 0, 0.0)
     device.receive(0, 0, 0.15)
     go_on(device.time + second)
     assert bench.levels[-1] == 0.15
@@ -747,7 +752,7 @@ def test_a_ramp_down_does_not_go_on_once_the_coil_is_off(end):
     bench.degrees = 20.0
     device.advance(START + 900 * MS)
     device.receive(0, 0, 0.05)
-    assert '0.05 T was commanded before' in device.notices()[-1].text
+    assert '0.05 T, and the coil was cut off' in device.notices()[-1].text
 
 
 def test_a_temperature_that_is_none_and_a_limit_without_one_are_refused():
@@ -829,7 +834,7 @@ def test_a_worker_that_is_to_reconnect_goes_on_from_zero_once_the_cable_is_in_ag
         for level in (0.15, 0.0, 0.12):
             worker.receive(0, 0, level)
         wait_until(lambda: cable.levels[-1] == 0.12, 'a new level')
-        assert '0.15 T, and an open interlock or a failure switched' in ''.join(
+        assert '0.15 T, and the coil was cut off' in ''.join(
             x.text for x in worker.device.notices() if x.kind is Kind.REFUSED)
         assert 0.15 not in cable.levels
     assert other.levels[-1] == 0.0

@@ -24,6 +24,7 @@ class Bench(Rig):
         self.lost = False  # whether samples show rest without a field
         self.samples = True
         self.hears = True  # whether commands arrive while the link works
+        self.cut_at = START + 1  # time that names the cut-off
         self._newest = 0
         self._came = 0  # time of the device at which a command arrived
         self._next = START
@@ -43,9 +44,11 @@ class Bench(Rig):
         for _, x in self.wire:
             self._newest, self._came = x.stamp, self.now + self.ahead
         if self.cut:
-            self.refused += [x.flux_density for _, x in self.wire if x.flux_density != 0.0]
-            self.cut = all(x.flux_density != 0.0 for _, x in self.wire)
-            self.wire = []
+            while self.wire and self.cut:
+                _, x = self.wire.pop(0)
+                self.cut = (x.stamp, x.flux_density) != (self.cut_at, 0.0)
+                if self.cut:
+                    self.refused.append(x.flux_density)
         super().deliver()
         self.give_receipt()
 
@@ -54,7 +57,8 @@ class Bench(Rig):
         if self.now >= self._next or self._came and self.now >= self._next - 80 * MS:
             self._next = self.now + 100 * MS
             self.runtime.received(
-                'a', self._came or self.now + self.ahead, self._newest, cut_off=self.cut)
+                'a', self._came or self.now + self.ahead,
+                self.cut_at if self.cut else self._newest, cut_off=self.cut)
             self._came = 0
 
     def cut_off(self):

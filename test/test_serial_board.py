@@ -232,6 +232,7 @@ def test_a_board_that_restarts_is_noticed_and_obeys_by_its_new_clock(line):
     assert f'the board on {line.path} has restarted' in notice.text
     assert device.coils[0].level == 0.0
     device.changes()
+    device.receive(0, device.guards[0].cut_off_time, 0.0)
     device.receive(0, time_ns() + 100 * MS, 0.15)
     go_on(device, reached(device, 0.15), 'the next level')
     assert [x.level for x in device.changes()] == pytest.approx([0.15])

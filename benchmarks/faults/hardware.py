@@ -17,7 +17,7 @@ from benchmarks.faults.rig import Child, Rig
 from benchmarks.faults.table import Seen
 from hmsa_ros.interfaces import topics
 from hmsa_ros.nodes import endpoints
-from hmsa_ros.nodes.conversions import CUT_OFF, to_command
+from hmsa_ros.nodes.conversions import CUT_OFF, from_time, to_command
 
 FAULTS = Register()
 _LEVEL = 0.02
@@ -43,11 +43,12 @@ class _Bench:
             'hardware.port': rig.folder / 'port', 'hardware.timeout': _CALL,
             'command_timeout': _TIMEOUT, 'publish_rate': 50.0, **parameters})
         self._command = rig.publisher(topics.FLUX_DENSITY_COMMAND)
-        self._cut_off = False
+        self._cut_off = 0  # time in ns that names a cut-off; 0 for none
         endpoints.subscribe(rig.node, topics.FLUX_DENSITY_RECEIVED, self._on_receipt)
 
     def _on_receipt(self, message: TimeReference) -> None:
-        self._cut_off = message.header.frame_id == CUT_OFF
+        cut_off = message.header.frame_id == CUT_OFF
+        self._cut_off = from_time(message.time_ref) if cut_off else 0
 
     def ready(self) -> None:
         """Wait until the driver accepts commands."""
@@ -62,7 +63,7 @@ class _Bench:
     def beat_until(
             self, condition: Callable[[], Any], what: str, level: float = _LEVEL, *,
             yields: bool = True) -> None:
-        """Repeat a level until a condition holds; if ``yields``, answer a cut-off by 0 first."""
+        """Repeat a level until a condition holds; if ``yields``, acknowledge cut-offs."""
         due = 0.0
 
         def look() -> Any:
@@ -70,8 +71,10 @@ class _Bench:
             if monotonic() >= due:
                 due = monotonic() + _BEAT
                 now = self.rig.node.get_clock().now().nanoseconds
-                wanted = 0.0 if yields and self._cut_off else level
-                self._command.publish(to_command(now + _LEAD, wanted, ''))
+                acknowledges = yields and self._cut_off
+                self._command.publish(
+                    to_command(self._cut_off, 0.0, '') if acknowledges else
+                    to_command(now + _LEAD, level, ''))
             return condition()
 
         self.rig.spin_until(look, what)

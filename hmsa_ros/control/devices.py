@@ -54,6 +54,8 @@ class Devices:
         self.apart: set[str] = set()
         self.since: int | None = None
         self._acknowledged: dict[str, int] = {}
+        self._cut_at: dict[str, int] = {}  # time in ns that names the cut-off of a joint
+        self._void: set[str] = set()  # joints whose plan is older than a cut-off
 
     # -- silence -------------------------------------------------------------------------------
 
@@ -72,9 +74,13 @@ class Devices:
     def send(self, now: int, *, everything: bool = False) -> None:
         """Send the levels that are due at a time in ns, or all planned levels."""
         for name, planner in self._planners.items():
-            if name in self.receipts.silent | self.apart:
-                # The command would arrive too late, or apply at another time.
+            if name in self.receipts.silent | self.apart | self.cut:
+                # The command would arrive too late, apply at another time, or be rejected.
                 continue
+            if name in self._void and name in self._following.astray:
+                # The plan is for another state, and is being replaced.
+                continue
+            self._void.discard(name)
             for level in planner.due(_FAR if everything else now):
                 self.fresh.discard(name)
                 self._hand_out(name, level.stamp, level.flux_density, now)
@@ -86,28 +92,44 @@ class Devices:
         self.receipts.sent(name, stamp, now)
 
     def beat(self, now: int) -> None:
-        """Send the levels in force again, as a heartbeat of the planner."""
+        """
+        Send the levels in force again, as a heartbeat of the planner.
+
+        A level that was sent and took no effect in time is not among them: by now it would leave
+        vibration, and the rest is planned anew instead.
+        """
         for name, planner in self._planners.items():
             if name in self.receipts.silent | self.cut | self.fresh | self.apart:
                 # The last level is not meant for this device.
                 continue
             stamp, following = planner.beat_stamp(now), planner.next_stamp
+            level = planner.last_sent.flux_density
+            if self._following.lost(name):
+                if stamp <= planner.last_sent.stamp:
+                    # It would replace the last level, which is on its way.
+                    continue
+                level = self._following.newest.get(name, (0, level))[1]
             if following is None or stamp < following:
-                self._hand_out(name, stamp, planner.last_sent.flux_density, now)
+                self._hand_out(name, stamp, level, now)
                 self.heartbeats += 1
 
     def acknowledge(self, joint: str) -> None:
         """
-        Acknowledge a cut-off by a command of 0 T if the coil is off; rate-limited.
+        Acknowledge a cut-off if the coil is off; rate-limited.
 
-        The device rejects other levels until then.
+        The command is 0 T from exactly the time of the cut-off on. The device rejects all others
+        until then, so that no level takes effect that was planned without knowing of it.
         """
-        steady, now = self._around.steady(), self._around.clock()
+        steady, now, stamp = (
+            self._around.steady(), self._around.clock(), self._cut_at.get(joint, 0))
         off = joint not in self.open if joint in self.locked else (
             self._following.newest.get(joint, (0, math.nan))[1] == 0.0)
-        if off and steady - self._acknowledged.get(joint, -_AGAIN) >= _AGAIN:
+        if joint in self.apart:
+            # No heartbeat would follow, and it would be cut off again.
+            return
+        if off and stamp and steady - self._acknowledged.get(joint, -_AGAIN) >= _AGAIN:
             self._acknowledged[joint] = steady
-            self._hand_out(joint, self._planners[joint].soonest(now), 0.0, now)
+            self._hand_out(joint, stamp, 0.0, now)
 
     # -- devices that are new, or cut off ------------------------------------------------------
 
@@ -129,7 +151,7 @@ class Devices:
             verdict = verdict or found
         return verdict
 
-    def received(self, joint: str, time: int, command: int) -> Verdict | None:
+    def received(self, joint: str, time: int, command: int | None) -> Verdict | None:
         """Process a receipt as `Receipts.received` does; return the verdict on a plan."""
         restarted = self.receipts.received(
             joint, time, command, self._around.clock(), comparable=not self._around.one_clock())
@@ -151,8 +173,12 @@ class Devices:
 
     def cut_off(
             self, joint: str, settings: Settings, *, in_force: bool,
-            locked: bool) -> Verdict | None:
-        """Record whether the coil of a joint is cut off; return the verdict on its plan."""
+            locked: bool, time: int = 0) -> Verdict | None:
+        """
+        Record whether the coil of a joint is cut off; return the verdict on its plan.
+
+        ``time`` names the cut-off, in ns of the device's clock; 0 while it is locked.
+        """
         known = joint in (self.open if locked else self.cut)
         self.open.discard(joint)
         if not in_force:
@@ -162,19 +188,24 @@ class Devices:
             self.cut.discard(joint)
             self.locked.discard(joint)
             self._acknowledged.pop(joint, None)
+            self._cut_at.pop(joint, None)
             return None
+        if time:
+            self._cut_at[joint] = time
         if locked:
             self.open.add(joint)
             self.locked.add(joint)
         if known:
             return None
         self.cut.add(joint)
+        self.receipts.void(joint)
         if not self._takeover.engaged or joint in self.apart:
             # Nothing is planned, or no longer.
             return None
         if settings.after_cut_off == 'resume' and not locked:
             self._takeover.doubt(joint)
-            self._following.astray.add(joint)
+            self._following.replan(joint)
+            self._void.add(joint)
             return None
         planned = bool(self._planners[joint].plan.segments)
         self._planners[joint].abandon()

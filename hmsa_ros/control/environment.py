@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from time import monotonic_ns
 from typing import NamedTuple
 
 from hmsa_ros.control.slices import Clock
+from hmsa_ros.timekeeping import steady_ns
 
 
 class Seen(NamedTuple):
@@ -29,7 +29,7 @@ class Environment:
     """
 
     clock: Clock  #: clock of the timestamps and of `hmsa_ros.control.planner.PlannerRuntime.tick`
-    steady: Clock = monotonic_ns  #: clock of timeouts and slices
+    steady: Clock = steady_ns  #: clock of timeouts and slices
     #: Whether all nodes share one clock, such as simulated time.
     one_clock: Callable[[], bool] = bool
     #: Whether there may be a publisher of samples.

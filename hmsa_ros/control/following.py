@@ -25,6 +25,7 @@ from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.drafting import Steps
 from hmsa_ros.planning.group import PlannerGroup, Resumption
+from hmsa_ros.planning.planner import Planner
 from hmsa_ros.planning.timeline import Draft, Options
 
 # Fraction of a period by which commands may be late and are still sent.
@@ -169,21 +170,33 @@ class Following:
             if name in self._receipts.silent or stamp is None or stamp >= now - tolerance or (
                     planner.as_sent(stamp)):
                 continue
-            model = planner.model
-            late = max(tolerance, model.ns(_PART * 2.0 * math.pi / model.frequency(
-                planner.last_sent.stretch)))
+            late = max(tolerance, self._quarter(planner))
             if stamp >= now - late or not self._group.may_resume(name):
                 continue
             for _ in range(planner.drop_missed(now, tolerance)):
                 self.lateness.missed(now - stamp, self._receipts.steady)
             self._report_advice()
-            self._leaves(name)
-            self._unsent.add(name)
+            self.replan(name)
 
     def _leaves(self, name: str) -> None:
         """Mark a joint as deviating, whatever lateness is expected."""
         self._strayed[name] = math.inf
         self.astray.add(name)
+
+    @staticmethod
+    def _quarter(planner: Planner) -> int:
+        """Return a quarter of a natural period in ns."""
+        model = planner.model
+        return model.ns(_PART * 2.0 * math.pi / model.frequency(planner.last_sent.stretch))
+
+    def lost(self, name: str) -> bool:
+        """Return whether levels of a joint seem to be lost, until the rest is planned anew."""
+        return name in self._suspected or name in self._unsent and name in self.astray
+
+    def replan(self, name: str) -> None:
+        """Have the rest planned anew for a joint, since its levels do not take effect."""
+        self._leaves(name)
+        self._unsent.add(name)
 
     def seen(self, stamp: int) -> None:
         """Record that plant or driver has reported the state at a timestamp in ns."""
@@ -196,7 +209,9 @@ class Following:
             if name not in self.newest:
                 # There are no reports of applied levels.
                 continue
-            stamp = planner.unheard(self._reported(name, now) - planner.options.lead_time)
+            reported = self._reported(name, now) - planner.options.lead_time
+            stamp = planner.unheard(
+                reported, reported - planner.delay - self._quarter(planner))
             if stamp is None:
                 continue
             if before.get(name) != stamp:
@@ -204,7 +219,7 @@ class Following:
                 self._suspected[name] = stamp
                 continue
             planner.drop_unheard(stamp)
-            self._leaves(name)
+            self.replan(name)
 
     def _reported(self, name: str, now: int) -> int:
         """Return the time in ns up to which a joint's reports have arrived."""

@@ -43,6 +43,12 @@ from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.timeline import Model
 from hmsa_ros.timekeeping import clock_set_words
 
+# In ns by the steady clock: delay of a service that is a stall of this process; time that the
+# middleware then takes to deliver what has arrived; and time within which a device that is within
+# reach gives a receipt, of which there are five a second.
+_STALL, _SETTLE, _OWED = 200_000_000, 50_000_000, 500_000_000
+# Heartbeats without which a watchdog is not expected to trip.
+_LOST = 2
 # Clock jumps that follow each other within this time are reported once.
 _STORM = NANOSECONDS
 # A name that no other request has: 128 random bits.
@@ -92,6 +98,11 @@ class PlannerRuntime:
             group, self.following, Corrections(self.feedback, clock), self._reporting,
             around, lambda: self.devices.send(clock()), self._stops.begin)
         self._next_beat = 0  # time in ns of the next heartbeat
+        # Time by the steady clock, in ns, by which the caller serves this again; None for any.
+        self._next_service: int | None = None
+        # Time until which reports are read after a stall, and joints that owe a receipt.
+        self._listens_until: tuple[int, int] | None = None
+        self._unheard: set[str] = set()
         self._last_jump: int | None = None
         self._set_back = 0
         self._differ = False  # whether a clock offset was reported
@@ -175,21 +186,28 @@ class PlannerRuntime:
         """
         Process a receipt: by its time in ns, a device has received the command of a timestamp.
 
-        A device that was cut off rejects commands from before that; one that is locked by an
-        interlock rejects all.
+        A device that was cut off rejects commands until that is acknowledged, and ``command`` is
+        the time of the cut-off; one that is locked by an interlock rejects all.
         """
         self.following.seen(time)
-        self._drop(self.devices.received(joint, time, command))
+        self._unheard.discard(joint)
+        self._drop(self.devices.received(joint, time, None if cut_off else command))
         self._check_clock(joint)
-        self.cut_off(joint, in_force=cut_off or locked, locked=locked)
+        self.cut_off(joint, in_force=cut_off or locked, locked=locked,
+                     time=command if cut_off else 0)
 
-    def cut_off(self, joint: str, *, in_force: bool, locked: bool = False) -> None:
-        """Record whether a joint's device is cut off, or locked, and rejects commands."""
+    def cut_off(
+            self, joint: str, *, in_force: bool, locked: bool = False, time: int = 0) -> None:
+        """
+        Record whether a joint's device is cut off, or locked, and rejects commands.
+
+        ``time`` in ns names the cut-off.
+        """
         if locked and joint not in self.devices.open:
             self.planning.refuse_all(self.devices.interlock(joint))
             self.planning.clear()
         self._drop(self.devices.cut_off(
-            joint, self.settings, in_force=in_force, locked=locked))
+            joint, self.settings, in_force=in_force, locked=locked, time=time))
         if in_force and self.active and self._takeover.engaged:
             # Before the first request there are no heartbeats: released, the device would be cut
             # off again.
@@ -367,7 +385,7 @@ class PlannerRuntime:
     def wake(self) -> int | None:
         """Time in ns of the next work; None for never, 0 for now."""
         if (self._set_back or self._stepped or self.planning or self._takeover.waiting
-                or self._outputs):
+                or self._outputs or self._listens_until is not None):
             return 0
         if not self._takeover.engaged:
             return None
@@ -389,12 +407,45 @@ class PlannerRuntime:
     def send(self, now: int) -> list[Output]:
         """Return the commands due at a time in ns: the urgent part of `tick`."""
         self._process_clock()
-        self._send(now)
+        if not self._listens():
+            self._send(now)
         return self._taken()
+
+    def serve_by(self, steady: int | None) -> None:
+        """Record that the caller serves this again by a steady time in ns; None for any time."""
+        self._listens()
+        self._next_service = steady
+
+    def _listens(self) -> bool:
+        """
+        Return whether reports must be read before anything is sent or planned.
+
+        After a stall of this process, such as a suspended computer, the coil may be off, and
+        reports that say so wait to be read.
+        """
+        # A stall in the middle of a service is found at its end.
+        steady, due = self._steady(), self._next_service
+        stall = 0 if due is None else steady - due
+        if stall > _STALL:
+            self._next_service = None
+        if stall > _STALL and self._takeover.engaged and (
+                stall > _LOST * (self.settings.heartbeat_period or math.inf) or self._overdue):
+            self._unheard = self.devices.receipts.joints
+            self._listens_until = steady + _SETTLE, steady + _OWED
+            self._note(
+                f'the planner stood still for {stall / NANOSECONDS:.3f} s: it reads what plant '
+                'or driver report before it sends anything')
+        if self._listens_until is not None:
+            least, most = self._listens_until
+            if steady >= (most if self._unheard else least):
+                self._listens_until = None
+        return self._listens_until is not None
 
     def tick(self, now: int) -> list[Output]:
         """Do the work due at a time in ns, for a few ms at most; return the outputs."""
         self._process_clock()
+        if self._listens():
+            return self._taken()
         self._engage()
         estimated = self._send(now) and self.feedback.update(now)
         if not estimated:
@@ -458,9 +509,16 @@ class PlannerRuntime:
         if self._takeover.engaged and not engaged:
             self._next_beat = self._clock() + self.settings.heartbeat_period
 
+    @property
+    def _overdue(self) -> bool:
+        """Whether a level that has not been sent should be in force by now."""
+        now = self._clock()
+        return any(x.next_stamp is not None and x.next_stamp < now
+                   for x in self.group.planners.values())
+
     def _work_on(self) -> bool:
         """Plan waiting work if the state of the joints is known; return whether it is."""
-        if not self._takeover.engaged or not self._sure():
+        if self._listens() or not self._takeover.engaged or not self._sure():
             return False
         self.planning.work_on()
         return True

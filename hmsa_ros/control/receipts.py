@@ -79,14 +79,16 @@ class Receipts:
         known.clock.sent(stamp, now)
 
     def received(
-            self, joint: str, time: int, command: int, now: int, *, comparable: bool) -> bool:
+            self, joint: str, time: int, command: int | None, now: int, *,
+            comparable: bool) -> bool:
         """
         Process a receipt with the device's time; return whether the device restarted.
 
         ``command`` is the timestamp of the newest command that the device has received, 0 for
-        none. ``now`` is the time of the planner's clock. The two times are ``comparable`` if each
-        side has its own clock: a shared clock may be slowed down or paused. A device has restarted
-        if it reports no command after it reported one.
+        none; None if the receipt contains none, as during a cut-off. ``now`` is the time of the
+        planner's clock. The two times are ``comparable`` if each side has its own clock: a shared
+        clock may be slowed down or paused. A device has restarted if it reports no command after
+        it reported one.
         """
         steady = self._steady()
         known = self._joints.get(joint)
@@ -96,14 +98,16 @@ class Receipts:
             return False
         if steady - known.arrived > _STALE:
             self._disturbed(known.arrived, _outage(joint, steady - known.arrived))
-        restarted, known.command = known.command != 0 and command == 0, command
+        restarted = known.command != 0 and command == 0
+        if command is not None:
+            known.command = command
         if restarted:
             # Commands that were sent to the previous device are lost.
             known.clock.lost()
             known.unanswered = None
             known.acknowledged = 0
         known.arrived, known.time, known.missing, known.delayed = steady, time, 0, None
-        if known.clock.awaits(command):
+        if command is not None and known.clock.awaits(command):
             known.unanswered, known.acknowledged = None, command
         if comparable:
             known.step += known.clock.received(time, command, now, steady)
@@ -124,6 +128,18 @@ class Receipts:
         found = list(self._disturbances)
         self._disturbances.clear()
         return found
+
+    def void(self, joint: str) -> None:
+        """Expect no acknowledgement of the commands sent so far, since they are rejected."""
+        known = self._joints.get(joint)
+        if known is not None:
+            known.clock.lost()
+            known.unanswered = None
+
+    @property
+    def joints(self) -> set[str]:
+        """Joints whose device gives receipts."""
+        return {*self._joints}
 
     def since(self, joint: str, time: int) -> bool:
         """Return whether a joint's newest receipt is no older than a time of its device."""

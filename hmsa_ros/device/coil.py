@@ -96,7 +96,8 @@ class Coil(GuardedJoint):
         self.too_warm = ''  # why the coil must be off
         self.limit = min(joint.limit, self.instrument.limit or math.inf)
         self.tolerance = self.instrument.tolerance(self.limit)
-        self._heard = False  # whether there was a command or heartbeat since the last look
+        # Timestamps of the commands and heartbeats since the last look.
+        self._heard: list[int] = []
         self._armed = False
         # The newest requested level, and the actual one.
         self.asked = self.level = math.nan
@@ -121,7 +122,7 @@ class Coil(GuardedJoint):
 
     def clock_set(self, by: int) -> None:
         """Shift all times by the ns that the host's clock was set ahead."""
-        self.pass_over(by)
+        super().clock_set(by)
         self._schedule.shift(by)
         self._history, self._handed, self._awaited = (
             deque(((x + by, level) for x, level in times), times.maxlen)
@@ -139,9 +140,10 @@ class Coil(GuardedJoint):
         """Accept a level in T from a timestamp on, unless it is rejected after a cut-off."""
         if self.refuses(stamp, level, now, self._schedule.current):
             return
-        self._heard = True
+        self._heard.append(stamp)
         self._wanted = self._wanted or abs(level) > self.tolerance
-        if not self._insert(stamp, level):
+        # A late one that is accepted applies at once.
+        if not self._insert(max(stamp, now) if stamp else 0, level):
             self._repeat = True
         elif stamp and now > stamp:
             self.note_late(now - stamp)
@@ -155,9 +157,9 @@ class Coil(GuardedJoint):
 
     def look(self, now: int) -> None:
         """Update the watchdog with the commands that have arrived."""
-        if self._heard:
-            self.feed(now)
-            self._heard = False
+        for stamp in self._heard:
+            self.feed(now, stamp)
+        self._heard.clear()
         for stamp, level in self.watch(now, now, self._schedule.current):
             self._insert(stamp, level)
 
@@ -197,6 +199,7 @@ class Coil(GuardedJoint):
         if self._wanted and not self._armed:
             self.instrument.arm()
             self._armed = True
+        self._drop_missed(now)
         self._schedule.apply_until(now)
         self._see_applied(now)
         level = self._schedule.current
@@ -214,6 +217,22 @@ class Coil(GuardedJoint):
             raise StateLostError('its clock is another one')
         if self.too_warm and self._wanted:
             raise StateLostError(self.too_warm)
+
+    def _drop_missed(self, now: int) -> None:
+        """Drop the pending levels if one is too late to be written, as after a stall."""
+        due = self._changed if self.instrument.keeps_levels else self._schedule.next_stamp
+        if not due or now - due <= self.lateness_limit:
+            # Nothing is pending, or for now.
+            return
+        count = len(self._schedule)
+        self._schedule = CommandSchedule(self._schedule.current)
+        if self.instrument.keeps_levels:
+            self._changed = now + 1
+        self.note(
+            Kind.REFUSED, f'{count} levels are dropped, the first of which is '
+            f'{(now - due) / NANOSECONDS:.3f} s late: expected to write it within '
+            f'{self.lateness_limit / NANOSECONDS:g} s (lateness_limit); the planner sends the '
+            'rest anew; let nothing stop or starve the driver')
 
     def _has_room(self, now: int) -> bool:
         """Return whether a heartbeat fits in before the next level, which replaces it."""
@@ -384,7 +403,7 @@ class Coil(GuardedJoint):
         """
         left = self.level if self.ramps and math.isfinite(self.level) else 0.0
         self.stand_by()
-        self.cut_off(now, zero_first=True)
+        self.cut_off(now, always=True)
         # This also drops the levels stored by the device.
         self.put(left, now)
         # No ramp if the hardware has lost its state meanwhile.

@@ -134,7 +134,7 @@ class HardwareDevice(Device):
 
     def receive_at(self, joint: int, stamp: int, level: float, now: int) -> None:
         """Accept a level that arrived at a time in ns (see `receive`); run the watchdog first."""
-        self._pass_to(now)
+        self.advance_to(now)
         self.coils[joint].look(now)
         self.receive(joint, stamp, level)
         self.coils[joint].look(now)
@@ -155,17 +155,30 @@ class HardwareDevice(Device):
         begins = bool(why) and not self.locked
         self.locked = why
         if begins:
-            self._pass_to(time)
+            self.advance_to(time)
             for coil in self.coils:
                 coil.lock(time)
 
     # -- time ----------------------------------------------------------------------------------
 
-    def _pass_to(self, time: int) -> None:
+    def advance_to(self, time: int) -> None:
+        """Adopt a time in ns as the present one."""
         if time < self._time:
             # The clock was set back.
             self._next_sample = min(self._next_sample, time)
+            for coil in self.coils:
+                coil.set_back(time)
         self._time = time
+
+    def stood_still(self, span: int) -> None:
+        """
+        Record that this process stood still for some ns until now.
+
+        A coil that was left alone for longer than a planner may be silent is cut off.
+        """
+        for coil in self.coils:
+            coil.stood_still(self._time, span)
+            coil.look(self._time)
 
     def clock_set(self, by: int) -> None:
         """Shift all future times by the ns that the clock was set ahead."""
@@ -185,7 +198,7 @@ class HardwareDevice(Device):
             If a call fails.
 
         """
-        self._pass_to(time)
+        self.advance_to(time)
         for coil in self.coils:
             coil.advance(time)
             if self.locked and coil.asked == 0.0:
@@ -209,7 +222,7 @@ class HardwareDevice(Device):
 
     def switch_off(self, time: int) -> str:
         """Switch off all coils at a time in ns; return the failures in words."""
-        self._pass_to(time)
+        self.advance_to(time)
         return '; '.join(filter(None, [x.switch_off(time) for x in self.coils]))
 
     def open(self) -> None:

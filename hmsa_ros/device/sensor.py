@@ -40,6 +40,10 @@ class Transport(Generic[T]):
         while self._moving and self._moving[0][0] <= now:
             yield self._moving.popleft()
 
+    def shift(self, span: int) -> None:
+        """Shift the times of arrival by some ns."""
+        self._moving = deque((time + span, item) for time, item in self._moving)
+
     def clear(self) -> None:
         """Discard the items in transit."""
         self._moving.clear()
@@ -96,6 +100,10 @@ class Sensor:
     def forget(self) -> None:
         """Discard the samples in transit."""
         self._transport.clear()
+
+    def shift(self, span: int) -> None:
+        """Shift the times at which the samples in transit arrive by some ns."""
+        self._transport.shift(span)
 
     def measure(self, sample: Sample) -> Iterator[Sample]:
         """Add a sample of the true state; yield the measured samples that have arrived by now."""

@@ -10,6 +10,7 @@ from hmsa_ros.model.actuators import Actuators, Setup
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.simulation import too_large
 from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.timekeeping import clock_set_words
 
 # Gap of the clock above which time is skipped instead of simulated.
 _LARGEST_GAP_NS = 5 * NANOSECONDS
@@ -54,6 +55,7 @@ class SimulatedDevice(Device):
         self.period = period
         self.next_sample = time
         self._actuators = Actuators([x.setup for x in joints], time=time)
+        self._present = time  # newest time of the clock, which the simulation may lag behind
         self._sensor = Sensor([x.errors for x in joints], measurement_delay, seed)
         self._transit: Transport[tuple[int, int, float]] = Transport(command_delay)
         self._changes += [Change(i, time, self.level(i)) for i in range(len(joints))]
@@ -121,7 +123,8 @@ class SimulatedDevice(Device):
         if guard.refuses(stamp, level, self.time, self.level(joint)):
             return
         late = self._actuators.command(joint, stamp or self.time, level)
-        guard.feed(self.time)
+        came = min(stamp, self._present) if stamp else self._present
+        guard.feed(max(self.time, came), stamp)
         if late:
             guard.note_late(late)
 
@@ -144,10 +147,14 @@ class SimulatedDevice(Device):
         for known, command in self._transit.arrived(time):
             self._integrate(known)
             self._obey(*command)
+        self._watch(time)
+        self._integrate(time)
+
+    def _watch(self, time: int) -> None:
+        """Command the safe flux up to a time in ns where a watchdog demands it."""
         for i, guard in enumerate(self.guards):
             for stamp, level in guard.watch(self.time, time, self.level(i)):
                 self._actuators.command(i, stamp, level)
-        self._integrate(time)
 
     def _integrate(self, time: int) -> None:
         """Advance all joints; those with an excessive load restart."""
@@ -162,6 +169,7 @@ class SimulatedDevice(Device):
         # Before the first time, while standing and after a jump ahead, the device continues from
         # the clock's time; after a jump back, it restarts.
         gap = now - self.time
+        self._present = now
         if self.time == 0:
             self._go_on_from(now)
             return 0
@@ -177,6 +185,28 @@ class SimulatedDevice(Device):
             self._go_on_from(now)
             return gap
         return 0
+
+    def stood_still(self, span: int) -> None:
+        """
+        Record that this process stood still for some ns until now.
+
+        The simulation then catches up: commands that have waited apply at their timestamps, and
+        feed the watchdog at them.
+        """
+        self._present = max(self._present, self.time + span)
+
+    def clock_set(self, by: int) -> None:
+        """Shift all times by the ns that the clock was set ahead; the motion continues."""
+        self._actuators.clock_set(by)
+        self._present += by
+        # Samples lie on a grid of the new time.
+        self.next_sample = -(-(self.next_sample + by) // self.period) * self.period
+        self._transit.shift(by)
+        self._sensor.shift(by)
+        for guard in self.guards:
+            guard.clock_set(by)
+        self.guards[0].note(
+            Kind.CLOCK, clock_set_words(by, 'the simulation and levels ahead continue'))
 
     def _go_on_from(self, now: int) -> None:
         for guard in self.guards:

@@ -1,4 +1,4 @@
-"""Devices and guards of their joints: watchdogs, and rejected commands after a cut-off."""
+"""Devices and guards of their joints: watchdogs, and commands that are rejected."""
 
 from abc import ABC, abstractmethod
 from collections import deque
@@ -19,8 +19,8 @@ _REASONS = {
     'hold': 'what is commanded stays (safe_flux hold)', 'zero': 'the field goes to zero',
     'ramp': 'the field ramps to zero'}
 _RAMP_STEP_NS = 1_000_000
-# Number of levels from before a cut-off that are stored.
-_REMEMBERED = 8
+# Number of commands far ahead whose times are stored: an hour of heartbeats.
+_REMEMBERED = 10_000
 #: Times that differ by more, in ns, come from clocks with different epochs.
 ANOTHER_CLOCK = 100_000_000 * NANOSECONDS
 
@@ -28,7 +28,7 @@ ANOTHER_CLOCK = 100_000_000 * NANOSECONDS
 @dataclass(frozen=True)
 class Fallback:
     """
-    Reaction to silence.
+    Reaction to silence, and to commands that come too late.
 
     Raises
     ------
@@ -40,6 +40,7 @@ class Fallback:
     timeout: float = 1.0  #: longest silence in s; 0 for unlimited
     safe_flux: str = 'hold'  #: one of `SAFE_FLUX`
     ramp_rate: float = 1.0  #: of a ramp to zero, in T/s, above 0
+    lateness_limit: float = math.inf  #: lateness in s above which a command is rejected, above 0
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.timeout < math.inf:
@@ -49,19 +50,25 @@ class Fallback:
                 f'safe flux is {self.safe_flux!r}: expected one of {", ".join(SAFE_FLUX)}')
         if not 0.0 < self.ramp_rate < math.inf:
             raise BadInputError(f'ramp rate is {self.ramp_rate:g} T/s: expected above 0')
+        if not self.lateness_limit > 0.0:
+            raise BadInputError(
+                f'lateness limit is {self.lateness_limit:g} s: expected above 0')
 
 
 class GuardedJoint:
     """
-    Guard of a coil: its watchdog, and the rejection of commands after a cut-off.
+    Guard of a coil: its watchdog, and the rejection of commands that no longer apply.
 
-    The watchdog detects that commands and heartbeats have stopped, and then commands the safe
-    flux. The first command arms it, so that an actuator without commands raises no alarm. During
-    an excessive silence it is ``tripped``; ``trips`` counts these silences.
+    The watchdog detects that no command or heartbeat applies any more, and then commands the safe
+    flux. A command feeds it once its timestamp is at most the timeout ahead, so that those of a
+    commander whose clock differs do not keep a coil on. The first command arms it, so that an
+    actuator without commands raises no alarm. During an excessive silence it is ``tripped``;
+    ``trips`` counts these silences.
 
-    After a cut-off, levels that were commanded before are rejected. A commander that was
-    disconnected repeats its last level as soon as it is back, and lost messages are sent again:
-    either would switch the field on in one unrequested step.
+    After a cut-off, every level is rejected, whatever its timestamp: it may have been planned
+    before. A commander shows that it knows of the cut-off by commanding 0 T either from exactly
+    that time on (`cut_off_time`, as in receipts) or immediately (timestamp 0). This also replaces
+    all that it commanded before.
 
     Notices to log are appended to ``notices``, with the ``number`` of the joint.
     """
@@ -70,15 +77,21 @@ class GuardedJoint:
         self.number, self._fallback, self._notices = number, fallback, notices
         self._timeout = round(fallback.timeout * NANOSECONDS)
         self._last: int | None = None
+        # Timestamps of commands that are too far ahead to feed the watchdog, rising.
+        self._ahead: deque[int] = deque()
+        self._stray = ''  # what is wrong with the commands that have not fed the watchdog
+        self._stood = 0  # time in ns for which this process stood still, if too long
         # Begin and initial level of the ramp, and number of its levels already given.
         self._ramp: tuple[int, float] | None = None
         self._steps = 0
         self.tripped = False
         self.trips = 0
-        # Commanded levels, and the time of the cut-off since which they are rejected.
-        self._before: deque[float] = deque(maxlen=_REMEMBERED)
+        self._obeyed = False  # whether a command was accepted since the last restart
+        # Time of the cut-off since which levels are rejected, by the clock of now.
         self._since: int | None = None
-        self._zero_first = False
+        #: Time in ns that names the cut-off in force; 0 for none.
+        self.cut_off_time = 0
+        self._acknowledged = 0  # the last one that was acknowledged
 
     def note(self, kind: Kind, text: str, late: int = 0) -> None:
         """Add a notice to log; ``late`` is a lateness in ns."""
@@ -100,6 +113,11 @@ class GuardedJoint:
         if self._since is not None:
             self._since += span
 
+    def clock_set(self, by: int) -> None:
+        """Shift all times by the ns that the clock was set ahead."""
+        self.pass_over(by)
+        self._ahead = deque(x + by for x in self._ahead)
+
     # -- the watchdog --------------------------------------------------------------------------
 
     @property
@@ -107,25 +125,46 @@ class GuardedJoint:
         """Whether to ramp the coil down rather than switch it off."""
         return self._fallback.safe_flux == 'ramp'
 
-    def feed(self, now: int) -> None:
-        """Record a command or heartbeat at a time in ns."""
+    def feed(self, now: int, stamp: int = 0) -> None:
+        """Record a command or heartbeat for a timestamp in ns (0: now) that came at a time."""
+        while self._ahead and self._ahead[-1] >= stamp:
+            self._ahead.pop()
+        if not self._timeout or stamp - now <= self._timeout:
+            self._feed(now)
+            return
+        self._stray = f'the newest one applies in {(stamp - now) / NANOSECONDS:.3f} s'
+        if len(self._ahead) < _REMEMBERED:
+            self._ahead.append(stamp)
+
+    def _feed(self, now: int) -> None:
         if self.tripped:
             self.note(Kind.HEARD, 'commands have come back')
         self.tripped = False
         self._ramp = None
         self._last = now
+        self._stray = ''
+
+    def set_back(self, now: int) -> None:
+        """Have no command come later than now, which is earlier than before."""
+        if self._last is not None:
+            self._last = min(self._last, now)
+
+    def stood_still(self, now: int, span: int) -> None:
+        """Trip if this process stood still for some ns, longer than a planner may be silent."""
+        if self._alarm is not None and span > self._timeout:
+            self._last, self._stood = now - self._timeout - 1, span
 
     def watch(self, now: int, until: int, level: float) -> Iterator[tuple[int, float]]:
         """Yield timestamps (ns) and levels (T) of the safe flux once commands have stopped."""
-        if self._last is not None:
-            self._last = min(self._last, now)
+        while self._ahead and self._ahead[0] - self._timeout <= now:
+            self._feed(self._ahead.popleft() - self._timeout)
         if self._alarm is not None and now >= self._alarm:
             self.tripped = True
             self.trips += 1
             safe = self._fallback.safe_flux
-            self.note(
-                Kind.SILENT, f'no command and no heartbeat for {self._fallback.timeout:g} s: '
-                f'{_REASONS[safe]}; is the planner running?')
+            self.note(Kind.SILENT, self._why.format(
+                limit=f'{self._fallback.timeout:g} s', reason=_REASONS[safe]))
+            self._stood = 0
             if safe != 'hold':
                 self.cut_off(now)
             if safe == 'zero':
@@ -143,6 +182,17 @@ class GuardedJoint:
                 self._ramp = None
                 return
 
+    @property
+    def _why(self) -> str:
+        """Why the watchdog trips, with places for its timeout and its reaction."""
+        if self._stood:
+            return (f'plant or driver stood still for {self._stood / NANOSECONDS:.3f} s, more '
+                    'than {limit}: {reason}; let nothing stop or starve this process')
+        if self._stray:
+            return (f'no command and no heartbeat that applies ({self._stray}) for {{limit}}: '
+                    '{reason}; compare the clocks of planner and driver')
+        return 'no command and no heartbeat for {limit}: {reason}; is the planner running?'
+
     def ramp_down(self, now: int, level: float) -> None:
         """Start to ramp a level in T to zero at a time in ns."""
         self._ramp, self._steps = (now, level), 0
@@ -150,8 +200,11 @@ class GuardedJoint:
     @property
     def watch_due(self) -> int | None:
         """Time in ns of the next `watch`; None if there is nothing to watch."""
-        return self._alarm if self._ramp is None else (
-            self._ramp[0] + self._steps * _RAMP_STEP_NS)
+        if self._ramp is not None:
+            return self._ramp[0] + self._steps * _RAMP_STEP_NS
+        if self._ahead and self._last is None:
+            return self._ahead[0] - self._timeout
+        return self._alarm
 
     @property
     def _alarm(self) -> int | None:
@@ -163,55 +216,59 @@ class GuardedJoint:
     def stand_by(self) -> None:
         """Wait for a first command again."""
         self._last = self._ramp = None
+        self._ahead.clear()
         self.tripped = False
 
-    # -- after a cut-off -----------------------------------------------------------------------
+    # -- commands that no longer apply ---------------------------------------------------------
+
+    @property
+    def lateness_limit(self) -> float:
+        """Lateness in ns above which a level is rejected."""
+        return self._fallback.lateness_limit * NANOSECONDS
 
     @property
     def is_cut_off(self) -> bool:
-        """Whether levels from before a cut-off are rejected."""
+        """Whether levels are rejected until a cut-off is acknowledged."""
         return self._since is not None
 
-    def cut_off(self, now: int, *, zero_first: bool = False) -> None:
+    def cut_off(self, now: int, *, always: bool = False) -> None:
         """
-        Reject levels commanded before a time in ns, if there are any.
+        Reject all levels from a time in ns until that is acknowledged.
 
-        With ``zero_first``, reject all levels except 0 T, regardless of earlier commands.
+        Without earlier commands, nothing is rejected unless ``always`` is set.
         """
-        if self._before or zero_first:
+        if self._obeyed or always:
             self._since = now
-            self._zero_first = self._zero_first or zero_first
+            self.cut_off_time = max(now, 1)
+        self._ahead.clear()
 
     def end_cut_off(self) -> None:
-        """End the rejection, and discard the stored levels."""
-        self._since, self._zero_first = None, False
-        self._before.clear()
+        """End the rejection without an acknowledgement, as for a restart."""
+        self._since, self.cut_off_time, self._obeyed = None, 0, False
 
     def refuses(self, stamp: int, level: float, now: int, current: float) -> bool:
-        """Return whether a level in T, other than the current one, is rejected after a cut-off."""
+        """Return whether a level in T is rejected: after a cut-off, or since it is too late."""
+        late = now - stamp if stamp else 0
         if self._since is not None:
-            why, ago = '', (now - self._since) / NANOSECONDS
-            if self._zero_first and (level or current):
-                why = (f'{level:g} T, and an open interlock or a failure switched the coil off '
-                       f'{ago:.3f} s ago: expected 0 T first, with the coil off')
-            elif stamp and stamp < max(now, self._since):
-                self._remember(level)
-                why = (f'{level:g} T applied {(now - stamp) / NANOSECONDS:.3f} s ago, and the '
-                       f'coil was cut off {ago:.3f} s ago: expected a command for a time that '
-                       'has not passed')
-            elif level != current and level in self._before:
-                why = (f'{level:g} T was commanded before, and the coil was cut off {ago:.3f} s '
-                       f'ago: expected another level, or the one in force, {current:g} T, first')
-            if why:
-                self.note(Kind.REFUSED, why)
+            if level or current or stamp not in (0, self.cut_off_time):
+                ago = (now - self._since) / NANOSECONDS
+                self.note(
+                    Kind.REFUSED, f'{level:g} T, and the coil was cut off {ago:.3f} s ago: '
+                    'expected 0 T first, with the coil off, and with the timestamp of the cut-off '
+                    f'(time_ref of receipts, {self.cut_off_time / NANOSECONDS:.9f} s) or 0')
                 return True
-            self.end_cut_off()
-        self._remember(level)
+            self._acknowledged = self.cut_off_time
+            self._since, self.cut_off_time = None, 0
+        elif late > self.lateness_limit and not (
+                stamp == self._acknowledged and level == current == 0.0):
+            self._stray = f'the newest one came {late / NANOSECONDS:.3f} s late'
+            self.note(
+                Kind.REFUSED, f'{level:g} T came {late / NANOSECONDS:.3f} s after the time it '
+                f'applies: expected at most {self._fallback.lateness_limit:g} s (lateness_limit); '
+                'the planner sends the rest anew; raise its lead_time, or compare the clocks')
+            return True
+        self._obeyed = True
         return False
-
-    def _remember(self, level: float) -> None:
-        if not self._before or level != self._before[-1]:
-            self._before.append(level)
 
 
 class Device(ABC):
@@ -244,6 +301,10 @@ class Device(ABC):
     def advance(self, time: int) -> None:
         """Do the work due up to a time in ns."""
 
+    @abstractmethod
+    def stood_still(self, span: int) -> None:
+        """Record that this process stood still for some ns until now."""
+
     def changes(self) -> list[Change]:
         """Return the levels that took effect since the last call."""
         return _emptied(self._changes)
@@ -268,7 +329,7 @@ class Device(ABC):
 
     @property
     def cut_offs(self) -> list[int]:
-        """Numbers of the joints that reject levels from before a cut-off."""
+        """Numbers of the joints that reject levels until a cut-off is acknowledged."""
         return [x.number for x in self.guards if x.is_cut_off]
 
     def _check_clock(self, stamp: int) -> None:

@@ -11,14 +11,14 @@ from functools import partial
 import math
 import sys
 from threading import Condition, Event, Thread
-from time import monotonic, monotonic_ns
+from time import monotonic
 
 from hmsa_ros.device.driven import HardwareDevice
 from hmsa_ros.device.hardware import described, HardwareError
 from hmsa_ros.device.protocol import Kind
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.timekeeping import StepWatch
+from hmsa_ros.timekeeping import steady_ns, StepWatch
 
 # In ns: a sleeping thread wakes up about 50 us late, and then waits for Python's global lock, at
 # most for the switch interval. Both are this time before a level.
@@ -31,6 +31,12 @@ _PATIENCE, _PAST, _HANGING = 0.8, 0.4, 2.5
 # In s, after failed hardware obeys again: a pause, and the time during which commands are refused,
 # so that planners receive that state.
 _BREATH, _AWAY = 0.2, 1.0
+# Longer than any pause between two levels, in ns.
+_LONG = 1_000_000 * NANOSECONDS
+#: A longer pause of a loop, in ns, may be a stall of the whole process.
+STALL = 100_000_000
+# Longest wait in s for the main thread after a stall, and interval of looks at it.
+_READING, _LOOK = 0.2, 0.002
 _MEND = 'correct it, then start the driver again'
 
 
@@ -51,12 +57,15 @@ class HardwareWorker:
 
     def __init__(
             self, make: Callable[[], HardwareDevice], clock: Callable[[], int],
-            steady: Callable[[], int] = monotonic_ns, *, reconnect: bool = False) -> None:
+            steady: Callable[[], int] = steady_ns, *, reconnect: bool = False) -> None:
         self._make, self._clock, self._steady = make, clock, steady
         self._reconnect = reconnect
         self._away = ''  # reason of a failure, until it continues
         self._resumes = 0.0  # end of the refusal after a failure, by the monotonic clock
         self._steps = StepWatch()
+        # Steady times in ns by which this thread is to wake up, and of the last `look_after`.
+        self._wakes = steady()
+        self._looked: int | None = None
         self._turn = Condition()
         self._ready = Event()
         self._ended = False
@@ -118,8 +127,17 @@ class HardwareWorker:
         with self._turn:
             self._turn.notify()
 
+    def stood_still(self, span: int) -> None:
+        """Record that this process stood still for some ns."""
+        self._put(lambda: self._stand_still(span))
+
+    def _stand_still(self, span: int) -> None:
+        self.device.advance_to(self._clock())
+        self.device.stood_still(span)
+
     def look_after(self) -> None:
         """Check that the thread is alive and its calls return; otherwise switch off without it."""
+        self._looked = self._steady()
         if self.failure is not None or self._saver is not None:
             return
         if not self._thread.is_alive():
@@ -169,6 +187,7 @@ class HardwareWorker:
                     self.device.lock(self.locked, self._clock())
                     self.trouble = ''
                 self._check_clock_step()
+                self._let_main_thread_read()
                 while self._commands:
                     self._commands.popleft()()
                 self.device.advance(self._clock())
@@ -192,6 +211,16 @@ class HardwareWorker:
         if by := self._steps.step(self._steady(), self._clock(), self._steady()):
             self.device.clock_set(by)
 
+    def _let_main_thread_read(self) -> None:
+        """After a stall, wait for the commands that arrived meanwhile, for a short time."""
+        woke = self._steady()
+        if woke - self._wakes < STALL or self._looked is None:
+            return
+        until = monotonic() + _READING
+        with self._turn:
+            while self._looked < woke and not self._ended and monotonic() < until:
+                self._turn.wait(_LOOK)
+
     def _obey(self, joint: int, stamp: int, level: float, came: int) -> None:
         """Accept a level that arrived at a steady time in ns, perhaps during a blocked call."""
         try:
@@ -208,6 +237,7 @@ class HardwareWorker:
         device = self.device
         due, level = device.due, device.next_level
         left = math.inf if due is None else due - self._clock()
+        self._wakes = self._steady() + round(min(max(left, 0), _LONG))
         if due == level and left <= _WATCHED:
             device.calls.make_ready()
             # By the steady clock, since the other may be set meanwhile.

@@ -117,8 +117,9 @@ ESTIMATE = Topic(
 FLUX_DENSITY_COMMAND = Topic(
     'flux_density_command', _FIELD, COMMAND,
     'The shaped command: from its timestamp on, which may be in the future, z is the flux density '
-    'in tesla; x and y are 0. A message replaces all '
-    'earlier ones with the same or a later timestamp.',
+    'in tesla; x and y are 0. A message replaces all earlier ones with the same or a later '
+    'timestamp. After a cut-off of the coil, all are rejected until 0 T is commanded with the '
+    'time of the cut-off as the timestamp, or with 0 (now).',
     publishers=(PLANNER,), subscribers=(PLANT, DRIVER))
 FLUX_DENSITY_APPLIED = Topic(
     'flux_density_applied', _FIELD, CHANGES,
@@ -129,11 +130,11 @@ FLUX_DENSITY_RECEIVED = Topic(
     'flux_density_received', 'sensor_msgs/msg/TimeReference', NEWEST,
     'A receipt for a command, and a heartbeat five times a second: `header.stamp` is when the '
     'newest command arrived, or the current time, in the clock of the sender; `time_ref` is the '
-    'timestamp of that command (0 before the first), `source` the joint. `frame_id` is `cut_off` '
-    'while commands from before a cut-off of the coil are rejected, and `interlock` while the '
-    'interlock is open. The planner uses it to check '
-    'that commands arrive, and to measure the offset of the clocks. Optional for a driver of your '
-    'own.',
+    'timestamp of that command (0 before the first), `source` the joint. `frame_id` is '
+    '`interlock` while the interlock is open, and `cut_off` after a cut-off of the coil, until '
+    'that is acknowledged: `time_ref` is then the time of the cut-off. The planner uses it to '
+    'check that commands arrive, and to measure the offset of the clocks. Optional for a driver '
+    'of your own.',
     publishers=(PLANT, DRIVER), subscribers=(PLANNER,))
 INTERLOCK = Topic(
     '~/interlock', 'std_msgs/msg/Bool', RELIABLE,

@@ -234,6 +234,14 @@ class Actuators:
         self.forces[i].insert(max(stamp, self.time), force)
         self._plan(i)
 
+    def clock_set(self, by: int) -> None:
+        """Shift the time, and those of all commands and forces, by some ns; nothing moves."""
+        self.time += by
+        for i, inputs in enumerate(zip(self.schedules, self.forces, strict=True)):
+            for schedule in inputs:
+                schedule.shift(by)
+            self._plan(i)
+
     def limit_slew(self, i: int, slew: float) -> None:
         """Limit the ramps of one amplifier to a rate in T/s, in addition to its own limit."""
         setup = self.setups[i]

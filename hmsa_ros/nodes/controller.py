@@ -18,12 +18,14 @@ from hmsa_ros.control.environment import Seen
 from hmsa_ros.control.records import Output, Send
 from hmsa_ros.device.protocol import Change, Sample
 from hmsa_ros.interfaces import topics
+from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.device_node import DeviceNode, TICK_SECONDS
 from hmsa_ros.nodes.driver import DriverNode, HARDWARE, SHORT
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 from hmsa_ros.nodes.runner import run
+from hmsa_ros.timekeeping import steady_ns
 
 # Time in ns that must remain of a period to publish one more message; limit on waiting messages.
 _ENOUGH, _CROWDED = 400_000, 50
@@ -55,6 +57,8 @@ class LinkedPlanner(PlannerNode):
     def serve(self, left: Callable[[], bool]) -> None:
         """Do the work that is due; publish at least one message, and more while there is time."""
         self._serve()
+        if self._channels:
+            self._runtime.serve_by(steady_ns() + round(TICK_SECONDS * NANOSECONDS))
         while self._waiting:
             self._publish(self._waiting.popleft())
             if not left() and len(self._waiting) < _CROWDED:
@@ -78,10 +82,11 @@ class LinkedPlanner(PlannerNode):
         for name, *values in _each(joints, sample):
             self._runtime.observed(name, sample.time, *values)
 
-    def take_refusal(self, joint: str, refuses: str) -> None:
+    def take_refusal(self, joint: str, refuses: str, cut_off_time: int) -> None:
         """Record why commands of a joint are rejected, as in a receipt."""
         self._runtime.cut_off(
-            joint, in_force=bool(refuses), locked=refuses == conversions.INTERLOCK)
+            joint, in_force=bool(refuses), locked=refuses == conversions.INTERLOCK,
+            time=cut_off_time)
 
     def _glance(self) -> Iterator[tuple[str, Seen]]:
         if self._seen is not None:
@@ -149,15 +154,18 @@ class Linked(DeviceNode):
 
     def _cycle(self) -> None:
         """Advance the device and send commands; then publish, poll and serve the planner."""
+        if self._joints and self.reads_first():
+            self._poll_commands()
+            return
         with self.cycles:
             if self._joints:
                 self._go_on()
+                for joint in self._joints:
+                    self._planner.take_refusal(joint.name, joint.refuses, joint.cut_off_time)
             self._planner.send()
         if self._joints:
             self._poll_commands()
             self._publish_news()
-            for joint in self._joints:
-                self._planner.take_refusal(joint.name, joint.refuses)
         self._planner.serve(lambda: self.cycles.left > _ENOUGH)
         self.cycles.note_rest()
 

@@ -75,7 +75,8 @@ def to_receipt(joint: str, time: int, command: int, refuses: str) -> TimeReferen
     """
     Return a receipt: timestamp of the newest command of a joint, and present time; both in ns.
 
-    ``refuses`` is `CUT_OFF` or `INTERLOCK` if commands are rejected, else empty.
+    ``refuses`` is `CUT_OFF` or `INTERLOCK` if commands are rejected, else empty. For `CUT_OFF`,
+    the time of the cut-off takes the place of the timestamp.
     """
     return TimeReference(
         header=Header(stamp=to_time(time), frame_id=refuses),

@@ -16,6 +16,7 @@ from hmsa_ros.control.throttle import Throttle
 from hmsa_ros.device.health import judge_commands
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.device.watchdog import Fallback, SAFE_FLUX
+from hmsa_ros.device.worker import STALL
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.parameters import JOINT, ParameterSpec
@@ -26,6 +27,7 @@ from hmsa_ros.nodes.managed import ManagedNode, silence
 from hmsa_ros.nodes.outlet import Outlet
 from hmsa_ros.nodes.parameters import JointParameters, JOINTS
 from hmsa_ros.nodes.presence import Presence
+from hmsa_ros.timekeeping import steady_ns
 
 #: Behaviour of a joint without commands; each joint may have its own values.
 FALLBACK = (
@@ -42,6 +44,10 @@ FALLBACK = (
     ParameterSpec(
         'safe_ramp_rate', 1.0, 'Rate of the ramp to zero, which has steps of 1 ms.', 'T/s',
         1e-9, 1e12),
+    ParameterSpec(
+        'lateness_limit', 0.1,
+        'Largest lateness of a command that is still applied, at once; a later one is refused, '
+        'and the planner sends the rest anew, from the state.', 's', 1e-4, 1e6),
 )
 
 COMMAND_SOURCE = ParameterSpec(
@@ -57,6 +63,8 @@ PUBLISH_SCALARS = ParameterSpec(
 COMMON = (JOINT, JOINTS, COMMAND_SOURCE, PUBLISH_SCALARS)
 #: Period of the node's main loop in s.
 TICK_SECONDS = 0.001
+# Time in ns after a stall for the middleware to deliver the commands that have arrived.
+_SETTLE = 30_000_000
 # State after a refused command, and while the interlock is open.
 _STAYS = ('the previous one stays in force', 'the coil is off')
 # Intervals of receipts of a joint in ns: the minimum with commands, the maximum without.
@@ -65,7 +73,8 @@ _RECEIPTS, _SIGNS_OF_LIFE = 20_000_000, 200_000_000
 
 def fallback_from(values: Mapping[str, Any]) -> Fallback:
     """Return the fallback described by the values of `FALLBACK`."""
-    return Fallback(values['command_timeout'], values['safe_flux'], values['safe_ramp_rate'])
+    return Fallback(*(
+        values[x] for x in ('command_timeout', 'safe_flux', 'safe_ramp_rate', 'lateness_limit')))
 
 
 class DeviceJoint:
@@ -115,9 +124,10 @@ class DeviceJoint:
         steady = monotonic_ns()
         if steady - self._reported_at < (_RECEIPTS if self._came else _SIGNS_OF_LIFE):
             return
+        refuses = self.refuses
+        cut = self.cut_off_time if refuses == conversions.CUT_OFF else 0
         self._received.publish(conversions.to_receipt(
-            self.name, self._came or self._node.now(), self._newest,
-            self.refuses))
+            self.name, self._came or self._node.now(), cut or self._newest, refuses))
         self._came, self._reported_at = 0, steady
 
     @property
@@ -126,6 +136,11 @@ class DeviceJoint:
         if self._commanded.locked or self._node.away:
             return conversions.INTERLOCK
         return conversions.CUT_OFF if self._number in self._device.cut_offs else ''
+
+    @property
+    def cut_off_time(self) -> int:
+        """Time in ns that names the cut-off in force; 0 for none."""
+        return int(self._device.guards[self._number].cut_off_time)
 
     def log(self, notice: Notice) -> None:
         """Count and log a notice of the device."""
@@ -198,6 +213,7 @@ class DeviceJoint:
     def _obey(self, read: Callable[[], tuple[int, float]]) -> None:
         if not self._node.active:
             return
+        self._node.reads_first()
         self.received += 1
         try:
             stamp, level = read()
@@ -282,12 +298,34 @@ class DeviceNode(ManagedNode):
     device: Any
     _joints: Sequence[DeviceJoint] = ()
     _rivals = ''
+    # Steady times in ns of the last tick, and until which commands are only read.
+    _ticked = _read_until = 0
 
     def on_tick(self) -> None:
         """Process the commands that have arrived, advance the device, and publish its reports."""
         self._poll_commands()
+        if self.reads_first():
+            return
         self._go_on()
         self._publish_news()
+
+    def reads_first(self) -> bool:
+        """
+        Return whether commands must be read before the device advances.
+
+        After a stall of this process, such as SIGSTOP, commands and heartbeats wait to be read,
+        which must not be a silence of the planner.
+        """
+        steady = steady_ns()
+        before, self._ticked = self._ticked, steady
+        if before and steady - before > STALL and self._joints and self.active:
+            self._read_until = steady + _SETTLE
+            self._stood_still(steady - before)
+        return steady < self._read_until
+
+    def _stood_still(self, span: int) -> None:
+        """Have the device consider that this process stood still for some ns."""
+        self.commanded.stood_still(span)
 
     def _poll_commands(self) -> None:
         for joint in self._joints:

@@ -32,7 +32,7 @@ from hmsa_ros.nodes.parameters import declare_joints
 from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from, SPECS
 from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.runner import run
-from hmsa_ros.timekeeping import StepWatch
+from hmsa_ros.timekeeping import steady_ns, StepWatch
 
 if TYPE_CHECKING:
     from hmsa_ros.nodes.follow import FollowJointTrajectory
@@ -262,10 +262,10 @@ class PlannerNode(ManagedNode):
                     self.get_logger().error(
                         f'message on /clock skipped: {error}', throttle_duration_sec=1.0)
             return super().now()
-        before = monotonic_ns()
+        before = steady_ns()
         # Equal to the time of rclpy's clock, without creating objects.
         now = time_ns()
-        if by := self._steps.step(before, now, monotonic_ns()):
+        if by := self._steps.step(before, now, steady_ns()):
             self._runtime.clock_set(by)
         return now
 
@@ -301,6 +301,7 @@ class PlannerNode(ManagedNode):
             longest = _POLL_NS if soon else _READ_NS
         elif wake is None and not self.simulated:
             self._poll.cancel()
+            self._runtime.serve_by(None)
             return
         period = _POLL_NS
         if not self.simulated:
@@ -309,6 +310,7 @@ class PlannerNode(ManagedNode):
         if period != self._poll.timer_period_ns or self._poll.is_canceled():
             self._poll.timer_period_ns = period
             self._poll.reset()
+        self._runtime.serve_by(steady_ns() + period)
 
     def _listen(self) -> None:
         """Subscribe to samples while they are needed."""

@@ -26,6 +26,7 @@ from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.markers import MARKER_FRAME, MARKER_RATE, MARKER_SCALE, show_states, State
 from hmsa_ros.nodes.parameters import declare_joints, JointParameters
 from hmsa_ros.nodes.runner import run
+from hmsa_ros.timekeeping import steady_ns, StepWatch
 
 #: Parameters that may have a separate value for each joint.
 OWN = (
@@ -161,6 +162,7 @@ class PlantNode(DeviceNode):
         self.on_change(self._take_parameters)
         self._pacer = Pacer(0, 1.0)
         self._clock_seen = 0
+        self._steps = StepWatch()
         self.autostart()
 
     def configure(self) -> None:
@@ -227,6 +229,13 @@ class PlantNode(DeviceNode):
         """Simulated time in ns, if this plant publishes the clock."""
         return self.device.time if self._joints and self._authority else None
 
+    def _stood_still(self, span: int) -> None:
+        """Have the simulation catch up, or continue from its time if that leads."""
+        if self._authority:
+            self._pacer.set_paused(self._pacer.paused, self.device.time)
+        elif not self.simulated and not self._standing:
+            super()._stood_still(span)
+
     def _go_on(self) -> None:
         """Simulate up to the present time, scaled by the real-time factor if leading."""
         if not self._authority:
@@ -242,9 +251,13 @@ class PlantNode(DeviceNode):
     def _follow(self) -> None:
         """Advance to the node's clock: the wall clock, or a /clock of another node."""
         # Equal to the wall clock of rclpy, without creating objects.
+        before = steady_ns()
         now = self.now() if self.simulated else time_ns()
         if now == 0:
             return
+        if not self.simulated and (by := self._steps.step(before, now, steady_ns())):
+            self._clock_seen += by
+            self.device.clock_set(by)
         behind = now - self._clock_seen < 1_000_000_000
         self._clock_seen = now
         jump = self.device.follow(now, standing=self._standing)

@@ -52,14 +52,20 @@ class History:
     def _with(self, levels: tuple[PlannedLevel, ...], **known: Any) -> 'History':
         return replace(self, plan=replace(self.plan, levels=levels), **known)
 
-    def unheard(self, now: int) -> int:
-        """Count the levels after the last known one that never took effect (time in ns)."""
+    def unheard(self, now: int, lost: int) -> int:
+        """
+        Count the levels after the last known one that never took effect.
+
+        ``now`` is the time in ns up to which changes are known. Levels before a time ``lost``
+        cannot take effect any more.
+        """
         # Only changes are reported. Commands that arrive so late that they apply all at once cause
         # no change if the last of them equals the present level: those before it never applied.
         levels, first = self.levels, self.known + 1
         for i in reversed(range(first, self.sent)):
             if (levels[i].stamp <= now
-                    and self._near(levels[i].flux_density, levels[self.known].flux_density)
+                    and (levels[i].stamp <= lost or self._near(
+                        levels[i].flux_density, levels[self.known].flux_density))
                     and self._changes(range(first, i + 1))):
                 return i + 1 - first
         return 0

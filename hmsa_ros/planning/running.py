@@ -213,15 +213,15 @@ class RunningPlan:
         self._history = self._history.without(first, end)
         self.revision += 1
 
-    def unheard(self, now: int) -> int | None:
-        """Return the timestamp in ns of the last level that never took effect; None for none."""
-        count = self._history.unheard(now)
+    def unheard(self, now: int, lost: int) -> int | None:
+        """Return the timestamp in ns of the last level that `History.unheard` finds, or None."""
+        count = self._history.unheard(now, lost)
         return self.plan.levels[self._history.known + count].stamp if count else None
 
     def drop_unheard(self, stamp: int) -> None:
         """Remove the levels found by `unheard` from the plan."""
         first = self._history.known + 1
-        self._leave_out(first, first + self._history.unheard(stamp), stamp)
+        self._leave_out(first, first + self._history.unheard(stamp, stamp), stamp)
 
     def applied(self, stamp: int, flux_density: float, tolerance: int) -> Deviation | None:
         """Record a change of level as `History.with_news` does; None if it is already known."""
