@@ -244,8 +244,8 @@ def _part(matrix: Array, loose: NDArray[np.bool_]) -> Array:
 def _solution(matrix: Array, gradient: Array, there: Array, loose: NDArray[np.bool_]) -> Array:
     """Return the steps to the optimum of a quadratic with given steps where fixed."""
     pull = np.where(loose, gradient - there @ matrix, there)
-    found: Array = np.linalg.solve(_part(matrix, loose), pull[..., None])[..., 0]
-    return found
+    return np.asarray(
+        np.linalg.solve(_part(matrix, loose), pull[..., None])[..., 0], dtype=np.float64)
 
 
 def inverse(matrix: Array, sought: NDArray[np.bool_]) -> Array:
