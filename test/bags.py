@@ -3,8 +3,6 @@
 from collections import Counter
 from pathlib import Path
 
-from rosbags.rosbag2 import Reader
-
 from hmsa_ros.bag.metadata import FILE_NAME
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.errors import HmsaError
@@ -12,6 +10,8 @@ from hmsa_ros.errors import HmsaError
 
 def hold_against_rosbags(folder):
     """Compare every complete bag in a folder with what rosbags reads, topic by topic."""
+    from rosbags.rosbag2 import Reader
+
     for path in Path(folder).rglob(FILE_NAME):
         try:
             reader = BagReader(path.parent)

@@ -12,6 +12,7 @@ import gc
 import itertools
 import os
 from pathlib import Path
+import re
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ import threading
 import time
 from typing import Any, ClassVar
 
+from extras import has, needs
 from hypothesis import HealthCheck, Phase, settings
 import pytest
 
@@ -32,6 +34,9 @@ POLL_SECONDS = 0.02
 # Interval of checks of a condition while callbacks are served.
 SPIN_SECONDS = 0.01
 DOMAINS = range(1, 102)
+# A module of tests with one of these lines needs ROS as soon as it is imported.
+ROS_IMPORT = re.compile(
+    r'^(from|import) (rclpy|\w+_(msgs|interfaces|srvs)|hmsa_ros\.(nodes|lab|panel|watch))\b', re.M)
 _turns = itertools.count(os.getpid())
 
 
@@ -53,6 +58,11 @@ def pytest_configure(config: pytest.Config) -> None:
             # Explaining an example traces the lines of Python: integrations then take minutes.
             phases=[x for x in Phase if x is not Phase.explain])
     settings.load_profile(config.getoption('--hypothesis-profile') or 'gate')
+
+
+def pytest_report_header() -> str | None:
+    """Say so where bags are not compared with an independent reader after each test."""
+    return None if has('rosbags') else 'rosbags is not installed: bags are NOT compared with it'
 
 
 @pytest.hookimpl(wrapper=True)
@@ -78,7 +88,14 @@ def pytest_xdist_auto_num_workers() -> int:
 def pytest_make_collect_report(
         collector: pytest.Collector
 ) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
-    """Let each worker begin with other modules, so that each is compiled only once."""
+    """
+    Let each worker begin with other modules, so that each is compiled only once.
+
+    Modules that need ROS are skipped where there is none.
+    """
+    if (isinstance(collector, pytest.Module) and not has('rclpy')
+            and ROS_IMPORT.search(collector.path.read_text(encoding='utf-8'))):
+        collector.collect = lambda: needs('rclpy')
     report = yield
     worker = os.environ.get('PYTEST_XDIST_WORKER', 'gw0')
     if isinstance(collector, pytest.Directory):
@@ -146,7 +163,9 @@ def wait_until(
 @pytest.fixture(autouse=True)
 def bags_are_whole_for_rosbags(request: pytest.FixtureRequest) -> Iterator[None]:
     """Compare every complete bag of a test with rosbags, which drops topics silently."""
-    folder = request.getfixturevalue('tmp_path') if 'tmp_path' in request.fixturenames else None
+    folder = None
+    if 'tmp_path' in request.fixturenames and has('rosbags'):
+        folder = request.getfixturevalue('tmp_path')
     yield
     if folder is not None:
         from bags import hold_against_rosbags
@@ -188,6 +207,7 @@ def own_domain_fixture() -> Callable[[], AbstractContextManager[int]]:
 @pytest.fixture
 def ros_domain_id() -> Iterator[int]:
     """Return a domain id that no other test on this machine uses at the same time."""
+    needs('rclpy')
     with own_domain() as domain:
         # Existing objects stay; only those of the test are searched for garbage at its end.
         gc.freeze()

@@ -3,15 +3,10 @@
 from pathlib import Path
 import random
 
+from extras import needs
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 import pytest
-from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import Reader as RosbagsReader
-from rosbags.rosbag2 import Writer as RosbagsWriter
-from rosbags.rosbag2.enums import StoragePlugin
-from rosbags.typesys import get_types_from_msg, get_typestore, Stores
-from ruamel.yaml import YAML
 
 from hmsa_ros.bag import limits, metadata, qos
 from hmsa_ros.bag.definitions import message_definition, type_hash
@@ -20,7 +15,9 @@ from hmsa_ros.bag.reader import BagReader, read_messages
 from hmsa_ros.bag.writer import BagWriter, parse_custom_data, PRESETS, Topic
 from hmsa_ros.errors import BadInputError, BagError
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
+AnyReader = needs('rosbags.highlevel').AnyReader
+rosbag2, typesys = needs('rosbags.rosbag2'), needs('rosbags.typesys')
+STORE = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
 FLOAT = 'std_msgs/msg/Float64'
 TYPES = (
     FLOAT, 'sensor_msgs/msg/MagneticField', 'sensor_msgs/msg/JointState',
@@ -51,7 +48,7 @@ def test_type_hashes_and_definitions_agree_with_rosbags(type_name):
     assert type_hash(type_name) == STORE.hash_rihs01(type_name)
     encoding, text = message_definition(type_name)
     assert encoding == 'ros2msg'
-    parsed = get_types_from_msg(text, type_name)
+    parsed = typesys.get_types_from_msg(text, type_name)
     assert all(parsed[name] == STORE.fielddefs[name] for name in parsed)
 
 
@@ -63,9 +60,9 @@ def test_other_readers_get_the_same_messages(tmp_path, preset):
         assert reader.message_count == 5000
         assert [reader.deserialize(data, connection.msgtype).data
                 for connection, _, data in reader.messages()] == list(range(5000))
-    assert YAML(typ='safe').load(folder / 'metadata.yaml')[
+    assert needs('ruamel.yaml').YAML(typ='safe').load(folder / 'metadata.yaml')[
         'rosbag2_bagfile_information']['custom_data'] == {'key': 'a value: with colon'}
-    with RosbagsReader(folder) as reader:
+    with rosbag2.Reader(folder) as reader:
         connection, = reader.connections
         assert connection.digest == type_hash(FLOAT)
         assert connection.ext.offered_qos_profiles[0].reliability.name == 'RELIABLE'
@@ -141,7 +138,8 @@ def test_decoded_messages_have_their_fields(tmp_path):
 
 
 def test_a_bag_of_rosbags_is_read(tmp_path):
-    writer = RosbagsWriter(tmp_path / 'other', version=9, storage_plugin=StoragePlugin.MCAP)
+    writer = rosbag2.Writer(
+        tmp_path / 'other', version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
     with writer:
         connection = writer.add_connection('/a', FLOAT, typestore=STORE)
         for i in range(100):
@@ -185,7 +183,7 @@ def test_publishers_that_come_later_hide_nothing_from_other_readers(tmp_path):
         writer.write([(number, 2, 2, 2, payload(2))])
         writer.split()
         writer.write([(number, 3, 3, 3, payload(3))])
-    with RosbagsReader(tmp_path / 'bag') as reader:
+    with rosbag2.Reader(tmp_path / 'bag') as reader:
         assert [stamp for _, stamp, _ in reader.messages()] == [1, 2, 3]
     assert BagReader(tmp_path / 'bag').topics['/a'].profiles == PROFILES
 

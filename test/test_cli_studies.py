@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 
+from extras import needs
 import pytest
 
 from hmsa_ros.cli import main
@@ -107,7 +108,7 @@ def test_robustness_as_json_has_everything_in_full_precision(run):
 
 @pytest.mark.slow
 def test_robustness_in_chunks_is_the_same_whatever_computes_it(run, tmp_path):
-    pytest.importorskip('pyarrow')
+    needs('pyarrow')
     words = ('robustness', '--move', '1:1.1', '--shapers', 'two_step,zv,step', '--errors', 0.05,
              '--zeta', 2.0, '--json')
     plain = json.loads(run(*words, '--out', 'plain')[1])
@@ -270,7 +271,7 @@ def test_sweep_of_cases_writes_a_file_and_names_it(run, tmp_path):
 
 
 def test_sweep_writes_parquet(run, tmp_path):
-    parquet = pytest.importorskip('pyarrow.parquet')
+    parquet = needs('pyarrow.parquet')
     status, out, _ = run('sweep', '--zeta', '0:2:10', '--out', 'o.PARQUET')
     assert (status, out) == (0, 'o.PARQUET\n')
     table = parquet.read_table(tmp_path / 'o.PARQUET')
@@ -310,7 +311,7 @@ def test_sweep_says_how_to_get_parquet_where_it_is_missing(refused, tmp_path, mo
 ])
 def test_sweep_refuses_bad_input_in_one_line(refused, tmp_path, words, message):
     if 'none/o.parquet' in words:
-        pytest.importorskip('pyarrow')
+        needs('pyarrow')
     assert message in refused('sweep', *words)
     assert list(tmp_path.iterdir()) == []
 

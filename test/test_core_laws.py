@@ -5,7 +5,7 @@ from functools import cache
 import json
 import math
 
-import mpmath
+from extras import needs
 import numpy as np
 import pytest
 
@@ -38,6 +38,8 @@ from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.two_step import Groups, plan_two_step, plan_two_step_batch
 from hmsa_ros.recordings.parameters import read_parameter_file, recorded
 
+mpmath = needs('mpmath')
+
 # Constants and energy of each law, typed from the literature, by the stretch and two invariants.
 CASES = {
     'neo_hookean': ({'actuator.shear_modulus': 9e3}, '4500 * (I1 - 3)'),
@@ -69,7 +71,7 @@ def block(name, constants=None):
 @cache
 def in_units_of_the_modulus(name):
     """Return the modulus of a law, and its energy and force in units of it, by SymPy."""
-    import sympy
+    sympy = needs('sympy')
     stretch = sympy.Symbol('l', positive=True)
     energy = sympy.sympify(CASES[name][1], {
         'l': stretch, 'I1': stretch ** 2 + 2 / stretch, 'I2': 2 * stretch + stretch ** -2})

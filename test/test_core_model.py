@@ -3,9 +3,9 @@
 import math
 
 from core_oracle import equation, follow
+from extras import needs
 from hypothesis import given, settings
 from hypothesis import strategies as st
-import mpmath
 import numpy as np
 import pytest
 from scipy.constants import mu_0
@@ -17,6 +17,8 @@ from hmsa_ros.model.parameters import (
     paper_actuator,
 )
 from hmsa_ros.model.simulation import simulate
+
+mpmath = needs('mpmath')
 
 EPS = np.finfo(float).eps
 PAPER = NondimensionalParameters()
@@ -39,7 +41,7 @@ def inside(j_lim: float, share: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope='module')
 def derivation():
     """Derive Eqs. 10 and 11 from the integrals and the energies of the paper."""
-    import sympy
+    sympy = needs('sympy')
     l, v, a, b = sympy.symbols('l v a B', real=True)  # noqa: E741
     rho, half_l, half_h, shear, j_lim, remanence, c, mu = sympy.symbols(
         'rho L H G J Br c mu', positive=True)

@@ -13,9 +13,9 @@ from core_oracle import (
     two_step,
     UPPER_LIMIT,
 )
+from extras import needs
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-import mpmath
 import numpy as np
 import pytest
 
@@ -33,6 +33,8 @@ from hmsa_ros.model.parameters import NondimensionalParameters
 from hmsa_ros.model.simulation import sampled
 from hmsa_ros.model.status import Code
 from hmsa_ros.planning.two_step import CODES, Groups, plan_two_step, plan_two_step_batch, TwoStep
+
+mpmath = needs('mpmath')
 
 PAPER = NondimensionalParameters()
 # Agreement with the independent solution, relative.

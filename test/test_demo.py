@@ -4,10 +4,9 @@ import json
 from pathlib import Path
 import signal
 
+from extras import needs
 from mcap.reader import make_reader
 import pytest
-from rosbags.highlevel import AnyReader
-from rosbags.typesys import get_typestore, Stores
 
 # Slow motion makes it last some 15 s; a loaded machine takes longer.
 DEMO_SECONDS = 120.0
@@ -51,7 +50,9 @@ def test_every_setpoint_is_reached_and_held_while_another_process_loads_a_core(s
 
 def _check_bag(bag: Path) -> None:
     """Read the bag with two independent readers."""
-    with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+    typesys = needs('rosbags.typesys')
+    with needs('rosbags.highlevel').AnyReader(
+            [bag], default_typestore=typesys.get_typestore(typesys.Stores.ROS2_JAZZY)) as reader:
         counts = {x.topic: x.msgcount for x in reader.connections}
         # Two a setpoint, and signs of life with the last one.
         assert counts['/flux_density_command'] >= 6

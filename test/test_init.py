@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 import re
 
+from extras import needs
 import numpy as np
 import pytest
 import yaml
@@ -313,9 +314,10 @@ def test_usual_numbers_are_not_warned_of():
 
 
 def test_numbers_are_taken_in_the_range_that_the_nodes_take():
-    specs = pytest.importorskip('hmsa_ros.interfaces.parameters').ACTUATOR
+    needs('rclpy')
+    from hmsa_ros.interfaces.parameters import ACTUATOR
     from hmsa_ros.nodes.planning import SPECS
-    declared = {x.name: x for x in (*specs, *SPECS)}
+    declared = {x.name: x for x in (*ACTUATOR, *SPECS)}
     for quantity in (*QUANTITIES, DAMPING):
         if quantity.parameter:
             spec = declared[quantity.parameter]

@@ -9,13 +9,14 @@ import socket
 import subprocess
 import sys
 
+from extras import needs
 import pytest
 from test_driver_node import TUTORIALS
 from test_package_imports import BLOCKED, run
 
 from hmsa_ros.errors import BadInputError
 
-websocket = pytest.importorskip('tornado.websocket')
+websocket = needs('tornado.websocket')
 
 from tornado.httpclient import HTTPError, HTTPRequest  # noqa: E402
 

@@ -7,9 +7,10 @@ import signal
 import threading
 
 from browser import Browser, find_browser, NAMES
+from extras import needs
 import pytest
 
-pytest.importorskip('tornado')
+needs('tornado')
 
 from hmsa_ros.panel.server import Server  # noqa: E402
 

@@ -4,6 +4,7 @@ import itertools
 import signal
 import time
 
+from extras import needs
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from mcap.writer import Writer
@@ -11,9 +12,6 @@ import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
-from rosbags.rosbag2 import Writer as RosbagsWriter
-from rosbags.rosbag2.enums import StoragePlugin
-from rosbags.typesys import get_typestore, Stores
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, MagneticField
 from std_msgs.msg import Float64
@@ -414,9 +412,10 @@ def test_topics_without_end_are_refused_and_those_named_are_played(ros, play, tm
 
 
 def test_a_bag_of_rosbags_is_played(ros, play, tmp_path):
-    store = get_typestore(Stores.ROS2_JAZZY)
-    with RosbagsWriter(
-            tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+    rosbag2, typesys = needs('rosbags.rosbag2'), needs('rosbags.typesys')
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    with rosbag2.Writer(
+            tmp_path / 'bag', version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
         connection = writer.add_connection('/a', FLOAT, typestore=store)
         for i in range(50):
             writer.write(connection, START + i * MS, store.serialize_cdr(

@@ -12,12 +12,10 @@ import sys
 from types import MappingProxyType
 
 from beam_oracle import silicone
+from extras import needs
 import numpy as np
 import plotly.graph_objects
 import pytest
-from rosbags.rosbag2 import Writer as RosbagsWriter
-from rosbags.rosbag2.enums import StoragePlugin
-from rosbags.typesys import get_typestore, Stores
 from scipy.io import loadmat
 
 import hmsa_ros
@@ -58,7 +56,8 @@ from hmsa_ros.report.outcome import level_results
 from hmsa_ros.report.page import page
 from hmsa_ros.report.picture import draw
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
+rosbag2, typesys = needs('rosbags.rosbag2'), needs('rosbags.typesys')
+STORE = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
 ACTUATOR = paper_actuator()
 UNIT = ACTUATOR.time_unit
 SEQUENCE = ((1.1, 10.0), (1.2, 10.0), (1.4, 10.0))
@@ -714,7 +713,8 @@ def test_each_joint_of_a_planner_of_several_is_a_run(tmp_path, bag):
 
 def write_with_rosbags(folder, messages):
     """Write a bag as another program does, without node parameters."""
-    with RosbagsWriter(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+    with rosbag2.Writer(
+            folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
         connections = {}
         for time, topic, kind, message in sorted(messages, key=lambda x: x[0]):
             if topic not in connections:

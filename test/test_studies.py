@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 import re
 
+from extras import needs
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -544,7 +545,7 @@ def test_csv_keeps_every_digit(tmp_path):
 
 
 def test_parquet_holds_the_same_columns(tmp_path):
-    parquet = pytest.importorskip('pyarrow.parquet')
+    parquet = needs('pyarrow.parquet')
     sweep = Sweep({'target': np.array([1.1, 3.0, 0.7])})
     path = tmp_path / 'sweep.parquet'
     with open_writer(path, COLUMNS) as write:
@@ -561,7 +562,7 @@ def test_parquet_holds_the_same_columns(tmp_path):
 @pytest.mark.parametrize('name', ['sweep.csv', 'sweep.parquet'])
 def test_sweep_that_is_broken_off_leaves_the_old_file(tmp_path, name):
     if name.endswith('.parquet'):
-        pytest.importorskip('pyarrow')
+        needs('pyarrow')
     path = tmp_path / name
     path.write_text('old')
 

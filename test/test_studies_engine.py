@@ -9,9 +9,8 @@ import signal
 import subprocess
 import sys
 
+from extras import needs
 import pytest
-
-pytest.importorskip('pyarrow')
 
 from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError, HmsaError
@@ -21,6 +20,8 @@ from hmsa_studies.chunks import Chunks, LEAST_ROWS
 from hmsa_studies.engine import compute, parse_shard
 from hmsa_studies.sweep import parse_grid, Sweep
 from hmsa_studies.tables import open_writer
+
+needs('pyarrow')
 
 #: Three chunks, the last one not full; some rows without a plan.
 AXES = {'zeta': '0:2:400', 'target': '1.1,1.2,3.0', 'j_lim': '4:9:80'}
@@ -190,15 +191,15 @@ def test_any_executor_computes_a_study(sweep, tmp_path, expected):
 
 @pytest.mark.slow
 def test_a_dask_cluster_writes_the_same_table(run, tmp_path, expected):
-    pytest.importorskip('distributed')
+    needs('distributed')
     assert run('--dask=local', '--workers=1', '--out=a.parquet')[:2] == (0, 'a.parquet\n')
     assert (tmp_path / 'a.parquet').read_bytes() == expected[0]
 
 
 @pytest.mark.slow
 def test_a_local_dask_cluster_leaves_the_cores_to_the_kernels():
-    pytest.importorskip('distributed')
-    dask = pytest.importorskip('dask')
+    needs('distributed')
+    dask = needs('dask')
     before = dask.config.get('distributed.worker.profile.enabled')
     with executors.dask('local', 1) as (executor, _):
         get = dask.config.get
@@ -236,7 +237,7 @@ def test_options_that_do_not_fit_are_refused_in_one_line(run, tmp_path, words, m
 
 
 def test_an_address_without_a_scheduler_is_refused(run, tmp_path, monkeypatch):
-    pytest.importorskip('distributed')
+    needs('distributed')
     monkeypatch.setattr(executors, 'PATIENCE', 0.5)
     for address in ('tcp://127.0.0.1:9', 'none.json'):
         status, out, err = run(f'--dask={address}', '--out=a')

@@ -4,6 +4,7 @@ import csv
 import json
 import math
 
+from extras import needs
 from matplotlib.axes import Axes
 import numpy as np
 import pytest
@@ -175,7 +176,7 @@ def test_samples_are_those_of_sobol_and_follow_from_number_and_seed_alone(run):
 
 @pytest.mark.slow
 def test_chunks_of_samples_shapers_and_laws_merge_to_the_table_of_one_process(run, tmp_path):
-    pytest.importorskip('pyarrow')
+    needs('pyarrow')
     words = ('sweep', '--zeta', 'sobol:0.1:0.3', '--samples', 200, '--shaper', 'two_step,robust',
              '--law', 'gent,neo_hookean')
     assert run(*words, '--workers', 1, '--out', 'a')[0] == 0
