@@ -40,19 +40,22 @@ demo: env ## run the demonstration
 	$(BIN)/hmsa demo $(ARGS)
 
 .PHONY: test
-test: tools ## run the gate: ruff, then mypy and all tests but the slow ones, in parallel
-	$(BIN)/python -m ruff check .
-	$(PYTEST) -m 'not slow' $(ARGS)
+test: tools ## run all tests but the slow ones, in parallel
+	$(PYTEST) -m 'not slow and not lint' $(ARGS)
 
 .PHONY: full
-full: tools ## run the gate with the slow tests too and random examples, as before a release
-	$(BIN)/python -m ruff check .
-	$(PYTEST) --hypothesis-profile full $(ARGS)
+full: tools ## run the slow tests too, and random examples, as before a release
+	$(PYTEST) -m 'not lint' --hypothesis-profile full $(ARGS)
 
 .PHONY: check
-check: tools ## run the part of the gate that needs no nodes: ruff, mypy, pytest
+check: tools ## run the tests that need no nodes
+	$(PYTEST) -m 'not slow and not lint and not ros' $(ARGS)
+
+.PHONY: lint
+lint: $(VENV)/.lint env ## check style and types: ruff, mypy and rules of this project
 	$(BIN)/python -m ruff check .
-	$(PYTEST) -m 'not slow and not ros' $(ARGS)
+	$(BIN)/python -m mypy
+	$(BIN)/python -m pytest -q -m lint test/test_style.py
 
 .PHONY: bench
 bench: $(VENV)/.bench env ## measure speed and accuracy
@@ -105,6 +108,9 @@ $(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml constraints.tx
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null \
 	|| { echo "hmsa_ros: $(PYTHON) cannot make environments: expected its modules venv and" \
 	"ensurepip; install them (on Debian and Ubuntu: python3-venv)" >&2; exit 1; }
+	@$(PYTHON) -c 'import os, sysconfig as s; open(os.path.join(s.get_path("include"), "Python.h"))' \
+	2>/dev/null || { echo "hmsa_ros: $(PYTHON) has no headers (Python.h): install them (on Debian and" \
+	"Ubuntu: python3-dev)" >&2; exit 1; }
 	@command -v c++ >/dev/null || { echo "hmsa_ros: no C++ compiler (c++): install one; on Debian" \
 	"and Ubuntu: apt install g++" >&2; exit 1; }
 	@echo "Making the environment $(VENV), which takes some minutes the first time"
@@ -114,6 +120,12 @@ $(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml constraints.tx
 
 $(VENV)/.tools: $(VENV)/.installed
 	$(EXTRAS) test studies cluster panel docs > $(VENV)/extras.txt
+	$(INSTALL) -r $(VENV)/extras.txt
+	@touch $@
+
+# With the tools, since mypy reads the types of what is imported.
+$(VENV)/.lint: $(VENV)/.tools
+	$(EXTRAS) lint > $(VENV)/extras.txt
 	$(INSTALL) -r $(VENV)/extras.txt
 	@touch $@
 

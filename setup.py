@@ -47,15 +47,18 @@ EXTRAS_REQUIRE = {
     ],
     'test': [
         'hypothesis>=6.98',
-        'mypy>=1.9',
         'pyserial>=3.5',
         # From 9.2 on, groups of pytest-xdist 3.8 are lost: it writes to a private attribute.
         'pytest>=7.4,<9.2',
         'pytest-timeout>=2.2',
         'pytest-xdist>=3.7',
         'rosbags>=0.10',
-        'ruff>=0.5',
         'sympy>=1.12',
+    ],
+    # Style and types, which no test depends on.
+    'lint': [
+        'mypy>=1.9',
+        'ruff>=0.5',
         'types-PyYAML',
     ],
     # Parquet, beside CSV.

@@ -7,8 +7,8 @@ import pytest
 
 # Of a module that the extra `test` does not bring, the smallest extra that does.
 EXTRAS = {
-    'casadi': 'bench', 'dask': 'cluster', 'distributed': 'cluster', 'numpydoc': 'docs',
-    'pyarrow': 'studies', 'rclpy': 'ros', 'sphinx': 'docs', 'tornado': 'panel'}
+    'dask': 'cluster', 'distributed': 'cluster', 'pyarrow': 'studies', 'rclpy': 'ros',
+    'sphinx': 'docs', 'tornado': 'panel'}
 
 
 def needs(module: str) -> Any:

@@ -21,6 +21,7 @@ from documents import (
     run_page,
     Session,
 )
+from extras import needs
 import pytest
 
 PAGES = pages()
@@ -51,7 +52,7 @@ def test_every_block_of_the_page_is_run_or_checked(page):
 @pytest.mark.ros
 @pytest.mark.long
 @pytest.mark.timeout(600)
-# One after the other, and not beside mypy, which would leave the nodes too little of two cores.
+# One after the other: a page with nodes takes both cores.
 @pytest.mark.xdist_group('heavy')
 @pytest.mark.parametrize('page', [
     pytest.param(
@@ -66,6 +67,7 @@ def test_page_does_what_it_says(page, ros_env, tmp_path):
 @pytest.mark.timeout(600)
 @pytest.mark.xdist_group('sphinx')
 def test_pages_are_built_without_a_warning(tmp_path):
+    needs('sphinx')
     built = subprocess.run(
         [sys.executable, '-m', 'sphinx', '-W', '--keep-going', '-q', '-b', 'html',
          '-d', str(tmp_path / 'doctrees'), str(ROOT / 'docs'), str(tmp_path / 'html')],

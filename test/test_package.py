@@ -10,6 +10,7 @@ import sys
 from typing import Any
 from xml.etree import ElementTree
 
+from extras import EXTRAS
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 import pytest
@@ -26,8 +27,8 @@ KEYS = {
     'lz4': 'mcap-ros2-support', 'mcap': 'mcap-ros2-support',
     'mcap-ros2-support': 'mcap-ros2-support', 'zstandard': 'mcap-ros2-support',
     'PyYAML': 'python3-yaml', 'pyserial': 'python3-serial', 'rosbags': 'python3-rosbags-pip'}
-# No key: ruff, type stubs, and plotly, without which only the page of a report is missing.
-WITHOUT_KEY = {'plotly', 'ruff', 'types-PyYAML'}
+# No key: plotly, without which only the page of a report is missing.
+WITHOUT_KEY = {'plotly'}
 # Requirements whose module has another name.
 MODULES = {'PyYAML': 'yaml', 'mcap-ros2-support': 'mcap_ros2'}
 # What only a part of the package needs.
@@ -212,6 +213,13 @@ def test_supported_pythons_are_the_ones_that_the_constraints_were_made_for(setup
     assert [f'3.{minor}' for minor in range(20) if f'3.{minor}' in supported] == list(PYTHONS)
     header = (ROOT / 'constraints.txt').read_text().partition('\n')[0]
     assert f'for Python {PYTHONS[0]} to {PYTHONS[-1]}' in header
+
+
+def test_a_skipped_test_names_the_extra_that_brings_what_it_needs(setup):
+    for module, extra in EXTRAS.items():
+        wanted = 'ros-jazzy-rclpy' if module == 'rclpy' else module
+        assert wanted in names(setup['extras_require'][extra])
+        assert wanted not in names(setup['extras_require']['test'])
 
 
 @pytest.mark.parametrize(

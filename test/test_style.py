@@ -7,6 +7,9 @@ from pathlib import Path
 import re
 import sys
 
+import pytest
+
+pytestmark = pytest.mark.lint
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = sorted(x for y in ('hmsa_ros', 'hmsa_studies') for x in (ROOT / y).rglob('*.py'))
 TESTS = sorted((ROOT / 'test').glob('test_*.py'))
