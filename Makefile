@@ -6,7 +6,7 @@ VENV ?= .venv
 # Passed to the command or to pytest, as in: make demo ARGS='--out /tmp/demo --json'
 ARGS ?=
 # For make constraints.
-PYTHONS ?= python3.10 python3.11 python3.12 python3.13
+PYTHONS ?= python3.10 python3.11 python3.12 python3.13 python3.14
 
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder
@@ -102,9 +102,9 @@ tools: $(VENV)/.tools env ## make the environment, with what tests and documenta
 
 # The stamps come last in their recipes: an environment left half made has none and is made anew.
 $(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(0 if (3, 10) <= sys.version_info[:2] <= (3, 13) else 1)' \
+	@$(PYTHON) -c 'import sys; sys.exit(0 if (3, 10) <= sys.version_info[:2] <= (3, 14) else 1)' \
 	2>/dev/null || { echo "hmsa_ros: $(PYTHON) is $$($(PYTHON) --version 2>/dev/null || echo not a Python that" \
-	"runs): expected Python 3.10 to 3.13; name one, as in: make PYTHON=python3.13" >&2; exit 1; }
+	"runs): expected Python 3.10 to 3.14; name one, as in: make PYTHON=python3.13" >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null \
 	|| { echo "hmsa_ros: $(PYTHON) cannot make environments: expected its modules venv and" \
 	"ensurepip; install them (on Debian and Ubuntu: python3-venv)" >&2; exit 1; }

@@ -151,7 +151,7 @@ setup(
           for folder in ('config', 'config/rviz', 'config/security')),
     ],
     zip_safe=False,
-    python_requires='>=3.10,<3.14',
+    python_requires='>=3.10,<3.15',
     install_requires=INSTALL_REQUIRES,
     extras_require=EXTRAS_REQUIRE,
     entry_points={

@@ -20,7 +20,7 @@ import hmsa_ros
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = [x for y in ('hmsa_ros', 'hmsa_studies') for x in (ROOT / y).rglob('*.py')]
-PYTHONS = ('3.10', '3.11', '3.12', '3.13')
+PYTHONS = ('3.10', '3.11', '3.12', '3.13', '3.14')
 # Where the key of a requirement is not python3- and its name in lower case.
 # mcap, lz4 and zstandard come along with mcap-ros2-support.
 KEYS = {
