@@ -215,6 +215,32 @@ def test_supported_pythons_are_the_ones_that_the_constraints_were_made_for(setup
     assert f'for Python {PYTHONS[0]} to {PYTHONS[-1]}' in header
 
 
+def test_every_file_that_names_the_supported_pythons_names_the_same():
+    span = f'Python {PYTHONS[0]} to {PYTHONS[-1]}'
+    for name in ('README.md', 'CONTRIBUTING.md', 'docs/tutorials/first-run.md', 'Makefile'):
+        spans = re.findall(r'Python 3\.\d+ to 3\.\d+', (ROOT / name).read_text(encoding='utf-8'))
+        assert set(spans) == {span}, name
+    commands = ' '.join(f'python{x}' for x in PYTHONS)
+    for name in ('CONTRIBUTING.md', 'Makefile', 'constraints.txt'):
+        assert commands in (ROOT / name).read_text(encoding='utf-8'), name
+    low, high = (x.replace('.', ', ') for x in (PYTHONS[0], PYTHONS[-1]))
+    assert f'({low}) <= sys.version_info[:2] <= ({high})' in (ROOT / 'Makefile').read_text()
+    workflow = yaml.safe_load((ROOT / '.github' / 'workflows' / 'ci.yml').read_text())
+    matrix = workflow['jobs']['gate']['strategy']['matrix']
+    assert matrix['python'] == list(PYTHONS)
+
+
+def test_the_workflow_runs_the_gate_and_the_gate_runs_what_the_readme_types():
+    workflow = yaml.safe_load((ROOT / '.github' / 'workflows' / 'ci.yml').read_text())
+    assert workflow['jobs']['gate']['steps'][-1]['run'] == '.ci/run'
+    typed = re.findall(r'^(make \w+) +#', (ROOT / 'README.md').read_text(encoding='utf-8'), re.M)
+    lines = (ROOT / '.ci' / 'run').read_text().splitlines()
+    assert typed == ['make demo', 'make test']
+    assert [x for x in lines if x in typed] == typed
+    # Last, so that its closing lines end the output.
+    assert lines[-1] == 'make test'
+
+
 def test_a_skipped_test_names_the_extra_that_brings_what_it_needs(setup):
     for module, extra in EXTRAS.items():
         wanted = 'ros-jazzy-rclpy' if module == 'rclpy' else module
