@@ -237,11 +237,11 @@ class PlannerClient(Link):
                 'the planner did not reply with a verdict', self.send_again,
                 awaited="the planner's verdict: it plans, or waits for plant, driver or samples")
             verdict = self.verdict.on(request)
-            assert verdict is not None
-            if verdict.level < DiagnosticStatus.ERROR[0]:
+            if verdict is not None and verdict.level < DiagnosticStatus.ERROR[0]:
                 return verdict
             # A planner that has just started may not have received the time yet.
-            if verdict.code != 'no_time' or monotonic() > deadline:
+            if verdict is not None and (
+                    verdict.code != 'no_time' or monotonic() > deadline):
                 raise BadInputError(f'the planner refused: {verdict.message}')
             self._executor.spin_once(timeout_sec=SLICE_SECONDS)
             sleep(SLICE_SECONDS)
