@@ -241,7 +241,15 @@ class Devices:
                 raise self.differs(joint)
 
     def differs(self, joint: str) -> RefusedError:
-        """Return the refusal of a request for a joint of ``apart``."""
+        """
+        Return the refusal of a request for a joint of ``apart``.
+
+        Raises
+        ------
+        ValueError
+            If no receipt has shown the offset of its clock.
+
+        """
         offset = self.receipts.offset_of(joint)
         if offset is None:
             raise ValueError(f'the clock offset of joint {joint} is unknown')
