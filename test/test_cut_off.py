@@ -258,6 +258,20 @@ def test_a_driver_that_stood_still_for_longer_than_its_watchdog_is_cut_off():
     assert 'stood still for 0.150 s, more than 0.1 s: the field goes to zero' in found[0]
 
 
+@pytest.mark.parametrize('safe', ['zero', 'ramp'])
+def test_levels_that_a_stall_has_made_late_do_not_keep_a_coil_on(safe):
+    device = driver(Fallback(0.1, safe, lateness_limit=0.02))
+    device.receive(0, START + MS, 0.05)
+    device.receive(0, START + 50 * MS, 0.03)
+    device.receive(0, START + 80 * MS, 0.04)
+    device.advance(START + 2 * MS)
+    device.advance_to(START + 500 * MS)
+    device.stood_still(498 * MS)
+    for time in range(501, 700):
+        device.advance(START + time * MS)
+    assert (device.changes()[-1].level, device.cut_offs) == (0.0, [0])
+
+
 def test_a_driver_drops_levels_that_it_could_not_write_in_time():
     device = driver(Fallback(10.0, 'zero', lateness_limit=0.02))
     device.receive(0, START + 10 * MS, 0.05)

@@ -221,8 +221,8 @@ class Coil(GuardedJoint):
     def _drop_missed(self, now: int) -> None:
         """Drop the pending levels if one is too late to be written, as after a stall."""
         due = self._changed if self.instrument.keeps_levels else self._schedule.next_stamp
-        if not due or now - due <= self.lateness_limit:
-            # Nothing is pending, or for now.
+        if not due or now - due <= self.lateness_limit or self.tripped or self.is_cut_off:
+            # Nothing is pending, or for now, or it is the safe flux.
             return
         count = len(self._schedule)
         self._schedule = CommandSchedule(self._schedule.current)
