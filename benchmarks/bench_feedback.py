@@ -13,8 +13,6 @@ import tempfile
 from typing import Any
 
 import numpy as np
-from rosbags.highlevel import AnyReader
-from rosbags.typesys import get_typestore, Stores
 
 from benchmarks.faults.rig import Rig
 from benchmarks.measure import ros_domain
@@ -121,6 +119,9 @@ def run(
 
 def read(bag: Path) -> dict[str, np.ndarray]:
     """Return time in s and values by topic; samples and levels by their timestamps."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import get_typestore, Stores
+
     rows: dict[str, list[tuple[float, ...]]] = {x: [] for x in _TOPICS}
     with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         for connection, stamp, data in reader.messages():

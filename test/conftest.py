@@ -41,7 +41,12 @@ _turns = itertools.count(os.getpid())
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Ignore warnings of ROS itself, which cannot be fixed here."""
+    """Ignore warnings of ROS itself, which cannot be fixed here, and start processes alike."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        # As nohup and the background of a shell leave them. Processes inherit what is ignored,
+        # not what is handled.
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, lambda *_: None)
     for warning in (
             'ignore:module .sre_:DeprecationWarning',  # lark, imported by rosidl_parser
             # A client that has gone, or that the server has not discovered yet and that retries.

@@ -3,6 +3,7 @@
 from dataclasses import replace
 import math
 
+from extras import needs
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
@@ -97,6 +98,7 @@ def test_from_a_bag_the_move_after_a_correction_rests_where_open_loop_misses(
         ros_domain_id, tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_DOMAIN_ID', str(ros_domain_id))
     # In slow motion, with commands far enough ahead for a busy machine.
+    needs('rosbags')
     found = run(replace(GRAPHS[1], lead=0.3, hold=1.2, factor=0.15), 0.2, tmp_path, 1)
     first, second = found['off']
     assert first.offset == pytest.approx(-0.18, abs=0.01)
