@@ -120,7 +120,7 @@ def test_time_in_which_a_process_is_stopped_does_not_count_for_a_call():
 
 @pytest.mark.parametrize(('node', 'module', 'number'), [
     (node, module, NUMBERS[i % 3]) for i, (node, module) in enumerate([
-        *((x, 'rclpy') for x in NODES), ('planner', 'numpy'), ('plant', 'numpy')])])
+        *((x, 'rclpy') for x in NODES), ('planner', 'numpy')])])
 def test_a_node_that_is_told_to_end_while_it_is_imported_ends_without_a_word(
         ros_env, node, module, number):
     # Tests that run in the background of a shell have SIGINT ignored.
@@ -133,7 +133,8 @@ def test_a_node_that_is_told_to_end_while_it_is_imported_ends_without_a_word(
     assert (done.returncode, done.stderr, done.stdout) == (*expected, '')
 
 
-@pytest.mark.parametrize('node', ['planner', 'plant'])
+@pytest.mark.parametrize('node', [
+    'planner', pytest.param('plant', marks=pytest.mark.slow)])
 def test_no_thread_of_fast_dds_outlives_a_node(ros_env, node):
     done = subprocess.run(
         [sys.executable, '-c', ONCE_IT_RUNS.format(entry=node)], capture_output=True, text=True,
@@ -212,7 +213,9 @@ class Sender""")
     assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
 
 
-@pytest.mark.parametrize('number', NUMBERS, ids=lambda x: x.name)
+@pytest.mark.parametrize('number', [
+    pytest.param(x, id=x.name, marks=[] if x == signal.SIGINT else pytest.mark.slow)
+    for x in NUMBERS])
 def test_a_recorder_told_to_end_again_and_again_closes_its_bag(
         tmp_path, start: Starter, number):
     process = start.hmsa(

@@ -88,7 +88,8 @@ def test_bad_arguments_refuse_the_start_in_one_line_with_status_2(
     assert out == ''
 
 
-@pytest.mark.parametrize('words', [['planner'], ['send', '1.1:1']])
+@pytest.mark.parametrize('words', [
+    ['planner'], pytest.param(['send', '1.1:1'], marks=pytest.mark.slow)])
 @pytest.mark.parametrize(('name', 'value', 'said'), [
     ('ROS_LOG_DIR', '/dev/null/log',
      r'ROS cannot write its log \(.*/dev/null/log.*\): set ROS_LOG_DIR .*'),
@@ -110,7 +111,9 @@ def test_process_that_refuses_to_start_says_why_and_has_no_traceback(start, node
     assert fragment in process.stderr
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=['SIGINT', 'SIGTERM'])
+@pytest.mark.parametrize('number', [
+    pytest.param(signal.SIGINT, id='SIGINT'),
+    pytest.param(signal.SIGTERM, id='SIGTERM', marks=pytest.mark.slow)])
 def test_signal_ends_planner_and_plant_at_work_with_status_0_and_no_word(ros, start, number):
     # At work: samples flow, and a plan is being sent.
     processes = [start.hmsa(node) for node in NODES]
