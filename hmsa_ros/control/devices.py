@@ -354,7 +354,8 @@ class Devices:
                     f'not acknowledged 0 T for {passed / NANOSECONDS:.0f} s: see its log, and '
                     'send the request again once the coil is off')
             how = (
-                'and no receipts either: start the plant or driver, or check the network'
+                'and no receipts either: start the plant or driver, check the network, or restart '
+                'it if its host has another address now'
                 if lost[0] in self.receipts.silent else
                 'though its receipts arrive: check the network in the direction from the planner '
                 'to the plant or driver')

@@ -223,7 +223,8 @@ class Receipts:
                 return (
                     f'no receipt of joint {name} from the plant or driver for more than '
                     f'{_PATIENCE / NANOSECONDS:g} s: it has ended, or its host cannot be '
-                    'reached; no command is sent until receipts arrive')
+                    'reached, or has another address now (then restart it); no command is sent '
+                    'until receipts arrive')
             if self.lost(name):
                 return (
                     f'commands of joint {name} do not arrive: the plant or driver sends receipts, '

@@ -24,7 +24,8 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.parameters import ParameterSpec
 from hmsa_ros.nodes import endpoints
-from hmsa_ros.nodes.conversions import to_diagnostics
+from hmsa_ros.nodes.address import AddressWatch
+from hmsa_ros.nodes.conversions import to_diagnostics, to_status
 from hmsa_ros.nodes.outlet import Outlet
 from hmsa_ros.nodes.parameters import (
     check_former_names,
@@ -56,6 +57,7 @@ class ManagedNode(LifecycleNode):
         self._guard_clock()
         self.active = False
         self.finished = False
+        self._address, self._moved = AddressWatch(), ''
         check_former_names(self._parameter_overrides)
         self._autostart: bool = declare(self, [AUTOSTART])[AUTOSTART.name]
         self._refusal: Exception | None = None
@@ -126,6 +128,13 @@ class ManagedNode(LifecycleNode):
 
         def publish() -> None:
             statuses = [*report()]
+            moved = self._address.words
+            if moved:
+                statuses.append(to_status(
+                    f'{self.get_name()}: host', '', DiagnosticStatus.WARN[0], moved, {}))
+            if moved and moved != self._moved:
+                self.get_logger().warning(moved)
+            self._moved = moved
             publisher.publish(to_diagnostics(self.now(), *statuses))
 
         self.every(1.0, publish)
