@@ -33,19 +33,22 @@ class Apart(Bench):
         there = self.now + self.ahead
         for _, x in arrived:
             self._newest, self._came = x.stamp, there
-            if self.cut and x.flux_density:
-                self.refused.append(x.flux_density)
+            if self.cut:
+                # Only the acknowledgement, which has the time of the cut-off, is obeyed.
+                self.cut = (x.stamp, x.flux_density) != (self.cut_at, 0.0)
+                self._fed = self.now
+                if self.cut:
+                    self.refused.append(x.flux_density)
                 continue
             if there - x.stamp > 20 * MS or x.stamp - there > self.TIMEOUT:
                 # It comes too late, or is for a time after the watchdog has tripped.
                 continue
-            self.cut = False
             self._fed = self.now
             self.plant.command(max(x.stamp - self.ahead, self.plant.time), x.flux_density)
         self.give_receipt()
         if self._fed is not None and self.now - self._fed > self.TIMEOUT and not self.cut:
             self.plant.command(self.plant.time, 0.0)
-            self.cut = True
+            self.cut, self.cut_at = True, there
 
     def advance(self):
         plant = self.plant
