@@ -29,19 +29,25 @@ if TYPE_CHECKING:
     from hmsa_ros.api.identified import Identified, identify
     from hmsa_ros.api.motion import compare, Motion, read
     from hmsa_ros.api.plan import Plan
-    from hmsa_ros.errors import AssumedWarning, BadInputError, HmsaError, UnusualWarning
+    from hmsa_ros.errors import (
+        AssumedWarning,
+        BadInputError,
+        HmsaError,
+        MissingWarning,
+        UnusualWarning,
+    )
     from hmsa_ros.table import Table
 
 __all__ = [
-    'Actuator', 'AssumedWarning', 'BadInputError', 'HmsaError', 'Identified', 'Motion', 'Plan',
-    'Table', 'UnusualWarning', 'compare', 'identify', 'read']
+    'Actuator', 'AssumedWarning', 'BadInputError', 'HmsaError', 'Identified',
+    'MissingWarning', 'Motion', 'Plan', 'Table', 'UnusualWarning', 'compare', 'identify', 'read']
 
 # Module of each name, which is imported on first use.
 _HOMES = {
     'Actuator': 'api.actuator', 'AssumedWarning': 'errors', 'BadInputError': 'errors',
-    'HmsaError': 'errors', 'Identified': 'api.identified', 'Motion': 'api.motion',
-    'Plan': 'api.plan', 'Table': 'table', 'UnusualWarning': 'errors', 'compare': 'api.motion',
-    'identify': 'api.identified', 'read': 'api.motion'}
+    'HmsaError': 'errors', 'Identified': 'api.identified', 'MissingWarning': 'errors',
+    'Motion': 'api.motion', 'Plan': 'api.plan', 'Table': 'table', 'UnusualWarning': 'errors',
+    'compare': 'api.motion', 'identify': 'api.identified', 'read': 'api.motion'}
 
 if not TYPE_CHECKING:
     def __getattr__(name):

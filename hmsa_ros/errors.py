@@ -55,6 +55,14 @@ class UnusualWarning(UserWarning):
     """
 
 
+class MissingWarning(UserWarning):
+    """
+    Messages that are missing from a recording, which is used without them.
+
+    ``warnings.simplefilter('ignore', hmsa_ros.MissingWarning)`` accepts all of them.
+    """
+
+
 def assume(text: str, kind: type[Warning] = AssumedWarning) -> None:
     """State an assumption or a doubt, as a warning at the line outside this package behind it."""
     frame, level = sys._getframe(1), 2

@@ -23,7 +23,7 @@ from hmsa_ros.cli import main
 from hmsa_ros.table import Column, Table
 
 FACE = {'Actuator', 'AssumedWarning', 'BadInputError', 'HmsaError', 'Identified', 'Motion', 'Plan',
-        'Table', 'UnusualWarning', 'compare', 'identify', 'read'}
+        'MissingWarning', 'Table', 'UnusualWarning', 'compare', 'identify', 'read'}
 LEVELS = [(0.0, 0.0), (0.02, 0.03), (0.12, -0.02), (0.25, 0.02), (0.4, 0.0)]
 MU_0 = 1.25663706127e-6
 

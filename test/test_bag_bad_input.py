@@ -480,8 +480,13 @@ def test_a_message_lost_from_a_chunk_is_said_by_recover(tmp_path, capsys):
     path.write_bytes(data)
     assert main(['bag', 'recover', str(tmp_path / 'bag'), '--out', str(tmp_path / 'new')]) == 0
     assert 'of 400 messages cannot be read' in capsys.readouterr().err
-    assert main(['bag', 'info', str(tmp_path / 'bag')]) == 0
-    assert 'the CRC of its data differs' in capsys.readouterr().out
+    assert main(['bag', 'info', str(tmp_path / 'bag')]) == 1
+    shown = capsys.readouterr().out
+    assert 'complete  no: 24 of 400 messages cannot be read; see hmsa bag recover' in shown
+    assert 'the CRC of its data differs' in shown
+    assert main(['bag', 'info', str(tmp_path / 'bag'), '--json']) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert (found['complete'], found['closed'], found['unreadable']) == (False, True, 24)
 
 
 def test_a_recovery_that_is_cancelled_leaves_no_bag_that_says_it_is_whole(tmp_path, monkeypatch):

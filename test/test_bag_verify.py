@@ -6,6 +6,8 @@ import math
 import re
 import time
 
+from mcap.opcode import Opcode
+from mcap_bytes import pieces
 import pytest
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
@@ -13,10 +15,12 @@ from sensor_msgs.msg import JointState, MagneticField
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
+import hmsa_ros
 from hmsa_ros.bag.definitions import message_definition
 from hmsa_ros.bag.reader import read_messages
 from hmsa_ros.bag.writer import BagWriter, Topic
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.cli import main
+from hmsa_ros.errors import BadInputError, MissingWarning
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.model.simulation import ActuatorSimulation
 from hmsa_ros.model.units import NANOSECONDS
@@ -119,11 +123,14 @@ def test_a_second_plant_moves_the_same_when_the_bag_is_played(
     assert max(moved) - min(moved) > 1e-3
 
 
-def write_joints(folder, densities, *, told=None, space='', lost=None, strange=()):
+def write_joints(
+        folder, densities, *, told=None, space='', lost=None, strange=(), close=True,
+        **options):
     """
     Write a run of several joints of one plant with different densities.
 
-    ``strange`` contains further messages: nanoseconds from the begin, topic, payload.
+    ``strange`` contains further messages: nanoseconds from the begin, topic, payload. Without
+    ``close``, the bag stays as a killed recorder leaves it.
     """
     actuators = {joint: replace(paper_actuator(), density=density)
                  for joint, density in densities.items()}
@@ -136,7 +143,7 @@ def write_joints(folder, densities, *, told=None, space='', lost=None, strange=(
         {'lost': json.dumps(lost)} if lost else {})
     simulations = {joint: ActuatorSimulation(actuator, time=BEGIN)
                    for joint, actuator in actuators.items()}
-    with BagWriter(folder, custom_data=custom_data) as writer:
+    with BagWriter(folder, custom_data=custom_data, **options) as writer:
         def topic(name, kind):
             encoding, text = message_definition(kind)
             return writer.add_topic(Topic(f'{space}/{name}', kind, text, encoding))
@@ -162,6 +169,9 @@ def write_joints(folder, densities, *, told=None, space='', lost=None, strange=(
             number = states if name == 'joint_states' else topic(
                 name, 'sensor_msgs/msg/MagneticField')
             writer.write([(number, BEGIN + after, 0, 0, payload)])
+        if not close:
+            writer.flush()
+            writer.abort()
     return folder
 
 
@@ -187,11 +197,41 @@ def test_several_joints_of_several_namespaces_are_told_apart(tmp_path):
 
 
 def test_lost_commands_are_named_beside_the_difference(tmp_path):
-    one, two = verify(write_joints(tmp_path / 'a', {'one': 900.0, 'two': 2000.0}, lost={
-        '/joint_states': 7, '/one/flux_density_command': 3, '/two/flux_density_command': 0}))
+    with pytest.warns(MissingWarning, match='its recorder lost 7 of /joint_states, 3 of /one'):
+        one, two = verify(write_joints(tmp_path / 'a', {'one': 900.0, 'two': 2000.0}, lost={
+            '/joint_states': 7, '/one/flux_density_command': 3, '/two/flux_density_command': 0}))
     assert one.note == ('the recorder lost messages, 3 of /one/flux_density_command: expected '
                         'differences from there on')
     assert two.note == ''
+
+
+def test_every_reader_says_what_is_missing_from_a_damaged_bag(tmp_path, capsys):
+    folder = write_joints(tmp_path / 'a', {'one': 900.0}, chunk_size=4_000)
+    path = folder / 'a_0.mcap'
+    data = bytearray(path.read_bytes())
+    places = [x for code, x, _ in pieces(bytes(data)) if code == Opcode.CHUNK]
+    data[places[len(places) // 2] + 200] ^= 1
+    path.write_bytes(data)
+    said = re.compile(
+        r'/a: (\d+) of 201 messages cannot be read; a has no samples for (0\.\d+) s from')
+    with pytest.warns(hmsa_ros.MissingWarning) as found:
+        motion = hmsa_ros.read(folder)
+    count, gap = said.search(str(found[0].message)).groups()
+    assert len(motion.times) == 200 - int(count)
+    assert float(gap) == pytest.approx((int(count) + 1) * 1e-3)
+    for command, status in (
+            (['export', folder, '--out', tmp_path / 'a.csv'], 0),
+            (['compare', folder, folder], 0), (['identify', folder], 0),
+            (['report', folder, '--out', tmp_path / 'a.html'], 0), (['bag', 'verify', folder], 1)):
+        assert main([*map(str, command)]) == status
+        shown = capsys.readouterr().err
+        assert said.search(shown), (command, shown)
+        assert shown.count('cannot be read') == 1, (command, shown)
+    assert f'{count} of 201 messages cannot be read' in (tmp_path / 'a.html').read_text()
+    # So is a bag whose recorder was killed.
+    write_joints(tmp_path / 'b', {'one': 900.0}, close=False)
+    assert main(['export', str(tmp_path / 'b'), '--out', str(tmp_path / 'b.csv')]) == 0
+    assert 'the last messages may be missing' in capsys.readouterr().err
 
 
 def test_messages_of_something_else_are_left_out_and_counted(tmp_path):

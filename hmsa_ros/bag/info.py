@@ -1,6 +1,6 @@
 """Summarize a bag."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 import datetime
 import json
@@ -9,12 +9,12 @@ import os
 from hmsa_ros.bag import limits, qos
 from hmsa_ros.bag.experiment import node_parameters, parameter_key
 from hmsa_ros.bag.reader import BagReader
-from hmsa_ros.errors import BagError, printable
+from hmsa_ros.errors import BagError, listed, printable
 
 # Keys of the JSON output, in this order.
 _SHOWN = (
     'path', 'files', 'start_ns', 'end_ns', 'duration', 'message_count', 'lost', 'sent_before',
-    'topics', 'parameters', 'custom_data', 'complete', 'problems')
+    'unreadable', 'topics', 'parameters', 'custom_data', 'closed', 'complete', 'problems')
 # Keys of custom data with counts by topic.
 _COUNTED = 'lost', 'sent_before'
 
@@ -44,7 +44,9 @@ class BagSummary:
     topics: tuple[TopicSummary, ...]  #: in order of name
     parameters: Mapping[str, str]  #: of the recorded nodes, values as JSON
     custom_data: Mapping[str, str]  #: all other custom data
-    complete: bool  #: whether every file was closed by its writer
+    unreadable: int  #: messages that the bag lists and that cannot be read
+    closed: bool  #: whether every file was closed by its writer
+    complete: bool  #: whether it was closed, and every message that it lists can be read
     problems: tuple[str, ...]  #: parts that could not be read, one sentence each
 
     @property
@@ -64,6 +66,27 @@ class BagSummary:
         """Return the number of lost messages, None if the recorder did not count."""
         return self._sum('lost')
 
+    def missing(self, topics: Collection[str] | None = None) -> str:
+        """
+        Return which messages are missing, as a part of a sentence; empty if none is known to be.
+
+        Of those that the recorder lost, only ``topics`` count, by default all.
+        """
+        parts = []
+        if self.unreadable:
+            total = self.message_count + self.unreadable
+            parts.append(f'{self.unreadable} of {total} messages cannot be read')
+        if not self.closed:
+            parts.append('the last messages may be missing, since it was cut off, or its recorder '
+                         'was killed or is still at work')
+        elif not (self.complete or self.unreadable):
+            parts.append('a part of it is damaged')
+        lost = [f'{x.lost} of {x.name}' for x in self.topics
+                if x.lost and (topics is None or x.name in topics)]
+        if lost:
+            parts.append(f'its recorder lost {listed(lost)}')
+        return '; '.join(parts)
+
     @property
     def sent_before(self) -> int | None:
         """Return how many messages were sent before the recorder was matched; None if unknown."""
@@ -80,7 +103,7 @@ def summarize(
     """Return the summary of a bag or of its reader; raise `BadInputError` if it is no bag."""
     reader = bag if isinstance(bag, BagReader) else BagReader(bag, max_chunk_size=max_chunk_size)
     # This comes first because it detects damage.
-    counts = reader.counts()
+    counts, unreadable = reader.counts(), reader.unreadable()
     start, end = reader.start_time, reader.end_time
     seconds = 0.0 if start is None or end is None else (end - start) * 1e-9
     lost, before = (missing_messages(reader.custom_data, key) for key in _COUNTED)
@@ -101,7 +124,7 @@ def summarize(
         end, topics, parameters,
         {key: value for key, value in reader.custom_data.items()
          if key not in {*parameters, *_COUNTED} and not key.startswith(qos.LATER)},
-        reader.complete, tuple(reader.problems))
+        unreadable, reader.closed, reader.complete and not unreadable, tuple(reader.problems))
 
 
 def missing_messages(custom_data: Mapping[str, str], key: str) -> dict[str, int] | None:
@@ -142,7 +165,8 @@ def _lines(
         yield f'file      {name}  {size / 1024:.1f} KiB'
     late = (f', except {_messages(summary.sent_before)} sent before the recorder was matched'
             if summary.sent_before else '')
-    yield f'complete  {"yes" + late if summary.complete else "no, see hmsa bag recover"}'
+    yield 'complete  ' + (
+        f'yes{late}' if summary.complete else f'no: {summary.missing(())}; see hmsa bag recover')
     if summary.start_ns is not None:
         yield f'start     {_time(summary.start_ns)}'
     yield f'duration  {summary.duration:.3f} s'

@@ -119,13 +119,32 @@ class BagReader:
         self.custom_data = noted or {
             key: value for key, value in self.records.get(EXPERIMENT, {}).items()
             if key != 'version'}
+        # Messages by file; of old versions of the metadata, 0.
+        self._listed = {} if self.metadata is None else {
+            Path(x.path).name: x.message_count for x in self.metadata.files}
+        read = {x.name for x in self.files}
+        self._missing = sum(
+            max(1, count) for name, count in self._listed.items() if name not in read)
         described = {} if self.metadata is None else {x.name: x for x in self.metadata.topics}
         self.topics = topics_of(self._files, described, self.custom_data, intake.problem)
 
     @property
     def complete(self) -> bool:
+        """Return whether the bag was closed, and no damage of it has been found so far."""
+        return self.closed and not self._missing and all(file.complete for file in self._files)
+
+    @property
+    def closed(self) -> bool:
         """Return whether every file, and the bag as a whole, was closed by its writer."""
-        return self._ended and all(file.complete for file in self._files)
+        return self._ended and all(file.closed for file in self._files)
+
+    def unreadable(self) -> int:
+        """Return how many messages cannot be read that the files or ``metadata.yaml`` list."""
+        said = sum(max(file.said or 0, self._listed.get(file.path.name, 0))
+                   for file in self._files) + self._missing
+        if self.metadata is not None and self._ended:
+            said = max(said, self.metadata.message_count)
+        return max(0, said - sum(self.counts().values()))
 
     @property
     def start_time(self) -> int | None:

@@ -81,13 +81,15 @@ class ScannedFile:
     """
     The content of a file: records by id, metadata records by name.
 
-    ``blocks`` are its parts with messages, in order; ``complete`` is whether its writer closed it.
-    Raises `BadInputError` if it is not an MCAP file.
+    ``blocks`` are its parts with messages, in order; ``closed`` is whether its writer closed it,
+    and ``said`` how many messages it says that it has, None if it does not. Raises `BadInputError`
+    if it is not an MCAP file.
     """
 
     def __init__(self, intake: Intake, path: Path, number: int) -> None:
         self.path = path
-        self.complete = False
+        self.closed = False
+        self.said: int | None = None
         self._intake = intake
         self._number = number  # its place in the bag
         self._damaged = self._counted = False
@@ -110,6 +112,11 @@ class ScannedFile:
             raise BadInputError(
                 f'{path} cannot be read ({error.strerror}): expected an MCAP file') from error
 
+    @property
+    def complete(self) -> bool:
+        """Return whether its writer closed it, and no damage has been found so far."""
+        return self.closed and not self._damaged
+
     def problem(self, sentence: str) -> None:
         """Record a problem, and that the file is damaged."""
         self._damaged = True
@@ -122,7 +129,7 @@ class ScannedFile:
                 self._descriptor = stream.fileno()
                 self._check_data()
                 if self._damaged and not self._counted:
-                    self._count(self._counts.total())
+                    self._count()
         except OSError as error:
             self.problem(f' cannot be read any more: {error.strerror}')
         return self._counts
@@ -185,10 +192,10 @@ class ScannedFile:
 
     def _walk(self) -> None:
         """Read the file record by record, and count its messages."""
-        offset, chunked, said = len(MAGIC), False, None
-        self.complete = False
+        offset, chunked = len(MAGIC), False
+        self.closed, self.said = False, None
         run: int | None = None  # where messages outside chunks begin
-        while offset + PREFIX.size <= self._size and not self.complete:
+        while offset + PREFIX.size <= self._size and not self.closed:
             head = os.pread(self._descriptor, PREFIX.size + records.CHUNK_HEAD_SIZE, offset)
             opcode, length = PREFIX.unpack_from(head)
             end = offset + PREFIX.size + length
@@ -211,8 +218,9 @@ class ScannedFile:
                 else:
                     chunked = chunked or opcode == Opcode.CHUNK
                     record = self._read_record(offset, head)
-                    said = record.message_count if isinstance(record, Statistics) else said
-                    self.complete = isinstance(record, Footer) and os.pread(
+                    if isinstance(record, Statistics):
+                        self.said = record.message_count
+                    self.closed = isinstance(record, Footer) and os.pread(
                         self._descriptor, len(MAGIC), end) == MAGIC
             except BagError as error:
                 self._end_run(run, offset)
@@ -220,10 +228,10 @@ class ScannedFile:
                 self.problem(f': {error}, at byte {offset}: skipped')
             offset = end
         self._end_run(run, offset)
-        if not self.complete:
+        if not self.closed:
             self.problem(
                 f' is not complete: it can be read up to byte {offset} of {self._size}')
-        self._count(said)
+        self._count()
 
     def _end_run(self, begin: int | None, end: int) -> None:
         """Add messages outside chunks as a chunk of unknown times."""
@@ -251,7 +259,7 @@ class ScannedFile:
             return record
         return None
 
-    def _count(self, said: int | None) -> None:
+    def _count(self) -> None:
         """Read all blocks for their declarations, counts and times."""
         blocks, self.blocks, self._counts, self._counted = self.blocks, [], Counter(), True
         unpack = records.MESSAGE_HEAD.unpack_from
@@ -278,7 +286,7 @@ class ScannedFile:
             self._counts.update(channels)
             if channels:
                 self.blocks.append(replace(block, start=start, end=end))
-        found = self._counts.total()
+        found, said = self._counts.total(), self.said
         if said is not None and said != found:
             self.problem(f': {said - found} of {said} messages cannot be read' if said > found else
                          f' holds {found} messages that can be read: it says {said}')
@@ -290,7 +298,7 @@ class ScannedFile:
         tail = os.pread(self._descriptor, _TAIL_SIZE, max(0, self._size - _TAIL_SIZE))
         if not (tail.endswith(MAGIC) and tail.startswith(PREFIX.pack(Opcode.FOOTER, 20))):
             return False
-        self.complete = True
+        self.closed = True
         try:
             footer = records.parse(Footer, tail[PREFIX.size:_FOOTER_SIZE])
             start, end = footer.summary_start, self._size - _TAIL_SIZE
@@ -324,6 +332,7 @@ class ScannedFile:
         for record in (*found[Schema], *found[Channel]):
             self._take(record)
         self._counts = Counter(statistics.channel_message_counts)
+        self.said = statistics.message_count
         end_record = records.read_exactly(self._descriptor, _DATA_END_SIZE, data_end)
         if not end_record.startswith(PREFIX.pack(Opcode.DATA_END, 4)):
             self.problem(f' is damaged at byte {data_end}: no end of data')

@@ -61,7 +61,7 @@ def _info(arguments: argparse.Namespace) -> int:
     List the contents of a bag.
 
     Print topics, counts, rates, losses and duration of a bag, and with --parameters the parameters
-    of the nodes.
+    of the nodes. The exit status is 1 if messages that the bag lists cannot be read.
 
     example: hmsa bag info hmsa_demo/run --json
     """
@@ -74,7 +74,8 @@ def _info(arguments: argparse.Namespace) -> int:
         summary, notes = summarize(reader), tuple(unanswered(reader))
     print(to_json(summary, notes) if arguments.json else to_text(
         summary, notes, parameters=arguments.parameters))
-    return 0
+    # A bag that is still written, or whose recorder was killed, is readable as far as it goes.
+    return 1 if summary.unreadable or summary.closed and not summary.complete else 0
 
 
 def _verify(arguments: argparse.Namespace) -> int:
@@ -100,8 +101,6 @@ def _verify(arguments: argparse.Namespace) -> int:
             arguments.bag, parameters=parameters, max_chunk_size=_chunk_size(arguments))
         results = [verify_run(x) for x in runs]
     problems = list(runs[0].summary.problems) if runs[0].summary else []
-    for problem in problems:
-        print(f'hmsa: note: {printable(problem)}', file=sys.stderr)
     # A bag that is not completely readable is not verified, and an unapplied command is a loss.
     passed = not problems and all(
         x.largest_difference <= arguments.tolerance and not x.unapplied_count for x in results)

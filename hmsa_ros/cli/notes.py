@@ -6,9 +6,9 @@ import sys
 from typing import Any, TextIO
 import warnings
 
-from hmsa_ros.errors import AssumedWarning, printable, UnusualWarning
+from hmsa_ros.errors import AssumedWarning, MissingWarning, printable, UnusualWarning
 
-_KINDS = AssumedWarning, UnusualWarning
+_KINDS = AssumedWarning, UnusualWarning, MissingWarning
 _said: list[str] = []
 _shown: list[str] = []
 

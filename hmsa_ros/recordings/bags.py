@@ -12,13 +12,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hmsa_ros.bag import limits
 from hmsa_ros.bag.info import BagSummary, summarize
 from hmsa_ros.bag.reader import BagReader, Message
-from hmsa_ros.errors import BadInputError, BagError
+from hmsa_ros.errors import assume, BadInputError, BagError, MissingWarning
 from hmsa_ros.interfaces.status import whole
 from hmsa_ros.judge.records import Sensor
 from hmsa_ros.model.schedule import obeyed
+from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings import answers
 from hmsa_ros.recordings import topics as roles
 from hmsa_ros.recordings.levels import Level
@@ -27,6 +30,8 @@ from hmsa_ros.recordings.record import LearntSensor, RecordedRequest, Run, Verdi
 from hmsa_ros.recordings.samples import nanoseconds_of, SampleReader
 from hmsa_ros.recordings.topics import topics_by_joint
 
+# Time between samples that is a gap in a bag with missing messages, relative to the median.
+_UNUSUAL_STEP = 10
 # Messages between two calls of the progress callback.
 _PROGRESS_MESSAGES = 20_000
 _MOST_NOTES = 20
@@ -60,7 +65,8 @@ def read_runs(
     Returns
     -------
     list of Run
-        At least one, ordered by namespace and joint.
+        At least one, ordered by namespace and joint. A `MissingWarning` tells of messages that are
+        missing from them.
 
     Raises
     ------
@@ -95,7 +101,19 @@ def read_runs(
         # Skipped messages may be the reason.
         notes = [x for each in collected.values() for x in each.notes]
         raise BadInputError('; '.join([str(reasons[0]), *notes[:1]]))
+    if missing := summary.missing({x for run in runs for x in run.topics.values()}):
+        assume('; '.join([f'{path}: {missing}', *filter(None, map(_gap, runs))]), MissingWarning)
     return runs
+
+
+def _gap(run: Run) -> str:
+    """Return the longest time without samples as a part of a sentence; empty if it is usual."""
+    steps = np.diff(run.time)
+    if not len(steps) or (longest := int(steps.max())) < _UNUSUAL_STEP * np.median(steps):
+        return ''
+    begin = run.time[int(steps.argmax())] - run.time[0]
+    return (f'{run.label} has no samples for {longest / NANOSECONDS:.3g} s from '
+            f'{begin / NANOSECONDS:.3g} s on')
 
 
 def read_run(
