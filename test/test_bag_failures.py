@@ -1,7 +1,8 @@
 """Recordings when the disk or the folder fails."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+import json
 import os
 from pathlib import Path
 import resource
@@ -98,6 +99,54 @@ def test_a_removed_folder_costs_what_was_in_it_and_that_is_counted(tmp_path, wai
     assert status.written == {'/a': 20}
     assert [item.sequence for item in BagReader(tmp_path / 'bag').messages()] == list(
         range(10, 30))
+
+
+@pytest.mark.parametrize('when', ['earlier', 'present', 'last'])
+@pytest.mark.parametrize('damage', ['removed', 'shortened'])
+def test_at_the_end_what_can_be_read_is_counted(tmp_path, damage, when):
+    writer = BagWriter(tmp_path / 'bag', chunk_size=1000)
+    recording = Recording(writer, Limits(flush_period=0.02))
+    recording.add_topic(TOPIC)
+
+    def record(first):
+        recording.put([message(i) for i in range(first, first + 100)], 500)
+        with suppress(OSError):  # in the file that was removed or shortened
+            recording._ask(writer.flush).result()
+
+    def harm():
+        path = tmp_path / 'bag' / writer.file_name
+        if damage == 'removed':
+            path.unlink()
+        else:
+            os.truncate(path, writer._file.size // 2)
+
+    record(0)
+    if when == 'earlier':
+        path = tmp_path / 'bag' / writer.file_name
+        recording.split()
+        if damage == 'removed':
+            path.unlink()
+        else:
+            os.truncate(path, path.stat().st_size // 2)
+    elif when == 'present':
+        harm()
+    record(100)
+    if when == 'last':
+        harm()
+    status = recording.close(lambda status: {'lost': json.dumps(
+        lost_by_topic(status.overflowed, status.dropped))})
+    assert bool(status.error) == (when == 'last')
+    if damage == 'removed' and when == 'last':
+        assert status.dropped == {'/a': 200}
+        return
+    reader = BagReader(tmp_path / 'bag')
+    count = sum(1 for _ in reader.messages())
+    assert count < 200
+    assert status.written == {'/a': count}
+    assert status.dropped == {'/a': 200 - count}
+    assert reader.custom_data == {'lost': json.dumps({'/a': 200 - count})}
+    assert reader.metadata.message_count == count
+    assert reader.unreadable() == 0
 
 
 def test_what_does_not_fit_into_memory_is_counted_by_topic(tmp_path):

@@ -7,6 +7,7 @@ disk beforehand, so that the file can be closed even if the disk is full.
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+import errno
 import itertools
 import os
 from pathlib import Path
@@ -231,6 +232,9 @@ class OutputFile:
 
     def _add(self, data: bytes, end_size: int = 0) -> None:
         """Store data completely or not at all, reserving ``end_size`` more bytes for the end."""
+        if os.fstat(self._descriptor).st_size < self.size:
+            # Otherwise the file would get a hole, and a summary of messages that it lost.
+            raise OSError(errno.EIO, f'another process has shortened {self.path.name}')
         self._end_size += end_size
         needed = self.size + len(data) + self._end_size + self._notes_room + RESERVE_STEP // 2
         if needed > self._room and not self._ending:

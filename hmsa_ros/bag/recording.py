@@ -203,7 +203,11 @@ class Recording:
                 0.0 if since is None else time.monotonic() - since, self._crowded)
 
     def close(self, last_words: Callable[[Status], Mapping[str, str]] | None = None) -> Status:
-        """Write the queued messages, add the custom data of ``last_words``, and close the bag."""
+        """
+        Write the queued messages, add the custom data of ``last_words``, and close the bag.
+
+        The state returned counts what can be read in the files.
+        """
         with self._condition:
             self._closing = True
             self._deadline = time.monotonic() + END_SECONDS
@@ -220,12 +224,18 @@ class Recording:
         except OSError as error:
             self._error = self._error or _not_closed(error)
             self._writer.drop_pending()
-        if last_words is not None:
-            self._writer.custom_data.update(last_words(self.status()))
-        try:
-            self._writer.close()
-        except OSError as error:
-            self._error = self._error or _not_closed(error)
+        def count() -> None:
+            """Count what can be read, and add the last words."""
+            self._writer.check_files()
+            if last_words is not None:
+                self._writer.custom_data.update(last_words(self.status()))
+
+        # Again at the end, since the last file may have been removed or shortened too.
+        for act in (count, self._writer.close, count, self._writer.write_metadata):
+            try:
+                act()
+            except OSError as error:
+                self._error = self._error or _not_closed(error)
         return self.status()
 
     def _ask(self, action: Callable[[], object]) -> Future[object]:

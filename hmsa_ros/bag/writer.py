@@ -20,6 +20,7 @@ from hmsa_ros import __version__
 from hmsa_ros.bag import metadata, qos
 from hmsa_ros.bag.metadata import Topic
 from hmsa_ros.bag.output import Entry, OutputFile, PRESETS
+from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.bag.records import MESSAGE_HEAD
 from hmsa_ros.bag.topics import number_of
 from hmsa_ros.errors import BadInputError, BagError
@@ -59,7 +60,7 @@ class BagWriter:
         As given; see `note`.
     dropped : dict of str to int
         By topic, messages given to `write` that are not in the bag: not written at the end, or
-        in a file that was removed during writing.
+        in a file that another process removed or shortened; see `check_files`.
 
     Raises
     ------
@@ -88,7 +89,8 @@ class BagWriter:
         self._stem = re.sub('[\ud800-\udfff]', '_', self.folder.name)
         self._ros_distro = ros_distro
         self._topics: list[Topic] = []
-        self._closed_files: list[metadata.FileMetadata] = []
+        # Files that were left, with their counts and size; None if they have no summary.
+        self._left: list[tuple[metadata.FileMetadata, Counter[int], int | None]] = []
         self._counts: Counter[int] = Counter()  # messages written, by the number of their topic
         self.custom_data: dict[str, str] = {}
         self.dropped: Counter[str] = Counter()
@@ -230,11 +232,9 @@ class BagWriter:
             file.close()
             if not isinstance(error, FileNotFoundError):
                 # The file has its messages but no summary; `hmsa bag recover` adds one.
-                self._closed_files.append(file.summary())
+                self._left.append((file.summary(), file.counts, None))
             else:
-                self._counts.subtract(file.counts)
-                for number, count in file.counts.items():
-                    self.dropped[self._topics[number].name] += count
+                self._drop(file.counts)
             self._file = None
 
     def abort(self) -> None:
@@ -254,8 +254,37 @@ class BagWriter:
         finally:
             self.drop_pending()
             self.abandon()
-            if self.folder.is_dir():
-                self._write_metadata()
+            self.write_metadata()
+
+    def check_files(self) -> None:
+        """Drop the messages in files that other processes removed or shortened meanwhile."""
+        found: list[tuple[metadata.FileMetadata, Counter[int], int | None]] = []
+        for entry, counts, size in self._left:
+            path = self.folder / entry.path
+            readable: Mapping[str, int] = {}
+            with contextlib.suppress(OSError, BagError, BadInputError):
+                if path.stat().st_size == size:
+                    found.append((entry, counts, size))
+                    continue
+                readable = BagReader(path).counts()
+            missing = Counter({number: count - readable.get(self._topics[number].name, 0)
+                               for number, count in counts.items()})
+            self._drop(+missing)
+            if readable:
+                left = counts - missing
+                found.append((replace(entry, message_count=left.total()), left, None))
+        self._left = found
+
+    def write_metadata(self) -> None:
+        """Write ``metadata.yaml`` again, if the folder is still there."""
+        if self.folder.is_dir():
+            self._write_metadata()
+
+    def _drop(self, counts: Mapping[int, int]) -> None:
+        """Count written messages that are not in the bag any more."""
+        self._counts.subtract(counts)
+        for number, count in counts.items():
+            self.dropped[self._topics[number].name] += count
 
     def _open(self) -> str:
         """Open the next file and write its header and metadata."""
@@ -303,13 +332,13 @@ class BagWriter:
             return
         file.check_still_there()
         file.finish(self._serialized(file), self._notes(), fsync=self._fsync)
-        self._closed_files.append(file.summary())
+        self._left.append((file.summary(), file.counts, file.size))
         self._file = None
         self._write_metadata()
 
     def _write_metadata(self) -> None:
         """Update ``metadata.yaml``."""
-        files = [*self._closed_files, *([self._file.summary()] if self._file else [])]
+        files = [*(x for x, _, _ in self._left), *([self._file.summary()] if self._file else [])]
         ended = {} if self._closed else {metadata.NOT_ENDED: 'true'}
         metadata.write(self.folder, self._metadata(
             files, self._counts, {**self.custom_data, **ended}))

@@ -345,8 +345,9 @@ class Recorder(ManagedNode):
                     print('hmsa recorder:', sentence.format(count, name), flush=True)
         if silent := self._recorded.silent():
             print(f'hmsa recorder: nothing was received of {", ".join(silent)}', flush=True)
-        if status.error and self.failure is None:
-            self.failure = BagError(status.error)
+        if self.failure is None and (status.error or any(lost.values())):
+            self.failure = BagError(status.error or (
+                f'{sum(lost.values())} messages are missing from {self.folder}'))
 
 
 def _parted(
