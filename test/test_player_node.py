@@ -59,7 +59,8 @@ def play(start):
     def play(bag, *parameters):
         arguments = [f'storage.uri:={bag}', *parameters]
         return start.hmsa('player', '--ros-args', *(
-            part for argument in arguments for part in ('-p', argument)))
+            part for argument in arguments
+            for part in ('-r' if argument.startswith('__') else '-p', argument)))
     return play
 
 
@@ -425,10 +426,29 @@ def test_a_bag_of_rosbags_is_played(ros, play, tmp_path):
     assert [message.data for message in got] == list(range(50))
 
 
-def test_an_empty_bag_ends_at_once(play, tmp_path):
-    process = play(write_bag(tmp_path / 'bag', []))
-    assert process.wait() == 0, process.output
+@pytest.mark.parametrize(('entries', 'parameters', 'why'), [
+    ([], (), 'the bag has none'),
+    ([('/coil/command', 0, 1)], (), 'no topic is sent, as said above; its topics are /coil/comma'),
+    ([('/a', 0, 1), ('/b', 900, 1)], ('play.topics_to_filter:=[/b]',
+                                      'play.playback_duration.nsec:=500000',
+                                      'play.playback_duration.sec:=0'),
+     '/b has none in the part that is played'),
+])
+def test_a_player_that_sends_nothing_says_why_and_fails(play, tmp_path, entries, parameters, why):
+    process = play(write_bag(tmp_path / 'bag', entries), *parameters)
+    assert process.wait() == 1, process.output
     assert '0 messages sent' in process.stdout
+    assert why in process.stderr
+
+
+@pytest.mark.parametrize(('name', 'heard'), [
+    ('chatter', '/left/chatter'), ('~/b', '/left/player/b')])
+def test_a_relative_topic_is_sent_in_the_namespace_of_the_player(
+        ros, play, tmp_path, name, heard):
+    got = ros.collect(Float64, heard)
+    path = write_bag(tmp_path / 'bag', [(name, i, i) for i in range(20)])
+    finish(ros, play(path, '__ns:=/left', f'play.wait_for_subscribers:=[{heard}]'), got, 20)
+    assert [x.data for x in got] == list(range(20))
 
 
 @pytest.mark.parametrize(('parameters', 'expected'), [

@@ -26,7 +26,7 @@ from rclpy.expand_topic_name import expand_topic_name
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.bag.sender import CLOCK_WHILE_WAITING_SECONDS, ClockOut, Excerpt, Sender
 from hmsa_ros.bag.transport import Transport
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.errors import BadInputError, BagError, HmsaError, listed
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.parameters import duration_from, duration_specs, ParameterSpec
 from hmsa_ros.nodes import endpoints
@@ -36,7 +36,7 @@ from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.selection import Filter
-from hmsa_ros.nodes.senders import create_senders, latched
+from hmsa_ros.nodes.senders import create_senders, full_name, latched, NAMED_AT_MOST
 
 _POLL_SECONDS = 0.02
 # Reliable messages that found the receiver's queue full are sent again when a heartbeat of Fast
@@ -150,7 +150,8 @@ class Player(ManagedNode):
                 values['play.exclude_regex_to_filter']),
             own_clock=self._clock_out is not None)
         self._audience = Audience(
-            self, self._senders, self._names('play.wait_for_subscribers'),
+            self, {full_name(self, name): x for name, x in self._senders.items()},
+            self._names('play.wait_for_subscribers'),
             self._names('play.wait_for_nodes'), ''.join(self._names('play.wait_for_recorder')))
         followers = self._names('play.wait_for_samples')
         if followers and self._clock_out is None:
@@ -315,7 +316,23 @@ class Player(ManagedNode):
                     + f' acknowledged every message within {limit * 1e-9:g} s; with a larger '
                     'play.wait_acked_timeout.sec they get more time')
                 break
-        print(f'hmsa player: {self._sender.count} messages sent', flush=True)
+        missing = self._reader.unreadable() if self._reader.problems else 0
+        print(f'hmsa player: {self._sender.count} messages sent'
+              + f', {missing} of the bag cannot be read' * bool(missing), flush=True)
+        if not (self._sender.count or transport.stopped):
+            self.failure = BagError(f'no message of {self._reader.path} was sent: '
+                                    + self._why_nothing())
+
+    def _why_nothing(self) -> str:
+        """Return why there was nothing to send."""
+        if not any(self._reader.counts().values()):
+            return 'the bag has none'
+        if not self._senders:
+            return ('no topic is sent, as said above; its topics are '
+                    + listed(sorted(self._reader.topics), NAMED_AT_MOST))
+        return (f'{listed(sorted(self._senders), NAMED_AT_MOST)} has none in the part that is '
+                'played; see play.start_offset, play.playback_duration and '
+                'play.topics_to_filter')
 
     # Services and parameters, in the executor's thread ---------------------------------------
 

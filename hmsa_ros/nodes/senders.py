@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from typing import Any
 
+from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 
 from hmsa_ros.bag.reader import BagReader, Topic
@@ -23,6 +24,9 @@ def create_senders(
     """
     Return a publisher for each selected topic of a bag; log omitted topics with the reason.
 
+    Topics are selected by full names. A name without a leading slash is relative to the node's
+    namespace, as for rosbag2.
+
     Raises
     ------
     BadInputError
@@ -30,7 +34,8 @@ def create_senders(
 
     """
     held = reader.topics
-    chosen = [name for name in held if selection.passes(name)]
+    full = {name: full_name(node, name) for name in held}
+    chosen = [name for name in held if selection.passes(full[name])]
     if len(chosen) > MOST_TOPICS:
         raise BadInputError(
             f'{reader.path} has {len(chosen)} topics to send: expected at most {MOST_TOPICS}; '
@@ -38,18 +43,18 @@ def create_senders(
     result: dict[str, Any] = {}
     reports = []
     for name in chosen:
-        reason = _left_out(node, selection, name, held[name], own_clock)
+        reason = _left_out(node, selection, full[name], held[name], own_clock)
         try:
             if not reason:
                 result[name] = node.create_publisher(
-                    interface_class(held[name].type), name, publisher(held[name].profiles))
+                    interface_class(held[name].type), full[name], publisher(held[name].profiles))
         except Exception as error:  # an invalid quality of service
             reason = f'it cannot be published ({" ".join(str(error).split())})'
         if reason:
             reports.append(f'topic {name} is left out: {reason}')
     if len(reports) > NAMED_AT_MOST:
         reports[NAMED_AT_MOST:] = [f'{len(reports) - NAMED_AT_MOST} more topics are left out']
-    missing = [x for x in selection.topics if x not in held]
+    missing = [x for x in selection.topics if x not in full.values()]
     if missing:
         reports.append(
             f'the bag has no topic {", ".join(missing)}; it has '
@@ -57,6 +62,14 @@ def create_senders(
     for sentence in reports:
         node.get_logger().warning(printable(sentence))
     return result
+
+
+def full_name(node: Node, name: str) -> str:
+    """Return the full name of a topic of a bag, or the name itself if it is invalid."""
+    relative = name.removeprefix('~/')
+    if name.startswith('/') or not is_full_name(f'/{relative}'):
+        return name
+    return str(expand_topic_name(name, node.get_name(), node.get_namespace()))
 
 
 def _left_out(
