@@ -23,6 +23,9 @@ def hold_against_rosbags(folder):
         if reader.metadata is not None and reader.metadata.version < 4:
             # rosbags matches topics by their profiles, which such metadata lack.
             continue
+        if reader.metadata is not None and not reader.metadata.storage:
+            # rosbags refuses it.
+            continue
         if any(x.encoding != 'cdr' for x in reader.topics.values()):
             # rosbags refuses them.
             continue

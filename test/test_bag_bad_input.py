@@ -266,7 +266,7 @@ def test_damage_outside_the_chunks_is_got_around_by_the_index(tmp_path):
 def test_a_file_that_is_no_mcap_is_named(tmp_path, capsys):
     for content, expected in (
             (b'', 'is empty: expected an MCAP file'),
-            (b'#ROSBAG V2.0\n', 'is not an MCAP file'),
+            (b'{"a": 1}', 'is not an MCAP file, as it begins with'),
             (MAGIC[:4], 'was cut off after 4 bytes')):
         path = tmp_path / 'file.mcap'
         path.write_bytes(content)
@@ -279,13 +279,55 @@ def test_a_file_that_is_no_mcap_is_named(tmp_path, capsys):
 
 def test_what_is_not_there_is_said(tmp_path, capsys):
     (tmp_path / 'empty').mkdir()
-    (tmp_path / 'old').mkdir()
-    (tmp_path / 'old' / 'old_0.db3').write_bytes(b'')
     for name, expected in (
-            ('none', 'does not exist'), ('empty', 'holds no .mcap file'),
-            ('old', 'holds an SQLite bag')):
+            ('none', 'does not exist'), ('empty', 'holds no .mcap file')):
         assert main(['bag', 'info', str(tmp_path / name)]) == 2
         assert expected in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('in_folder', [True, False])
+@pytest.mark.parametrize(('name', 'content', 'advice'), [
+    ('a.db3', b'', '"ros2 bag convert"'),
+    ('a.db3', b'SQLite format 3\0 ...', 'is an SQLite bag: expected MCAP; convert it with "ros2'),
+    ('a.mcap.zstd', zstandard.compress(MAGIC), 'decompress it with "zstd -d FILE"'),
+    ('a.bag', b'#ROSBAG V2.0\n', 'is a bag of ROS 1: expected MCAP; convert it with "rosbags-con'),
+    ('a.mcap', b'version https://git-lfs.github.com/spec/v1\n', 'the file with "git lfs pull"'),
+])
+def test_a_bag_of_another_format_is_refused_with_a_way_on(
+        tmp_path, capsys, name, content, advice, in_folder):
+    (tmp_path / 'bag').mkdir()
+    path = tmp_path / 'bag' / name
+    path.write_bytes(content)
+    assert main(['bag', 'info', str(path.parent if in_folder else path)]) == 2
+    assert advice in capsys.readouterr().err
+
+
+def test_a_bag_that_rosbag2_has_indexed_again_is_read(tmp_path):
+    write_bag(tmp_path / 'bag')
+    path = tmp_path / 'bag' / 'metadata.yaml'
+    path.write_text(path.read_text().replace('storage_identifier: mcap', "storage_identifier: ''"))
+    reader = BagReader(tmp_path / 'bag')
+    assert reader.metadata.storage == ''
+    assert len(list(reader.messages())) == 400
+    assert not reader.problems
+
+
+def test_empty_definitions_are_those_of_the_installed_types(tmp_path):
+    with BagWriter(tmp_path / 'bag') as writer:
+        for i, (kind, hash_of) in enumerate((
+                (FLOAT, type_hash(FLOAT)), (FLOAT, 'RIHS01_' + '0' * 64), ('x/msg/Y', ''))):
+            number = writer.add_topic(Topic(f'/t{i}', kind, '', 'ros2msg', (), hash_of))
+            writer.write([(number, i, i, i, payload(i))])
+    reader = BagReader(tmp_path / 'bag')
+    read, = read_messages(tmp_path / 'bag', ['/t0'])
+    assert read.message.data == 0.0
+    assert reader.topics['/t0'].definition == message_definition(FLOAT)[1]
+    for i, reason in ((1, 'is not the recorded one, as their hashes differ'),
+                      (2, 'no definition of message type x/msg/Y')):
+        assert any(f'/t{i} has no message definition' in x and reason in x
+                   for x in reader.problems)
+        with pytest.raises(BagError, match='no message definition'):
+            reader.decoder(f'/t{i}')
 
 
 def test_a_missing_or_wrong_metadata_file_does_not_hide_the_messages(tmp_path):

@@ -7,6 +7,7 @@ need ROS. Definitions are read from the ``share`` folders of the environment, wi
 
 from collections.abc import Callable
 import contextlib
+from dataclasses import replace
 from functools import cache
 import io
 import json
@@ -27,6 +28,8 @@ _BUILTIN = frozenset((
     'bool', 'byte', 'char', 'float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32',
     'uint32', 'int64', 'uint64', 'string', 'wstring'))
 _FIELD = re.compile(r'^([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]\w*')
+#: The one usual type whose definition is empty.
+EMPTY = 'std_msgs/msg/Empty'
 _SEPARATOR = '\n' + '=' * 80 + '\nMSG: '
 
 
@@ -110,10 +113,27 @@ def type_hash(type_name: str) -> str:
 _NESTED = re.compile(r'^\s*(?:[A-Z]\w*|\w+/[\w/]+)\s*\[', re.MULTILINE)
 
 
+def installed(topic: 'Topic') -> 'Topic':
+    """
+    Return a topic without a definition with that of its installed type.
+
+    Raise `BagError` if the type is not installed, or is another one than that recorded.
+    """
+    encoding, definition = message_definition(topic.type)
+    found = type_hash(topic.type)
+    if topic.type_hash and found and topic.type_hash != found:
+        raise BagError(
+            f'the installed {topic.type} is not the recorded one, as their hashes differ')
+    return replace(topic, definition=definition, definition_encoding=encoding)
+
+
 def make_decoder(info: 'Topic') -> Callable[[bytes], Any]:
     """Return the decoder of a topic's payloads; both raise `BagError` if they cannot decode."""
     from mcap.records import Schema
     from mcap_ros2.decoder import DecoderFactory
+    if not info.definition.strip() and info.type != EMPTY and info.encoding == 'cdr':
+        raise BagError(f'topic {info.name} ({info.type or "unknown type"}) cannot be decoded: it '
+                       'has no message definition in the bag, and its type is not installed')
     # A new factory for each topic: the library caches decoders by schema id, which differs between
     # the files of a bag.
     try:

@@ -9,6 +9,29 @@ from hmsa_ros.errors import BadInputError, BagError
 _Problem = Callable[[str], None]
 
 
+_CONVERT = 'convert it with "ros2 bag convert"'
+# Files that are often given in place of an MCAP file: how they begin, and what to do.
+_FOREIGN = (
+    (b'SQLite format 3\0', f'is an SQLite bag: expected MCAP; {_CONVERT}'),
+    (b'#ROSBAG V', 'is a bag of ROS 1: expected MCAP; convert it with "rosbags-convert --src FILE '
+     '--dst FOLDER --dst-storage mcap" (pip install rosbags)'),
+    (b'version https://git-lfs.github.com/', 'is a pointer of Git LFS in place of the file: '
+     'expected MCAP; fetch the file with "git lfs pull"'),
+    (b'\x28\xb5\x2f\xfd', 'is compressed as a whole by zstd: expected MCAP with compressed '
+     f'chunks; decompress it with "zstd -d FILE" and name the .mcap file, or {_CONVERT}'))
+
+
+def foreign(path: Path) -> str:
+    """Return what a file is in place of an MCAP file and what to do; empty if it may be one."""
+    if not path.is_file():
+        return ''
+    with path.open('rb') as file:
+        begin = file.read(max(len(magic) for magic, _ in _FOREIGN))
+    if path.suffix == '.db3' and not begin:
+        begin = _FOREIGN[0][0]
+    return next((advice for magic, advice in _FOREIGN if begin.startswith(magic)), '')
+
+
 def find(path: Path, problem: _Problem) -> tuple[list[Path], metadata.BagMetadata | None]:
     """
     Return the files of a bag (a folder or one file) in order, and its metadata.
@@ -45,10 +68,9 @@ def find(path: Path, problem: _Problem) -> tuple[list[Path], metadata.BagMetadat
                         'name: skipped')
         return listed, stored
     if not present:
-        if others := [x.name for x in entries if x.suffix == '.db3']:
-            raise BadInputError(
-                f'{path} holds an SQLite bag ({others[0]}): expected MCAP; convert it with '
-                '"ros2 bag convert"')
+        for entry in entries:
+            if advice := foreign(entry):
+                raise BadInputError(f'{entry} {advice}')
         inside = sorted(x.parent for x in path.glob('*/*.mcap'))
         links = [x for x in entries if x.suffix == '.mcap' and x.is_file()]
         raise BadInputError(f'{path} holds no .mcap file: expected a bag' + (
@@ -86,14 +108,14 @@ def _metadata(folder: Path, problem: _Problem) -> metadata.BagMetadata | None:
     except BagError as error:
         problem(f'{error}; the files themselves are read')
         return None
-    if stored.storage != 'mcap':
+    # "ros2 bag reindex" leaves no storage.
+    if stored.storage not in ('', 'mcap'):
         raise BadInputError(
-            f'{folder} is stored as {stored.storage!r}: expected mcap; convert it with '
-            '"ros2 bag convert"')
+            f'{folder} is stored as {stored.storage!r}: expected mcap; {_CONVERT}')
     if stored.compression_mode.upper() not in ('', 'NONE'):
         raise BadInputError(
             f'{folder} is compressed by rosbag2 in mode {stored.compression_mode}: expected MCAP '
-            'with compressed chunks; convert it with "ros2 bag convert"')
+            f'with compressed chunks; {_CONVERT}')
     return stored
 
 

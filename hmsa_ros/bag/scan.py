@@ -24,6 +24,7 @@ from mcap.records import (
 )
 
 from hmsa_ros.bag import limits, records
+from hmsa_ros.bag.folder import foreign
 from hmsa_ros.bag.records import Block, MAGIC, PREFIX
 from hmsa_ros.errors import BadInputError, BagError, printable
 
@@ -101,10 +102,11 @@ class ScannedFile:
                 self._size = os.fstat(self._descriptor).st_size
                 magic = stream.read(len(MAGIC))
                 if magic != MAGIC:
-                    what = 'is empty' if not magic else (
+                    what = foreign(path) or ('is empty' if not magic else (
                         f'was cut off after {self._size} bytes' if MAGIC.startswith(magic) else
                         f'is not an MCAP file, as it begins with {magic!r}')
-                    raise BadInputError(f'{path} {what}: expected an MCAP file')
+                        ) + ': expected an MCAP file'
+                    raise BadInputError(f'{path} {what}')
                 if not self._read_summary():
                     self._clear()
                     self._walk()

@@ -6,6 +6,7 @@ from dataclasses import replace
 from mcap.records import Schema
 
 from hmsa_ros.bag import limits, qos
+from hmsa_ros.bag.definitions import EMPTY, installed
 from hmsa_ros.bag.metadata import Topic
 from hmsa_ros.bag.scan import ScannedFile
 from hmsa_ros.errors import BagError
@@ -31,8 +32,6 @@ def topics_of(
                 continue
             schema, stored = file.schemas.get(channel.schema_id), described.get(name)
             if schema is None:
-                problem(f'{file.path.name}: topic {name} has no message definition: its messages '
-                        'can be sent again but not decoded')
                 schema = Schema(
                     id=0, name='' if stored is None else stored.type, encoding='', data=b'')
             if known is not None and known.type != schema.name:
@@ -46,14 +45,27 @@ def topics_of(
             for more in () if stored is None else stored.profiles, later:
                 profiles += tuple(x for x in more if x not in profiles)
             if known is None:
-                topics[name] = Topic(
+                topic = topics[name] = Topic(
                     name, schema.name, schema.data.decode('utf-8', 'replace'), schema.encoding,
                     profiles, channel.metadata.get('topic_type_hash', ''),
                     channel.message_encoding)
+                if not schema.data.strip() and topic.type != EMPTY and (
+                        schema.encoding in ('', 'ros2msg')):
+                    topics[name] = _defined(topic, file.path.name, problem)
             elif len(profiles) > len(known.profiles):
                 # A later file may contain more publishers.
                 topics[name] = replace(known, profiles=profiles)
     return topics
+
+
+def _defined(topic: Topic, file: str, problem: Callable[[str], None]) -> Topic:
+    """Return a topic without a definition with that of the installed type, if there is one."""
+    try:
+        return installed(topic)
+    except BagError as error:
+        problem(f'{file}: topic {topic.name} has no message definition: its messages can be sent '
+                f'again but not decoded ({error})')
+        return topic
 
 
 def _profiles(text: str, where: str, problem: Callable[[str], None]) -> tuple[qos.Qos, ...]:
