@@ -60,8 +60,8 @@ class Recorder:
     def call(self, name):
         return self.ros.call(Trigger, f'recorder/{name}')
 
-    def end(self, number=signal.SIGINT, *, status=0):
-        assert self.process.stop(number) == status, self.process.output
+    def end(self, number=signal.SIGINT):
+        assert self.process.stop(number) == 0, self.process.output
         assert 'Traceback' not in self.process.output
         return BagReader(self.folder)
 
@@ -132,7 +132,7 @@ def test_lost_messages_are_counted_to_the_last_one(record, ros):
     recorder.process.popen.send_signal(signal.SIGCONT)
     ros.spin_until(lambda: int(recorder.says('received')) + int(recorder.says('lost')) == 1001,
                    'all 1001 messages to be received or counted as lost')
-    reader = recorder.end(status=1)
+    reader = recorder.end()
     got = values(reader)
     lost = missing_messages(reader.custom_data, 'lost')['/a']
     assert got[0] == -1.0

@@ -56,8 +56,6 @@ from hmsa_ros.report.outcome import level_results
 from hmsa_ros.report.page import page
 from hmsa_ros.report.picture import draw
 
-# The bag says that its recorder lost two commands.
-pytestmark = pytest.mark.filterwarnings('ignore::hmsa_ros.MissingWarning')
 rosbag2, typesys = needs('rosbags.rosbag2'), needs('rosbags.typesys')
 STORE = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
 ACTUATOR = paper_actuator()
