@@ -300,7 +300,7 @@ def test_late_commands_a_slow_coil_creep_and_the_watchdog_come_out_again(start, 
         'plant', '--ros-args', '-p', 'mismatch.density:=1.1', '-p', 'coil_time_constant:=0.002',
         '-p', 'viscoelastic.ratio:=[0.1, 0.2]', '-p', 'viscoelastic.time:=[0.005, 0.05]',
         '-p', 'slew_limit:=20.0', '-p', 'command_timeout:=0.1', '-p', 'safe_flux:=ramp', '-p',
-        'safe_ramp_rate:=0.1')
+        'safe_ramp_rate:=0.1', '-p', 'lateness_limit:=100.0')
     recorder = start.hmsa(
         'recorder', '--ros-args', '-p', f'storage.uri:={bag}', '-p',
         'record.topics:=[joint_states, flux_density_command, flux_density_applied]')
