@@ -219,6 +219,7 @@ def test_a_table_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch
 
 
 def test_a_sweep_that_is_ended_leaves_its_chunks_and_one_into_a_full_device_says_so(tmp_path):
+    needs('pyarrow')
     words = [
         sys.executable, '-m', 'hmsa_ros', 'sweep', '--zeta', '0:2:3000', '--j-lim', '1:9:3000']
     process = subprocess.Popen([*words, '--out', 'sweep.csv'], cwd=tmp_path)
@@ -344,6 +345,7 @@ def test_sweep_ends_quietly_when_its_reader_has_gone():
 
 
 def test_robustness_with_feedback_compares_open_loop_with_corrections(run, monkeypatch):
+    needs('pyarrow')
     monkeypatch.setattr(matrix, 'ERRORS', ((-0.2, 0.2),))
     monkeypatch.setattr(matrix.Matrix.__init__, '__defaults__', (
         SCENARIOS[1:2], STRATEGIES[1::5]))

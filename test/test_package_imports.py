@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 
+from extras import needs
 import pytest
 
 from hmsa_ros.cli.node import NODES
@@ -109,6 +110,7 @@ def test_nodes_do_not_import_without_ros_so_the_blocking_works():
 
 
 def test_commands_that_need_ros_say_how_to_get_it_where_there_is_none(tmp_path):
+    needs('tornado')
     commands = [
         *([x] for x in NODES),
         ['demo'], ['run', '1.1:0.1'], ['run', '1.1:0.1', '--simulate'], ['send', '1.1:0.1'],

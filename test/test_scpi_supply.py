@@ -3,6 +3,7 @@
 import socket
 from threading import Thread
 
+from extras import needs
 import pytest
 
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
@@ -40,6 +41,7 @@ def tcp():
 
 
 def test_a_supply_sets_currents_that_its_driver_confirms_and_is_off_in_the_end(tcp):
+    needs('serial')
     simulated, port, faults = tcp
     simulated.on, simulated.current = True, 3.0
     hardware = ScpiSupply('a', port, **{'coil.tesla_per_ampere': 0.05})
@@ -74,6 +76,7 @@ def test_a_supply_that_was_switched_off_is_put_on_again_without_a_current():
 
 
 def test_what_a_supply_refuses_or_does_not_understand_is_said(tcp, monkeypatch):
+    needs('serial')
     simulated, port, faults = tcp
     supply = Supply(port)
     with pytest.raises(SupplyError, match='refuses CURR 11 .error -222 "Data out of range"'):

@@ -13,6 +13,7 @@ from time import monotonic, time_ns
 import tty
 
 from conftest import wait_until
+from extras import needs
 import numpy as np
 import pytest
 
@@ -74,6 +75,7 @@ def test_a_board_keeps_no_more_than_it_has_room_for_and_tells_what_it_still_has(
 
 
 def test_a_board_tells_the_temperature_of_its_coil_if_it_measures_one(line):
+    needs('serial')
     board = _board.make(1000, 1)
     ask(board, '1 0 H 7 1000000')
     # As firmware from before answers what it does not know.
@@ -185,6 +187,7 @@ def line(tmp_path, monkeypatch):
 
 
 def test_lost_bytes_and_garbage_cost_attempts_and_nothing_else(line):
+    needs('serial')
     board = Board(str(line.path), watchdog=60.0)
     line.loss, line.garbage = 0.001, 0.1
     begin = board.clock() + 1500 * MS
@@ -223,6 +226,7 @@ def reached(device, level):
 
 
 def test_a_board_that_restarts_is_noticed_and_obeys_by_its_new_clock(line):
+    needs('serial')
     device = driver(line, watchdog=5.0)
     device.receive(0, time_ns() + 50 * MS, 0.1)
     go_on(device, reached(device, 0.1), 'the level')
@@ -240,6 +244,7 @@ def test_a_board_that_restarts_is_noticed_and_obeys_by_its_new_clock(line):
 
 
 def test_a_board_whose_cable_is_pulled_switches_off_and_is_found_again(line):
+    needs('serial')
     device = driver(line, watchdog=1.0)
     device.receive(0, 0, 0.1)
     go_on(device, reached(device, 0.1), 'the level')
@@ -300,6 +305,7 @@ def test_a_driver_goes_on_after_a_pulled_cable_when_it_is_asked_to(start, ros, l
 
 
 def test_a_board_without_room_and_one_that_is_none_are_said(line, monkeypatch):
+    needs('serial')
     board = Board(str(line.path))
     monkeypatch.setattr(serial_board, '_PATIENCE', 0.4)
     with pytest.raises(BoardError, match='is full, 0.4 s after it was asked S'):
@@ -324,6 +330,7 @@ def test_a_board_without_room_and_one_that_is_none_are_said(line, monkeypatch):
     (['coil.tesla_per_ampere=1', 'port=sim', 'watchdog=-1'], 'watchdog is -1'),
 ])
 def test_a_board_that_cannot_be_had_is_refused_in_a_sentence(capsys, settings, expected):
+    needs('serial')
     given = [x for setting in settings for x in ('--set', setting)]
     assert main(['check-driver', 'serial_board', *given]) == 2
     assert expected in capsys.readouterr().err

@@ -328,6 +328,7 @@ def test_a_folder_gets_the_map_of_its_table_and_other_pictures_are_named(run, tm
 
 
 def test_no_number_of_a_contour_is_cut_off_at_the_edge_of_a_map(run, monkeypatch):
+    needs('pyarrow')
     drawn, label = [], Axes.clabel
     monkeypatch.setattr(Axes, 'clabel', lambda *x, **y: drawn.extend(label(*x, **y)) or drawn)
     assert run('sweep', '--zeta', '0:3:7', '--j-lim', 'log:0.1:100:6', '--out', 'map',
