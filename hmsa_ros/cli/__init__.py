@@ -133,8 +133,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return ENDING.status
     except BrokenPipeError:
-        # The reader of the output (head, less) has ended, so nothing can be reported.
-        sys.stderr.close()
+        # The reader of the output (head, less) has ended, so nothing can be reported, and Python
+        # would fail at its end to write what is left.
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(nowhere, stream.fileno())
         return 0
     except OSError as error:
         if error.filename is not None:
