@@ -7,16 +7,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.equations import natural_frequency
-from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.drafting import finish
-from hmsa_ros.planning.group import PlannerGroup, Progress
-from hmsa_ros.planning.history import Deviation
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa.errors import BadInputError
+from hmsa.model.creep import Creep
+from hmsa.model.equations import natural_frequency
+from hmsa.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.drafting import finish
+from hmsa.planning.group import PlannerGroup, Progress
+from hmsa.planning.history import Deviation
+from hmsa.planning.planner import Options, Planner
 
 MS = 1_000_000
 LEAD = 50 * MS

@@ -7,10 +7,10 @@ from bench_oracle import Bench, MS, paper, Plant
 import numpy as np
 import pytest
 
-from hmsa_ros.control import joint
+from hmsa.planning.drafting import finish
 from hmsa_ros.estimation import estimator, window
 from hmsa_ros.estimation.motion import follow
-from hmsa_ros.planning.drafting import finish
+from hmsa_ros.runtime import joint
 
 MOVES = (1.4, 1.1, 1.4, 1.1, 1.4)
 

@@ -11,9 +11,9 @@ from bench_oracle import Bench, Plant
 import numpy as np
 import pytest
 
-from hmsa_ros.control.offload import goes_on, here, Offload
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.planning.drafting import finish
+from hmsa.model.parameters import paper_actuator
+from hmsa.offload import goes_on, here, Offload
+from hmsa.planning.drafting import finish
 
 MS = 1_000_000
 
@@ -35,7 +35,7 @@ def ends(parent):
 @pytest.fixture
 def offload():
     told = []
-    found = Offload(told.append)
+    found = Offload(told.append, 'hmsa_ros.runtime.feedback')
     found.told = told
     yield found
     found.close()
@@ -71,7 +71,7 @@ def test_a_process_that_ends_is_done_without_and_said_once(offload):
 def test_a_process_that_does_not_answer_is_done_without(offload, monkeypatch):
     _, process = finish(offload(whose, 1))
     os.kill(process, signal.SIGSTOP)
-    monkeypatch.setattr('hmsa_ros.control.offload._PATIENCE', 0)
+    monkeypatch.setattr('hmsa.offload._PATIENCE', 0)
     assert finish(offload(whose, 2)) == (2, os.getpid())
     assert 'does not answer' in offload.told[0]
 
@@ -80,10 +80,10 @@ def test_it_ends_with_the_planner_however_that_ends_and_not_by_ctrl_c(tmp_path):
     script = tmp_path / 'planner.py'
     script.write_text(
         'import time\n'
-        'from hmsa_ros.control.offload import Offload\n'
-        'from hmsa_ros.planning.drafting import finish\n'
+        'from hmsa.offload import Offload\n'
+        'from hmsa.planning.drafting import finish\n'
         'from test_offload import whose\n'
-        'offload = Offload(print)\n'
+        'offload = Offload(print, "os")\n'
         'print(finish(offload(whose, 1))[1], flush=True)\n'
         'time.sleep(600)\n')
     with subprocess.Popen(

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
 
-from hmsa_ros import Actuator
-from hmsa_ros.cli import main
-from hmsa_ros.control.environment import Environment
-from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.records import Settings, Severity, Trajectory
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.drafting import finish
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa import Actuator
+from hmsa.cli import main
+from hmsa.model.creep import Creep
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.drafting import finish
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
+from hmsa_ros.runtime.environment import Environment
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import Settings, Severity, Trajectory
 
 SECOND = 1_000_000_000
 # The paper's block: units of time (s) and load (T), damping, shape and chain limit.

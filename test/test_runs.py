@@ -10,23 +10,23 @@ from beam_oracle import silicone
 import numpy as np
 import pytest
 
-from hmsa_ros.bag.info import BagSummary
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import json_text, replacing, write_text
-from hmsa_ros.interfaces.actuator import parameters_of
-from hmsa_ros.interfaces.parameters import number_of
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
-from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.recordings import bags
-from hmsa_ros.recordings.levels import lateness_of, Level
-from hmsa_ros.recordings.parameters import actuators, read_parameter_file, recorded, values_of
-from hmsa_ros.recordings.record import Run
-from hmsa_ros.recordings.tables import levels_of, samples_of, write_table
-from hmsa_ros.recordings.topics import APPLIED, COMMAND
-from hmsa_ros.recordings.verify import verify_run
+from hmsa.bag.info import BagSummary
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.files import json_text, replacing, write_text
+from hmsa.interfaces.actuator import parameters_of
+from hmsa.interfaces.parameters import number_of
+from hmsa.model.creep import Creep
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
+from hmsa.model.units import NANOSECONDS
+from hmsa.runs import bags
+from hmsa.runs.levels import lateness_of, Level
+from hmsa.runs.parameters import actuators, read_parameter_file, recorded, values_of
+from hmsa.runs.record import Run
+from hmsa.runs.tables import levels_of, samples_of, write_table
+from hmsa.runs.topics import APPLIED, COMMAND
+from hmsa.runs.verify import verify_run
 
 BEGIN = NANOSECONDS
 STEP = 1_000_000
@@ -169,7 +169,7 @@ def test_a_table_has_the_samples_in_full_precision_and_the_levels_at_their_times
 def test_parameter_files_that_are_none_are_refused_in_a_sentence(tmp_path, text):
     file = tmp_path / 'bad.yaml'
     file.write_text(text)
-    from hmsa_ros.interfaces.parameters import ACTUATOR
+    from hmsa.interfaces.parameters import ACTUATOR
     with pytest.raises(BadInputError, match='expected'):
         values_of(read_parameter_file(file), 'plant', ACTUATOR)
 

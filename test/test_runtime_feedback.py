@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 from test_runtime_watch import Loop, MS, START
 
-from hmsa_ros.control.records import (
+from hmsa.errors import BadInputError
+from hmsa.identification.files import read_belief
+from hmsa.identification.known import Known
+from hmsa.model.creep import Creep
+from hmsa.model.parameters import paper_actuator
+from hmsa.planning.planner import Options
+from hmsa.planning.timeline import Model
+from hmsa_ros.estimation import Estimator
+from hmsa_ros.runtime.records import (
     EstimateChanged,
     Send,
     Settings,
@@ -17,14 +25,6 @@ from hmsa_ros.control.records import (
     StatusChanged,
     Target,
 )
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.estimation import Estimator
-from hmsa_ros.identification.files import read_belief
-from hmsa_ros.identification.known import Known
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.planning.planner import Options
-from hmsa_ros.planning.timeline import Model
 from hmsa_studies.scenario import SCENARIOS
 
 

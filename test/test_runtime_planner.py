@@ -5,9 +5,16 @@ import math
 
 import pytest
 
-from hmsa_ros.control.environment import Environment
-from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.records import (
+from hmsa.errors import HmsaError
+from hmsa.model.equations import natural_frequency
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
+from hmsa_ros.runtime.environment import Environment
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import (
     Note,
     PlanChanged,
     Send,
@@ -18,13 +25,6 @@ from hmsa_ros.control.records import (
     Target,
     Trajectory,
 )
-from hmsa_ros.errors import HmsaError
-from hmsa_ros.model.equations import natural_frequency
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options, Planner
 
 MS = 1_000_000
 START = 1000 * MS

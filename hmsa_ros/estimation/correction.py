@@ -15,11 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hmsa.model.equations import Array
+from hmsa.model.laws.coordinate import coordinate_of
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.estimation.estimator import Estimate
 from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
-from hmsa_ros.model.equations import Array
-from hmsa_ros.model.laws.coordinate import coordinate_of
-from hmsa_ros.model.units import NANOSECONDS
 
 #: Expected error, as a fraction of the step, above which a move is given more time.
 TOLERANCE = 5e-3

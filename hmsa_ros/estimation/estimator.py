@@ -9,14 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
-from hmsa_ros.estimation.prior import Prior
-from hmsa_ros.estimation.screening import Screening
-from hmsa_ros.estimation.suspects import Suspects
-from hmsa_ros.estimation.window import Doubt, Rest, Solution, Trial, Window
-from hmsa_ros.identification.fit import robust_scale
-from hmsa_ros.identification.quantities import (
+from hmsa.errors import BadInputError
+from hmsa.identification.fit import robust_scale
+from hmsa.identification.quantities import (
     actuator_of,
     BRANCHES,
     complete,
@@ -25,12 +20,17 @@ from hmsa_ros.identification.quantities import (
     QUANTITIES,
     values_at,
 )
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.equations import Array
-from hmsa_ros.model.parameters import ActuatorParameters
-from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.planning.timeline import ESTIMATED, Model
-from hmsa_ros.planning.timeline import Options as PlannerOptions
+from hmsa.model.creep import Creep
+from hmsa.model.equations import Array
+from hmsa.model.parameters import ActuatorParameters
+from hmsa.model.units import NANOSECONDS
+from hmsa.planning.timeline import ESTIMATED, Model
+from hmsa.planning.timeline import Options as PlannerOptions
+from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
+from hmsa_ros.estimation.prior import Prior
+from hmsa_ros.estimation.screening import Screening
+from hmsa_ros.estimation.suspects import Suspects
+from hmsa_ros.estimation.window import Doubt, Rest, Solution, Trial, Window
 
 # Initial noise, before it is estimated, and minimum noise.
 _FIRST_NOISE, _LEAST_NOISE = 1e-3, 2e-6

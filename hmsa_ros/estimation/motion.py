@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from hmsa_ros.identification.recording import pieces
-from hmsa_ros.identification.response import Setup
-from hmsa_ros.model.delivery import late
-from hmsa_ros.model.equations import Array
-from hmsa_ros.model.law import elastic_force, natural_frequency
-from hmsa_ros.motion import respond
-from hmsa_ros.motion import rest as motion_rest
-from hmsa_ros.motion import theta as places
+from hmsa.identification.recording import pieces
+from hmsa.identification.response import Setup
+from hmsa.model.delivery import late
+from hmsa.model.equations import Array
+from hmsa.model.law import elastic_force, natural_frequency
+from hmsa.motion import respond
+from hmsa.motion import rest as motion_rest
+from hmsa.motion import theta as places
 
 # Relative tolerance: far below the noise of a sensor.
 _RTOL = 1e-7

@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.known import Known
-from hmsa_ros.identification.quantities import (
+from hmsa.errors import BadInputError
+from hmsa.identification.known import Known
+from hmsa.identification.quantities import (
     check_free,
     complete,
     derivative,
     QUANTITIES,
     values_of,
 )
-from hmsa_ros.model.equations import Array
-from hmsa_ros.model.laws.coordinate import Coordinate, coordinate_of
-from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa.model.equations import Array
+from hmsa.model.laws.coordinate import Coordinate, coordinate_of
+from hmsa.model.parameters import ActuatorParameters
 
 #: Default standard deviations: of the logarithm for parameters that are estimated by it, else of
 #: the value, with the force as a load, and latency and lag in time scales. Those of damping and

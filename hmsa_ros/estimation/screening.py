@@ -6,8 +6,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa_ros.model.equations import Array
-from hmsa_ros.model.laws.coordinate import Coordinate
+from hmsa.model.equations import Array
+from hmsa.model.laws.coordinate import Coordinate
 
 # Number of rejected samples in a row that are no outliers: sensor or actuator has changed.
 _LOST = 6

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa_ros.model.equations import Array
+from hmsa.model.equations import Array
 
 # Prior improbability of a suspect that is not named, as a logarithm, and the gain of log evidence
 # above which the set of estimated suspects changes.

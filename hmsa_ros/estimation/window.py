@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hmsa.identification.fit import loss, weights_of
+from hmsa.identification.quantities import complete, QUANTITIES, values_at
+from hmsa.identification.response import sensed
+from hmsa.model.equations import Array
+from hmsa.model.laws.coordinate import coordinate_of
 from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
 from hmsa_ros.estimation.suspects import GAIN, inverse, Look, optimum, Others, Suspects
-from hmsa_ros.identification.fit import loss, weights_of
-from hmsa_ros.identification.quantities import complete, QUANTITIES, values_at
-from hmsa_ros.identification.response import sensed
-from hmsa_ros.model.equations import Array
-from hmsa_ros.model.laws.coordinate import coordinate_of
 
 # Maximum Gauss-Newton iterations, halvings of each step, and small step in standard deviations.
 _PASSES, _HALVINGS, _SMALL = 4, 4, 0.1
