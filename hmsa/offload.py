@@ -34,6 +34,16 @@ def here(work: Callable[..., T], *arguments: object) -> Awaited[T]:
     return work(*arguments)
 
 
+def finish(work: Awaited[T]) -> T:
+    """Wait for the result of work."""
+    while True:
+        try:
+            next(work)
+        except StopIteration as end:
+            result: T = end.value
+            return result
+
+
 def goes_on(work: Iterator[None]) -> bool:
     """Continue work; return whether its result is still pending."""
     return next(work, work) is not work

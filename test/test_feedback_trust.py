@@ -7,7 +7,6 @@ from bench_oracle import Bench, MS, paper, Plant
 import numpy as np
 import pytest
 
-from hmsa.planning.drafting import finish
 from hmsa_ros.estimation import estimator, window
 from hmsa_ros.estimation.motion import follow
 from hmsa_ros.runtime import joint
@@ -153,8 +152,8 @@ def test_a_move_from_a_learnt_level_leaves_no_more_than_open_loop_once_it_is_for
         if mode == 'adapt':
             it.runtime.feedback.reset()
         # A first point that repeats the setpoint is accepted as before.
-        assert finish(it.planner.draft_request(
-            [(MOVES[0], 0), (MOVES[1], 400 * MS)], None, it.now)) is not None
+        assert it.planner.draft_request(
+            [(MOVES[0], 0), (MOVES[1], 400 * MS)], None, it.now) is not None
         left[mode] = moves(it, MOVES[1:2])[0]
     assert left['adapt'][0] < left['off'][0] + 0.5
 

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from hmsa.model.parameters import paper_actuator
-from hmsa.offload import goes_on, here, Offload
-from hmsa.planning.drafting import finish
+from hmsa.offload import finish, goes_on, here, Offload
 
 MS = 1_000_000
 
@@ -81,7 +80,7 @@ def test_it_ends_with_the_planner_however_that_ends_and_not_by_ctrl_c(tmp_path):
     script.write_text(
         'import time\n'
         'from hmsa.offload import Offload\n'
-        'from hmsa.planning.drafting import finish\n'
+        'from hmsa.offload import finish\n'
         'from test_offload import whose\n'
         'offload = Offload(print, "os")\n'
         'print(finish(offload(whose, 1))[1], flush=True)\n'

@@ -21,7 +21,6 @@ from hmsa.errors import HmsaError
 from hmsa.identification.files import errors_from
 from hmsa.interfaces import topics
 from hmsa.model.parameters import paper_actuator
-from hmsa.planning.drafting import finish
 from hmsa.planning.planner import Options, Planner
 from hmsa.planning.shapers.pace import Pace
 from hmsa.planning.timeline import PlannedLevel
@@ -291,7 +290,7 @@ def test_velocities_are_followed_in_mode_path_which_can_be_set_while_it_runs(ben
     assert [(x.successful, x.reason) for x in results] == [(True, '')]
     points = [((*x, math.nan), y) for *x, y in zip(
         stretches.tolist(), rates.tolist(), times, strict=True)]
-    planner.core.take(finish(planner.core.draft_path(points, None, planner.now)), planner.now)
+    planner.core.take(planner.core.draft_path(points, None, planner.now), planner.now)
     planner.send(message)
     planner.take()
     planner.run(START + LEAD + 150 * MS)

@@ -25,8 +25,7 @@ def planned(levels, **options):
     planner = Planner(BLOCK, Options(**{'flux_density_min': -0.5, 'flux_density_max': 0.5,
                                         **options}))
     points = [(y, round(x * SECOND)) for x, y in levels]
-    from hmsa.planning.drafting import finish
-    return planner.take(finish(planner.draft_levels(points, None, SECOND)), SECOND)
+    return planner.take(planner.draft_levels(points, None, SECOND), SECOND)
 
 
 def followed(plan, end=0.3):

@@ -31,7 +31,6 @@ from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.residual import percent, residual_vibration
 from hmsa.model.simulation import ActuatorSimulation, simulate
 from hmsa.model.units import NANOSECONDS
-from hmsa.planning.drafting import finish
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa.report.arrivals import Part, timing
@@ -150,7 +149,7 @@ def fresh(
     asked = [(end, x) for x, end in points]
     if path:
         ends, asked = [path[-1][1]], [(end, x, rate) for (x, rate, _), end in path]
-        plan = planner.take(finish(planner.draft_path(path, None, START)), START)
+        plan = planner.take(planner.draft_path(path, None, START), START)
     else:
         plan = planner.request(points, None, START)
     levels = [x for x in plan.levels if x.stamp >= 0]
@@ -1356,7 +1355,7 @@ def test_joints_that_are_moved_in_turn_keep_their_setpoints(tmp_path, late, topi
     messages = [(START - 1, '/planner/status', TYPES[STATUS], status(0, 'none', '', plan='0'))]
     for number, (joint, target) in enumerate(asked, 1):
         time = START + number * pause
-        group.take(finish(group.draft_setpoint(joint, target, time)), time)
+        group.take(group.draft_setpoint(joint, target, time), time)
         stamps, samples = group.preview(time, 100)
         plan = trajectory(stamps[0], [(x - stamps[0],) for x in stamps])
         plan.joint_names = list(joints)

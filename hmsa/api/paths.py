@@ -15,7 +15,7 @@ from hmsa.model.moves import State
 from hmsa.model.simulation import check_stretch
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
-from hmsa.planning.drafting import check_path, finish
+from hmsa.planning.drafting import check_path
 from hmsa.planning.path import along, Path
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.setpoint import Setpoint
@@ -226,6 +226,6 @@ def followed(
     if period := grid_of(period):
         frame = replace(frame, delivery=replace(
             frame.delivery, period=period / actuator.model.units.time))
-    move = finish(along(replace(frame, target=ends[1]), path, tolerance))
+    move = along(replace(frame, target=ends[1]), path, tolerance)
     return Plan(actuator, plan_sequence(
         [Setpoint(ends[1], np.inf)], frame, lambda request: move), 'path')

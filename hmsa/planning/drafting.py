@@ -1,15 +1,14 @@
 """
-Drafts: requests planned step by step, without changing the running plan.
+Drafts: requests planned without changing the running plan.
 
-Each function is a generator that pauses after a bounded amount of work and finally returns the
-draft, so that callers can do other work in between. `finish` runs one without pauses.
+Each function calls ``check`` after a bounded amount of work, which abandons the draft by raising.
 """
 
-from collections.abc import Generator, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 import math
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -27,11 +26,10 @@ from hmsa.planning.shapers.request import Request, Shaper
 from hmsa.planning.stopping import brake, holdable
 from hmsa.planning.timeline import Draft, Model, Plan, PlannedLevel, PlannedSegment
 
-T = TypeVar('T')
 #: Stretch, rate in 1/s and acceleration in 1/s^2; the acceleration is NaN if not given.
 PathPoint = tuple[float, float, float]
-#: Work that pauses regularly.
-Steps = Generator[None, None, T]
+#: Called after each bounded amount of work; raises to abandon it.
+Check = Callable[[], None]
 
 # Fractions of the hardest braking to try, in this order, if that leads to no plan.
 _BRAKE_SHARES = (0.5, 0.1, 0.02, 0.0)
@@ -46,18 +44,12 @@ _STOPPED = 1e-7
 _BACK = 0.4
 # Minimum tolerance of a corrected path, as a fraction of its range.
 _ANEW = 1e-4
-# Setpoints checked between two pauses, in about 0.1 ms; levels take longer.
+# Setpoints between two checks, in about 0.1 ms; levels take longer.
 _CHECKED = 200
 
 
-def finish(steps: Steps[T]) -> T:
-    """Run work without pauses and return its result."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            result: T = end.value
-            return result
+def proceed() -> None:
+    """Go on, as a `Check` that abandons nothing."""
 
 
 @dataclass(frozen=True)
@@ -70,16 +62,18 @@ class Outset:
     state: State
     #: Index of the first level of the plan whose prediction is no longer valid.
     stale: int | None = None
+    check: Check = field(default=proceed, compare=False)
 
 
-def check_points(points: Sequence[tuple[float, int]], rest: float) -> Steps[None]:
+def check_points(
+        points: Sequence[tuple[float, int]], rest: float, check: Check = proceed) -> None:
     """Check points (stretch, end in ns from the start); raise `RefusedError` if invalid."""
     for begin in range(0, max(len(points), 1), _CHECKED):
         part = points[begin:begin + _CHECKED]
         for stretch, _ in part:
             check_target(stretch, rest)
         check_times(part, 'point', begin, points[begin - 1][1] if begin else -1)
-        yield
+        check()
 
 
 def check_times(
@@ -106,7 +100,7 @@ def check_target(stretch: float, rest: float) -> None:
 
 def draft_sequence(
         outset: Outset, points: Sequence[tuple[float, int]], base: int,
-        now: int) -> Steps[Draft | None]:
+        now: int) -> Draft | None:
     """
     Draft checked points (stretch, end in ns) from a start in ns; None if they change nothing.
 
@@ -138,8 +132,8 @@ def draft_sequence(
             setpoints.append(Setpoint(stretch, outset.model.time(end - left)))
             left = end
         if number % _CHECKED == _CHECKED - 1:
-            yield
-    return (yield from draft_setpoints(outset, setpoints))
+            outset.check()
+    return draft_setpoints(outset, setpoints)
 
 
 def check_path(points: Sequence[tuple[PathPoint, int]], rest: float) -> None:
@@ -163,7 +157,7 @@ def check_path(points: Sequence[tuple[PathPoint, int]], rest: float) -> None:
 
 def draft_path(
         outset: Outset, points: Sequence[tuple[PathPoint, int]], base: int,
-        now: int) -> Steps[Draft]:
+        now: int) -> Draft:
     """
     Draft a checked path from a start in ns, or join it if it has begun.
 
@@ -193,13 +187,13 @@ def draft_path(
         times = np.append(0.0, times[ahead])
         rows = np.column_stack([here, rows[:, ahead]])
         path = Path.through(times, rows[0], rows[1], None if given is None else rows[2])
-    yield
-    return (yield from _along(
+    outset.check()
+    return _along(
         outset, path, float(rows[0, -1]), model.options.path_tolerance,
-        path=path.scaled(1.0 / unit)))
+        path=path.scaled(1.0 / unit))
 
 
-def draft_path_anew(outset: Outset) -> Steps[Draft]:
+def draft_path_anew(outset: Outset) -> Draft:
     """
     Draft the rest of the running path again, with a return to it within half a natural period.
 
@@ -211,7 +205,7 @@ def draft_path_anew(outset: Outset) -> Steps[Draft]:
         raise ValueError('the setpoint under way is no path')
     left = segment.path.scaled(model.units.time).since(model.time(outset.begin - segment.since))
     span = min(_BACK * 2.0 * math.pi / model.frequency(segment.stretch), float(left.breaks[-1]))
-    return replace((yield from _along(
+    return replace((_along(
         outset, left.joined(state.stretch, state.rate, span), segment.stretch,
         max(model.options.path_tolerance, _ANEW), since=segment.since, path=segment.path)),
         resumed=place)
@@ -219,25 +213,26 @@ def draft_path_anew(outset: Outset) -> Steps[Draft]:
 
 def _along(
         outset: Outset, wanted: Path, target: float, tolerance: float,
-        **known: Any) -> Steps[Draft]:
+        **known: Any) -> Draft:
     """Follow a path to rest at a target; further fields of its segment are given."""
-    move = yield from along(
-        replace(_frame(outset.model, outset.state), target=target), wanted, tolerance)
-    draft = yield from draft_moves(
+    move = along(
+        replace(_frame(outset.model, outset.state), target=target), wanted, tolerance,
+        outset.check)
+    draft = draft_moves(
         outset, [Setpoint(target, math.inf)], first=lambda request: move)
     return replace(draft, segments=(replace(draft.segments[0], **known),))
 
 
-def draft_setpoints(outset: Outset, setpoints: Sequence[Setpoint]) -> Steps[Draft | None]:
+def draft_setpoints(outset: Outset, setpoints: Sequence[Setpoint]) -> Draft | None:
     """Draft setpoints; None if the only one is the last of the plan and has begun."""
     planned = outset.plan.segments
     if len(setpoints) == 1 and planned and planned[-1].stretch == setpoints[0].stretch \
             and planned[-1].since <= outset.begin:
         return None
-    return (yield from draft_moves(outset, setpoints))
+    return draft_moves(outset, setpoints)
 
 
-def draft_stop(outset: Outset) -> Steps[Draft]:
+def draft_stop(outset: Outset) -> Draft:
     """Draft a stop: rest as near as the flux density limits allow."""
     # A two-step command with the hardest braking load as beta_p: that load up to the first turning
     # point, then the load that holds this point. If a single brake is impossible (on a command
@@ -254,19 +249,19 @@ def draft_stop(outset: Outset) -> Steps[Draft]:
             + [Level(found.duration, model.holding(found.stretch))]),
             found.duration, 'stopped')
         end = State(found.stretch, 0.0, move.levels[-1].load)
-        levels, placed = yield from _placed(model, outset.begin, Segment(
+        levels, placed = _placed(model, outset.begin, outset.check, Segment(
             Setpoint(found.stretch, math.inf), 0.0, state, end, move, end.load))
         return Draft(outset.begin, tuple(levels), (placed,))
     ways = [(0.0, 'smooth')] * smooth + [(x, 'two_step') for x in _BRAKE_SHARES]
     for share, shaper in ways:
         stretch = holdable(model, brake(model, state, share).stretch)
         try:
-            return (yield from draft_moves(outset, [Setpoint(stretch, math.inf)], shaper))
+            return draft_moves(outset, [Setpoint(stretch, math.inf)], shaper)
         except BadInputError:
-            yield
+            outset.check()
     # No command stops the motion at once: let it settle.
-    return (yield from draft_moves(
-        outset, [Setpoint(holdable(model, state.stretch), math.inf)], 'step'))
+    return draft_moves(
+        outset, [Setpoint(holdable(model, state.stretch), math.inf)], 'step')
 
 
 def _settled(model: Model, state: State) -> bool:
@@ -275,15 +270,14 @@ def _settled(model: Model, state: State) -> bool:
         state.load, model.holding(state.stretch), rel_tol=_SETTLED, abs_tol=_SETTLED)
 
 
-def later_outsets(outset: Outset) -> Iterator[int]:
-    """Yield times in ns at which to try again if no plan is possible from the first one."""
-    model = outset.model
-    period = 2.0 * math.pi / model.frequency(outset.state.stretch)
+def later_starts(model: Model, stretch: float, begin: int) -> Iterator[int]:
+    """Yield times in ns at which to try in turn; ``stretch`` is that at the first of them."""
+    period = 2.0 * math.pi / model.frequency(stretch)
     for share in _PATIENCE:
-        yield model.on_grid(outset.begin + model.ns(share * period))
+        yield model.on_grid(begin + model.ns(share * period))
 
 
-def draft_resumption(outset: Outset, arrival: int | None = None) -> Steps[Draft | None]:
+def draft_resumption(outset: Outset, arrival: int | None = None) -> Draft | None:
     """
     Draft the rest of the running plan again, up to where both agree; None if nothing is left.
 
@@ -300,13 +294,13 @@ def draft_resumption(outset: Outset, arrival: int | None = None) -> Steps[Draft 
     for index in range(begun, len(planned)):
         # A skipped setpoint leaves its time to the next one, to which the move starts at once.
         try:
-            draft = yield from draft_moves(
+            draft = draft_moves(
                 outset, _left(outset, index), first=first, index=index)
         except RefusedError as error:
             refusal = refusal or error
             if error.code is not Code.SPELL_TOO_SHORT or arrival is not None:
                 break
-            yield
+            outset.check()
             continue
         anew = replace(
             draft.segments[0], since=min(planned[index].since, draft.segments[0].since))
@@ -342,7 +336,7 @@ def _meeting(outset: Outset, state: State, following: int) -> int | None:
 
 def draft_moves(
         outset: Outset, setpoints: Iterable[Setpoint], shaper: str = '',
-        first: Shaper | None = None, index: int | None = None) -> Steps[Draft]:
+        first: Shaper | None = None, index: int | None = None) -> Draft:
     """
     Draft setpoints on the timeline; the default shaper is that of the options.
 
@@ -354,7 +348,7 @@ def draft_moves(
     for segment in segments(
             _frame(model, outset.state), setpoints, get_shaper(shaper or model.options.shaper),
             model.options.short_spell, first=first):
-        more, one = yield from _placed(model, outset.begin, segment)
+        more, one = _placed(model, outset.begin, outset.check, segment)
         levels += more
         placed.append(one)
         following = len(planned) if index is None else index + len(placed)
@@ -363,7 +357,7 @@ def draft_moves(
             levels += outset.plan.levels[place:]
             placed += planned[following:]
             break
-        yield
+        outset.check()
     return Draft(outset.begin, tuple(levels), tuple(placed))
 
 
@@ -376,8 +370,8 @@ def _frame(model: Model, state: State) -> Request:
 
 
 def _placed(
-        model: Model, begin: int,
-        segment: Segment) -> Steps[tuple[list[PlannedLevel], PlannedSegment]]:
+        model: Model, begin: int, check: Check,
+        segment: Segment) -> tuple[list[PlannedLevel], PlannedSegment]:
     """Place a planned move on the timeline, in SI units."""
     start = begin + model.ns(segment.begin)
     state = segment.start
@@ -395,7 +389,7 @@ def _placed(
         levels.append(PlannedLevel(
             start + model.ns(time), model.flux_density(level.load), state, model))
         if number % _CHECKED == _CHECKED - 1:
-            yield
+            check()
     duration = segment.move.duration
     return levels, PlannedSegment(
         segment.setpoint.stretch, start,

@@ -6,13 +6,14 @@ A single joint is a group of one, planned as by its planner alone.
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from itertools import groupby
 import math
 from typing import Any
 
 from hmsa.model.status import RefusedError
-from hmsa.planning.drafting import Steps
+from hmsa.planning.drafting import Check, proceed
 from hmsa.planning.history import Deviation
 from hmsa.planning.planner import Planner
 from hmsa.planning.timeline import Draft, Plan, PlannedSegment
@@ -23,7 +24,7 @@ _ATTEMPTS = 3
 _AT_REST = 1e-6
 # The state of the group is the first of these that any joint is in.
 _STATES = ('moving', 'waiting', 'holding', 'settling', 'at_rest', 'idle')
-# Setpoints whose arrivals are compared between two pauses.
+# Setpoints whose arrivals are compared between two checks.
 _COMPARED = 100
 
 
@@ -62,31 +63,45 @@ class PlannerGroup:
         self.simultaneous = simultaneous
         self.number = 0
         self._attempts = dict.fromkeys(self.planners, 0)
+        self.check: Check = proceed
+
+    def snapshot(self, start: Callable[[Planner], int]) -> 'PlannerGroup':
+        """Return a group with the present plans, to draft from a start in another thread."""
+        group = copy(self)
+        group.planners = {name: x.snapshot([start(x)]) for name, x in self.planners.items()}
+        return group
+
+    def checked(self, check: Check) -> 'PlannerGroup':
+        """Return a group with the same plans whose drafts call ``check``."""
+        group = copy(self)
+        group.planners = {name: x.checked(check) for name, x in self.planners.items()}
+        group.check = check
+        return group
 
     # -- requests ------------------------------------------------------------------------------
 
     def draft_request(
             self, points: Mapping[str, Sequence[tuple[Any, int]]], stamp: int | None,
-            now: int, *, raw: bool = False, path: bool = False) -> Steps[dict[str, Draft]]:
+            now: int, *, raw: bool = False, path: bool = False) -> dict[str, Draft]:
         """Draft a sequence, levels if raw, or a path; omit joints that it does not change."""
-        draft: Callable[..., Steps[Draft | None]] = (
+        draft: Callable[..., Draft | None] = (
             Planner.draft_levels if raw else Planner.draft_path if path
             else Planner.draft_request)
-        drafts = yield from self._each(
+        drafts = self._each(
             points, lambda name: draft(self.planners[name], points[name], stamp, now))
         if self.simultaneous and not (raw or path):
-            return (yield from self._together(drafts))
+            return self._together(drafts)
         return drafts
 
-    def draft_setpoint(self, name: str, stretch: float, now: int) -> Steps[dict[str, Draft]]:
+    def draft_setpoint(self, name: str, stretch: float, now: int) -> dict[str, Draft]:
         """Draft a move of one joint; see `draft_request`."""
-        return (yield from self._each(
-            [name], lambda name: self.planners[name].draft_setpoint(stretch, now)))
+        return self._each(
+            [name], lambda name: self.planners[name].draft_setpoint(stretch, now))
 
-    def draft_stop(self, now: int) -> Steps[dict[str, Draft]]:
+    def draft_stop(self, now: int) -> dict[str, Draft]:
         """Draft a stop of all joints; see `draft_request`."""
-        return (yield from self._each(
-            self.planners, lambda name: self.planners[name].draft_stop(now)))
+        return self._each(
+            self.planners, lambda name: self.planners[name].draft_stop(now))
 
     def take(self, drafts: Mapping[str, Draft], now: int) -> bool:
         """Take drafts of one request, made at the same time (ns); return whether there are any."""
@@ -95,14 +110,6 @@ class PlannerGroup:
             self._attempts[name] = 0
         self.number += bool(drafts)
         return bool(drafts)
-
-    def draft_resumption(self, name: str, now: int) -> Steps[Resumption]:
-        """Draft the rest of a joint's plan, or else a stop."""
-        planner = self.planners[name]
-        try:
-            return Resumption((yield from planner.draft_resumption(now)))
-        except RefusedError as error:
-            return Resumption((yield from planner.draft_stop(now)), str(error))
 
     def resume(self, name: str, found: Resumption, now: int) -> None:
         """Take the new plan of a joint."""
@@ -124,11 +131,11 @@ class PlannerGroup:
 
     def _each(
             self, names: Iterable[str],
-            draft: Callable[[str], Steps[Draft | None]]) -> Steps[dict[str, Draft]]:
+            draft: Callable[[str], Draft | None]) -> dict[str, Draft]:
         drafts = {}
         for name in names:
             try:
-                made = yield from draft(name)
+                made = draft(name)
             except RefusedError as error:
                 if len(self.planners) == 1:
                     raise
@@ -137,7 +144,7 @@ class PlannerGroup:
                 drafts[name] = made
         return drafts
 
-    def _together(self, drafts: dict[str, Draft]) -> Steps[dict[str, Draft]]:
+    def _together(self, drafts: dict[str, Draft]) -> dict[str, Draft]:
         """Delay moves that would arrive before the slowest one to the same setpoint."""
         delays: dict[str, list[int]] = {name: [] for name in drafts}
         for number, row in enumerate(zip(*(x.segments for x in drafts.values()), strict=True)):
@@ -148,7 +155,7 @@ class PlannerGroup:
                     if latest is not None and segment.arrival is not None
                     and _rests(draft, segment) else 0)
             if number % _COMPARED == _COMPARED - 1:
-                yield
+                self.check()
         return {name: draft.delayed(delays[name]) for name, draft in drafts.items()}
 
     # -- progress ------------------------------------------------------------------------------
@@ -199,6 +206,14 @@ class PlannerGroup:
         stamps = sorted({x for each in ahead for x in each if x >= start})[:limit]
         return stamps, {
             name: _samples(planner.plan, stamps) for name, planner in self.planners.items()}
+
+
+def resumed(planner: Planner, now: int) -> Resumption:
+    """Draft the rest of a joint's plan, or else a stop."""
+    try:
+        return Resumption(planner.draft_resumption(now))
+    except RefusedError as error:
+        return Resumption(planner.draft_stop(now), str(error))
 
 
 def _rests(draft: Draft, segment: PlannedSegment) -> bool:

@@ -9,7 +9,7 @@ if the field lags). They are as long as the tolerance allows. The last ones are 
 exactly at rest.
 """
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 import math
@@ -150,9 +150,13 @@ def _quintic(spans: Array, x: Array, v: Array, a: Array) -> Array:
     return found
 
 
-def along(request: Request, path: Path, tolerance: float) -> Generator[None, None, Move]:
+def along(
+        request: Request, path: Path, tolerance: float,
+        check: Callable[[], None] = lambda: None) -> Move:
     """
-    Follow a path to rest at its end, the target of the request; pause after a few ms of work each.
+    Follow a path to rest at its end, the target of the request.
+
+    ``check`` is called every few ms of work, and abandons it by raising.
 
     The tolerance is the deviation that levels may leave, as a fraction of the range of the path;
     if the maximum is larger, the reason of the move reports it. Raise `RefusedError` if the path
@@ -162,7 +166,7 @@ def along(request: Request, path: Path, tolerance: float) -> Generator[None, Non
     follower = _Follower(request, path, tolerance)
     while follower.done < len(follower.edges) - 1:
         follower.advance()
-        yield
+        check()
     return follower.move()
 
 

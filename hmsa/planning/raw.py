@@ -12,7 +12,7 @@ import math
 from hmsa.model.equations import equilibrium_stretch, stretch_limits
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
-from hmsa.planning.drafting import check_times, draft_moves, Outset, Steps
+from hmsa.planning.drafting import check_times, draft_moves, Outset
 from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.timeline import Draft, Model, PlannedLevel, PlannedSegment
 
@@ -44,7 +44,7 @@ def check_levels(points: Sequence[tuple[float, int]], model: Model) -> None:
     check_times(points, 'level')
 
 
-def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Steps[Draft]:
+def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Draft:
     """
     Draft checked levels (T, ns); their one setpoint is the equilibrium stretch of the last one.
 
@@ -66,7 +66,7 @@ def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Steps[D
             state = model.follow(
                 state, before.load, model.time(stamp - before.stamp))
         levels.append(PlannedLevel(stamp, flux_density, state, model))
-        yield
+        outset.check()
     last = levels[-1]
     _check_motion(len(points) - 1, last, None)
     rest = float(equilibrium_stretch(last.load, model.material))
@@ -78,7 +78,7 @@ def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Steps[D
     arrival: int | None = last.stamp + settled
     if moves > _REST:
         try:
-            end = yield from draft_moves(
+            end = draft_moves(
                 replace(outset, begin=last.stamp, state=state), [Setpoint(rest, math.inf)],
                 'two_step')
         except RefusedError as error:

@@ -32,6 +32,7 @@ from hmsa_ros.nodes.runner import run
 from hmsa_ros.runtime import records
 from hmsa_ros.runtime.environment import Environment, Seen
 from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.worker import PlanningThread
 from hmsa_ros.timekeeping import steady_ns, StepWatch
 
 if TYPE_CHECKING:
@@ -63,6 +64,7 @@ class PlannerNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__(topics.PLANNER)
         self._settings = declare_joints(self, PARAMETERS, OWN)
+        self._worker = PlanningThread()
         self._offload = Offload(
             self.get_logger().warning, 'hmsa_ros.runtime.feedback')
         # The executor would store an event for each message on /clock, without limit if the node
@@ -88,8 +90,9 @@ class PlannerNode(ManagedNode):
     def _new_runtime(self) -> PlannerRuntime:
         runtime = PlannerRuntime(
             group_from(self._settings), settings_from(self._settings), Environment(
-                self.now, one_clock=self._one_clock, observable=self._observable,
-                unheard=self._unheard, found=lambda joint: self._channels[joint].found,
+                self.now, worker=self._worker, one_clock=self._one_clock,
+                observable=self._observable, unheard=self._unheard,
+                found=lambda joint: self._channels[joint].found,
                 reports=lambda joint: self._channels[joint].reports,
                 reporters=lambda joint: self._channels[joint].reporters, glance=self._glance))
         runtime.devices.deliver = lambda command: self._take((command,))

@@ -9,7 +9,6 @@ import numpy as np
 
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
-from hmsa.planning.drafting import Steps
 from hmsa.planning.planner import Planner
 from hmsa.planning.timeline import Draft, Model, Plan, PlannedLevel
 from hmsa_ros.estimation import Estimate
@@ -29,12 +28,13 @@ from hmsa_ros.estimation.correction import (
 )
 from hmsa_ros.estimation.motion import rest
 from hmsa_ros.estimation.words import confounded
+from hmsa_ros.runtime.environment import Clock
 from hmsa_ros.runtime.feedback import Feedback
 from hmsa_ros.runtime.joint import Joint
 from hmsa_ros.runtime.learnt import alike, as_of_path, believed, learnt_model
 from hmsa_ros.runtime.ledger import Moves
 from hmsa_ros.runtime.records import Severity, Verdict
-from hmsa_ros.runtime.slices import Clock, replanning, Work
+from hmsa_ros.runtime.slices import Replanning, replanning, Work
 from hmsa_ros.runtime.weighing import LEAST_STEP, step_of
 
 # Minimum gain of a correction as a fraction of the step, and the smaller one during a move that
@@ -127,11 +127,11 @@ class Corrections:
             elif joint.adapted() and _may_gain(joint, estimate, now):
                 yield self._work(joint, _correct)
 
-    def _work(self, joint: Joint, make: Callable[[Joint, int], Steps[Draft | None]]) -> Work:
-        return replanning(
-            joint.name, joint.planner, partial(make, joint), self._clock, corrects=True)
+    def _work(
+            self, joint: Joint, make: Callable[[Joint, int], Replanning | None]) -> Work:
+        return replanning(joint.name, joint.planner, partial(make, joint), corrects=True)
 
-    def _rejoin(self, joint: Joint, now: int) -> Steps[Draft | None]:
+    def _rejoin(self, joint: Joint, now: int) -> Replanning | None:
         """Replan the rest of a path with the current estimate, if that follows it more closely."""
         planner, begun = joint.planner, self._clock()
         begin = planner.soonest(now + joint.planning)
@@ -141,17 +141,22 @@ class Corrections:
         model = learnt_model(
             planner.model, estimate, planner.plan.segments[-1].stretch, _CREEPS)
         model = as_of_path(model, planner.model, estimate)
-        draft = yield from planner.draft_path_anew(
-            begin, model, believed(estimate, creeps=bool(model.actuator.creep)))
-        spent = self._clock() - begun
-        joint.planning = spent + spent // 2
-        joint.next_path = begin + max(_JOINED * _period(planner), _IDLE * spent)
-        before, after = (_leaves(estimate, planner, x, ahead)
-                         for x in (planner.plan.levels, draft.levels))
-        if _saturates(joint, draft) or not _nearer(joint, before, after, estimate):
-            return None
-        joint.after = after.size
-        return draft
+        state = believed(estimate, creeps=bool(model.actuator.creep))
+
+        def adopt(draft: Draft | None) -> Draft | None:
+            spent = self._clock() - begun
+            joint.planning = spent + spent // 2
+            joint.next_path = begin + max(_JOINED * _period(planner), _IDLE * spent)
+            if draft is None:
+                return None
+            before, after = (_leaves(estimate, planner, x, ahead)
+                             for x in (planner.plan.levels, draft.levels))
+            if _saturates(joint, draft) or not _nearer(joint, before, after, estimate):
+                return None
+            joint.after = after.size
+            return draft
+
+        return Replanning(lambda plan: plan.draft_path_anew(begin, model, state), adopt)
 
     def take(self, work: Work, drafts: Mapping[str, Draft], now: int) -> Verdict | None:
         """Adopt a correction made for a time in ns; None if nothing changes."""
@@ -175,7 +180,7 @@ class Corrections:
         return Verdict(Severity.OK, Code.CORRECTED, f'corrected from samples: {words}')
 
 
-def _take_back(joint: Joint, now: int) -> Steps[Draft | None]:
+def _take_back(joint: Joint, now: int) -> Replanning | None:
     """Replan the rest with the model in force, discarding earlier corrections."""
     planner = joint.planner
     plan, model, soonest = planner.plan, planner.model, planner.soonest(now)
@@ -184,20 +189,21 @@ def _take_back(joint: Joint, now: int) -> Steps[Draft | None]:
         return None
     segment = plan.segments[place]
     if planner.as_sent(soonest):
-        return None if _ahead(planner, soonest) is None else (
-            yield from planner.draft_path_anew(soonest, model, None))
+        return None if _ahead(planner, soonest) is None else Replanning(
+            lambda plan: plan.draft_path_anew(soonest, model, None))
     if place + 1 < len(plan.segments) or segment.arrival is None or segment.arrival > soonest:
-        draft = yield from planner.draft_resumption(now)
-        return None if draft is None or draft.missed else draft
+        return Replanning(
+            lambda plan: plan.draft_resumption(now),
+            lambda draft: None if draft is None or draft.missed else draft)
     holding = model.flux_density(model.holding(segment.stretch))
     level = plan.levels[-1].flux_density
     return None if abs(holding - level) < _SAME * model.units.load else (
-        yield from planner.draft_trim(now, holding))
+        _trim(joint, now, level=holding))
 
 
-def _trim(joint: Joint, now: int, *, level: float) -> Steps[Draft | None]:
+def _trim(joint: Joint, now: int, *, level: float) -> Replanning:
     """Hold the setpoint with another level in T."""
-    return (yield from joint.planner.draft_trim(now, level))
+    return Replanning(lambda plan: plan.draft_trim(now, level))
 
 
 def _arrival(joint: Joint, now: int) -> int:
@@ -219,15 +225,23 @@ def _saturates(joint: Joint, draft: Draft) -> bool:
     return max(abs(x.flux_density) for x in draft.levels) > joint.largest
 
 
-def _correct(joint: Joint, now: int) -> Steps[Draft | None]:
+def _correct(joint: Joint, now: int) -> Replanning:
     """Replan the rest if that reduces the predicted error."""
-    planner, arrival = joint.planner, _arrival(joint, now)
-    try:
-        draft = yield from planner.draft_resumption(now, arrival or None)
-    except RefusedError:
-        if not arrival:
-            raise
-        return None
+    arrival = _arrival(joint, now)
+
+    def draft(plan: Planner) -> Draft | None:
+        try:
+            return plan.draft_resumption(now, arrival or None)
+        except RefusedError:
+            if not arrival:
+                raise
+            return None
+    return Replanning(draft, partial(_gains, joint, arrival))
+
+
+def _gains(joint: Joint, arrival: int, draft: Draft | None) -> Draft | None:
+    """Return a correction if it reduces the predicted error."""
+    planner = joint.planner
     estimate = None if draft is None else joint.state(draft.begin)
     if draft is None or estimate is None or draft.missed or _saturates(joint, draft):
         # A correction must not leave out a setpoint.

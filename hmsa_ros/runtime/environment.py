@@ -1,11 +1,14 @@
 """Information that a planner at work requests from its caller."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from hmsa_ros.runtime.slices import Clock
+from hmsa_ros.runtime.worker import Inline, Worker
 from hmsa_ros.timekeeping import steady_ns
+
+#: Returns the time in ns of the clock of timestamps.
+Clock = Callable[[], int]
 
 
 class Seen(NamedTuple):
@@ -30,6 +33,7 @@ class Environment:
 
     clock: Clock  #: clock of the timestamps and of `hmsa_ros.runtime.planner.PlannerRuntime.tick`
     steady: Clock = steady_ns  #: clock of timeouts and slices
+    worker: Worker = field(default_factory=Inline)  #: plans requests
     #: Whether all nodes share one clock, such as simulated time.
     one_clock: Callable[[], bool] = bool
     #: Whether there may be a publisher of samples.

@@ -12,10 +12,10 @@ from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Believed
 from hmsa.planning.timeline import Model
 from hmsa_ros.estimation.words import differences
+from hmsa_ros.runtime.environment import Clock
 from hmsa_ros.runtime.joint import as_held, Joint, RESTING
 from hmsa_ros.runtime.learnt import alike, save
 from hmsa_ros.runtime.records import EstimateChanged, Output, Settings, Severity
-from hmsa_ros.runtime.slices import Clock
 
 #: Values of the parameter `feedback`.
 MODES = ('off', 'observe', 'adapt', 'cautious')

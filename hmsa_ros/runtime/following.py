@@ -10,14 +10,13 @@ import numpy as np
 from hmsa.errors import HmsaError
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
-from hmsa.planning.drafting import Steps
-from hmsa.planning.group import PlannerGroup, Resumption
+from hmsa.planning.group import PlannerGroup, resumed, Resumption
 from hmsa.planning.planner import Planner
 from hmsa.planning.timeline import Draft, Options
 from hmsa_ros.runtime.lateness import Lateness
 from hmsa_ros.runtime.receipts import Receipts
 from hmsa_ros.runtime.records import Settings, Severity, Verdict
-from hmsa_ros.runtime.slices import Clock, replanning, Work
+from hmsa_ros.runtime.slices import Replanning, replanning, Work
 from hmsa_ros.runtime.throttle import Throttle
 from hmsa_ros.runtime.weighing import (
     aims,
@@ -274,12 +273,11 @@ class Following:
             self._report_kept()
         return sorted(self.astray)
 
-    def resumption(self, name: str, clock: Clock) -> Work:
+    def resumption(self, name: str) -> Work:
         """Return the work of replanning the rest for a joint if that reduces the error."""
-        return replanning(
-            name, self._group.planners[name], partial(self._resumed, name), clock)
+        return replanning(name, self._group.planners[name], partial(self._resumed, name))
 
-    def _resumed(self, name: str, now: int) -> Steps[Draft | None]:
+    def _resumed(self, name: str, now: int) -> Replanning | None:
         planner = self._group.planners[name]
         self._found.pop(name, None)
         plan, (start, levels) = planner.plan, planner.unknown(now)
@@ -295,18 +293,28 @@ class Following:
         if news and unsure and left.min() <= SHARE:
             self._found[name] = Resumption(None)
             return None
-        yield
-        found = yield from self._group.draft_resumption(name, now)
-        if found.draft is None:
-            return None
-        before, after = compared(plan, start, levels, found.draft, self.lateness)
-        # A plan without its lost levels is no alternative: kept, it left 1.3 of the step after
-        # a stall of 1 s (row planner_stopped of the fault table).
-        if name not in self._unsent and not worthwhile(before, after, news=news, unsure=unsure):
-            found = Resumption(None, left=float(before.mean()))
-            self._again[name] = 0 if unsure else now + max(_PAUSE, planner.model.ns(1.0))
-        self._found[name] = found
-        return found.draft
+        found = Resumption(None)
+
+        def draft(planner: Planner) -> Draft | None:
+            nonlocal found
+            found = resumed(planner, now)
+            return found.draft
+
+        def adopt(draft: Draft | None) -> Draft | None:
+            if draft is None:
+                return None
+            before, after = compared(plan, start, levels, draft, self.lateness)
+            # A plan without its lost levels is no alternative: kept, it left 1.3 of the step after
+            # a stall of 1 s (row planner_stopped of the fault table).
+            if name not in self._unsent and not worthwhile(
+                    before, after, news=news, unsure=unsure):
+                self._found[name] = Resumption(None, left=float(before.mean()))
+                self._again[name] = 0 if unsure else now + max(_PAUSE, planner.model.ns(1.0))
+                return None
+            self._found[name] = found
+            return draft
+
+        return Replanning(draft, adopt)
 
     def take(self, work: Work, drafts: Mapping[str, Draft], now: int) -> Verdict | None:
         """Adopt a new plan made for a time in ns; None if there is nothing to report."""

@@ -12,14 +12,14 @@ from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.following import Following
 from hmsa_ros.runtime.records import Note, Request, Severity, Stop, Verdict
 from hmsa_ros.runtime.reporting import Reporting
-from hmsa_ros.runtime.slices import SLICE, Work, work_on
+from hmsa_ros.runtime.slices import Drafts, SLICE, Work, work_on
 
 # Number of levels and setpoints of replaced plans that are freed at a time.
 _FREED = 2_000
 
 
 class Planning:
-    """Plan waiting requests in slices, and report the results."""
+    """Have waiting requests planned, and report the results."""
 
     def __init__(
             self, group: PlannerGroup, following: Following, corrections: Corrections,
@@ -46,6 +46,7 @@ class Planning:
         """Refuse all waiting requests for the same reason."""
         for work in list(self._queue):
             if work.request is not None:
+                work.abandon()
                 self._queue.remove(work)
                 self.refuse(error, work.request)
 
@@ -54,12 +55,14 @@ class Planning:
 
     def clear(self) -> None:
         """Drop all waiting work."""
+        for work in self._queue:
+            work.abandon()
         self._queue.clear()
         self._leftovers.clear()
 
     def add(self, request: Request, *, engaged: bool) -> Work:
         """Add a checked request; once ``engaged``, one that replaces all others comes first."""
-        work = work_on(request, self._group, self._around.clock, self._corrections.cautious)
+        work = work_on(request, self._group, self._corrections.cautious)
         if engaged and work.replaces(self._queue):
             self._queue.appendleft(work)
         else:
@@ -70,6 +73,7 @@ class Planning:
         """Drop earlier requests that this one would replace as soon as they are planned."""
         for old in list(self._queue):
             if old.number < work.number and old.joints <= work.joints and not work.postponed:
+                old.abandon()
                 self._queue.remove(old)
                 if old.request is not None:
                     self._reporting.give(Verdict(
@@ -77,29 +81,27 @@ class Planning:
                         'planned', old.request.name))
 
     def work_on(self) -> None:
-        """Plan waiting work for the duration of a slice."""
+        """Wait for the plans of waiting work, for the duration of a slice."""
         for name in self._following.to_resume():
             if not any(x.request is None and name in x.joints for x in self._queue):
-                self._queue.appendleft(self._following.resumption(name, self._around.clock))
+                self._queue.appendleft(self._following.resumption(name))
         if not self._queue:
             self._queue += self._corrections.due(self._around.clock())
         del self._leftovers[-_FREED:]
         end = self._around.steady() + SLICE
-        while self._queue and self._around.steady() < end:
+        while self._queue and (left := end - self._around.steady()) > 0:
             work = self._queue[0]
-            if self.advance(work) and work in self._queue:
+            if self.advance(work, left) and work in self._queue:
                 self._queue.remove(work)
         while self._following.verdicts:
             self._reporting.go_on(self._following.verdicts.pop(0))
 
-    def advance(self, work: Work) -> bool:
-        """Continue one piece of work; return whether it is done."""
+    def advance(self, work: Work, wait: int = SLICE) -> bool:
+        """Continue work for some ns; return whether it is done."""
         begun = self._around.clock() if work.corrects else 0
-        found: tuple[Mapping[str, Draft], int] | None = None
+        found: tuple[Drafts, int] | None = None
         try:
-            next(work.steps)
-        except StopIteration as end:
-            found = end.value
+            found = work.advance(self._group, self._around, wait)
         except HmsaError as error:
             if work.corrects:
                 self._reporting.note(f'plan not corrected: {error}')
