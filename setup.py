@@ -176,6 +176,7 @@ setup(
             f'{name} = {package}.{module}'
             for package, modules in COMMANDS.items() for name, module in modules.items()],
         'hmsa_ros.nodes': [f'{name} = {package}.nodes.{name}' for name, package in NODES.items()],
+        'hmsa_ros.follower': ['adapt = hmsa_lab.adapt.feedback:Feedback'],
         'hmsa_ros.hardware': [
             'scpi_supply = hmsa_lab.bench.scpi_supply:ScpiSupply',
             'serial_board = hmsa_lab.bench.serial_board:SerialBoard',

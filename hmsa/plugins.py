@@ -1,9 +1,10 @@
-"""Entry points: the commands, nodes and hardware that packages register in their ``setup.py``."""
+"""Entry points of commands, nodes, hardware and feedback, registered in ``setup.py``."""
 
 from importlib.metadata import entry_points, EntryPoint
 
-#: Groups: commands of ``hmsa``, nodes, and hardware by its short name.
-COMMANDS, NODES, HARDWARE = 'hmsa.commands', 'hmsa_ros.nodes', 'hmsa_ros.hardware'
+#: Groups: commands of ``hmsa``, nodes, hardware by its short name, and feedback from samples.
+COMMANDS, NODES, HARDWARE, FOLLOWER = (
+    'hmsa.commands', 'hmsa_ros.nodes', 'hmsa_ros.hardware', 'hmsa_ros.follower')
 
 
 def registered(group: str) -> dict[str, EntryPoint]:

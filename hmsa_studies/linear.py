@@ -20,7 +20,7 @@ from hmsa.identification.quantities import complete, values_of
 from hmsa.model.equations import Array
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.estimation.motion import follow, Levels
+from hmsa_lab.adapt.motion import follow, Levels
 
 # Load increment for the linearisation.
 _SMALL = 1e-4

@@ -14,10 +14,11 @@ from hmsa.identification.known import Known
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options as PlannerOptions
 from hmsa.planning.planner import Planner
-from hmsa_ros.estimation import Estimator, Options, Prior
-from hmsa_ros.estimation.correction import Course, expect
-from hmsa_ros.estimation.motion import follow, Levels
-from hmsa_ros.runtime.corrections import course_of
+from hmsa_lab.adapt.corrections import course_of
+from hmsa_lab.adapt.estimator import Estimator, Options
+from hmsa_lab.adapt.expected_error import Course, expect
+from hmsa_lab.adapt.motion import follow, Levels
+from hmsa_lab.adapt.prior import Prior
 from hmsa_ros.runtime.loop import Loop
 from hmsa_ros.runtime.records import Settings, Target
 from hmsa_studies.feedback import trial

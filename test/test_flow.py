@@ -24,8 +24,8 @@ from hmsa.model.simulation import ActuatorSimulation, follow, sampled, with_foll
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers.request import Request
-from hmsa_ros.estimation.estimator import Options
-from hmsa_ros.estimation.prior import Prior
+from hmsa_lab.adapt.estimator import Options
+from hmsa_lab.adapt.prior import Prior
 
 MS = 1_000_000
 ONE = NondimensionalParameters(creep=Creep((0.2,), (2.0,), 'power_law', ((4.0,), (0.3,))))

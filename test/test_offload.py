@@ -34,7 +34,7 @@ def ends(parent):
 @pytest.fixture
 def offload():
     told = []
-    found = Offload(told.append, 'hmsa_ros.runtime.feedback')
+    found = Offload(told.append, 'hmsa_lab.adapt.feedback')
     found.told = told
     yield found
     found.close()
@@ -107,7 +107,7 @@ def test_what_is_learnt_is_the_same_in_either_process(offload):
         block = paper_actuator()
         stiffer = replace(block, shear_modulus=1.1 * block.shear_modulus)
         bench = Bench(Plant(stiffer), block, 1e-3, seed=1)
-        bench.runtime.feedback.doing = at_once
+        bench.runtime.follower.doing = at_once
         for target in (1.3, 1.1, 1.25):
             bench.move(target, 200 * MS)
         assert 'plans use it' in bench.message

@@ -185,6 +185,26 @@ def test_nodes_start_without_scipy_which_takes_longer_to_load_than_all_else():
     assert (result.returncode, result.stderr) == (0, '')
 
 
+def test_a_planner_without_feedback_imports_none_of_it():
+    result = run(BLOCKED.format(blocked=('hmsa_lab',)) + """
+from hmsa.model.actuators import Setup
+from hmsa.model.parameters import paper_actuator
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
+from hmsa_ros.runtime.loop import Loop
+from hmsa_ros.runtime.records import Settings, Target
+from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
+import hmsa_ros.nodes.planner
+group = PlannerGroup({'a': Planner(paper_actuator(), Options())})
+loop = Loop(group, Settings(takeover_timeout=0), SimulatedDevice(
+    [SimulatedJoint(Setup(paper_actuator()))], period=10**6, time=10**9))
+assert loop.runtime.request(Target('a', 1.2)).code == 'accepted'
+loop.run(11 * 10**8)
+assert abs(loop.device.stretch[0] - 1.2) < 1e-6
+""")
+    assert (result.returncode, result.stderr) == (0, '')
+
+
 def test_a_plan_without_a_file_imports_no_reader_of_files():
     result = run(BLOCKED.format(blocked=('scipy', 'mcap', 'yaml')) + """
 from hmsa.cli import main

@@ -15,8 +15,7 @@ from rclpy.node import Node
 from rclpy.parameter import get_parameter_value, Parameter, parameter_value_to_python
 import yaml
 
-from hmsa import Actuator
-from hmsa import plugins
+from hmsa import Actuator, plugins
 from hmsa.errors import BadInputError
 from hmsa.interfaces.actuator import actuator_from
 from hmsa.interfaces.parameters import ACTUATOR, BLOCK, ParameterSpec

@@ -282,7 +282,7 @@ def test_what_is_done_with_a_plan_before_it_is_taken_makes_no_command_late(monke
     def cautious(drafts):
         rig.now += 2 * LEAD
         return drafts
-    monkeypatch.setattr(rig.runtime.planning._corrections, 'cautious', cautious)
+    monkeypatch.setattr(rig.runtime.follower, 'cautious', cautious)
     rig.runtime.request(trajectory(*SEQUENCE))
     rig.run(rig.now + 20 * LEAD)
     assert len(rig.sent) >= 2 * len(SEQUENCE)

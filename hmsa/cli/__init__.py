@@ -22,7 +22,6 @@ from hmsa.ending import ENDING
 from hmsa.errors import complain, HmsaError
 from hmsa.plugins import COMMANDS, registered
 
-
 # Commands of rosbag2 and others, with those for the same purpose.
 _MEANT = {
     'record': 'hmsa recorder', 'play': 'hmsa player', 'sim': 'hmsa simulate',

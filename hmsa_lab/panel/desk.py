@@ -28,7 +28,7 @@ from hmsa_ros.clients.client import PlannerClient
 from hmsa_ros.clients.link import Stopping
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.service_call import ServiceCall
-from hmsa_ros.runtime.feedback import MODES
+from hmsa_ros.runtime.records import FEEDBACK_MODES as MODES
 
 # Frame interval in s; number of chart slots in a frame; time in s for which a new page gets all.
 _PERIOD, _TAIL, _NEW_SECONDS = 0.02, 24, 1.0

@@ -19,6 +19,7 @@ from hmsa.model.actuators import unheld
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.offload import Offload
+from hmsa.plugins import FOLLOWER, registered
 from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
 from hmsa_ros.nodes.cdr import read_trajectory, stamp_of
@@ -66,7 +67,7 @@ class PlannerNode(ManagedNode):
         self._settings = declare_joints(self, PARAMETERS, OWN)
         self._worker = PlanningThread()
         self._offload = Offload(
-            self.get_logger().warning, 'hmsa_ros.runtime.feedback')
+            self.get_logger().warning, registered(FOLLOWER)['adapt'].module)
         # The executor would store an event for each message on /clock, without limit if the node
         # cannot keep up. This subscription, read by `now`, only keeps the newest. It is unsuitable
         # for a node that must process commands before the time published after them.
@@ -96,8 +97,8 @@ class PlannerNode(ManagedNode):
                 reports=lambda joint: self._channels[joint].reports,
                 reporters=lambda joint: self._channels[joint].reporters, glance=self._glance))
         runtime.devices.deliver = lambda command: self._take((command,))
-        runtime.feedback.doing = self._offload
-        if runtime.feedback.on:
+        runtime.follower.doing = self._offload
+        if runtime.follower.on:
             self._offload.start()
         return runtime
 
@@ -119,9 +120,9 @@ class PlannerNode(ManagedNode):
         self._targets = TargetMarkers(self, self._settings)
         endpoints.subscribe(self, topics.JOINT_TRAJECTORY, self._on_trajectory, raw=True)
         self.offer(topics.STOP, self._on_stop)
-        self.offer(topics.RESET_ESTIMATE, lambda: (True, self._runtime.feedback.reset()))
+        self.offer(topics.RESET_ESTIMATE, lambda: (True, self._runtime.follower.reset()))
         self.offer(topics.SAVE_ESTIMATE, lambda: (
-            True, self._runtime.feedback.save(by_joint=bool(self._settings['joints']))))
+            True, self._runtime.follower.save(by_joint=bool(self._settings['joints']))))
         # Timers on simulated time fire at most once for each /clock message, and the node's clock
         # decides what is due.
         self._poll = self.every(_POLL_NS / NANOSECONDS, self._serve)

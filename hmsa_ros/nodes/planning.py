@@ -25,8 +25,12 @@ from hmsa.planning.timeline import Model
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.markers import MARKER_SCALE
 from hmsa_ros.nodes.parameters import JointParameters, JOINTS
-from hmsa_ros.runtime.feedback import MODES
-from hmsa_ros.runtime.records import AFTER_CUT_OFF, Settings, TRAJECTORY_MODES
+from hmsa_ros.runtime.records import (
+    AFTER_CUT_OFF,
+    FEEDBACK_MODES,
+    Settings,
+    TRAJECTORY_MODES,
+)
 
 _OPTIONS = Options()
 _SETTINGS = Settings()
@@ -141,7 +145,7 @@ SPECS = (
         'also extends moves whose predicted error exceeds feedback_tolerance, to correct them on '
         'the way: three times (five times for six estimated parameters, and up to twice that for '
         'large noise).',
-        choices=MODES),
+        choices=FEEDBACK_MODES),
     ParameterSpec(
         'feedback_parameters', list(_SETTINGS.feedback_parameters),
         'Parameters that feedback estimates: shear_modulus, damping_coefficient, '

@@ -17,10 +17,9 @@ from hmsa.planning import path
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.timeline import Model
 from hmsa_ros.runtime.checks import check_joints, check_ready
-from hmsa_ros.runtime.corrections import Corrections
 from hmsa_ros.runtime.devices import Devices
 from hmsa_ros.runtime.environment import Environment, Seen
-from hmsa_ros.runtime.feedback import Feedback
+from hmsa_ros.runtime.follower import feedback, Follower
 from hmsa_ros.runtime.following import Following
 from hmsa_ros.runtime.planning import Planning
 from hmsa_ros.runtime.receipts import Receipts
@@ -80,12 +79,13 @@ class PlannerRuntime:
         self._outputs: list[Output] = []
         receipts = Receipts(around.steady)
         self.following = Following(group, receipts, self._note)
-        self.feedback = Feedback(group, settings, self._outputs, clock, self._report_ended)
+        self.follower = Follower(group, settings)
+        self._follow()
         self._takeover = Takeover(
-            group.planners, around, receipts, self.following.newest, self.feedback.follows,
-            self._note)
+            group.planners, around, receipts, self.following.newest,
+            self._follows, self._note)
         self._silence = Silence(around)
-        self._watch = Watch(group, around, self.feedback)
+        self._watch = Watch(group, around, lambda: self.follower)
         self.devices = Devices(
             group.planners, receipts, self.following, self._takeover, around, self._outputs)
         self._reporting = Reporting(
@@ -95,7 +95,7 @@ class PlannerRuntime:
             group, self.devices, self.following.newest, self._watch, around, around.unheard,
             lambda: self.settings.tolerances)
         self.planning = Planning(
-            group, self.following, Corrections(self.feedback, clock), self._reporting,
+            group, self.following, lambda: self.follower, self._reporting,
             around, lambda: self.devices.send(clock()), self._stops.begin)
         self._next_beat = 0  # time in ns of the next heartbeat
         # Time by the steady clock, in ns, by which the caller serves this again; None for any.
@@ -107,6 +107,16 @@ class PlannerRuntime:
         self._set_back = 0
         self._differ = False  # whether a clock offset was reported
         self._impossible_due = Throttle()
+
+    def _follow(self) -> None:
+        """Begin feedback from samples, once it is wanted."""
+        if self.settings.feedback != 'off' and self.follower.open_loop:
+            self.follower = feedback(
+                self.group, self.settings, self._outputs, self._clock, self._report_ended,
+                self.follower.doing)
+
+    def _follows(self, joint: str) -> bool:
+        return self.follower.follows(joint)
 
     def _note(self, words: str) -> None:
         self._outputs.append(Note(Severity.WARN, words))
@@ -220,7 +230,7 @@ class PlannerRuntime:
         now = joint in self.devices.apart
         if before is not now or verdict is not None:
             # Samples from before and after do not belong to one motion.
-            self.feedback.restart()
+            self.follower.restart()
             self._silence.restart()
         if now and not before:
             self.planning.refuse_all(self.devices.differs(joint))
@@ -252,8 +262,7 @@ class PlannerRuntime:
             # The clock of the device was set, and the time is unknown.
             self.following.newest[joint] = 0, flux_density
             return
-        if joint in self.feedback.joints:
-            self.feedback.joints[joint].applied(stamp, flux_density)
+        self.follower.applied(joint, stamp, flux_density)
         if self._takeover.engaged:
             self.following.applied(joint, stamp, flux_density, self.settings, now)
         else:
@@ -275,8 +284,7 @@ class PlannerRuntime:
         if joint in self.devices.apart:
             return
         self._watch.add(joint, stamp, stretch)
-        if joint in self.feedback.joints:
-            self.feedback.joints[joint].add(stamp, stretch, flux_density, came)
+        self.follower.observed(joint, stamp, stretch, flux_density, came)
 
     def clock_set(self, by: int) -> None:
         """Record that the clock was set ahead by some ns; plans continue."""
@@ -302,7 +310,7 @@ class PlannerRuntime:
         requests = [] if back else self.planning.requests
         self.planning.clear()
         self.following.restart(levels=not back)
-        self.feedback.restart()
+        self.follower.restart()
         self.devices.receipts.clock_set()
         self._silence.restart()
         if back:
@@ -359,7 +367,8 @@ class PlannerRuntime:
             self._next_beat = self._clock() + settings.heartbeat_period
         self.settings = settings
         self._prepare()
-        for name, model in self.feedback.change(settings, models).items():
+        self._follow()
+        for name, model in self.follower.change(settings, models).items():
             self.group.planners[name].take_model(model)
         self.group.simultaneous = simultaneous
 
@@ -373,13 +382,13 @@ class PlannerRuntime:
     def wants_samples(self) -> bool:
         """Whether samples are needed now or soon."""
         return self._takeover.waiting or self.active and (
-            self._watch.open or self.feedback.on)
+            self._watch.open or self.follower.on)
 
     def looks_at(self, stamp: int) -> bool:
         """Return whether a sample with a timestamp in ns is needed; most are not."""
         self.following.seen(stamp)
         return (self._takeover.waiting or self._watch.wants(stamp)
-                or self.feedback.looks_at(stamp))
+                or self.follower.wants(stamp))
 
     @property
     def wake(self) -> int | None:
@@ -393,7 +402,7 @@ class PlannerRuntime:
         times = [
             None if self.devices.all_silent else self.group.next_command(),
             self._reporting.next_change, self._reporting.preview_again, self._watch.wake(now),
-            self.feedback.wake]
+            self.follower.wake]
         if self.settings.heartbeat_period:
             times.append(self._next_beat)
         if self.following.astray or self.following.verdicts:
@@ -447,7 +456,7 @@ class PlannerRuntime:
         if self._listens():
             return self._taken()
         self._engage()
-        estimated = self._send(now) and self.feedback.update(now)
+        estimated = self._send(now) and self.follower.update(now)
         if not estimated:
             self._work_on()
         if self._reporting.preview_again is not None and now >= self._reporting.preview_again:
@@ -478,7 +487,7 @@ class PlannerRuntime:
         late = self.following.lateness.count
         self.devices.send(now)
         if self.following.lateness.count > late:
-            self.feedback.give_way(now)
+            self.follower.give_way(now)
         if self.settings.heartbeat_period and now >= self._next_beat:
             # Heartbeats, and a check which devices report.
             self._next_beat = now + self.settings.heartbeat_period
@@ -528,7 +537,8 @@ class PlannerRuntime:
         requests = self.planning.requests
         if not requests and not self.following.astray:
             return True
-        if requests and all(isinstance(x, Stop) for x in requests):
+        if requests and isinstance(requests[0], Stop):
+            # It does not wait.
             return True
         try:
             if self.devices.must_wait(self.settings):

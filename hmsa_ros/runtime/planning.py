@@ -7,8 +7,8 @@ from hmsa.errors import BadInputError, HmsaError
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.timeline import Draft
-from hmsa_ros.runtime.corrections import Corrections
 from hmsa_ros.runtime.environment import Environment
+from hmsa_ros.runtime.follower import Follower
 from hmsa_ros.runtime.following import Following
 from hmsa_ros.runtime.records import Note, Request, Severity, Stop, Verdict
 from hmsa_ros.runtime.reporting import Reporting
@@ -22,12 +22,12 @@ class Planning:
     """Have waiting requests planned, and report the results."""
 
     def __init__(
-            self, group: PlannerGroup, following: Following, corrections: Corrections,
+            self, group: PlannerGroup, following: Following, follower: Callable[[], Follower],
             reporting: Reporting, environment: Environment, send: Callable[[], None],
             stopping: Callable[[str], None]) -> None:
         """Begin without requests; ``stopping`` is called with the name of an adopted stop."""
         self._group, self._following, self._reporting = group, following, reporting
-        self._corrections = corrections
+        self._follower = follower
         self._around, self._send, self._stopping = environment, send, stopping
         self._queue: deque[Work] = deque()
         # Parts of replaced plans: freeing all at once takes tens of ms.
@@ -62,7 +62,7 @@ class Planning:
 
     def add(self, request: Request, *, engaged: bool) -> Work:
         """Add a checked request; once ``engaged``, one that replaces all others comes first."""
-        work = work_on(request, self._group, self._corrections.cautious)
+        work = work_on(request, self._group, lambda drafts: self._follower().cautious(drafts))
         if engaged and work.replaces(self._queue):
             self._queue.appendleft(work)
         else:
@@ -86,7 +86,7 @@ class Planning:
             if not any(x.request is None and name in x.joints for x in self._queue):
                 self._queue.appendleft(self._following.resumption(name))
         if not self._queue:
-            self._queue += self._corrections.due(self._around.clock())
+            self._queue += self._follower().due(self._around.clock())
         del self._leftovers[-_FREED:]
         end = self._around.steady() + SLICE
         while self._queue and (left := end - self._around.steady()) > 0:
@@ -161,7 +161,7 @@ class Planning:
 
     def _go_on(self, work: Work, drafts: Mapping[str, Draft], now: int) -> None:
         """Adopt a plan that was replanned, or corrected from samples."""
-        by = self._corrections if work.corrects else self._following
+        by = self._follower() if work.corrects else self._following
         verdict = by.take(work, drafts, now)
         self._send()
         if verdict is None:

@@ -3,21 +3,25 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from hmsa.errors import BadInputError
-from hmsa.identification.known import Known
 from hmsa.judge.records import Finding, GoalTolerances, Tolerances
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import Progress
-from hmsa_ros.estimation.correction import TOLERANCE
-from hmsa_ros.estimation.prior import TRACKED
+
+if TYPE_CHECKING:
+    from hmsa.identification.known import Known
 
 #: How velocities in a trajectory are treated: refused, as it rests at each point, or as a path.
 TRAJECTORY_MODES = ('rest', 'path')
 #: What to do after a coil was cut off: wait for a request, or continue with a shaped move.
 AFTER_CUT_OFF = ('wait', 'resume')
+#: Open loop; estimates from samples; corrected plans, too; slower moves where errors are likely.
+FEEDBACK_MODES = ('off', 'observe', 'adapt', 'cautious')
+#: Parameters that feedback estimates by default.
+TRACKED = ('shear_modulus', 'damping_coefficient', 'stretch_bias')
 
 
 @dataclass(frozen=True)
@@ -35,17 +39,15 @@ class Settings:
     trajectory_mode: str = 'rest'  # one of `TRAJECTORY_MODES`
     allow_partial_joints: bool = False  # whether a trajectory may omit joints
     tolerances: Tolerances = field(default_factory=Tolerances)
-    # ``off``; ``observe`` to estimate from samples; ``adapt`` to correct plans as well;
-    # ``cautious`` to slow down moves with a large predicted error, too.
-    feedback: str = 'off'
+    feedback: str = 'off'  # one of `FEEDBACK_MODES`
     feedback_parameters: tuple[str, ...] = TRACKED  # estimated in addition to the state
     feedback_cautious: bool = False  # whether ``adapt`` is ``cautious``
-    feedback_tolerance: float = TOLERANCE  # large predicted error, as a fraction of the step
+    feedback_tolerance: float = 5e-3  # large predicted error, as a fraction of the step
     feedback_trim: float = 0.0  # limit in T for trimming against a force; 0: off
     feedback_frozen: bool = False  # estimate only the state, keep the parameters
     feedback_file: str = ''  # file for learnt parameters; empty: none
     # By joint, prior uncertainty of the parameters.
-    known: Mapping[str, Known] = field(default_factory=dict)
+    known: Mapping[str, 'Known'] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ('heartbeat_period', 'lateness_tolerance', 'takeover_timeout',

@@ -1,8 +1,9 @@
 """The setpoints of a request as requested, and the findings from samples of each."""
 
 from bisect import bisect_left
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from hmsa.judge.holds import AHEAD, Hold
 from hmsa.judge.records import (
@@ -15,11 +16,11 @@ from hmsa.judge.records import (
 )
 from hmsa.model.equations import stretch_limits
 from hmsa.model.law import critical_zeta
-from hmsa.offload import Doing
+from hmsa.offload import Awaited, Doing
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.timeline import Plan, PlannedSegment
 from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.feedback import Feedback
+from hmsa_ros.runtime.follower import Follower
 
 # Largest age of the newest sample for further samples to be expected, by the steady clock.
 _RECENT = 10_000_000_000
@@ -184,8 +185,9 @@ class Watch:
     """Gather samples of each setpoint as requested, and judge them."""
 
     def __init__(
-            self, group: PlannerGroup, environment: Environment, feedback: Feedback) -> None:
-        self._group, self._around, self._feedback = group, environment, feedback
+            self, group: PlannerGroup, environment: Environment,
+            follower: Callable[[], Follower]) -> None:
+        self._group, self._around, self._follower = group, environment, follower
         #: Goal tolerances of the newest request, by joint.
         self.goals: Mapping[str, GoalTolerances] = {}
         self._joints: dict[str, _Joint] = {}
@@ -206,8 +208,12 @@ class Watch:
     def _begin(self, name: str, asked: Plan, plan: Plan) -> None:
         """Watch the requested setpoints of a joint."""
         self._joints[name] = _Joint(
-            name if len(self._group.planners) > 1 else '', self._feedback.do, asked, plan,
+            name if len(self._group.planners) > 1 else '', self._do, asked, plan,
             self._group.number, self.goals.get(name))
+
+    def _do(self, *work: Any) -> Awaited[Any]:
+        """Execute judging where feedback executes its work."""
+        return self._follower().do(*work)
 
     def clock_set(self, by: int) -> None:
         """Shift all times by the ns that the clock was set ahead."""
@@ -324,10 +330,10 @@ class Watch:
                 if (steady := self._around.steady()) >= until:
                     return None
                 found = hold.judge(
-                    now, steady, tolerances, self._feedback.sensor(name), observable=observable)
+                    now, steady, tolerances, self._follower().sensor(name), observable=observable)
                 if hold.news:
                     hold.news = False
-                    self._feedback.audit(name, hold)
+                    self._follower().audit(name, hold)
                 if found is not None:
                     joint.newest = found
                     return found

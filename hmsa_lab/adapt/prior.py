@@ -19,6 +19,7 @@ from hmsa.identification.quantities import (
 from hmsa.model.equations import Array
 from hmsa.model.laws.coordinate import Coordinate, coordinate_of
 from hmsa.model.parameters import ActuatorParameters
+from hmsa_ros.runtime.records import TRACKED
 
 #: Default standard deviations: of the logarithm for parameters that are estimated by it, else of
 #: the value, with the force as a load, and latency and lag in time scales. Those of damping and
@@ -34,8 +35,6 @@ _LEAST_LIMIT, _LEAST_ZETA = 0.02, 0.1
 _SENSED = ('stretch_bias', 'stretch_gain', 'sensor_latency', 'constant_force')
 _NOT_TRACKED = (
     'initial_stretch', 'initial_rate', *(x for x in QUANTITIES if x.startswith('viscoelastic_')))
-#: Tracked by default.
-TRACKED = ('shear_modulus', 'damping_coefficient', 'stretch_bias')
 #: Possible other errors, tracked so that they are not mistaken for errors of these. The gain of
 #: the sensor, here about rest without field, is never estimated: it resembles another remanence
 #: and chain limit.

@@ -18,11 +18,9 @@ import numpy as np
 from hmsa.model.equations import Array
 from hmsa.model.laws.coordinate import coordinate_of
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.estimation.estimator import Estimate
-from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
+from hmsa_lab.adapt.estimator import Estimate
+from hmsa_lab.adapt.motion import follow, Levels, Motion, rest
 
-#: Expected error, as a fraction of the step, above which a move is given more time.
-TOLERANCE = 5e-3
 #: Maximum error after a correction, relative to that of the present course, while more corrections
 #: are possible, and at rest.
 SHARE, AT_REST = 0.9, 0.5

@@ -9,19 +9,21 @@ from hmsa.errors import HmsaError
 from hmsa.identification.known import Known
 from hmsa.judge.holds import Hold
 from hmsa.judge.records import Sensor
-from hmsa.model.equations import equilibrium_stretch, stretch_limits
+from hmsa.model.equations import equilibrium_stretch
 from hmsa.model.units import flux_text, NANOSECONDS
 from hmsa.offload import Awaited, Doing
 from hmsa.planning.planner import Believed, Planner
 from hmsa.planning.timeline import Model, Plan
-from hmsa_ros.estimation import Estimate, Estimator, Options, Prior
-from hmsa_ros.estimation.motion import held, rest
-from hmsa_ros.estimation.words import sentence
-from hmsa_ros.runtime.choice import clearly_better
-from hmsa_ros.runtime.learnt import as_of_path, believed, differs, learnt_model, sensor_of
-from hmsa_ros.runtime.ledger import Ledger, Moves
+from hmsa_lab.adapt.choice import clearly_better
+from hmsa_lab.adapt.estimator import Estimate, Estimator, Options
+from hmsa_lab.adapt.learnt import as_of_path, believed, differs, learnt_model, sensor_of
+from hmsa_lab.adapt.ledger import Ledger, Moves
+from hmsa_lab.adapt.motion import held, rest
+from hmsa_lab.adapt.prior import Prior
+from hmsa_lab.adapt.trust import Trust
+from hmsa_lab.adapt.words import sentence
+from hmsa_ros.runtime.follower import as_held
 from hmsa_ros.runtime.records import Settings
-from hmsa_ros.runtime.trust import Trust
 
 # Earlier levels that still affect the samples: the field of a coil with lag depends on them.
 _BEFORE = 8
@@ -412,27 +414,6 @@ class Joint:
             'too_late': screening.late, 'ahead_of_clock': screening.ahead,
             'new_beginnings': self.trust.beginnings, 'ended': self.trust.ended,
             **self.sensor.to_dict()}
-
-
-def as_held(planner: Planner, time: int) -> Believed | None:
-    """
-    Return the predicted state at a time in ns, in the stretches of the planner's model.
-
-    The last level may be planned with other parameters. With those of the model it holds another
-    stretch, and a move from the planned one would leave vibration. None if both have the same
-    parameters, or if the model cannot be at that stretch.
-    """
-    last, model = planner.plan.levels[-1], planner.model
-    if last.model.actuator == model.actuator and last.model.others == model.others:
-        return None
-    state = planner.state(time)
-    stretch = state.stretch + float(
-        equilibrium_stretch(model.load(last.flux_density), model.material)
-        - equilibrium_stretch(last.load, last.model.material))
-    low, high = stretch_limits(model.material)
-    return None if not low < stretch < high else (
-        stretch, state.rate / model.units.time, tuple(
-            x + model.holding(stretch) - model.holding(state.stretch) for x in state.followed))
 
 
 def _updated(estimator: Estimator, now: int) -> tuple[Estimator, Estimate | None]:

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from hmsa.identification.quantities import modulus_of
-from hmsa_ros.estimation.estimator import Estimate
-from hmsa_ros.estimation.motion import held
+from hmsa_lab.adapt.estimator import Estimate
+from hmsa_lab.adapt.motion import held
 
 # Standard deviations and relative change above which a parameter differs from the nominal one.
 _SURE, _MATTERS = 3.0, 0.01

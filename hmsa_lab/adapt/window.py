@@ -20,8 +20,8 @@ from hmsa.identification.quantities import complete, QUANTITIES, values_at
 from hmsa.identification.response import sensed
 from hmsa.model.equations import Array
 from hmsa.model.laws.coordinate import coordinate_of
-from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
-from hmsa_ros.estimation.suspects import GAIN, inverse, Look, optimum, Others, Suspects
+from hmsa_lab.adapt.motion import follow, Levels, Motion, rest
+from hmsa_lab.adapt.suspects import GAIN, inverse, Look, optimum, Others, Suspects
 
 # Maximum Gauss-Newton iterations, halvings of each step, and small step in standard deviations.
 _PASSES, _HALVINGS, _SMALL = 4, 4, 0.1

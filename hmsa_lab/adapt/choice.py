@@ -15,8 +15,8 @@ import numpy as np
 from hmsa.errors import HmsaError
 from hmsa.planning.planner import Planner
 from hmsa.planning.timeline import Model
-from hmsa_ros.estimation import Estimate
-from hmsa_ros.estimation.correction import (
+from hmsa_lab.adapt.estimator import Estimate
+from hmsa_lab.adapt.expected_error import (
     AT_REST,
     CLEARLY,
     Course,
@@ -25,7 +25,7 @@ from hmsa_ros.estimation.correction import (
     Outcome,
     worthwhile,
 )
-from hmsa_ros.estimation.motion import rest
+from hmsa_lab.adapt.motion import rest
 
 # Other parameters must reduce the predicted error by at least this fraction of the step.
 _LEAST = 3e-4

@@ -26,11 +26,11 @@ from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.timeline import ESTIMATED, Model
 from hmsa.planning.timeline import Options as PlannerOptions
-from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
-from hmsa_ros.estimation.prior import Prior
-from hmsa_ros.estimation.screening import Screening
-from hmsa_ros.estimation.suspects import Suspects
-from hmsa_ros.estimation.window import Doubt, Rest, Solution, Trial, Window
+from hmsa_lab.adapt.motion import follow, Levels, Motion, rest
+from hmsa_lab.adapt.prior import Prior
+from hmsa_lab.adapt.screening import Screening
+from hmsa_lab.adapt.suspects import Suspects
+from hmsa_lab.adapt.window import Doubt, Rest, Solution, Trial, Window
 
 # Initial noise, before it is estimated, and minimum noise.
 _FIRST_NOISE, _LEAST_NOISE = 1e-3, 2e-6
@@ -86,7 +86,7 @@ class Estimate:
     time: int  # in ns
     stretch: float
     rate: float  # of the block in 1/s
-    # Of all quantities; see `hmsa_ros.estimation.motion.follow` for branches.
+    # Of all quantities; see `hmsa_lab.adapt.motion.follow` for branches.
     values: dict[str, Any]
     free: tuple[str, ...]  # tracked quantities
     deviations: dict[str, float]  # standard deviations of these, in SI units

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,8 +12,8 @@ from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Planner
 from hmsa.planning.timeline import Draft, Model, Plan, PlannedLevel
-from hmsa_ros.estimation import Estimate
-from hmsa_ros.estimation.correction import (
+from hmsa_lab.adapt.estimator import Estimate
+from hmsa_lab.adapt.expected_error import (
     Ahead,
     AT_REST,
     caution,
@@ -26,16 +27,18 @@ from hmsa_ros.estimation.correction import (
     SHARE,
     worthwhile,
 )
-from hmsa_ros.estimation.motion import rest
-from hmsa_ros.estimation.words import confounded
+from hmsa_lab.adapt.joint import Joint
+from hmsa_lab.adapt.learnt import alike, as_of_path, believed, learnt_model
+from hmsa_lab.adapt.ledger import Moves
+from hmsa_lab.adapt.motion import rest
+from hmsa_lab.adapt.words import confounded
 from hmsa_ros.runtime.environment import Clock
-from hmsa_ros.runtime.feedback import Feedback
-from hmsa_ros.runtime.joint import Joint
-from hmsa_ros.runtime.learnt import alike, as_of_path, believed, learnt_model
-from hmsa_ros.runtime.ledger import Moves
 from hmsa_ros.runtime.records import Severity, Verdict
 from hmsa_ros.runtime.slices import Replanning, replanning, Work
 from hmsa_ros.runtime.weighing import LEAST_STEP, step_of
+
+if TYPE_CHECKING:
+    from hmsa_lab.adapt.feedback import Feedback
 
 # Minimum gain of a correction as a fraction of the step, and the smaller one during a move that
 # has time for corrections: an actuator at rest is not moved for a small gain.
@@ -68,7 +71,7 @@ _SURE, _OFF = 3.0, 1e-4
 class Corrections:
     """Correct plans if that reduces the predicted error."""
 
-    def __init__(self, feedback: Feedback, clock: Clock) -> None:
+    def __init__(self, feedback: 'Feedback', clock: Clock) -> None:
         self._feedback, self._clock = feedback, clock
 
     def cautious(self, drafts: Mapping[str, Draft]) -> Mapping[str, Draft]:

@@ -4,21 +4,21 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
-from hmsa.errors import BadInputError
 from hmsa.judge.holds import Hold
 from hmsa.judge.records import Sensor
 from hmsa.offload import ANSWER, Awaited, Doing, goes_on, here
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Believed
 from hmsa.planning.timeline import Model
-from hmsa_ros.estimation.words import differences
+from hmsa_lab.adapt.corrections import Corrections
+from hmsa_lab.adapt.joint import Joint, RESTING
+from hmsa_lab.adapt.learnt import alike, save
+from hmsa_lab.adapt.words import differences
 from hmsa_ros.runtime.environment import Clock
-from hmsa_ros.runtime.joint import as_held, Joint, RESTING
-from hmsa_ros.runtime.learnt import alike, save
-from hmsa_ros.runtime.records import EstimateChanged, Output, Settings, Severity
+from hmsa_ros.runtime.follower import as_held, Follower
+from hmsa_ros.runtime.records import EstimateChanged, Output, Settings, Severity, Verdict
+from hmsa_ros.runtime.slices import Drafts, Work
 
-#: Values of the parameter `feedback`.
-MODES = ('off', 'observe', 'adapt', 'cautious')
 # Interval in ns at which the estimate is published.
 _REPORT = 200_000_000
 # Minimum delay of the next update, as a multiple of the time that an update or a correction took,
@@ -29,23 +29,23 @@ _IDLE = 6
 _SELDOM, _OFTENER = 32.0, 0.8
 
 
-class Feedback:
+class Feedback(Follower):
     """
-    Estimate from samples, report discrepancies, and learn parameters to plan with.
+    Estimate from samples, report discrepancies, and plan with the parameters learnt.
 
     ``joints`` contains all joints, or none if feedback is off.
     """
 
+    open_loop = False
+
     def __init__(
             self, group: PlannerGroup, settings: Settings, outputs: list[Output], clock: Clock,
-            report_ended: Callable[[str], None]) -> None:
+            report_ended: Callable[[str], None], doing: Doing = here) -> None:
         """Begin; ``report_ended`` is called with the reason why feedback of a joint has ended."""
-        self._group, self._outputs, self._clock = group, outputs, clock
-        self._report_ended = report_ended
-        #: Executes long-running work.
-        self.doing: Doing = here
-        self._settings = settings
+        super().__init__(group, settings, doing)
+        self._outputs, self._clock, self._report_ended = outputs, clock, report_ended
         self.joints: dict[str, Joint] = {}
+        self._corrections = Corrections(self, clock)
         self.corrections = 0  # number of corrected plans
         self._seldom = 1.0  # factor of the delay between updates
         self._ended: list[Joint] = []  # joints whose plans are to be reverted
@@ -59,8 +59,8 @@ class Feedback:
         return self._settings.feedback != 'off'
 
     def do(self, *work: Any) -> Awaited[Any]:
-        """Execute work with ``doing`` if feedback is on, else in this process."""
-        return (self.doing if self.on else here)(*work)
+        """Execute work with `doing` if feedback is on, else in this process."""
+        return self.doing(*work) if self.on else super().do(*work)
 
     def _believed(self, name: str, time: int) -> Believed | None:
         joint = self.joints.get(name)
@@ -104,25 +104,45 @@ class Feedback:
 
     def reset(self) -> str:
         """Discard the estimates and return a confirmation; refused if feedback is off."""
-        self._check_on()
+        if not self.on:
+            return super().reset()
         self.restart()
         return 'the estimates are discarded: plans use the parameters as given'
 
     def save(self, *, by_joint: bool) -> str:
         """Write the estimates to the configured file and return a confirmation, or refuse."""
-        self._check_on()
+        if not self.on:
+            return super().save(by_joint=by_joint)
         return save(
             self._settings.feedback_file,
             {name: joint.latest for name, joint in self.joints.items()}, by_joint=by_joint)
 
-    def _check_on(self) -> None:
-        if not self.on:
-            raise BadInputError(
-                'feedback is off and nothing is learnt: expected observe or adapt')
-
-    def looks_at(self, stamp: int) -> bool:
+    def wants(self, stamp: int) -> bool:
         """Return whether a sample with a timestamp in ns is needed."""
         return any(x.wants(stamp) for x in self.joints.values())
+
+    def observed(
+            self, joint: str, stamp: int, stretch: float, flux_density: float, came: int) -> None:
+        """Process a sample of a joint; its timestamp and arrival in ns, its field in T."""
+        if joint in self.joints:
+            self.joints[joint].add(stamp, stretch, flux_density, came)
+
+    def applied(self, joint: str, stamp: int, flux_density: float) -> None:
+        """Record that a level in T has taken effect, before the plan does."""
+        if joint in self.joints:
+            self.joints[joint].applied(stamp, flux_density)
+
+    def cautious(self, drafts: Drafts) -> Drafts:
+        """Return the drafts of a request with more time for moves to be corrected."""
+        return self._corrections.cautious(drafts)
+
+    def due(self, now: int) -> Iterator[Work]:
+        """Yield corrections that may help at a time in ns."""
+        return self._corrections.due(now)
+
+    def take(self, work: Work, drafts: Drafts, now: int) -> Verdict | None:
+        """Adopt a correction made for a time in ns; None if nothing changes."""
+        return self._corrections.take(work, drafts, now)
 
     def follows(self, name: str) -> bool:
         """Return whether plans for a joint begin from its estimate."""

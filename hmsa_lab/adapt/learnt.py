@@ -19,9 +19,9 @@ from hmsa.model.laws.coordinate import coordinate_of
 from hmsa.model.simulation import check_stretch
 from hmsa.planning.planner import Believed
 from hmsa.planning.timeline import Model
-from hmsa_ros.estimation import Estimate, Prior
-from hmsa_ros.estimation.estimator import CREEPS
-from hmsa_ros.estimation.motion import followed, rest
+from hmsa_lab.adapt.estimator import CREEPS, Estimate
+from hmsa_lab.adapt.motion import followed, rest
+from hmsa_lab.adapt.prior import Prior
 
 # A parameter has changed if it differs by this fraction and this many standard deviations.
 _NEWS, _SURE = 1e-3, 0.5

@@ -2,7 +2,7 @@
 
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.timeline import Model, Plan
-from hmsa_ros.estimation import Estimator
+from hmsa_lab.adapt.estimator import Estimator
 
 # Number of successive updates with samples that do not fit until the estimator restarts.
 _PERSISTENT = 3
