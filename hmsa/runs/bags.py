@@ -65,7 +65,7 @@ def read_runs(
     Returns
     -------
     list of Run
-        At least one, ordered by namespace and joint. A `MissingWarning` tells of messages that are
+        At least one, ordered by namespace and joint. A `MissingWarning` reports messages that are
         missing from them.
 
     Raises
