@@ -104,11 +104,11 @@ class Follower:
         return models
 
     def reset(self) -> str:
-        """Discard the estimates and return a confirmation; refused without estimates."""
+        """Discard the estimates and return a confirmation; raise `BadInputError` if off."""
         raise BadInputError('feedback is off and nothing is learnt: expected observe or adapt')
 
     def save(self, *, by_joint: bool) -> str:
-        """Write the estimates to the configured file and return a confirmation, or refuse."""
+        """Write the estimates to a file and return a confirmation; `BadInputError` if off."""
         raise BadInputError('feedback is off and nothing is learnt: expected observe or adapt')
 
 
