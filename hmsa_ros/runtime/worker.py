@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import suppress
 import sys
 from threading import Condition, Thread
@@ -47,7 +48,8 @@ class Job:
 
     def done(self, seconds: float = 0.0) -> bool:
         """Wait up to some seconds for the end of the work; return whether it has ended."""
-        with suppress(TimeoutError):
+        # Before Python 3.11 it is no TimeoutError.
+        with suppress(FutureTimeoutError):
             self._future.exception(seconds)
         return self._future.done()
 
