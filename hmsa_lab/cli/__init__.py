@@ -1,1 +1,0 @@
-"""Commands for work at a bench."""

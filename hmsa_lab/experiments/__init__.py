@@ -1,1 +1,0 @@
-"""Experiments: tuning an actuator, and calibrating coil, latency and sensor."""

@@ -1,1 +1,0 @@
-"""Nodes and hardware classes that convert topics of other nodes."""
