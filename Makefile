@@ -135,8 +135,8 @@ $(VENV)/.bench: $(VENV)/.installed
 	@touch $@
 
 # The installation compiles the motion, too; this is for when its sources change.
-$(VENV)/.motion: $(wildcard hmsa_ros/*.c hmsa_ros/device/*.cpp \
-	hmsa_ros/device/hmsa_board/*.hpp hmsa_ros/motion/*.cpp hmsa_ros/motion/hmsa/*.hpp) | $(VENV)/.installed
+$(VENV)/.motion: $(wildcard hmsa/*.c hmsa_lab/bench/*.cpp \
+	hmsa_lab/bench/hmsa_board/*.hpp hmsa/motion/*.cpp hmsa/motion/hmsa/*.hpp) | $(VENV)/.installed
 	@test -e $@ && test -z "$$(find $^ -newer $@)" \
 	|| { echo "Compiling the motion"; $(BIN)/python setup.py --quiet build_ext --inplace; }
 	@touch $@

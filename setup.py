@@ -20,7 +20,7 @@ def read(*parts):
 
 
 # Read, not imported: the package need not be importable where it is built.
-VERSION = re.search(r"^__version__ = '([^']+)'$", read(PACKAGE, '__init__.py'), re.M).group(1)
+VERSION = re.search(r"^__version__ = '([^']+)'$", read('hmsa', '__init__.py'), re.M).group(1)
 README = 'README.md' if os.path.exists(os.path.join(HERE, 'README.md')) else None
 
 INSTALL_REQUIRES = [
@@ -95,19 +95,18 @@ EXTRAS_REQUIRE = {
 
 # The same bits on every x86-64: no instructions beyond the baseline, nothing fused or reordered.
 MOTION = Extension(
-    PACKAGE + '.motion._motion', [PACKAGE + '/motion/module.cpp'],
-    include_dirs=[PACKAGE + '/motion'], depends=sorted(glob(PACKAGE + '/motion/hmsa/*.hpp')),
+    'hmsa.motion._motion', ['hmsa/motion/module.cpp'],
+    include_dirs=['hmsa/motion'], depends=sorted(glob('hmsa/motion/hmsa/*.hpp')),
     language='c++', extra_compile_args=[
         '-std=c++17', '-O2', '-ftree-vectorize', '-ffp-contract=off', '-fno-math-errno',
         '-fno-trapping-math', '-fvisibility=hidden', '-fno-exceptions', '-fno-rtti', '-Wno-psabi',
         '-g0'])
 BOARD = Extension(
-    PACKAGE + '.device._board', [PACKAGE + '/device/_board.cpp'],
-    include_dirs=[PACKAGE + '/device'], depends=[PACKAGE + '/device/hmsa_board/board.hpp'],
+    'hmsa_lab.bench._board', ['hmsa_lab/bench/_board.cpp'],
+    include_dirs=['hmsa_lab/bench'], depends=['hmsa_lab/bench/hmsa_board/board.hpp'],
     language='c++', extra_compile_args=[
         '-std=c++11', '-O2', '-fno-exceptions', '-fno-rtti', '-g0'])
-DEADLINE = Extension(
-    PACKAGE + '._deadline', [PACKAGE + '/_deadline.c'], extra_compile_args=['-g0'])
+DEADLINE = Extension('hmsa._deadline', ['hmsa/_deadline.c'], extra_compile_args=['-g0'])
 
 
 class BuildMotion(build_ext):
@@ -125,21 +124,37 @@ class BuildMotion(build_ext):
         super().build_extension(ext)
 
 
-NODES = ('planner', 'plant', 'driver', 'recorder', 'player', 'sense', 'controller')
+NODES = {
+    **dict.fromkeys(
+        ('planner', 'plant', 'driver', 'recorder', 'player', 'controller'), 'hmsa_ros'),
+    'sense': 'hmsa_lab'}
+# Commands of ``hmsa`` by package, with their modules if those have another name.
+COMMANDS = {
+    'hmsa.cli': {
+        **{x: x for x in (
+            'bag', 'compare', 'completion', 'export', 'identify', 'init', 'plan', 'report',
+            'simulate')}, 'wave': 'waves'},
+    'hmsa_ros.cli': {
+        **{x: x for x in ('demo', 'param', 'run', 'send', 'stop')},
+        **{node: 'node' for node, package in NODES.items() if package == 'hmsa_ros'}},
+    'hmsa_lab.cli': {
+        **{x: x for x in ('calibrate', 'excite', 'learn', 'panel', 'sense', 'tune', 'watch')},
+        'check-driver': 'check_driver'},
+    'hmsa_studies.commands': {x: x for x in ('figures', 'robustness', 'sweep')},
+}
 
 setup(
     name=PACKAGE,
     version=VERSION,
-    packages=find_packages(include=[PACKAGE, PACKAGE + '.*', 'hmsa_studies', 'hmsa_studies.*']),
-    package_data={PACKAGE: [
-        'fastdds.xml', 'fastdds_localhost.xml', 'motion/_motion.pyi', '_deadline.pyi', 'py.typed',
-        'device/_board.pyi', 'device/hmsa_board/board.hpp', 'device/hmsa_board/hmsa_board.ino',
-        'panel/index.html', 'panel/panel.css', 'panel/panel.js',
-        'report/page.css', 'report/page.js', 'report/style.mplstyle',
-        *(f'report/{x}.html' for x in ('page', 'parts', 'run', 'identified', 'conformance')),
-        *(f'cli/completion.{x}' for x in ('bash', 'zsh', 'fish')),
-        *(os.path.relpath(x, os.path.join(HERE, PACKAGE)) for x in sorted(glob(
-            os.path.join(HERE, PACKAGE, 'motion', 'hmsa', '*.hpp'))))]},
+    packages=find_packages(include=['hmsa*']),
+    package_data={
+        'hmsa': [
+            'py.typed', '*.pyi', 'cli/completion.[bfz]*', 'motion/*.pyi', 'motion/hmsa/*.hpp',
+            'report/*.css', 'report/*.html', 'report/*.js', 'report/*.mplstyle'],
+        'hmsa_ros': ['py.typed', '*.xml'],
+        'hmsa_lab': [
+            'py.typed', 'bench/*.pyi', 'bench/hmsa_board/*', 'panel/index.html', 'panel/panel.*',
+            'report/*.html']},
     ext_modules=[MOTION, BOARD, DEADLINE],
     cmdclass={'build_ext': BuildMotion},
     data_files=[
@@ -156,9 +171,16 @@ setup(
     extras_require=EXTRAS_REQUIRE,
     entry_points={
         'console_scripts': [
-            'hmsa = hmsa_ros.entry:main',
-            *(f'{node} = hmsa_ros.entry:{node}' for node in NODES),
-        ],
+            'hmsa = hmsa.entry:main', *(f'{x} = hmsa_ros.entry:{x}' for x in NODES)],
+        'hmsa.commands': [
+            f'{name} = {package}.{module}'
+            for package, modules in COMMANDS.items() for name, module in modules.items()],
+        'hmsa_ros.nodes': [f'{name} = {package}.nodes.{name}' for name, package in NODES.items()],
+        'hmsa_ros.follower': ['adapt = hmsa_lab.adapt.feedback:Feedback'],
+        'hmsa_ros.hardware': [
+            'scpi_supply = hmsa_lab.bench.scpi_supply:ScpiSupply',
+            'serial_board = hmsa_lab.bench.serial_board:SerialBoard',
+            'topic = hmsa_lab.nodes.topic_coil:TopicCoil'],
     },
     author='hmsa_ros maintainers',
     maintainer='hmsa_ros maintainers',

@@ -12,8 +12,8 @@ import math
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from hmsa_ros.model.equations import Array
-from hmsa_ros.model.units import MU_0
+from hmsa.model.equations import Array
+from hmsa.model.units import MU_0
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ import numpy as np
 from benchmarks.faults.rig import Rig
 from benchmarks.measure import ros_domain
 from benchmarks.sheet import Sheet
-from hmsa_ros.interfaces import topics
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.interfaces import topics
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes.conversions import to_trajectory
 
 #: Bound in us of the 99 % quantile of a cycle's processor time, beyond the excess of a bare loop's

@@ -52,8 +52,8 @@ class Recorder:
 
     def wait(self):
         """Wait until something has been recorded."""
-        from hmsa_ros.bag.reader import BagReader
-        from hmsa_ros.errors import HmsaError
+        from hmsa.bag.reader import BagReader
+        from hmsa.errors import HmsaError
         end = time.monotonic() + 60.0
         while True:
             # Until its first bytes are written there is no bag.
@@ -73,8 +73,8 @@ class Recorder:
         """Recover the bag; return the loss in seconds, the number of messages and of gaps."""
         from rosbags.rosbag2 import Reader
 
-        from hmsa_ros.bag.reader import BagReader
-        from hmsa_ros.bag.recover import recover
+        from hmsa.bag.reader import BagReader
+        from hmsa.bag.recover import recover
         self.process.wait()
         recovered = self.folder.with_name(self.folder.name + '_recovered')
         recover(self.folder, recovered)

@@ -20,10 +20,10 @@ import numpy as np
 
 from benchmarks.defects import away, measured, motion, PERIOD, plants, Sensor, sequence
 from benchmarks.sheet import Sheet
-from hmsa_ros.errors import HmsaError
-from hmsa_ros.identification.identify import identify
-from hmsa_ros.identification.quantities import DEFAULT_FREE
-from hmsa_ros.identification.result import Estimate
+from hmsa.errors import HmsaError
+from hmsa.identification.identify import identify
+from hmsa.identification.quantities import DEFAULT_FREE
+from hmsa.identification.result import Estimate
 
 #: Recordings of each defect, and the factor for those without one.
 RUNS, _EXACT = 30, 4

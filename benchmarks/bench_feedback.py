@@ -18,8 +18,8 @@ from benchmarks.faults.rig import Rig
 from benchmarks.measure import ros_domain
 from benchmarks.reference import Actuator, two_step
 from benchmarks.sheet import Sheet
-from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.actuator import parameters_of
+from hmsa.interfaces import topics
+from hmsa.interfaces.actuator import parameters_of
 from hmsa_studies.scenario import Scenario, SCENARIOS
 
 #: Stretches of a first move from 1, and of the next one.

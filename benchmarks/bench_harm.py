@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from benchmarks.bounds import bound
 from benchmarks.laboratory import Bench, Device, drawn, GROUPS
 from benchmarks.sheet import Sheet
-from hmsa_ros.control.loop import Loop
-from hmsa_ros.control.records import EstimateChanged, Output, Settings, StatusChanged, Target
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
+from hmsa_ros.runtime.loop import Loop
+from hmsa_ros.runtime.records import EstimateChanged, Output, Settings, StatusChanged, Target
 
 #: Benches, and the seed of the first; earlier seeds are for development.
 RUNS, SEED = 400, 90_000

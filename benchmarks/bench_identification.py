@@ -8,13 +8,13 @@ import numpy as np
 
 from benchmarks.fits import Fitted, with_casadi, with_scipy
 from benchmarks.sheet import Sheet
-from hmsa_ros.identification.identify import identify
-from hmsa_ros.identification.quantities import DEFAULT_FREE, derivative, values_of
-from hmsa_ros.identification.recording import Recording
-from hmsa_ros.identification.response import respond
-from hmsa_ros.model.equations import Array, elastic_force
-from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
-from hmsa_ros.planning.two_step import plan_two_step
+from hmsa.identification.identify import identify
+from hmsa.identification.quantities import DEFAULT_FREE, derivative, values_of
+from hmsa.identification.recording import Recording
+from hmsa.identification.response import respond
+from hmsa.model.equations import Array, elastic_force
+from hmsa.model.parameters import ActuatorParameters, paper_actuator
+from hmsa.planning.two_step import plan_two_step
 
 BLOCK = paper_actuator()
 SPAN = 10.0 * BLOCK.time_unit

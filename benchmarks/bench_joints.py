@@ -13,9 +13,9 @@ import numpy as np
 from benchmarks.faults.rig import Child, Rig
 from benchmarks.measure import ros_domain
 from benchmarks.sheet import Sheet
-from hmsa_ros.errors import HmsaError
-from hmsa_ros.interfaces import topics
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.errors import HmsaError
+from hmsa.interfaces import topics
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.capture import Capture, Taken
 from hmsa_ros.nodes.cdr import stamp_of

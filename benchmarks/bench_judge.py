@@ -18,8 +18,8 @@ import math
 import numpy as np
 
 from benchmarks.sheet import Sheet
-from hmsa_ros.judge.judging import judge
-from hmsa_ros.judge.records import Setpoint, Tolerances
+from hmsa.judge.judging import judge
+from hmsa.judge.records import Setpoint, Tolerances
 
 #: Runs of each kind.
 RUNS = 200

@@ -24,27 +24,27 @@ import numpy as np
 
 from benchmarks.laboratory import Bench, Iron, Plant
 from benchmarks.sheet import Sheet
-from hmsa_ros.control.loop import Loop
-from hmsa_ros.control.records import Output, Settings, StatusChanged, Trajectory
-from hmsa_ros.device import _board, line, serial_board
-from hmsa_ros.device.assembly import Assembly, CoilModel, SensorScale
-from hmsa_ros.device.calibration import calibrate_coil, decay, loop
+from hmsa.identification.files import read_belief
+from hmsa.identification.learning import learn, Target
+from hmsa.identification.learning import Trial as Repeat
+from hmsa.identification.recording import Recording
+from hmsa.interfaces.actuator import planned_from
+from hmsa.interfaces.topics import PLANNER
+from hmsa.model.equations import natural_frequency
+from hmsa.model.parameters import ActuatorParameters, paper_actuator
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
+from hmsa.runs.levels import ROUNDED
+from hmsa_lab.bench import _board, line, serial_board
+from hmsa_lab.bench.assembly import Assembly, CoilModel, SensorScale
+from hmsa_lab.bench.calibration import calibrate_coil, decay, loop
+from hmsa_lab.bench.iron_core import fit_core
+from hmsa_lab.bench.simulated_board import REST_LENGTH, SimulatedBoard, TESLA_PER_AMPERE
+from hmsa_lab.experiments.tuning import chosen, excitation, identified, Tuning
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
-from hmsa_ros.device.iron_core import fit_core
-from hmsa_ros.device.simulated_board import REST_LENGTH, SimulatedBoard, TESLA_PER_AMPERE
 from hmsa_ros.device.watchdog import Fallback
-from hmsa_ros.identification.files import read_belief
-from hmsa_ros.identification.learning import learn, Target
-from hmsa_ros.identification.learning import Trial as Repeat
-from hmsa_ros.identification.recording import Recording
-from hmsa_ros.interfaces.actuator import planned_from
-from hmsa_ros.interfaces.topics import PLANNER
-from hmsa_ros.lab.tuning import chosen, excitation, identified, Tuning
-from hmsa_ros.model.equations import natural_frequency
-from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options, Planner
-from hmsa_ros.recordings.levels import ROUNDED
+from hmsa_ros.runtime.loop import Loop
+from hmsa_ros.runtime.records import Output, Settings, StatusChanged, Trajectory
 
 #: Laboratories of each kind, and the first seed without and with hysteresis; earlier seeds are for
 #: development.

@@ -31,11 +31,11 @@ from benchmarks.bench_laboratory import (
 )
 from benchmarks.laboratory import Plant
 from benchmarks.sheet import Sheet
-from hmsa_ros.device.assembly import CoilModel
+from hmsa.errors import HmsaError
+from hmsa.model.equations import elastic_force
+from hmsa_lab.bench.assembly import CoilModel
+from hmsa_lab.bench.simulated_board import TESLA_PER_AMPERE
 from hmsa_ros.device.protocol import Kind
-from hmsa_ros.device.simulated_board import TESLA_PER_AMPERE
-from hmsa_ros.errors import HmsaError
-from hmsa_ros.model.equations import elastic_force
 
 RUNS, SEED = 20, 33_000
 #: Allowed error of the move after a fault, as a fraction of the step.

@@ -25,14 +25,14 @@ import numpy as np
 from benchmarks import contenders
 from benchmarks.measure import Contender, loosest, race, Report, Row, stopwatch
 from benchmarks.reference import Actuator, two_step
-from hmsa_ros import motion
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.delivery import Delivery
-from hmsa_ros.model.moves import State
-from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.planning.shapers.two_step import two_step as shaper
-from hmsa_ros.planning.two_step import (
+from hmsa import motion
+from hmsa.model.creep import Creep
+from hmsa.model.delivery import Delivery
+from hmsa.model.moves import State
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.two_step import two_step as shaper
+from hmsa.planning.two_step import (
     available_cores,
     HOLD_TOLERANCE,
     plan_two_step,
@@ -269,8 +269,8 @@ def choices(*, quick: bool = False) -> Report:
 
 _FIRST = (
     'from time import perf_counter; begin = perf_counter()\n'
-    'from hmsa_ros.model.parameters import NondimensionalParameters\n'
-    'from hmsa_ros.planning.two_step import plan_two_step\n'
+    'from hmsa.model.parameters import NondimensionalParameters\n'
+    'from hmsa.planning.two_step import plan_two_step\n'
     'imported = perf_counter()\n'
     'plan_two_step(1.0, 1.1, NondimensionalParameters())\n'
     'print(imported - begin, perf_counter() - imported)\n')

@@ -16,9 +16,9 @@ from scipy.integrate import odeint, solve_ivp
 from benchmarks.contenders import acceleration, holding_load
 from benchmarks.measure import Contender, loosest, race, Report, stopwatch
 from benchmarks.reference import Actuator, response
-from hmsa_ros.model.moves import Level, State
-from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.simulation import RTOL, sampled
+from hmsa.model.moves import Level, State
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.simulation import RTOL, sampled
 
 LIMIT = 1e-9
 ACTUATOR = Actuator(zeta=0.2, j_lim=5.0, c1=2.0)

@@ -26,9 +26,9 @@ def write(folder, rate, seconds):
     """Write a bag of numbers at a rate."""
     import struct
 
-    from hmsa_ros.bag.definitions import message_definition, type_hash
-    from hmsa_ros.bag.qos import Qos
-    from hmsa_ros.bag.writer import BagWriter, Topic
+    from hmsa.bag.definitions import message_definition, type_hash
+    from hmsa.bag.qos import Qos
+    from hmsa.bag.writer import BagWriter, Topic
     name = 'std_msgs/msg/Float64'
     encoding, text = message_definition(name)
     with BagWriter(folder, preset='zstd_fast') as writer:

@@ -78,7 +78,7 @@ def round_trip(count: int) -> Row:
     from rclpy.executors import SingleThreadedExecutor
     from std_msgs.msg import Float64
 
-    from hmsa_ros.interfaces import topics
+    from hmsa.interfaces import topics
     from hmsa_ros.nodes import endpoints
 
     planner = subprocess.Popen([sys.executable, '-m', 'hmsa_ros', 'planner'])

@@ -105,7 +105,7 @@ def receive(kind, folder):
             count += 1
         executor = EventsExecutor()
     else:
-        from hmsa_ros.bag.writer import BagWriter, Topic
+        from hmsa.bag.writer import BagWriter, Topic
         writer = BagWriter(folder)
         number = writer.add_topic(Topic(TOPIC, 'std_msgs/msg/UInt8MultiArray'))
         flushed = time.monotonic()
@@ -203,7 +203,7 @@ def plain(rate, seconds, folder):
 
 def recorder(rate, seconds, folder):
     """Measure the recorder of this package."""
-    from hmsa_ros.bag.reader import BagReader
+    from hmsa.bag.reader import BagReader
     return measure(
         [sys.executable, '-m', 'hmsa_ros', 'recorder', '--ros-args', '-p',
          f'storage.uri:={folder}', '-p', f'record.topics:=[{TOPIC}]'], rate, seconds,

@@ -143,12 +143,12 @@ class Result:
 
 def check_bag(folder: Path, kind: str, killed: str, step: int = _STEP_NS) -> Cycle:
     """Check a bag for gaps, integrate its commands again, and remove it if it has no fault."""
-    from hmsa_ros.bag.info import missing_messages
-    from hmsa_ros.bag.reader import BagReader
-    from hmsa_ros.bag.recover import recover
-    from hmsa_ros.errors import HmsaError
+    from hmsa.bag.info import missing_messages
+    from hmsa.bag.reader import BagReader
+    from hmsa.bag.recover import recover
+    from hmsa.errors import HmsaError
+    from hmsa.runs.verify import verify
     from hmsa_ros.nodes.cdr import stamp_of
-    from hmsa_ros.recordings.verify import verify
 
     found = Cycle(kind, killed)
     bag = folder
@@ -187,7 +187,7 @@ def read_witness(folder: Path, hours: float) -> Witness:
     """Count the messages of a long recording with a reader independent of this package."""
     from mcap.reader import make_reader
 
-    from hmsa_ros.bag.info import summarize
+    from hmsa.bag.info import summarize
 
     samples = messages = 0
     files = sorted(folder.glob('*.mcap'))
@@ -436,7 +436,7 @@ class Soak:
     def _rubbish(self, *, calm: bool) -> None:
         """Send garbage; in calm cycles only where it cannot reach the plant or checked topics."""
         from benchmarks.faults import garbage
-        from hmsa_ros.interfaces import topics
+        from hmsa.interfaces import topics
         from hmsa_ros.nodes.endpoints import interface_class
 
         inputs = [
@@ -509,7 +509,7 @@ class Soak:
         """Undo settings that garbage may have changed."""
         from std_srvs.srv import SetBool
 
-        from hmsa_ros.interfaces import topics
+        from hmsa.interfaces import topics
 
         self._publish_inputs()
         rig = self.rig
@@ -538,7 +538,7 @@ def run_over_dds(
         ('calm', 'planner'), ('rough', 'plant'), ('calm', 'recorder'), ('rough', ''),
         ('calm', ''), ('rough', 'planner'), ('calm', ''), ('calm', '')))
     from benchmarks.faults.rig import hushed
-    from hmsa_ros.errors import HmsaError
+    from hmsa.errors import HmsaError
 
     with hushed(folder / 'hushed.log') as stderr, Soak(folder, domain, seed, factor, rate) as soak:
         end = monotonic() + 60.0 * minutes
@@ -610,11 +610,11 @@ def run_in_process(hours: float, seed: int = 2) -> Core:
     from rclpy.serialization import deserialize_message, serialize_message
     from sensor_msgs.msg import MagneticField
 
-    from hmsa_ros.errors import HmsaError
-    from hmsa_ros.model.parameters import paper_actuator
-    from hmsa_ros.model.simulation import ActuatorSimulation
+    from hmsa.errors import HmsaError
+    from hmsa.model.parameters import paper_actuator
+    from hmsa.model.simulation import ActuatorSimulation
+    from hmsa.planning.planner import Options, Planner
     from hmsa_ros.nodes.conversions import from_command, to_command
-    from hmsa_ros.planning.planner import Options, Planner
 
     dice = random.Random(seed)
     wild = (math.nan, math.inf, -1.0, 0.0, 1e300, 2.7, 0.2)

@@ -26,9 +26,9 @@ from time import perf_counter, process_time, sleep
 import numpy as np
 
 from benchmarks.sheet import Sheet
-from hmsa_ros import motion
-from hmsa_ros.model.law import pack
-from hmsa_ros.planning.two_step import Groups, HOLD_TOLERANCE, plan_two_step_batch, RTOL
+from hmsa import motion
+from hmsa.model.law import pack
+from hmsa.planning.two_step import Groups, HOLD_TOLERANCE, plan_two_step_batch, RTOL
 from hmsa_studies.chunks import Chunks, LEAST_ROWS
 from hmsa_studies.engine import compute
 from hmsa_studies.executors import dask, local_processes

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.laboratory import Bench, KINDS
-from hmsa_ros.estimation.motion import follow, Levels, rest
-from hmsa_ros.identification.quantities import complete, values_of
-from hmsa_ros.model.parameters import ActuatorParameters
-from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa.identification.quantities import complete, values_of
+from hmsa.model.parameters import ActuatorParameters
+from hmsa.model.units import NANOSECONDS
+from hmsa.planning.planner import Options, Planner
+from hmsa_lab.adapt.motion import follow, Levels, rest
 
 Array = NDArray[np.float64]
 # Parameters that may deviate, and the width of each one's distribution: of the logarithm, or

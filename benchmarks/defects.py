@@ -16,8 +16,8 @@ from scipy.constants import mu_0
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
-from hmsa_ros.identification.recording import Recording
-from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
+from hmsa.identification.recording import Recording
+from hmsa.model.parameters import ActuatorParameters, paper_actuator
 
 Array = NDArray[np.float64]
 BLOCK = paper_actuator()

@@ -8,10 +8,10 @@ import numpy as np
 from scipy.constants import mu_0
 from scipy.optimize import least_squares
 
-from hmsa_ros.identification.quantities import from_coordinate, to_coordinate
-from hmsa_ros.identification.recording import Recording
-from hmsa_ros.identification.response import respond
-from hmsa_ros.model.equations import Array
+from hmsa.identification.quantities import from_coordinate, to_coordinate
+from hmsa.identification.recording import Recording
+from hmsa.identification.response import respond
+from hmsa.model.equations import Array
 
 # Runge-Kutta steps from one sample to the next: errors far below the noise.
 _SUBSTEPS = 4

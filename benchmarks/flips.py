@@ -16,11 +16,11 @@ from typing import Any
 
 from mcap.opcode import Opcode
 
-from hmsa_ros.bag.info import summarize
-from hmsa_ros.bag.reader import BagReader
-from hmsa_ros.bag.records import MAGIC, PREFIX
-from hmsa_ros.bag.writer import BagWriter, Topic
-from hmsa_ros.errors import HmsaError
+from hmsa.bag.info import summarize
+from hmsa.bag.reader import BagReader
+from hmsa.bag.records import MAGIC, PREFIX
+from hmsa.bag.writer import BagWriter, Topic
+from hmsa.errors import HmsaError
 
 _FLOAT = 'std_msgs/msg/Float64'
 # Bytes of a chunk or a message index before its bulk.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.constants import mu_0
 from scipy.integrate import OdeSolution, solve_ivp
 
-from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
+from hmsa.model.parameters import ActuatorParameters, paper_actuator
 
 Array = NDArray[np.float64]
 #: Possible deviations, by name.
@@ -251,7 +251,7 @@ class Plant:
 
 
 class Device:
-    """Actuator and sensor of a bench, for `hmsa_ros.control.loop.Loop`."""
+    """Actuator and sensor of a bench, for `hmsa_ros.runtime.loop.Loop`."""
 
     def __init__(self, bench: Bench, time: int) -> None:
         self.bench, self.time = bench, time

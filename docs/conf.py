@@ -5,7 +5,7 @@ import sys
 
 sys.path[:0] = [str(Path(__file__).parent.parent), str(Path(__file__).parent / '_ext')]
 
-from hmsa_ros import __version__  # noqa: E402
+from hmsa import __version__  # noqa: E402
 
 project = 'hmsa_ros'
 author = 'hmsa_ros maintainers'

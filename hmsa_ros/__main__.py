@@ -2,7 +2,7 @@
 
 import sys
 
-from hmsa_ros.entry import main
+from hmsa.entry import main
 
 if __name__ == '__main__':
     sys.exit(main())

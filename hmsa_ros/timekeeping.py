@@ -3,7 +3,7 @@
 from functools import partial
 import time
 
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.model.units import NANOSECONDS
 
 # Smaller differences may be due to the time between two readings.
 _STEP_NS = 5_000_000

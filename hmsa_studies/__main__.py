@@ -11,14 +11,14 @@ import sys
 
 import numpy as np
 
-from hmsa_ros.errors import complain, HmsaError
-from hmsa_ros.model.moves import State
-from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.residual import percent
-from hmsa_ros.planning.shapers import SHAPERS
-from hmsa_ros.planning.shapers.pace import Pace
-from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.report.paper import SCREEN
+from hmsa.errors import complain, HmsaError
+from hmsa.model.moves import State
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.residual import percent
+from hmsa.planning.shapers import SHAPERS
+from hmsa.planning.shapers.pace import Pace
+from hmsa.planning.shapers.request import Request
+from hmsa.report.paper import SCREEN
 from hmsa_studies.damped import damped_study, DampedStudy, LIMITS
 from hmsa_studies.pictures import draw_damped, draw_front, draw_robustness, draw_sampled
 from hmsa_studies.residual import Actual, Errors

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.equations import Array
+from hmsa.errors import BadInputError
+from hmsa.model.equations import Array
 
 #: Maximum number of values of a column, or of cases, since they are kept in memory.
 MOST_VALUES = 10_000_000

@@ -21,9 +21,9 @@ from typing import Any, Protocol
 import uuid
 import zlib
 
-from hmsa_ros import __version__
-from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.files import make_folder, require_arrow, write_text
+from hmsa import __version__
+from hmsa.errors import BadInputError, HmsaError
+from hmsa.files import make_folder, require_arrow, write_text
 from hmsa_studies.tables import open_writer, repeating
 
 #: Rows of a chunk: a thousandth of the study, at least 0.1 s and at most about 100 MB of work; a
@@ -220,7 +220,7 @@ def code() -> str:
     """Return a hash of the version, and of the sources that plan, simulate and estimate."""
     root = Path(__file__).resolve().parent.parent
     made = hashlib.sha256(__version__.encode())
-    for folder in ('hmsa_ros', 'hmsa_studies'):
+    for folder in ('hmsa', 'hmsa_ros', 'hmsa_studies'):
         for path in sorted(x for x in (root / folder).rglob('*') if x.suffix in _SOURCES):
             made.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
     return made.hexdigest()

@@ -10,17 +10,17 @@ import sys
 
 import numpy as np
 
-from hmsa_ros.model.equations import (
+from hmsa.model.equations import (
     Array,
     critical_zeta,
     Floats,
     signed_root,
     stretch_limits,
 )
-from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.residual import residual_vibration
-from hmsa_ros.model.simulation import simulate
-from hmsa_ros.planning.two_step import CODES, Groups, plan_two_step, plan_two_step_batch
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.residual import residual_vibration
+from hmsa.model.simulation import simulate
+from hmsa.planning.two_step import CODES, Groups, plan_two_step, plan_two_step_batch
 from hmsa_studies import paper_data
 from hmsa_studies.paper_data import Run
 

@@ -2,16 +2,16 @@
 
 from abc import ABC, abstractmethod
 
-from hmsa_ros.control.loop import Loop
-from hmsa_ros.control.records import Settings, Target
+from hmsa.model.actuators import Setup
+from hmsa.model.simulation import ActuatorSimulation
+from hmsa.model.units import NANOSECONDS
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
+from hmsa_lab.adapt.expected_error import caution
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.estimation.correction import caution
-from hmsa_ros.model.actuators import Setup
-from hmsa_ros.model.simulation import ActuatorSimulation
-from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa_ros.runtime.loop import Loop
+from hmsa_ros.runtime.records import Settings, Target
 from hmsa_studies.linear import Controller, Predictive, Quadratic
 from hmsa_studies.scenario import Scenario, Strategy
 

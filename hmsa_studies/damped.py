@@ -9,13 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hmsa_ros.errors import HmsaError
-from hmsa_ros.model.equations import Array, elastic_force, Floats
-from hmsa_ros.model.moves import Limits, Move, State
-from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.planning.shapers.linear import step
-from hmsa_ros.planning.shapers.minimum_time import minimum_time
-from hmsa_ros.planning.shapers.request import Request
+from hmsa.errors import HmsaError
+from hmsa.model.equations import Array, elastic_force, Floats
+from hmsa.model.moves import Limits, Move, State
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.planning.shapers.linear import step
+from hmsa.planning.shapers.minimum_time import minimum_time
+from hmsa.planning.shapers.request import Request
 from hmsa_studies.residual import Actual, ringing
 
 #: Deviation from the target, as a fraction of the step, at which a motion counts as settled.

@@ -18,7 +18,7 @@ import shutil
 from typing import cast
 import uuid
 
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa.errors import BadInputError, HmsaError
 from hmsa_studies.chunks import Chunks, Study
 from hmsa_studies.executors import given, held_signals, here, Start
 

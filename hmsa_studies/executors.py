@@ -14,7 +14,7 @@ import signal
 import threading
 from typing import Any, TypeVar
 
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa.errors import BadInputError, HmsaError
 
 Result = TypeVar('Result')
 #: Creates an executor; also returns the number of tasks to submit ahead.

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hmsa_ros.model.simulation import ActuatorSimulation
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.model.simulation import ActuatorSimulation
+from hmsa.model.units import NANOSECONDS
 from hmsa_studies.commanders import Commander, commander, LARGEST, planner_of
 from hmsa_studies.learning import carried_out, Learner
 from hmsa_studies.scenario import Scenario, Strategy

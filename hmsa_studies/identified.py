@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.files import Belief as Known
+from hmsa.errors import BadInputError
+from hmsa.identification.files import Belief as Known
 from hmsa_studies.axes import Belief
 
 # Identified names that differ from those of the block's parameters.

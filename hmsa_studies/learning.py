@@ -9,10 +9,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from hmsa_ros.model.equations import Array
-from hmsa_ros.model.parameters import ActuatorParameters
-from hmsa_ros.model.simulation import ActuatorSimulation
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.model.equations import Array
+from hmsa.model.parameters import ActuatorParameters
+from hmsa.model.simulation import ActuatorSimulation
+from hmsa.model.units import NANOSECONDS
 
 # Duration of the samples after the arrival, in time scales, and increment of levels and durations
 # for the Jacobian, relative to their units.

@@ -15,12 +15,12 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
 
-from hmsa_ros.errors import HmsaError
-from hmsa_ros.estimation.motion import follow, Levels
-from hmsa_ros.identification.quantities import complete, values_of
-from hmsa_ros.model.equations import Array
-from hmsa_ros.model.parameters import ActuatorParameters
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.errors import HmsaError
+from hmsa.identification.quantities import complete, values_of
+from hmsa.model.equations import Array
+from hmsa.model.parameters import ActuatorParameters
+from hmsa.model.units import NANOSECONDS
+from hmsa_lab.adapt.motion import follow, Levels
 
 # Load increment for the linearisation.
 _SMALL = 1e-4

@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 
-from hmsa_ros.model.equations import signed_root, stretch_limits
-from hmsa_ros.report import looks, style
-from hmsa_ros.report.paper import named, Paper
+from hmsa.model.equations import signed_root, stretch_limits
+from hmsa.report import looks, style
+from hmsa.report.paper import named, Paper
 from hmsa_studies import paper_data
 from hmsa_studies.paper_data import Data, Run, Sweep
 

@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from hmsa_ros.files import replacing
-from hmsa_ros.model.equations import Array, critical_zeta, signed_root, stretch_limits
-from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.simulation import simulate
-from hmsa_ros.model.status import Code
-from hmsa_ros.planning.sequence import plan_sequence, Segment
-from hmsa_ros.planning.setpoint import Setpoint
-from hmsa_ros.planning.two_step import CODES, Groups, plan_two_step_batch
+from hmsa.files import replacing
+from hmsa.model.equations import Array, critical_zeta, signed_root, stretch_limits
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.simulation import simulate
+from hmsa.model.status import Code
+from hmsa.planning.sequence import plan_sequence, Segment
+from hmsa.planning.setpoint import Setpoint
+from hmsa.planning.two_step import CODES, Groups, plan_two_step_batch
 
 #: Duration of each setpoint, as stated in the paper.
 SPAN = 10.0

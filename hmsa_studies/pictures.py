@@ -8,16 +8,16 @@ from typing import Any
 from matplotlib.axes import Axes
 import numpy as np
 
-from hmsa_ros.model.equations import critical_zeta, elastic_force
-from hmsa_ros.model.moves import Move, State
-from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.residual import percent, RESOLVED
-from hmsa_ros.planning.shapers.linear import step
-from hmsa_ros.planning.shapers.minimum_time import minimum_time
-from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.report import looks, style
-from hmsa_ros.report.looks import Look
-from hmsa_ros.report.paper import Paper
+from hmsa.model.equations import critical_zeta, elastic_force
+from hmsa.model.moves import Move, State
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.residual import percent, RESOLVED
+from hmsa.planning.shapers.linear import step
+from hmsa.planning.shapers.minimum_time import minimum_time
+from hmsa.planning.shapers.request import Request
+from hmsa.report import looks, style
+from hmsa.report.looks import Look
+from hmsa.report.paper import Paper
 from hmsa_studies.damped import DampedStudy, LIMITS, limits_of, SETTLED
 from hmsa_studies.residual import Actual
 from hmsa_studies.robustness import Candidate, Case, ORDERED, Result

@@ -8,16 +8,16 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.model import law
-from hmsa_ros.model.equations import Array
-from hmsa_ros.model.laws.record import Elastic
-from hmsa_ros.model.moves import Move, State
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.sequence import plan_sequence
-from hmsa_ros.planning.setpoint import Setpoint
-from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.planning.two_step import CODES, Groups, plan_two_step_batch
+from hmsa.errors import BadInputError, HmsaError
+from hmsa.model import law
+from hmsa.model.equations import Array
+from hmsa.model.laws.record import Elastic
+from hmsa.model.moves import Move, State
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.sequence import plan_sequence
+from hmsa.planning.setpoint import Setpoint
+from hmsa.planning.shapers.request import Request
+from hmsa.planning.two_step import CODES, Groups, plan_two_step_batch
 from hmsa_studies.residual import Actual, arrival_of
 from hmsa_studies.settings import Setting
 

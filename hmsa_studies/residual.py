@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 
-from hmsa_ros.model.delivery import Delivery, IDEAL
-from hmsa_ros.model.equations import (
+from hmsa.model.delivery import Delivery, IDEAL
+from hmsa.model.equations import (
     Array,
     critical_zeta,
     elastic_force,
@@ -14,14 +14,14 @@ from hmsa_ros.model.equations import (
     Floats,
     natural_frequency,
 )
-from hmsa_ros.model.mismatch import Errors
-from hmsa_ros.model.moves import Level, Move, State
-from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.residual import residual_vibration
-from hmsa_ros.model.simulation import sampled
-from hmsa_ros.model.status import Code
-from hmsa_ros.motion import STRETCH
-from hmsa_ros.planning.two_step import plan_two_step
+from hmsa.model.mismatch import Errors
+from hmsa.model.moves import Level, Move, State
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.residual import residual_vibration
+from hmsa.model.simulation import sampled
+from hmsa.model.status import Code
+from hmsa.motion import STRETCH
+from hmsa.planning.two_step import plan_two_step
 from hmsa_studies.settings import Setting
 
 __all__ = ['Actual', 'arrival_of', 'Errors']

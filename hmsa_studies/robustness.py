@@ -15,17 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.files import replacing
-from hmsa_ros.model.delivery import Delivery, IDEAL
-from hmsa_ros.model.equations import Array
-from hmsa_ros.model.moves import Level, Limits, Move, State
-from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.simulation import check_stretch
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.shapers import get_shaper, SHAPERS
-from hmsa_ros.planning.shapers.creeping import held
-from hmsa_ros.planning.shapers.request import Request
+from hmsa.errors import BadInputError, HmsaError
+from hmsa.files import replacing
+from hmsa.model.delivery import Delivery, IDEAL
+from hmsa.model.equations import Array
+from hmsa.model.moves import Level, Limits, Move, State
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.simulation import check_stretch
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.shapers import get_shaper, SHAPERS
+from hmsa.planning.shapers.creeping import held
+from hmsa.planning.shapers.request import Request
 from hmsa_studies.residual import Actual, arrival_of, Errors
 from hmsa_studies.tasks import Tasks
 

@@ -10,14 +10,14 @@ import math
 
 import numpy as np
 
-from hmsa_ros.errors import HmsaError
-from hmsa_ros.model.delivery import Delivery
-from hmsa_ros.model.equations import Array, Floats
-from hmsa_ros.model.moves import Level, Move, State
-from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.planning.shapers.two_step import two_step
+from hmsa.errors import HmsaError
+from hmsa.model.delivery import Delivery
+from hmsa.model.equations import Array, Floats
+from hmsa.model.moves import Level, Move, State
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.two_step import two_step
 from hmsa_studies.residual import Actual
 
 #: Maximum command period, as a fraction of tau_p, for which the residual should be exact.

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from hmsa_ros.estimation.prior import TRACKED
-from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters
+from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
+from hmsa_ros.runtime.records import TRACKED
 from hmsa_studies.linear import Weights
 
 #: Distances of the first and the next target from rest.

@@ -12,16 +12,16 @@ import math
 import sys
 from typing import Any
 
-from hmsa_ros.interfaces.actuator import completed, model_from
-from hmsa_ros.interfaces.parameters import LAW, LAW_NAME, ParameterSpec, PLANNED
-from hmsa_ros.model.delivery import Delivery
-from hmsa_ros.model.laws import LAWS
-from hmsa_ros.model.mismatch import Errors, Uncertainty
-from hmsa_ros.model.moves import Limits
-from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.units import NANOSECONDS, Units
-from hmsa_ros.planning.scales import USUAL_MOVE
-from hmsa_ros.planning.shapers.request import ERRORS
+from hmsa.interfaces.actuator import completed, model_from
+from hmsa.interfaces.parameters import LAW, LAW_NAME, ParameterSpec, PLANNED
+from hmsa.model.delivery import Delivery
+from hmsa.model.laws import LAWS
+from hmsa.model.mismatch import Errors, Uncertainty
+from hmsa.model.moves import Limits
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.units import NANOSECONDS, Units
+from hmsa.planning.scales import USUAL_MOVE
+from hmsa.planning.shapers.request import ERRORS
 
 #: Minimum and maximum value of a column.
 Range = tuple[float, float]
@@ -46,7 +46,7 @@ def _ranges(specs: tuple[ParameterSpec, ...]) -> dict[str, Range]:
 
 @dataclass(frozen=True)
 class Setting:
-    """A block and its delivery, as in `hmsa_ros.planning.timeline.Model`."""
+    """A block and its delivery, as in `hmsa.planning.timeline.Model`."""
 
     material: NondimensionalParameters
     limits: Limits = field(default_factory=Limits)

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import require_arrow
-from hmsa_ros.interfaces.parameters import LAW_NAME, present_name
-from hmsa_ros.model.equations import Array, signed_root
-from hmsa_ros.model.laws import LAWS
-from hmsa_ros.planning.shapers import get_shaper
+from hmsa.errors import BadInputError
+from hmsa.files import require_arrow
+from hmsa.interfaces.parameters import LAW_NAME, present_name
+from hmsa.model.equations import Array, signed_root
+from hmsa.model.laws import LAWS
+from hmsa.planning.shapers import get_shaper
 from hmsa_studies.axes import parse_grid
 from hmsa_studies.chunks import LEAST_ROWS, MOST_ROWS
 from hmsa_studies.plans import by_batch, by_settings, carried_out, Plans, STATUS

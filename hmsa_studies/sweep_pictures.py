@@ -13,10 +13,10 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FormatStrFormatter, MaxNLocator, NullLocator
 import numpy as np
 
-from hmsa_ros.interfaces.parameters import PLANNED
-from hmsa_ros.model.equations import Array
-from hmsa_ros.report import looks, style
-from hmsa_ros.report.paper import Paper
+from hmsa.interfaces.parameters import PLANNED
+from hmsa.model.equations import Array
+from hmsa.report import looks, style
+from hmsa.report.paper import Paper
 from hmsa_studies.settings import ACTUAL, BLOCK_OF, Nondimensional
 from hmsa_studies.views import Axis, View
 

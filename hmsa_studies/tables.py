@@ -7,8 +7,8 @@ from pathlib import Path
 import sys
 from typing import Any, Protocol, TextIO
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import replacing, require_arrow
+from hmsa.errors import BadInputError
+from hmsa.files import replacing, require_arrow
 
 
 class Block(Protocol):

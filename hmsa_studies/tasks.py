@@ -5,7 +5,7 @@ from functools import cached_property
 import hashlib
 from typing import Any
 
-from hmsa_ros.files import require_arrow
+from hmsa.files import require_arrow
 
 
 class Tasks:

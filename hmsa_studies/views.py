@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.equations import Array
+from hmsa.errors import BadInputError
+from hmsa.model.equations import Array
 
 #: Maximum number of rows of a sweep to draw, as they are kept in memory.
 MOST_ROWS = 4_000_000

@@ -10,8 +10,8 @@ actuators in RViz.
 
 from launch import LaunchDescription
 
-from hmsa_ros.lab.launching import DEMO
-from hmsa_ros.lab.ros_launch import description
+from hmsa_ros.clients.launching import DEMO
+from hmsa_ros.clients.ros_launch import description
 
 
 def generate_launch_description() -> LaunchDescription:

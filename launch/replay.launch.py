@@ -9,8 +9,8 @@ is done, all of it ends.
 
 from launch import LaunchDescription
 
-from hmsa_ros.lab.launching import REPLAY
-from hmsa_ros.lab.ros_launch import description
+from hmsa_ros.clients.launching import REPLAY
+from hmsa_ros.clients.ros_launch import description
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -19,35 +19,35 @@ from matplotlib.patches import Rectangle
 import numpy as np
 from PIL import Image
 
-from hmsa_ros.model.delivery import ramps
-from hmsa_ros.planning.shapers.request import Request
+from hmsa.model.delivery import ramps
+from hmsa.planning.shapers.request import Request
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from benchmarks.beam_segments import Chain  # noqa: E402
-from hmsa_ros.interfaces.actuator import actuator_from  # noqa: E402
-from hmsa_ros.interfaces.parameters import BLOCK  # noqa: E402
-from hmsa_ros.lab.adapting import second_act  # noqa: E402
-from hmsa_ros.lab.demo import SEQUENCE  # noqa: E402
-from hmsa_ros.model.creep import Creep  # noqa: E402
-from hmsa_ros.model.delivery import Delivery  # noqa: E402
-from hmsa_ros.model.equations import elastic_force, stretch_limits  # noqa: E402
-from hmsa_ros.model.laws import LAWS  # noqa: E402
-from hmsa_ros.model.laws.bending import centreline  # noqa: E402
-from hmsa_ros.model.moves import State  # noqa: E402
-from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator  # noqa: E402
-from hmsa_ros.model.simulation import ActuatorSimulation, simulate  # noqa: E402
-from hmsa_ros.model.units import NANOSECONDS  # noqa: E402
-from hmsa_ros.planning.planner import Options, Planner  # noqa: E402
-from hmsa_ros.planning.sequence import plan_sequence, Setpoint  # noqa: E402
-from hmsa_ros.planning.two_step import plan_two_step  # noqa: E402
-from hmsa_ros.recordings.levels import Level  # noqa: E402
-from hmsa_ros.recordings.record import RecordedRequest, Run  # noqa: E402
-from hmsa_ros.report import looks, style  # noqa: E402
-from hmsa_ros.report.arrivals import Part  # noqa: E402
-from hmsa_ros.report.paper import SCREEN  # noqa: E402
-from hmsa_ros.report.picture import draw  # noqa: E402
+from hmsa.interfaces.actuator import actuator_from  # noqa: E402
+from hmsa.interfaces.parameters import BLOCK  # noqa: E402
+from hmsa.model.creep import Creep  # noqa: E402
+from hmsa.model.delivery import Delivery  # noqa: E402
+from hmsa.model.equations import elastic_force, stretch_limits  # noqa: E402
+from hmsa.model.laws import LAWS  # noqa: E402
+from hmsa.model.laws.bending import centreline  # noqa: E402
+from hmsa.model.moves import State  # noqa: E402
+from hmsa.model.parameters import NondimensionalParameters, paper_actuator  # noqa: E402
+from hmsa.model.simulation import ActuatorSimulation, simulate  # noqa: E402
+from hmsa.model.units import NANOSECONDS  # noqa: E402
+from hmsa.planning.planner import Options, Planner  # noqa: E402
+from hmsa.planning.sequence import plan_sequence, Setpoint  # noqa: E402
+from hmsa.planning.two_step import plan_two_step  # noqa: E402
+from hmsa.report import looks, style  # noqa: E402
+from hmsa.report.arrivals import Part  # noqa: E402
+from hmsa.report.paper import SCREEN  # noqa: E402
+from hmsa.report.picture import draw  # noqa: E402
+from hmsa.runs.levels import Level  # noqa: E402
+from hmsa.runs.record import RecordedRequest, Run  # noqa: E402
+from hmsa_ros.clients.adapting import second_act  # noqa: E402
+from hmsa_ros.clients.demo import SEQUENCE  # noqa: E402
 from hmsa_studies.__main__ import PICTURES as STUDIES  # noqa: E402
 from hmsa_studies.paper import draw_figure, FIGURES  # noqa: E402
 

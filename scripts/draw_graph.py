@@ -1,5 +1,5 @@
 """
-Draw docs/images/graph.svg, the graph of nodes and topics, from hmsa_ros.interfaces.topics.
+Draw docs/images/graph.svg, the graph of nodes and topics, from hmsa.interfaces.topics.
 
 Used by ``make graph``. With ``--check`` nothing is written; the exit status is 1 if the file is
 not what would be drawn.
@@ -68,8 +68,8 @@ class Drawing:
 
 def draw() -> str:
     """Return the graph as SVG."""
-    from hmsa_ros.interfaces import topics
-    from hmsa_ros.interfaces.topics import PLANNER, PLANT, PLAYER, RECORDER
+    from hmsa.interfaces import topics
+    from hmsa.interfaces.topics import PLANNER, PLANT, PLAYER, RECORDER
 
     declared = [x for x in vars(topics).values() if isinstance(x, topics.Topic)]
     own = [x for x in declared if not x.name.startswith('/')]
@@ -165,7 +165,7 @@ def main(words: Sequence[str]) -> int:
     if '--check' not in words:
         FILE.write_text(drawn, encoding='utf-8')
     elif not FILE.exists() or FILE.read_text(encoding='utf-8') != drawn:
-        print(f'{FILE} is not what hmsa_ros.interfaces.topics says: expected it drawn anew, '
+        print(f'{FILE} is not what hmsa.interfaces.topics says: expected it drawn anew, '
               'run make graph', file=sys.stderr)
         return 1
     return 0

@@ -3,9 +3,9 @@
 from collections import Counter
 from pathlib import Path
 
-from hmsa_ros.bag.metadata import FILE_NAME
-from hmsa_ros.bag.reader import BagReader
-from hmsa_ros.errors import HmsaError
+from hmsa.bag.metadata import FILE_NAME
+from hmsa.bag.reader import BagReader
+from hmsa.errors import HmsaError
 
 
 def hold_against_rosbags(folder):

@@ -8,10 +8,10 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
-from hmsa_ros.interfaces.actuator import actuator_from
-from hmsa_ros.interfaces.parameters import BLOCK
-from hmsa_ros.model.parameters import ActuatorParameters
-from hmsa_ros.model.units import MU_0
+from hmsa.interfaces.actuator import actuator_from
+from hmsa.interfaces.parameters import BLOCK
+from hmsa.model.parameters import ActuatorParameters
+from hmsa.model.units import MU_0
 
 # A strip of silicone with 20 % of magnetised powder, in SI.
 YOUNGS, LENGTH, WIDTH, THICKNESS, DENSITY, REMANENCE = 1e6, 0.025, 0.005, 0.001, 2000.0, 0.1

@@ -9,12 +9,12 @@ import numpy as np
 from scipy.constants import mu_0
 from scipy.integrate import solve_ivp
 
-from hmsa_ros.control.environment import Environment
-from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.records import EstimateChanged, Send, Settings, StatusChanged, Target
-from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa.model.parameters import ActuatorParameters, paper_actuator
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
+from hmsa_ros.runtime.environment import Environment
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import EstimateChanged, Send, Settings, StatusChanged, Target
 
 MS = 1_000_000
 START = 1000 * MS

@@ -149,7 +149,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def bound(kind: Any, qos: Any = 1000) -> tuple[Any, Any]:
-    """Return message class and profile, from rclpy objects or `hmsa_ros.interfaces` names."""
+    """Return message class and profile, from rclpy objects or `hmsa.interfaces` names."""
     from hmsa_ros.nodes import endpoints
     from hmsa_ros.nodes.endpoints import interface_class
     return (interface_class(kind) if isinstance(kind, str) else kind,

@@ -439,11 +439,13 @@ def commands(text: str) -> list[list[str]]:
 
 def declared(node: str) -> dict[str, Any]:
     """Return the parameters of a node by name."""
-    return {x.name: x for x in import_module(f'hmsa_ros.nodes.{node}').PARAMETERS}
+    from hmsa.plugins import NODES, registered
+
+    return {x.name: x for x in registered(NODES)[node].load().PARAMETERS}
 
 
 def _nodes() -> tuple[str, ...]:
-    from hmsa_ros.interfaces import topics
+    from hmsa.interfaces import topics
 
     return topics.NODES
 
@@ -483,7 +485,7 @@ def _check_parameter(name: str, nodes: Iterable[str]) -> None:
 
 def _topic_names() -> dict[str, str]:
     """Return each topic by its name from outside, without a namespace, with its type."""
-    from hmsa_ros.interfaces import topics
+    from hmsa.interfaces import topics
 
     found: dict[str, str] = {}
     for topic in vars(topics).values():
@@ -542,7 +544,7 @@ def _check_parameters(node: str, words: list[str]) -> None:
 
 def _check_hmsa(words: list[str]) -> None:
     """Require that a command line can be parsed, without running it."""
-    from hmsa_ros.cli import build_parser, split_ros_args
+    from hmsa.cli import build_parser, split_ros_args
 
     try:
         build_parser().parse_args(split_ros_args(words))
@@ -555,7 +557,7 @@ def _check_hmsa(words: list[str]) -> None:
 def _check_launch(name: str, rest: list[str]) -> None:
     file = ROOT / 'launch' / name
     _require(file.is_file(), f'no launch file {name!r}')
-    from hmsa_ros.lab import launching
+    from hmsa_ros.clients import launching
 
     known = {x.name: x for x in getattr(launching, name.partition('.')[0].upper()).arguments}
     for word in rest:
@@ -568,7 +570,7 @@ def _check_launch(name: str, rest: list[str]) -> None:
 
 def _check_message(kind: str, words: list[str]) -> None:
     """Require that a payload matches the type, and the type the topic or service."""
-    from hmsa_ros.interfaces import topics
+    from hmsa.interfaces import topics
 
     name, type_name = words[:2]
     package, group, cls = type_name.split('/')

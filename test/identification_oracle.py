@@ -9,7 +9,7 @@ import numpy as np
 from scipy.constants import mu_0
 from scipy.optimize import brentq
 
-from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
+from hmsa.model.parameters import ActuatorParameters, paper_actuator
 
 BLOCK = paper_actuator()
 

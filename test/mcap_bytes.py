@@ -6,7 +6,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel, DataEnd, Footer, Header, Metadata, Schema
 
-from hmsa_ros.bag.records import MAGIC, PREFIX
+from hmsa.bag.records import MAGIC, PREFIX
 
 
 def made(record):

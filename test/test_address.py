@@ -3,7 +3,7 @@
 from diagnostic_msgs.msg import DiagnosticArray
 import pytest
 
-from hmsa_ros.interfaces import topics
+from hmsa.interfaces import topics
 from hmsa_ros.nodes import address
 from hmsa_ros.nodes.address import addresses, AddressWatch
 from hmsa_ros.nodes.planner import PlannerNode

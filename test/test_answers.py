@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from hmsa_ros.recordings.answers import answered, plans_of
-from hmsa_ros.recordings.record import Verdict
+from hmsa.runs.answers import answered, plans_of
+from hmsa.runs.record import Verdict
 
 MS = 1_000_000
 

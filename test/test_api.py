@@ -1,4 +1,4 @@
-"""The public API: the contents of ``import hmsa_ros``, without ROS, in seconds and tesla."""
+"""The public API: the contents of ``import hmsa``, without ROS, in seconds and tesla."""
 
 import contextlib
 import doctest
@@ -18,9 +18,10 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
+import hmsa
+from hmsa.cli import main
+from hmsa.table import Column, Table
 import hmsa_ros
-from hmsa_ros.cli import main
-from hmsa_ros.table import Column, Table
 
 FACE = {'Actuator', 'AssumedWarning', 'BadInputError', 'HmsaError', 'Identified', 'Motion', 'Plan',
         'MissingWarning', 'Table', 'UnusualWarning', 'compare', 'identify', 'read'}
@@ -47,7 +48,7 @@ class Frame:
 
 @pytest.fixture(scope='module')
 def block():
-    return hmsa_ros.Actuator(shear_modulus=30e3, half_length=5e-3, remanence=0.08, zeta=0.1)
+    return hmsa.Actuator(shear_modulus=30e3, half_length=5e-3, remanence=0.08, zeta=0.1)
 
 
 def followed(block, levels, end):
@@ -60,12 +61,20 @@ def followed(block, levels, end):
 
 
 def test_the_package_shows_its_face_and_no_more_and_loads_nothing_for_it():
-    assert set(dir(hmsa_ros)) == FACE
+    assert set(dir(hmsa)) == FACE
     seen = subprocess.run(
-        [sys.executable, '-c', 'import sys, hmsa_ros; print(sorted({x.partition(".")[0] for x in '
+        [sys.executable, '-c', 'import sys, hmsa; print(sorted({x.partition(".")[0] for x in '
          'sys.modules} & {"numpy", "scipy", "matplotlib", "rclpy", "rich", "yaml"}))'],
         capture_output=True, text=True, check=True)
     assert seen.stdout == '[]\n'
+    with pytest.raises(AttributeError, match="no attribute 'plans'"):
+        hmsa.plans  # noqa: B018
+
+
+def test_names_that_were_in_the_package_of_ros_still_work_and_say_where_they_are():
+    for name in FACE:
+        with pytest.warns(DeprecationWarning, match=f'hmsa_ros.{name} is hmsa.{name} now'):
+            assert getattr(hmsa_ros, name) is getattr(hmsa, name)
     with pytest.raises(AttributeError, match="no attribute 'plans'"):
         hmsa_ros.plans  # noqa: B018
 
@@ -73,7 +82,7 @@ def test_the_package_shows_its_face_and_no_more_and_loads_nothing_for_it():
 @pytest.mark.parametrize('name', [
     '', '.api.actuator', '.api.identified', '.api.motion', '.api.plan'])
 def test_examples_in_docstrings_print_what_they_show(name):
-    found = doctest.testmod(import_module(f'hmsa_ros{name}'))
+    found = doctest.testmod(import_module(f'hmsa{name}'))
     assert found.attempted
     assert found.failed == 0
 
@@ -103,33 +112,33 @@ def test_setpoints_and_levels_are_taken_from_pairs_arrays_mappings_and_frames(bl
         pairs, np.array(pairs), (np.array([1.1, 1.0]), np.array([0.5, 0.5])), columns,
         Frame(columns))]
     assert all(x == plans[0] for x in plans)
-    with pytest.raises(hmsa_ros.BadInputError, match='expected one named duration'):
+    with pytest.raises(hmsa.BadInputError, match='expected one named duration'):
         block.plan({'stretch': [1.1]})
 
 
 def test_limits_laws_creep_lag_and_beams_reach_the_plan(block):
-    with pytest.raises(hmsa_ros.HmsaError, match=r'needs a flux density of .* expected -0.1 T to'):
+    with pytest.raises(hmsa.HmsaError, match=r'needs a flux density of .* expected -0.1 T to'):
         block.plan([(1.4, 0.5)], limits=0.1)
     slow = block.replace(coil_time_constant=1e-3, creep=[(0.2, 1.0)])
     made = slow.plan([(1.1, 0.5)])
     assert len(made.times) > 3
     assert made.simulate().report()['verdict'] == ['arrived']
-    yeoh = hmsa_ros.Actuator(law='yeoh', constants={'c10': 5e3, 'c20': 300.0})
+    yeoh = hmsa.Actuator(law='yeoh', constants={'c10': 5e3, 'c20': 300.0})
     assert yeoh.shear_modulus == 1e4
     assert yeoh.scaled(shear_modulus=1.1).parameters['law.c20'] == pytest.approx(330.0)
-    beam = hmsa_ros.Actuator.beam(length=0.01, thickness=1e-3, width=5e-3, youngs_modulus=2e6)
+    beam = hmsa.Actuator.beam(length=0.01, thickness=1e-3, width=5e-3, youngs_modulus=2e6)
     report = beam.plan([(0.1, 0.4)]).simulate().report()
     assert report['verdict'] == ['arrived']
 
 
 def test_a_parameter_file_is_the_actuator_again(block, tmp_path):
-    laws = hmsa_ros.Actuator(
+    laws = hmsa.Actuator(
         law='ogden', constants={'mu': [6e3, 100.0], 'alpha': [1.3, 5.0]}, slew_limit=20.0,
         creep=[(0.1, 0.5)], flux_density_limits=(-0.1, 0.3))
     for number, one in enumerate((block, laws, block.replace(chain_limit=np.inf))):
         path = tmp_path / f'{number}.yaml'
         one.to_yaml(path)
-        again = hmsa_ros.Actuator.from_yaml(path)
+        again = hmsa.Actuator.from_yaml(path)
         assert again.block.numbers == pytest.approx(one.block.numbers)
         assert again.parameters.keys() == one.parameters.keys()
         assert again.plan([(1.05, 0.5)]).levels == pytest.approx(
@@ -137,12 +146,12 @@ def test_a_parameter_file_is_the_actuator_again(block, tmp_path):
 
 
 def test_what_is_identified_plans_and_is_written_with_its_covariance(tmp_path):
-    true = hmsa_ros.Actuator(remanence=0.12)
+    true = hmsa.Actuator(remanence=0.12)
     motion = true.simulate(LEVELS, until=0.6, noise=1e-4, rate=500.0)
     free = ['remanence', 'shear_modulus']
     samples = np.column_stack([motion.times, motion.stretches])
-    for found in (hmsa_ros.identify(motion, actuator=hmsa_ros.Actuator(), free=free),
-                  hmsa_ros.identify(samples, LEVELS, free=free)):
+    for found in (hmsa.identify(motion, actuator=hmsa.Actuator(), free=free),
+                  hmsa.identify(samples, LEVELS, free=free)):
         assert found.verdict == 'identified', found.reason
         low, high = found.intervals['remanence']
         assert low - 1e-4 < 0.12 < high + 1e-4
@@ -157,28 +166,28 @@ def test_what_is_identified_plans_and_is_written_with_its_covariance(tmp_path):
 
 def test_what_cannot_be_identified_says_why(block, tmp_path):
     motion = block.plan([(1.1, 0.2)]).simulate(noise=3e-3, rate=300)
-    found = hmsa_ros.identify(motion)
+    found = hmsa.identify(motion)
     assert found.verdict == 'not_identifiable'
     assert found.report()
-    with pytest.raises(hmsa_ros.HmsaError, match='the verdict is not_identifiable'):
+    with pytest.raises(hmsa.HmsaError, match='the verdict is not_identifiable'):
         found.to_yaml(tmp_path / 'found.yaml')
 
 
 @pytest.mark.parametrize(('call', 'said'), [
-    (lambda x: hmsa_ros.Actuator(shear_modulus='30kPa'), "shear_modulus is '30kPa': expected"),
-    (lambda x: hmsa_ros.Actuator(half_length=-1.0), 'half_length is -1: expected 1e-09 to 1000 m'),
-    (lambda x: hmsa_ros.Actuator(zeta=-1.0), 'zeta is -1'),
-    (lambda x: hmsa_ros.Actuator(zeta=0.1, damping_coefficient=0.1), 'expected one of them'),
-    (lambda x: hmsa_ros.Actuator(law='rubber'), "law is 'rubber': expected one of gent"),
-    (lambda x: hmsa_ros.Actuator(law='yeoh', constants={'c50': 1}), "no constant 'c50'"),
-    (lambda x: hmsa_ros.Actuator(law='yeoh', constants=[1e4]), 'expected values by name'),
-    (lambda x: hmsa_ros.Actuator(law='ogden', constants={'mu': 'soft'}), "mu is 'soft'"),
-    (lambda x: hmsa_ros.Actuator(creep=0.1), r'branches of creep have the shape \(\)'),
-    (lambda x: hmsa_ros.Actuator(law='yeoh', shear_modulus=1e4), 'whose constants it follows'),
-    (lambda x: hmsa_ros.Actuator(flux_density_limits=(1, -1)), 'the least below the largest'),
-    (lambda x: hmsa_ros.Actuator(slew_limit=0.0), 'or inf for steps'),
-    (lambda x: hmsa_ros.Actuator.from_yaml(5), 'path is 5: expected the path'),
-    (lambda x: hmsa_ros.Actuator.from_yaml('nothing.yaml'), 'cannot be read'),
+    (lambda x: hmsa.Actuator(shear_modulus='30kPa'), "shear_modulus is '30kPa': expected"),
+    (lambda x: hmsa.Actuator(half_length=-1.0), 'half_length is -1: expected 1e-09 to 1000 m'),
+    (lambda x: hmsa.Actuator(zeta=-1.0), 'zeta is -1'),
+    (lambda x: hmsa.Actuator(zeta=0.1, damping_coefficient=0.1), 'expected one of them'),
+    (lambda x: hmsa.Actuator(law='rubber'), "law is 'rubber': expected one of gent"),
+    (lambda x: hmsa.Actuator(law='yeoh', constants={'c50': 1}), "no constant 'c50'"),
+    (lambda x: hmsa.Actuator(law='yeoh', constants=[1e4]), 'expected values by name'),
+    (lambda x: hmsa.Actuator(law='ogden', constants={'mu': 'soft'}), "mu is 'soft'"),
+    (lambda x: hmsa.Actuator(creep=0.1), r'branches of creep have the shape \(\)'),
+    (lambda x: hmsa.Actuator(law='yeoh', shear_modulus=1e4), 'whose constants it follows'),
+    (lambda x: hmsa.Actuator(flux_density_limits=(1, -1)), 'the least below the largest'),
+    (lambda x: hmsa.Actuator(slew_limit=0.0), 'or inf for steps'),
+    (lambda x: hmsa.Actuator.from_yaml(5), 'path is 5: expected the path'),
+    (lambda x: hmsa.Actuator.from_yaml('nothing.yaml'), 'cannot be read'),
     (lambda x: x.replace(stiffness=1.0), 'stiffness is no parameter'),
     (lambda x: x.scaled(law=1.0), 'law has no factor'),
     (lambda x: x.plan(1.1), r'setpoints have the shape \(\)'),
@@ -205,15 +214,15 @@ def test_what_cannot_be_identified_says_why(block, tmp_path):
     (lambda x: x.simulate([(0.1, 0.0), (0.0, 0.1)]), 'increasing times from 0 s on'),
     (lambda x: x.simulate([(0.0, 0.01)], rate=0), 'rate is 0 Hz'),
     (lambda x: x.amplifiers([(1.1, 0.5)], inductance=1e-3), 'tesla_per_ampere is missing'),
-    (lambda x: hmsa_ros.identify([(0.0, 1.0)]), 'commands are missing'),
-    (lambda x: hmsa_ros.compare(1, 2), 'expected two motions or more'),
-    (lambda x: hmsa_ros.read(3), 'path is 3: expected the folder of a bag'),
+    (lambda x: hmsa.identify([(0.0, 1.0)]), 'commands are missing'),
+    (lambda x: hmsa.compare(1, 2), 'expected two motions or more'),
+    (lambda x: hmsa.read(3), 'path is 3: expected the folder of a bag'),
     (lambda x: x.plan([(1.1, 0.5)]).save('no/levels.mat'), 'cannot write no/levels.mat: No such'),
-    (lambda x: hmsa_ros.read('nothing'), 'does not exist'),
+    (lambda x: hmsa.read('nothing'), 'does not exist'),
 ])
 def test_wrong_types_units_and_ranges_get_a_sentence(block, tmp_path, monkeypatch, call, said):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(hmsa_ros.HmsaError, match=said) as found:
+    with pytest.raises(hmsa.HmsaError, match=said) as found:
         call(block)
     assert '\n' not in str(found.value)
 
@@ -238,13 +247,13 @@ WELL = {
     ({'chain_limit': 300.0}, 'j lim 300 is unusual'),
 ])
 def test_an_unusual_value_causes_the_warning_of_the_command(tmp_path, capsys, given, said):
-    with pytest.warns(hmsa_ros.UnusualWarning) as found:
-        made = hmsa_ros.Actuator(**given)
+    with pytest.warns(hmsa.UnusualWarning) as found:
+        made = hmsa.Actuator(**given)
     assert all(x.filename == __file__ for x in found)
     words = [str(x.message) for x in found]
     assert any(x.startswith(said) for x in words)
-    with pytest.warns(hmsa_ros.UnusualWarning) as again:
-        assert hmsa_ros.Actuator().replace(**{
+    with pytest.warns(hmsa.UnusualWarning) as again:
+        assert hmsa.Actuator().replace(**{
             'half_thickness': made.block.half_thickness, **given}) == made
     assert [str(x.message) for x in again] == words
     names = {'chain_limit': 'j_lim', 'flux_density_limits': 'flux_max'}
@@ -257,19 +266,19 @@ def test_an_unusual_value_causes_the_warning_of_the_command(tmp_path, capsys, gi
 
 def test_usual_actuators_cause_no_warning_and_models_without_j_lim_none_about_it():
     # Warnings are errors in tests.
-    hmsa_ros.Actuator(chain_limit=math.inf)
-    hmsa_ros.Actuator(law='neo_hookean', chain_limit=1e4)
-    hmsa_ros.Actuator(law='yeoh', constants={'c10': 15e3})
-    hmsa_ros.Actuator().scaled(shear_modulus=1e-2)
-    with pytest.warns(hmsa_ros.UnusualWarning, match='sags by') as found:
-        hmsa_ros.Actuator.beam(length=25e-3, thickness=1e-3, width=5e-3, youngs_modulus=1e6)
+    hmsa.Actuator(chain_limit=math.inf)
+    hmsa.Actuator(law='neo_hookean', chain_limit=1e4)
+    hmsa.Actuator(law='yeoh', constants={'c10': 15e3})
+    hmsa.Actuator().scaled(shear_modulus=1e-2)
+    with pytest.warns(hmsa.UnusualWarning, match='sags by') as found:
+        hmsa.Actuator.beam(length=25e-3, thickness=1e-3, width=5e-3, youngs_modulus=1e6)
     assert found[0].filename == __file__
 
 
 def test_damping_is_zeta_a_ratio_or_a_coefficient(block):
     # Critical damping of a cube at rest: sqrt(6).
     assert block.damping_ratio == pytest.approx(0.1 / 6.0**0.5, rel=1e-9)
-    same = hmsa_ros.Actuator(
+    same = hmsa.Actuator(
         shear_modulus=30e3, half_length=5e-3, remanence=0.08, damping_ratio=0.1 / 6.0**0.5)
     assert same.zeta == pytest.approx(0.1, rel=1e-9)
     assert block.replace(damping_ratio=0.2).damping_ratio == pytest.approx(0.2, rel=1e-9)
@@ -283,15 +292,15 @@ def test_damping_is_zeta_a_ratio_or_a_coefficient(block):
         same.damping_ratio, rel=2e-3)
     for given in ({'zeta': 0.1, 'damping_ratio': 0.1},
                   {'damping_ratio': 0.1, 'damping_coefficient': 0.1}):
-        with pytest.raises(hmsa_ros.BadInputError, match='both .* are given'):
-            hmsa_ros.Actuator(**given)
-        with pytest.raises(hmsa_ros.BadInputError, match='both .* are given'):
+        with pytest.raises(hmsa.BadInputError, match='both .* are given'):
+            hmsa.Actuator(**given)
+        with pytest.raises(hmsa.BadInputError, match='both .* are given'):
             block.replace(**given)
-    with pytest.raises(hmsa_ros.BadInputError, match='damping_ratio is -1'):
-        hmsa_ros.Actuator(damping_ratio=-1.0)
+    with pytest.raises(hmsa.BadInputError, match='damping_ratio is -1'):
+        hmsa.Actuator(damping_ratio=-1.0)
 
 
-@pytest.mark.filterwarnings('ignore::hmsa_ros.UnusualWarning')
+@pytest.mark.filterwarnings('ignore::hmsa.UnusualWarning')
 @pytest.mark.parametrize('name', [
     'Actuator', 'Actuator.beam', 'Actuator.from_parameters',
     'Actuator.from_yaml', 'block.plan', 'block.follow', 'block.wave', 'block.wave_bands',
@@ -304,7 +313,7 @@ def test_every_argument_takes_garbage_or_refuses_it_with_a_sentence(
     motion = plan.simulate(noise=1e-3)
     place, _, method = name.partition('.')
     function = {'block': block, 'plan': plan, 'motion': motion}.get(
-        place, getattr(hmsa_ros, place, None))
+        place, getattr(hmsa, place, None))
     function = getattr(function, method) if method else function
     arguments = inspect.signature(function).parameters.values()
     names = {x.name for x in arguments if x.kind is not x.VAR_KEYWORD}
@@ -312,7 +321,7 @@ def test_every_argument_takes_garbage_or_refuses_it_with_a_sentence(
         {'samples': motion} if name == 'identify' else {})
     for argument in names:
         for value in GARBAGE:
-            with contextlib.suppress(hmsa_ros.HmsaError):
+            with contextlib.suppress(hmsa.HmsaError):
                 function(**{**well, argument: value})
 
 
@@ -326,11 +335,11 @@ def test_so_does_what_is_passed_on(block, tmp_path, value):
             (block.scaled, {}, ('shear_modulus', 'remanence')),
             (motion.plot, {'path': tmp_path / 'a.svg'}, ('width', 'letters', 'dpi'))):
         for name in names:
-            with contextlib.suppress(hmsa_ros.HmsaError):
+            with contextlib.suppress(hmsa.HmsaError):
                 function(**{**well, name: value})
     for name in ('actuator.shear_modulus', 'law.mu', 'viscoelastic.time', 'flux_density_max'):
-        with contextlib.suppress(hmsa_ros.HmsaError):
-            hmsa_ros.Actuator.from_parameters({name: value})
+        with contextlib.suppress(hmsa.HmsaError):
+            hmsa.Actuator.from_parameters({name: value})
 
 
 def test_a_notebook_shows_tables_and_pictures(block, tmp_path):
@@ -406,7 +415,7 @@ def test_a_motion_and_a_plan_are_drawn_into_given_axes(block):
             ({'ax': 'axes'}, "ax is 'axes'"), ({'ax': one, 'panel': 'map'}, "panel is 'map'"),
             ({'panel': 'phase'}, 'with a panel'), ({'ax': one, 'path': 'a.png'}, "path 'a.png'"),
             ({'ax': one, 'width': 'x'}, 'width cannot be drawn')):
-        with pytest.raises(hmsa_ros.BadInputError, match=said):
+        with pytest.raises(hmsa.BadInputError, match=said):
             motion.plot(**given)
 
 
@@ -469,9 +478,9 @@ def test_a_plan_shows_the_levels_between_and_writes_all_for_other_commands(files
 
 
 def test_of_an_unshaped_step_the_residual_is_shown_beside_what_is_left_when_it_is_judged():
-    block = hmsa_ros.Actuator()
+    block = hmsa.Actuator()
     runs = [block.plan([(1.1, 0.5)], shaper=x).simulate() for x in ('two_step', 'step')]
-    table = hmsa_ros.compare(*runs)
+    table = hmsa.compare(*runs)
     assert table['verdict'] == ['arrived', 'arrived after ringing']
     shaped, unshaped = table['residual']
     assert shaped < 1e-4
@@ -496,23 +505,23 @@ def test_of_an_unshaped_step_the_residual_is_shown_beside_what_is_left_when_it_i
 
 
 def test_an_overdamped_step_arrives_without_ringing_and_a_setpoint_cut_off_has_a_reason():
-    with pytest.warns(hmsa_ros.UnusualWarning):
-        overdamped = hmsa_ros.Actuator(zeta=3.0)
+    with pytest.warns(hmsa.UnusualWarning):
+        overdamped = hmsa.Actuator(zeta=3.0)
     slow = overdamped.plan([(1.1, 5.0)], 'step').simulate()
     assert slow.report()['verdict'] == ['arrived']
-    block = hmsa_ros.Actuator()
+    block = hmsa.Actuator()
     cut = block.plan([(1.1, 0.5), (1.0, 0.5)]).simulate(until=0.5)
     said = 'setpoint 2 of 2: 1 is predicted, not measured: the samples end before its arrival'
     assert cut.report()['verdict'] == ['arrived', 'unobserved']
     assert cut.report().notes == (said,)
-    assert hmsa_ros.compare(cut, cut).notes[1] == f'simulated (2), {said}'
+    assert hmsa.compare(cut, cut).notes[1] == f'simulated (2), {said}'
 
 
 @pytest.mark.parametrize('where', ['notebook', 'terminal'])
 def test_rows_of_a_table_are_broken_between_columns_only(monkeypatch, where):
-    runs = [hmsa_ros.Actuator().plan([(1.1, 0.5)], shaper=x).simulate(label=x)
+    runs = [hmsa.Actuator().plan([(1.1, 0.5)], shaper=x).simulate(label=x)
             for x in ('two_step', 'step')]
-    table = hmsa_ros.compare(*runs)
+    table = hmsa.compare(*runs)
     monkeypatch.delenv('COLUMNS', raising=False)
     whole = str(table).splitlines()
     assert len(whole[0]) > 140   # in a file or a pipe

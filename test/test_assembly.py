@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from hmsa_ros.device import Assembly, CoilModel, parts, SensorScale
-from hmsa_ros.device import assembly as assembly_module
+from hmsa.errors import BadInputError
+from hmsa_lab.bench import Assembly, CoilModel, parts, SensorScale
+from hmsa_lab.bench import assembly as assembly_module
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.protocol import Kind
 from hmsa_ros.device.watchdog import Fallback
-from hmsa_ros.errors import BadInputError
 
 MS = 1_000_000
 START = 1000 * MS

@@ -18,15 +18,15 @@ import yaml
 import zstandard
 
 from benchmarks import flips
-from hmsa_ros.bag import limits, metadata, qos
-from hmsa_ros.bag.definitions import message_definition, type_hash
-from hmsa_ros.bag.info import summarize, to_json, to_text
-from hmsa_ros.bag.reader import BagReader, read_messages
-from hmsa_ros.bag.records import Block, MAGIC, PREFIX
-from hmsa_ros.bag.recover import recover
-from hmsa_ros.bag.writer import BagWriter, Topic
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError, BagError
+from hmsa.bag import limits, metadata, qos
+from hmsa.bag.definitions import message_definition, type_hash
+from hmsa.bag.info import summarize, to_json, to_text
+from hmsa.bag.reader import BagReader, read_messages
+from hmsa.bag.records import Block, MAGIC, PREFIX
+from hmsa.bag.recover import recover
+from hmsa.bag.writer import BagWriter, Topic
+from hmsa.cli import main
+from hmsa.errors import BadInputError, BagError
 
 FLOAT = 'std_msgs/msg/Float64'
 

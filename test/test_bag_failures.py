@@ -14,14 +14,14 @@ import sys
 from extras import needs
 import pytest
 
-from hmsa_ros.bag import metadata
-from hmsa_ros.bag.output import OutputFile
-from hmsa_ros.bag.reader import BagReader
-from hmsa_ros.bag.reception import judge, WARN
-from hmsa_ros.bag.recording import Limits, lost_by_topic, Recording
-from hmsa_ros.bag.recover import recover
-from hmsa_ros.bag.writer import BagWriter, Topic
-from hmsa_ros.errors import BadInputError, BagError
+from hmsa.bag import metadata
+from hmsa.bag.output import OutputFile
+from hmsa.bag.reader import BagReader
+from hmsa.bag.recover import recover
+from hmsa.bag.writer import BagWriter, Topic
+from hmsa.errors import BadInputError, BagError
+from hmsa_ros.recording.reception import judge, WARN
+from hmsa_ros.recording.recording import Limits, lost_by_topic, Recording
 
 TOPIC = Topic('/a', 'std_msgs/msg/UInt8', 'uint8 data\n')
 PAYLOAD = bytes((0, 1, 0, 0, 7))
@@ -222,7 +222,7 @@ def test_messages_that_a_snapshot_has_no_room_for_are_counted(tmp_path):
 # A writer that is killed: it says after each flush what is safe.
 WRITER = """
 import sys
-from hmsa_ros.bag.writer import BagWriter, Topic
+from hmsa.bag.writer import BagWriter, Topic
 writer = BagWriter(sys.argv[1], preset=sys.argv[2])
 number = writer.add_topic(Topic('/a', 'std_msgs/msg/UInt8', 'uint8 data\\n'))
 i = 0
@@ -293,7 +293,7 @@ def test_time_that_jumps_to_and_fro_does_not_make_a_file_each_time(tmp_path):
 
 @pytest.mark.slow
 def test_an_end_that_takes_too_long_is_cut_off_and_counted(tmp_path, monkeypatch):
-    monkeypatch.setattr('hmsa_ros.bag.recording.END_SECONDS', 0.0)
+    monkeypatch.setattr('hmsa_ros.recording.recording.END_SECONDS', 0.0)
     recording = Recording(BagWriter(tmp_path / 'bag'), Limits())
     recording.add_topic(TOPIC)
     for i in range(200_000):

@@ -8,12 +8,12 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 import pytest
 
-from hmsa_ros.bag import limits, metadata, qos
-from hmsa_ros.bag.definitions import message_definition, type_hash
-from hmsa_ros.bag.info import summarize
-from hmsa_ros.bag.reader import BagReader, read_messages
-from hmsa_ros.bag.writer import BagWriter, parse_custom_data, PRESETS, Topic
-from hmsa_ros.errors import BadInputError, BagError
+from hmsa.bag import limits, metadata, qos
+from hmsa.bag.definitions import message_definition, type_hash
+from hmsa.bag.info import summarize
+from hmsa.bag.reader import BagReader, read_messages
+from hmsa.bag.writer import BagWriter, parse_custom_data, PRESETS, Topic
+from hmsa.errors import BadInputError, BagError
 
 AnyReader = needs('rosbags.highlevel').AnyReader
 rosbag2, typesys = needs('rosbags.rosbag2'), needs('rosbags.typesys')
@@ -202,7 +202,7 @@ def test_notes_survive_without_a_clean_end(tmp_path):
 
 
 def test_notes_that_change_for_hours_take_a_bounded_part_of_a_file(tmp_path, monkeypatch):
-    monkeypatch.setattr('hmsa_ros.bag.writer._NOTES_SIZE', 30_000)
+    monkeypatch.setattr('hmsa.bag.writer._NOTES_SIZE', 30_000)
     # Less than all values that there were, and more than the last ones.
     monkeypatch.setattr(limits, 'KEPT_SIZE', 12_000)
     writer = BagWriter(tmp_path / 'bag')

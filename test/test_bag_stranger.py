@@ -15,13 +15,13 @@ import pytest
 import yaml
 import zstandard
 
-from hmsa_ros.bag import limits, metadata
-from hmsa_ros.bag.definitions import message_definition
-from hmsa_ros.bag.reader import BagReader, read_messages
-from hmsa_ros.bag.recover import recover
-from hmsa_ros.bag.writer import BagWriter, Topic
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError, BagError
+from hmsa.bag import limits, metadata
+from hmsa.bag.definitions import message_definition
+from hmsa.bag.reader import BagReader, read_messages
+from hmsa.bag.recover import recover
+from hmsa.bag.writer import BagWriter, Topic
+from hmsa.cli import main
+from hmsa.errors import BadInputError, BagError
 
 ROOT = Path(__file__).resolve().parent.parent
 FLOAT = 'std_msgs/msg/Float64'
@@ -32,10 +32,10 @@ DECLARED = schema(1, FLOAT, b'float64 data\n') + channel(1, 1, '/a')
 # Reads bags in every way there is, each in a process with no more memory than it is given.
 READER = """
 import os, resource, sys
-from hmsa_ros.bag.info import summarize, to_json, to_text
-from hmsa_ros.bag.reader import BagReader
-from hmsa_ros.bag.recover import recover
-from hmsa_ros.errors import HmsaError
+from hmsa.bag.info import summarize, to_json, to_text
+from hmsa.bag.reader import BagReader
+from hmsa.bag.recover import recover
+from hmsa.errors import HmsaError
 import lz4.frame, mcap_ros2.decoder, zstandard
 
 def read(path, chunk):

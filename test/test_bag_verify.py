@@ -15,17 +15,18 @@ from sensor_msgs.msg import JointState, MagneticField
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
+import hmsa
+from hmsa.bag.definitions import message_definition
+from hmsa.bag.reader import read_messages
+from hmsa.bag.writer import BagWriter, Topic
+from hmsa.cli import main
+from hmsa.errors import BadInputError, MissingWarning
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
+from hmsa.model.units import NANOSECONDS
+from hmsa.runs.verify import verify
 import hmsa_ros
-from hmsa_ros.bag.definitions import message_definition
-from hmsa_ros.bag.reader import read_messages
-from hmsa_ros.bag.writer import BagWriter, Topic
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError, MissingWarning
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
-from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes.conversions import from_time, to_command
-from hmsa_ros.recordings.verify import verify
 
 SAME = 1e-9
 BEGIN = 1_000_000_000
@@ -215,7 +216,7 @@ def test_every_reader_says_what_is_missing_from_a_damaged_bag(tmp_path, capsys):
     said = re.compile(
         r'/a: (\d+) of 201 messages cannot be read; a has no samples for (0\.\d+) s from')
     with pytest.warns(hmsa_ros.MissingWarning) as found:
-        motion = hmsa_ros.read(folder)
+        motion = hmsa.read(folder)
     count, gap = said.search(str(found[0].message)).groups()
     assert len(motion.times) == 200 - int(count)
     assert float(gap) == pytest.approx((int(count) + 1) * 1e-3)

@@ -23,20 +23,20 @@ import pytest
 from scipy.integrate import solve_bvp
 
 from benchmarks.beam_segments import Chain
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces.actuator import actuator_from, parameters_of
-from hmsa_ros.interfaces.parameters import BLOCK
-from hmsa_ros.model import equations
-from hmsa_ros.model.actuators import check_stretch
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.laws import bending
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.model.units import MU_0
-from hmsa_ros.planning.planner import Options, Planner
-from hmsa_ros.planning.two_step import plan_two_step
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.interfaces.actuator import actuator_from, parameters_of
+from hmsa.interfaces.parameters import BLOCK
+from hmsa.model import equations
+from hmsa.model.actuators import check_stretch
+from hmsa.model.creep import Creep
+from hmsa.model.laws import bending
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
+from hmsa.model.status import Code, RefusedError
+from hmsa.model.units import MU_0
+from hmsa.planning.planner import Options, Planner
+from hmsa.planning.two_step import plan_two_step
 
 
 def test_the_first_frequency_is_that_of_euler_and_bernoulli():

@@ -19,16 +19,16 @@ import numpy as np
 import pytest
 
 from benchmarks.beam_segments import Chain
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.excitation import Bounds, Designer, excite
-from hmsa_ros.identification.files import read_belief
-from hmsa_ros.identification.identify import identify
-from hmsa_ros.identification.quantities import derivative, values_of
-from hmsa_ros.identification.recording import Course, Recording
-from hmsa_ros.identification.response import respond
-from hmsa_ros.model import equations
-from hmsa_ros.model.laws.coordinate import DEFLECTION
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.identification.excitation import Bounds, Designer, excite
+from hmsa.identification.files import read_belief
+from hmsa.identification.identify import identify
+from hmsa.identification.quantities import derivative, values_of
+from hmsa.identification.recording import Course, Recording
+from hmsa.identification.response import respond
+from hmsa.model import equations
+from hmsa.model.laws.coordinate import DEFLECTION
 
 BEAM = silicone()
 PERIOD = 2.0 * np.pi * BEAM.time_unit / float(

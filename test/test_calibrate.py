@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from benchmarks.laboratory import Iron
-from hmsa_ros.cli import main
-from hmsa_ros.device.assembly import Assembly, CoilModel
-from hmsa_ros.device.calibration import calibrate_coil, loop
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.recordings.parameters import entries_of
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.runs.parameters import entries_of
+from hmsa_lab.bench.assembly import Assembly, CoilModel
+from hmsa_lab.bench.calibration import calibrate_coil, loop
 
 # Amperes of a loop, in its order.
 LOOP = np.array(loop(8.0, 8))

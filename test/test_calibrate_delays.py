@@ -9,14 +9,14 @@ from bench_oracle import Plant, slow
 import numpy as np
 import pytest
 
-from hmsa_ros.cli import main
-from hmsa_ros.device.assembly import SensorScale
-from hmsa_ros.device.statics import scale_at_rest, scale_by_gauge, statics
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.delays import delays, field_delays
-from hmsa_ros.identification.recording import Recording
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.recordings.parameters import entries_of
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.identification.delays import delays, field_delays
+from hmsa.identification.recording import Recording
+from hmsa.model.parameters import paper_actuator
+from hmsa.runs.parameters import entries_of
+from hmsa_lab.bench.assembly import SensorScale
+from hmsa_lab.bench.statics import scale_at_rest, scale_by_gauge, statics
 
 NOISE = 1e-3
 

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from hmsa_ros.cli import main
-from hmsa_ros.device import conformance
-from hmsa_ros.device.bench import Seen
+from hmsa.cli import main
+from hmsa_lab.bench import conformance
+from hmsa_lab.bench.bench import Seen
 from hmsa_ros.device.protocol import Sample
 
 # One class for all: a block at a level, whose state survives its process, in a file.

@@ -19,10 +19,10 @@ import time
 
 import pytest
 
-from hmsa_ros.cli import build_parser, main, split_ros_args
-from hmsa_ros.cli.completion import commands_of
-from hmsa_ros.cli.progress import progress
-from hmsa_ros.planning.shapers import SHAPERS
+from hmsa.cli import build_parser, main, split_ros_args
+from hmsa.cli.completion import commands_of
+from hmsa.cli.progress import progress
+from hmsa.planning.shapers import SHAPERS
 
 TOLERANCE = 1e-9
 ROOT = Path(__file__).resolve().parent.parent
@@ -83,7 +83,7 @@ def test_too_much_damping_falls_back_to_the_plain_step_and_says_so(capsys):
     (['send', '1.1:1', '--timeout', '0'], 'timeout is 0'),
     (['send', '1.1:1', '--namespace', '9 bad'], "namespace '9 bad': Invalid namespace"),
     (['plot'], "invalid choice: 'plot': did you mean"),
-    (['xyzzy'], "invalid choice: 'xyzzy': expected one of demo, "),
+    (['xyzzy'], "invalid choice: 'xyzzy': expected one of bag, "),
     (['plann', '1.1:10'], "invalid choice: 'plann': did you mean plan?; see hmsa --help"),
     (['record'], 'did you mean hmsa recorder?'), (['play', 'bag'], 'did you mean hmsa player?'),
     (['bag', 'play', 'x'], 'did you mean hmsa player?'),
@@ -160,7 +160,7 @@ def test_send_is_patient_in_simulated_time_that_is_slower_than_the_wall(start, r
 @pytest.mark.slow
 @pytest.mark.ros
 def test_send_trusts_a_driver_that_publishes_samples_alone(start, ros):
-    from hmsa_ros.interfaces import topics
+    from hmsa.interfaces import topics
     from hmsa_ros.nodes import endpoints
 
     ros.collect(
@@ -196,7 +196,7 @@ def test_send_fails_where_the_actuator_is_measured_to_miss_the_setpoint(start, r
 @pytest.mark.slow
 @pytest.mark.ros
 def test_send_moves_several_joints_each_to_its_stretch_or_all_to_one(start, ros):
-    from hmsa_ros.interfaces import topics
+    from hmsa.interfaces import topics
 
     plans = ros.collect(topics.PLAN.type, 'planner/plan', topics.PLAN.qos)
     joints = ['--ros-args', '-p', 'joints:=[left, right]']
@@ -403,12 +403,12 @@ def on_terminal(code, **env):
 
 
 PROGRESS = """
-from hmsa_ros.cli.progress import progress
+from hmsa.cli.progress import progress
 with progress('waiting') as update:
     update('drawing', 0.5)
 print('done')
 """
-TABLE = "from hmsa_ros.cli import main; main(['plan', '1.1:10'])"
+TABLE = "from hmsa.cli import main; main(['plan', '1.1:10'])"
 
 
 def test_progress_is_shown_on_a_terminal_and_gone_at_the_end(capsys):

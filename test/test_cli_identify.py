@@ -9,10 +9,10 @@ import pytest
 import yaml
 
 from benchmarks.defects import measured, motion, plants, Sensor, sequence
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.files import read_belief
-from hmsa_ros.identification.tables import read_csv
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.identification.files import read_belief
+from hmsa.identification.tables import read_csv
 
 TIMES = np.arange(500) * 1e-3
 LEVELS = steps((1.1, 1.4, 1.0), 0.0444, 3)

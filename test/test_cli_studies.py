@@ -16,9 +16,9 @@ import sys
 from extras import needs
 import pytest
 
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.planning.shapers import SHAPERS
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.planning.shapers import SHAPERS
 from hmsa_studies import matrix, paper_data, robustness
 from hmsa_studies.executors import given, here, in_order
 from hmsa_studies.feedback import trial

@@ -7,8 +7,8 @@ import sys
 import pytest
 from trajectory_msgs.msg import JointTrajectory
 
-from hmsa_ros.lab.client import PlannerClient
-from hmsa_ros.lab.link import Link
+from hmsa_ros.clients.client import PlannerClient
+from hmsa_ros.clients.link import Link
 from hmsa_ros.nodes.planner import PlannerNode
 
 # Far ahead for a busy machine.
@@ -97,5 +97,5 @@ def test_a_stop_without_a_plant_fails_and_says_so(start):
 
 
 def test_the_stop_needs_no_numpy():
-    code = "import sys, hmsa_ros.lab.link; sys.exit('numpy' in sys.modules)"
+    code = "import sys, hmsa_ros.clients.link; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, '-c', code], check=False).returncode == 0

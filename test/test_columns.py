@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 import pytest
 
-import hmsa_ros
-from hmsa_ros.api.paths import read_path
-from hmsa_ros.cli import main
-from hmsa_ros.columns import read_table
-from hmsa_ros.device.assembly import CoilModel
-from hmsa_ros.errors import AssumedWarning, BadInputError
-from hmsa_ros.identification.tables import read_levels
-from hmsa_ros.model.laws.curve import points_in
+import hmsa
+from hmsa.api.paths import read_path
+from hmsa.cli import main
+from hmsa.columns import read_table
+from hmsa.errors import AssumedWarning, BadInputError
+from hmsa.identification.tables import read_levels
+from hmsa.model.laws.curve import points_in
+from hmsa_lab.bench.assembly import CoilModel
 
 WANTED = ('time', 'flux_density')
 
@@ -66,7 +66,7 @@ def said(read):
 def test_each_reader_says_what_it_took_for_what(csv):
     path = csv('t,position,field\n0,1,0\n1,1.1,0.1\n')
     time, field = "column 't' was taken for time", "column 'field' was taken for flux_density"
-    for read in (read_levels, hmsa_ros.Actuator().simulate):
+    for read in (read_levels, hmsa.Actuator().simulate):
         assert said(lambda read=read: read(path)) == [time, field]
     assert said(lambda: read_path(path)) == [time, "column 'position' was taken for stretch"]
     path = csv('lambda,b\n' + '\n'.join(f'{1 + 0.05 * i:g},{0.02 * i:g}' for i in range(-3, 4)))

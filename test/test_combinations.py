@@ -9,18 +9,18 @@ from creep_oracle import elastic, ended
 import numpy as np
 import pytest
 
-from hmsa_ros.interfaces.actuator import actuator_from
-from hmsa_ros.interfaces.parameters import BLOCK
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.delivery import Delivery
-from hmsa_ros.model.equations import elastic_force, natural_frequency
-from hmsa_ros.model.laws import LAWS
-from hmsa_ros.model.moves import Limits
-from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.planning.sequence import plan_sequence
-from hmsa_ros.planning.setpoint import Setpoint
-from hmsa_ros.planning.shapers import SHAPERS
-from hmsa_ros.planning.shapers.request import Request
+from hmsa.interfaces.actuator import actuator_from
+from hmsa.interfaces.parameters import BLOCK
+from hmsa.model.creep import Creep
+from hmsa.model.delivery import Delivery
+from hmsa.model.equations import elastic_force, natural_frequency
+from hmsa.model.laws import LAWS
+from hmsa.model.moves import Limits
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.planning.sequence import plan_sequence
+from hmsa.planning.setpoint import Setpoint
+from hmsa.planning.shapers import SHAPERS
+from hmsa.planning.shapers.request import Request
 
 STRETCHES = np.linspace(0.7, 1.8, 23)
 CONSTANTS = {

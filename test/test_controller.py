@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from std_msgs.msg import Float64
 
-from hmsa_ros.control.cycles import Cycles
-from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.status import texts
+from hmsa.interfaces import topics
+from hmsa.interfaces.status import texts
 from hmsa_ros.nodes import conversions
+from hmsa_ros.runtime.cycles import Cycles
 
 MS = 1_000_000
 # In slow motion, so that a busy machine is no matter; commands come just in time.

@@ -10,16 +10,16 @@ import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from hmsa_ros.control import records
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces.status import Verdict, whole
-from hmsa_ros.judge.records import Finding, missed, Setpoint, unobserved
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.status import Code, RefusedError
+from hmsa.errors import BadInputError
+from hmsa.interfaces.status import Verdict, whole
+from hmsa.judge.records import Finding, missed, Setpoint, unobserved
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.group import PlannerGroup, Progress
+from hmsa.planning.planner import Options, Planner
 from hmsa_ros.nodes import conversions
 from hmsa_ros.nodes.cdr import read_trajectory
-from hmsa_ros.planning.group import PlannerGroup, Progress
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa_ros.runtime import records
 
 SECOND = 10**9
 # What the fields of a stamp can hold, in ns.

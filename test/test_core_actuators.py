@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.actuators import Actuators, Setup
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
+from hmsa.errors import BadInputError
+from hmsa.model.actuators import Actuators, Setup
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
 
 ACTUATOR = paper_actuator()
 MS = 1_000_000

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces.actuator import actuator_from, creep_from, parameters_of
-from hmsa_ros.model.actuators import Actuators, Setup
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
+from hmsa.errors import BadInputError
+from hmsa.interfaces.actuator import actuator_from, creep_from, parameters_of
+from hmsa.model.actuators import Actuators, Setup
+from hmsa.model.creep import Creep
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
 
 MS = 1_000_000
 GENT = paper_actuator()

@@ -7,19 +7,19 @@ from creep_oracle import elastic, ended, judged
 import numpy as np
 import pytest
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.delivery import Delivery, IDEAL
-from hmsa_ros.model.moves import Limits, State
-from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.model.simulation import follow
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.planner import Options, Planner
-from hmsa_ros.planning.sequence import plan_sequence
-from hmsa_ros.planning.setpoint import Setpoint
-from hmsa_ros.planning.shapers import get_shaper
-from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.planning.two_step import plan_two_step
+from hmsa.errors import BadInputError
+from hmsa.model.creep import Creep
+from hmsa.model.delivery import Delivery, IDEAL
+from hmsa.model.moves import Limits, State
+from hmsa.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa.model.simulation import follow
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.planner import Options, Planner
+from hmsa.planning.sequence import plan_sequence
+from hmsa.planning.setpoint import Setpoint
+from hmsa.planning.shapers import get_shaper
+from hmsa.planning.shapers.request import Request
+from hmsa.planning.two_step import plan_two_step
 
 MS = 1_000_000
 # Times in units of time: about as fast as the block, and from faster to much slower.
@@ -221,11 +221,11 @@ def test_one_search_finds_two_levels_and_another_ends_where_they_do(
         lag, creep, start, monkeypatch):
     request = Request(start, 1.25, replace(ONE, creep=creep), delivery=Delivery(lag=lag))
     with monkeypatch.context() as alone:
-        alone.setattr('hmsa_ros.motion.solve', None)
+        alone.setattr('hmsa.motion.solve', None)
         move = get_shaper('two_step')(request)
     assert move.code is Code.TWO_STEP
     with monkeypatch.context() as without:
-        without.setattr('hmsa_ros.motion.two_step_late', lambda *_: (5, *[math.nan] * 5))
+        without.setattr('hmsa.motion.two_step_late', lambda *_: (5, *[math.nan] * 5))
         slowly = get_shaper('two_step')(request)
     for found in (move, slowly):
         end = follow(

@@ -7,16 +7,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.equations import natural_frequency
-from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.drafting import finish
-from hmsa_ros.planning.group import PlannerGroup, Progress
-from hmsa_ros.planning.history import Deviation
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa.errors import BadInputError
+from hmsa.model.creep import Creep
+from hmsa.model.equations import natural_frequency
+from hmsa.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.group import PlannerGroup, Progress, resumed
+from hmsa.planning.history import Deviation
+from hmsa.planning.planner import Options, Planner
 
 MS = 1_000_000
 LEAD = 50 * MS
@@ -86,7 +85,7 @@ class Joint:
     def resume(self):
         if not self.group.may_resume('x'):
             return None
-        found = finish(self.group.draft_resumption('x', self.now))
+        found = resumed(self.group.planners['x'], self.now)
         assert self.stops or not found.refusal
         self.group.resume('x', found, self.now)
         return found
@@ -107,7 +106,7 @@ def group(**options):
 
 def test_each_joint_is_planned_as_it_would_be_alone():
     joints = group()
-    drafts = finish(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, START))
+    drafts = joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, START)
     assert joints.take(drafts, START)
     assert joints.number == 1
     for name, block in BLOCKS.items():
@@ -123,27 +122,27 @@ def test_each_joint_is_planned_as_it_would_be_alone():
 @pytest.mark.parametrize('name', BLOCKS)
 def test_what_one_joint_cannot_do_none_does(bad, name):
     joints = group()
-    joints.take(finish(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, START)), START)
+    joints.take(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, START), START)
     before = {name: x.plan for name, x in joints.planners.items()}
     with pytest.raises(RefusedError, match=f'^joint (left|{name}): '):
-        finish(joints.draft_request(
-            {x: [bad if x == name else (1.2, bad[1])] for x in BLOCKS}, None, START + MS))
+        joints.draft_request(
+            {x: [bad if x == name else (1.2, bad[1])] for x in BLOCKS}, None, START + MS)
     assert all(joints.planners[x].plan is plan for x, plan in before.items())
 
 
 def test_stop_and_setpoint_and_progress():
     joints = group()
     assert joints.progress(START)[0] == Progress()
-    joints.take(finish(joints.draft_setpoint('left', 1.2, START)), START)
-    assert finish(joints.draft_setpoint('left', 1.2, START + LEAD)) == {}
+    joints.take(joints.draft_setpoint('left', 1.2, START), START)
+    assert joints.draft_setpoint('left', 1.2, START + LEAD) == {}
     assert joints.next_command() == START
     found, each = joints.progress(START + LEAD)
     assert (found, each['right']) == (Progress('moving', 1, 1, ''), Progress())
     assert each['left'] == Progress('moving', 1, 1, '1.2')
     now = START + 2 * MS
-    joints.take(finish(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, now)), now)
+    joints.take(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, now), now)
     stop = now + 3 * MS
-    joints.take(finish(joints.draft_stop(stop)), stop)
+    joints.take(joints.draft_stop(stop), stop)
     for planner in joints.planners.values():
         planner.due(stop + LEAD)
         assert abs(planner.state(stop + 10**9).rate) < 1e-8
@@ -161,9 +160,9 @@ def test_simultaneous_arrival_is_that_of_the_slowest_to_the_nanosecond(period):
     joints = group(period=period)
     now = START // MS * MS
     alone = group(period=period)
-    alone.take(finish(alone.draft_request(dict.fromkeys(BLOCKS, SOME), None, now)), now)
+    alone.take(alone.draft_request(dict.fromkeys(BLOCKS, SOME), None, now), now)
     joints.simultaneous = True
-    joints.take(finish(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, now)), now)
+    joints.take(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, now), now)
     for k in range(3):
         sooner = [x.plan.segments[k] for x in alone.planners.values()]
         found = [x.plan.segments[k] for x in joints.planners.values()]
@@ -189,11 +188,11 @@ def test_simultaneous_arrival_is_that_of_the_slowest_to_the_nanosecond(period):
 def test_joint_in_motion_is_not_held_back():
     joints = group()
     joints.simultaneous = True
-    joints.take(finish(joints.draft_setpoint('left', 1.2, START)), START)
+    joints.take(joints.draft_setpoint('left', 1.2, START), START)
     joints.planners['left'].due(START + LEAD)
     now = START + 2 * MS
-    drafts = finish(joints.draft_request(
-        dict.fromkeys(BLOCKS, [(1.1, 44 * MS)]), None, now))
+    drafts = joints.draft_request(
+        dict.fromkeys(BLOCKS, [(1.1, 44 * MS)]), None, now)
     assert drafts['left'].segments[0].begin == now + LEAD
     assert drafts['left'].levels[0].stamp == now + LEAD
     latest = max(x.segments[0].arrival for x in drafts.values())
@@ -205,7 +204,7 @@ def test_joint_in_motion_is_not_held_back():
 def test_preview_has_every_joint_at_every_change(creep):
     joints = PlannerGroup({
         name: Planner(replace(block, creep=creep), Options()) for name, block in BLOCKS.items()})
-    joints.take(finish(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, START)), START)
+    joints.take(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, START), START)
     stamps, samples = joints.preview(START, 10_000)
     assert stamps == sorted({
         x.stamp for p in joints.planners.values() for x in p.plan.levels if x.stamp > 0})
@@ -272,19 +271,19 @@ def test_setpoint_there_is_no_time_left_for_is_left_out():
     joint = Joint(lead_time=5 * MS)
     joint.planner.request([(1.1, 44 * MS), (1.3, 60 * MS)], None, START)
     level, _ = joint.planner.due(START + 10 * MS)
-    draft = finish(joint.planner.draft_resumption(START + 39 * MS))
+    draft = joint.planner.draft_resumption(START + 39 * MS)
     assert (draft.missed, [x.stretch for x in draft.segments]) == (0, [1.1, 1.3])
     # The first move begins 36 ms late: its time is over before it is.
     assert joint.news(START + 41 * MS, level.flux_density) == Deviation(36 * MS)
-    draft = finish(joint.planner.draft_resumption(START + 41 * MS))
+    draft = joint.planner.draft_resumption(START + 41 * MS)
     assert (draft.missed, [x.stretch for x in draft.segments]) == (1, [1.3])
     assert draft.segments[0].begin == START + 46 * MS
     # It would do with less of a rest at the first.
     joint.planner.set_options(replace(joint.planner.options, short_spell='continue'))
-    draft = finish(joint.planner.draft_resumption(START + 41 * MS))
+    draft = joint.planner.draft_resumption(START + 41 * MS)
     assert (draft.missed, [x.stretch for x in draft.segments]) == (0, [1.1, 1.3])
     joint.planner.restart()
-    assert finish(joint.planner.draft_resumption(START)) is None
+    assert joint.planner.draft_resumption(START) is None
 
 
 def test_what_cannot_be_resumed_is_stopped():
@@ -292,7 +291,7 @@ def test_what_cannot_be_resumed_is_stopped():
     joint.planner.setpoint(1.4, START)
     joint.planner.due(START + 2 * MS)
     joint.planner.set_options(replace(joint.planner.options, flux_density_max=0.1))
-    found = finish(joint.group.draft_resumption('x', START + 3 * MS))
+    found = resumed(joint.planner, START + 3 * MS)
     assert 'stretch 1.4 needs a flux density of' in found.refusal
     joint.group.resume('x', found, START + 3 * MS)
     rest = joint.planner.state(START + 10**9)
@@ -336,7 +335,7 @@ def test_the_level_in_force_is_not_the_early_beginning_of_a_gentle_path():
     joint = Joint(flux_density_min=-0.5, flux_density_max=0.5)
     path = [((1.0 + 0.3 * x * x * (3.0 - 2.0 * x), 9.0 * x * (1.0 - x), math.nan),
              round(200 * MS * x)) for x in (i / 20 for i in range(21))]
-    joint.planner.take(finish(joint.planner.draft_path(path, None, START)), START)
+    joint.planner.take(joint.planner.draft_path(path, None, START), START)
     sent = joint.planner.due(START + 50 * MS)
     assert len(sent) > 50
     # Its levels begin and differ by less than hardware that rounds resolves.
@@ -428,7 +427,7 @@ def test_commands_that_are_late_for_ever_are_not_planned_anew_for_ever():
     assert joint.resume() is None
     # A new request is a new beginning, and so is a command in time.
     joint.delay = 0
-    drafts = finish(joint.group.draft_setpoint('x', 1.3, joint.now))
+    drafts = joint.group.draft_setpoint('x', 1.3, joint.now)
     joint.group.take(drafts, joint.now)
     assert joint.resume().draft is not None
     joint.wait(100)
@@ -531,5 +530,5 @@ def test_block_that_cannot_be_where_it_is_held_is_refused():
 def test_code_of_a_refusal_stays():
     joints = group()
     with pytest.raises(RefusedError) as caught:
-        finish(joints.draft_setpoint('top', 9.0, START))
+        joints.draft_setpoint('top', 9.0, START)
     assert caught.value.code is Code.OUT_OF_RANGE

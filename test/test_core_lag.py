@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hmsa_ros.model.delivery import Delivery, ramps
-from hmsa_ros.model.equations import elastic_force
-from hmsa_ros.model.moves import Level, Limits, State
-from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation, sampled
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.planner import Options, Planner
-from hmsa_ros.planning.sequence import plan_sequence
-from hmsa_ros.planning.setpoint import Setpoint
-from hmsa_ros.planning.shapers import get_shaper
-from hmsa_ros.planning.shapers.request import Request
+from hmsa.model.delivery import Delivery, ramps
+from hmsa.model.equations import elastic_force
+from hmsa.model.moves import Level, Limits, State
+from hmsa.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa.model.simulation import ActuatorSimulation, sampled
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.planner import Options, Planner
+from hmsa.planning.sequence import plan_sequence
+from hmsa.planning.setpoint import Setpoint
+from hmsa.planning.shapers import get_shaper
+from hmsa.planning.shapers.request import Request
 
 PAPER = NondimensionalParameters()
 LIMITS = Limits(-2.5, 2.5)

@@ -7,19 +7,19 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from hmsa_ros import motion
-from hmsa_ros.model import law
-from hmsa_ros.model.equations import (
+from hmsa import motion
+from hmsa.model import law
+from hmsa.model.equations import (
     elastic_energy,
     elastic_force,
     equilibrium_stretch,
     stretch_limits,
 )
-from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.simulation import simulate
-from hmsa_ros.model.status import Code
-from hmsa_ros.motion.theta import CONSTANT
-from hmsa_ros.planning.two_step import Groups, plan_two_step, plan_two_step_batch
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.simulation import simulate
+from hmsa.model.status import Code
+from hmsa.motion.theta import CONSTANT
+from hmsa.planning.two_step import Groups, plan_two_step, plan_two_step_batch
 
 NEO_HOOKEAN = NondimensionalParameters(j_lim=math.inf)
 

@@ -9,34 +9,34 @@ from extras import needs
 import numpy as np
 import pytest
 
-from hmsa_ros import motion
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.files import read_belief
-from hmsa_ros.identification.identify import identify
-from hmsa_ros.identification.recording import Recording
-from hmsa_ros.interfaces.actuator import actuator_from, parameters_of
-from hmsa_ros.interfaces.parameters import BLOCK
-from hmsa_ros.model.actuators import check_stretch, unheld
-from hmsa_ros.model.delivery import Delivery
-from hmsa_ros.model.equations import (
+from hmsa import motion
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.identification.files import read_belief
+from hmsa.identification.identify import identify
+from hmsa.identification.recording import Recording
+from hmsa.interfaces.actuator import actuator_from, parameters_of
+from hmsa.interfaces.parameters import BLOCK
+from hmsa.model.actuators import check_stretch, unheld
+from hmsa.model.delivery import Delivery
+from hmsa.model.equations import (
     elastic_energy,
     elastic_force,
     elastic_stiffness,
     equilibrium_stretch,
     stretch_limits,
 )
-from hmsa_ros.model.laws import LAWS
-from hmsa_ros.model.moves import State
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.simulation import simulate
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.sequence import plan_sequence
-from hmsa_ros.planning.setpoint import Setpoint
-from hmsa_ros.planning.shapers import get_shaper
-from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.planning.two_step import Groups, plan_two_step, plan_two_step_batch
-from hmsa_ros.recordings.parameters import read_parameter_file, recorded
+from hmsa.model.laws import LAWS
+from hmsa.model.moves import State
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import simulate
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.sequence import plan_sequence
+from hmsa.planning.setpoint import Setpoint
+from hmsa.planning.shapers import get_shaper
+from hmsa.planning.shapers.request import Request
+from hmsa.planning.two_step import Groups, plan_two_step, plan_two_step_batch
+from hmsa.runs.parameters import read_parameter_file, recorded
 
 mpmath = needs('mpmath')
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.constants import mu_0
 
-from hmsa_ros.model import equations
-from hmsa_ros.model.parameters import (
+from hmsa.model import equations
+from hmsa.model.parameters import (
     ActuatorParameters,
     NondimensionalParameters,
     paper_actuator,
 )
-from hmsa_ros.model.simulation import simulate
+from hmsa.model.simulation import simulate
 
 mpmath = needs('mpmath')
 

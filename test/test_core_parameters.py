@@ -6,8 +6,8 @@ import math
 import pytest
 from scipy.constants import mu_0
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.parameters import (
+from hmsa.errors import BadInputError
+from hmsa.model.parameters import (
     ActuatorParameters,
     NondimensionalParameters,
     paper_actuator,

@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.equations import elastic_force, natural_frequency
-from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.planner import Options, Planner
-from hmsa_ros.planning.sequence import plan_sequence
-from hmsa_ros.planning.setpoint import Setpoint
+from hmsa.errors import BadInputError
+from hmsa.model.equations import elastic_force, natural_frequency
+from hmsa.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.planner import Options, Planner
+from hmsa.planning.sequence import plan_sequence
+from hmsa.planning.setpoint import Setpoint
 
 ACTUATOR = paper_actuator()
 GROUP = ACTUATOR.nondimensional

@@ -9,17 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.delivery import Delivery
-from hmsa_ros.model.equations import critical_zeta, natural_frequency, stretch_limits
-from hmsa_ros.model.moves import Limits, State
-from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.model.units import Units
-from hmsa_ros.planning.sequence import plan_sequence
-from hmsa_ros.planning.setpoint import Setpoint
-from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.planning.two_step import plan_two_step
+from hmsa.errors import BadInputError
+from hmsa.model.delivery import Delivery
+from hmsa.model.equations import critical_zeta, natural_frequency, stretch_limits
+from hmsa.model.moves import Limits, State
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.status import Code, RefusedError
+from hmsa.model.units import Units
+from hmsa.planning.sequence import plan_sequence
+from hmsa.planning.setpoint import Setpoint
+from hmsa.planning.shapers.request import Request
+from hmsa.planning.two_step import plan_two_step
 
 PAPER = NondimensionalParameters()
 SPAN = 10.0

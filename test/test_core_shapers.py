@@ -11,26 +11,26 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hmsa_ros import motion
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.delivery import Delivery, ramps
-from hmsa_ros.model.equations import (
+from hmsa import motion
+from hmsa.errors import BadInputError
+from hmsa.model.creep import Creep
+from hmsa.model.delivery import Delivery, ramps
+from hmsa.model.equations import (
     acceleration,
     critical_zeta,
     elastic_force,
     natural_frequency,
     stretch_limits,
 )
-from hmsa_ros.model.moves import Limits, Move, State
-from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation, follow
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.planner import Options, Planner
-from hmsa_ros.planning.sequence import plan_sequence
-from hmsa_ros.planning.setpoint import Setpoint
-from hmsa_ros.planning.shapers import get_shaper, SHAPERS
-from hmsa_ros.planning.shapers.request import Request
+from hmsa.model.moves import Limits, Move, State
+from hmsa.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa.model.simulation import ActuatorSimulation, follow
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.planner import Options, Planner
+from hmsa.planning.sequence import plan_sequence
+from hmsa.planning.setpoint import Setpoint
+from hmsa.planning.shapers import get_shaper, SHAPERS
+from hmsa.planning.shapers.request import Request
 
 PAPER = NondimensionalParameters()
 WIDE = Limits(-20.0, 20.0)

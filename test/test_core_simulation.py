@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp, trapezoid
 
-from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.model.equations import damping, elastic_force, energy, equilibrium_stretch, mass
-from hmsa_ros.model.moves import Level, State
-from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.model.schedule import CommandSchedule
-from hmsa_ros.model.simulation import (
+from hmsa.errors import BadInputError, HmsaError
+from hmsa.model.equations import damping, elastic_force, energy, equilibrium_stretch, mass
+from hmsa.model.moves import Level, State
+from hmsa.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa.model.schedule import CommandSchedule
+from hmsa.model.simulation import (
     ActuatorSimulation,
     longest_motion,
     sampled,
     simulate,
 )
-from hmsa_ros.planning.sequence import plan_sequence
-from hmsa_ros.planning.setpoint import Setpoint
+from hmsa.planning.sequence import plan_sequence
+from hmsa.planning.setpoint import Setpoint
 
 PAPER = NondimensionalParameters()
 ACTUATOR = paper_actuator()

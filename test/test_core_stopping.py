@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from hmsa_ros.model.moves import State
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.simulation import simulate
-from hmsa_ros.planning.stopping import brake
-from hmsa_ros.planning.timeline import Model, Options
+from hmsa.model.moves import State
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import simulate
+from hmsa.planning.stopping import brake
+from hmsa.planning.timeline import Model, Options
 
 
 @pytest.mark.parametrize('excursion', [1e-4, 1e-3, 1e-2, 0.3])

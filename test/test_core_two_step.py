@@ -19,20 +19,20 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from hmsa_ros import motion
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.equations import (
+from hmsa import motion
+from hmsa.errors import BadInputError
+from hmsa.model.equations import (
     critical_zeta,
     elastic_force,
     natural_frequency,
     stretch_limits,
 )
-from hmsa_ros.model.law import gent_limits, pack
-from hmsa_ros.model.moves import Level, State
-from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.simulation import sampled
-from hmsa_ros.model.status import Code
-from hmsa_ros.planning.two_step import CODES, Groups, plan_two_step, plan_two_step_batch, TwoStep
+from hmsa.model.law import gent_limits, pack
+from hmsa.model.moves import Level, State
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.simulation import sampled
+from hmsa.model.status import Code
+from hmsa.planning.two_step import CODES, Groups, plan_two_step, plan_two_step_batch, TwoStep
 
 mpmath = needs('mpmath')
 

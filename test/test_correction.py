@@ -10,16 +10,17 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from hmsa_ros.control.corrections import course_of
-from hmsa_ros.control.loop import Loop
-from hmsa_ros.control.records import Settings, Target
-from hmsa_ros.estimation import Estimator, Options, Prior
-from hmsa_ros.estimation.correction import Course, expect
-from hmsa_ros.estimation.motion import follow, Levels
-from hmsa_ros.identification.known import Known
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options as PlannerOptions
-from hmsa_ros.planning.planner import Planner
+from hmsa.identification.known import Known
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options as PlannerOptions
+from hmsa.planning.planner import Planner
+from hmsa_lab.adapt.corrections import course_of
+from hmsa_lab.adapt.estimator import Estimator, Options
+from hmsa_lab.adapt.expected_error import Course, expect
+from hmsa_lab.adapt.motion import follow, Levels
+from hmsa_lab.adapt.prior import Prior
+from hmsa_ros.runtime.loop import Loop
+from hmsa_ros.runtime.records import Settings, Target
 from hmsa_studies.feedback import trial
 from hmsa_studies.linear import Linearised
 from hmsa_studies.scenario import scenario_of, SCENARIOS, STRATEGIES, Strategy
@@ -208,10 +209,10 @@ def test_others_that_use_samples_take_the_offset_away_and_leave_more_vibration(n
 
 
 def test_open_loop_in_the_study_leaves_what_the_study_of_shapers_says():
-    from hmsa_ros.model.moves import State
-    from hmsa_ros.model.parameters import NondimensionalParameters
-    from hmsa_ros.planning.shapers import get_shaper
-    from hmsa_ros.planning.shapers.request import Request
+    from hmsa.model.moves import State
+    from hmsa.model.parameters import NondimensionalParameters
+    from hmsa.planning.shapers import get_shaper
+    from hmsa.planning.shapers.request import Request
     from hmsa_studies.residual import Actual, Errors
 
     material = NondimensionalParameters()

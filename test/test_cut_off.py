@@ -2,13 +2,13 @@
 
 import pytest
 
+from hmsa.errors import BadInputError
+from hmsa.model.actuators import Setup
+from hmsa.model.parameters import paper_actuator
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.protocol import Kind
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.device.watchdog import Fallback
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.actuators import Setup
-from hmsa_ros.model.parameters import paper_actuator
 
 MS = 1_000_000
 START = 1000 * MS

@@ -9,16 +9,16 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from hmsa.errors import BadInputError
+from hmsa.model.actuators import Setup
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.sampling import enough_samples, too_few_samples
+from hmsa.model.simulation import ActuatorSimulation
 from hmsa_ros.device.health import judge_commands
 from hmsa_ros.device.protocol import Kind, Sample
 from hmsa_ros.device.sensor import Sensor, SensorErrors, Transport
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.device.watchdog import Fallback, GuardedJoint
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.actuators import Setup
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.sampling import enough_samples, too_few_samples
-from hmsa_ros.model.simulation import ActuatorSimulation
 
 ACTUATOR = paper_actuator()
 MS = 1_000_000

@@ -8,9 +8,9 @@ import pytest
 from test_runtime_hosts import BEATING, Bench
 from test_runtime_planner import HOLD, LEAD, MS, START, trajectory
 
-from hmsa_ros.control.device_clock import DeviceClock
-from hmsa_ros.control.receipts import Receipts
-from hmsa_ros.control.records import Severity, Stop, Target
+from hmsa_ros.runtime.device_clock import DeviceClock
+from hmsa_ros.runtime.receipts import Receipts
+from hmsa_ros.runtime.records import Severity, Stop, Target
 
 SECOND = 1000 * MS
 

@@ -1,6 +1,5 @@
 """The pages: built with warnings as errors, with every block run or checked."""
 
-from importlib import import_module
 from pathlib import Path
 import subprocess
 import sys
@@ -23,6 +22,8 @@ from documents import (
 )
 from extras import needs
 import pytest
+
+from hmsa.plugins import NODES, registered
 
 PAGES = pages()
 RUNNING = [page for page in PAGES if any(block.runs for block in blocks(page))]
@@ -78,7 +79,7 @@ def test_pages_are_built_without_a_warning(tmp_path):
     assert '~/split_bagfile' in topics
     parameters = (tmp_path / 'html' / 'reference' / 'parameters.html').read_text(encoding='utf-8')
     for node in ('planner', 'plant', 'recorder', 'player'):
-        for spec in import_module(f'hmsa_ros.nodes.{node}').PARAMETERS:
+        for spec in registered(NODES)[node].load().PARAMETERS:
             assert f'>{spec.name}<' in parameters
     theory = (tmp_path / 'html' / 'explanation' / 'theory.html').read_text(encoding='utf-8')
     assert '<math' in theory
@@ -179,7 +180,7 @@ def test_a_block_cannot_be_left_out(language, marker, reason):
 
 @pytest.mark.ros
 def test_topics_and_services_are_those_that_the_nodes_have(start, ros, ros_env):
-    from hmsa_ros.interfaces import topics
+    from hmsa.interfaces import topics
 
     # By parameter only, or only while it is needed.
     sometimes = {'/clock', '/planner/markers', '/plant/markers'}

@@ -5,8 +5,8 @@ import sys
 
 import pytest
 
-from hmsa_ros.cli import main
-from hmsa_ros.interfaces import topics
+from hmsa.cli import main
+from hmsa.interfaces import topics
 from hmsa_ros.nodes.conversions import from_time, to_command
 
 TUTORIALS = Path(__file__).resolve().parent.parent / 'docs' / 'tutorials'

@@ -45,8 +45,8 @@ print(sorted(x for x in names if x.startswith('dds.')))
 # Begins `hmsa send`, with an interrupt where Python drops an exception.
 IN_A_DESTRUCTOR = """
 import os, signal, sys
-from hmsa_ros.entry import main
-from hmsa_ros.lab.client import PlannerClient
+from hmsa.entry import main
+from hmsa_ros.clients.client import PlannerClient
 class Trap:
     def __del__(self):
         os.kill(os.getpid(), signal.SIGINT)
@@ -62,7 +62,7 @@ sys.exit(main(['send', '1.1:1', '--timeout', '1000']))
 # Runs the command line, and says when signals are no longer answered by Python itself.
 TOLD = """
 import os, sys
-from hmsa_ros import entry
+from hmsa import entry
 take_over = entry._take_over
 entry._take_over = lambda: (take_over(), os.write(1, b'.'))
 sys.exit(entry.main(sys.argv[1:]))
@@ -70,7 +70,7 @@ sys.exit(entry.main(sys.argv[1:]))
 # Ends in native code that holds the interpreter for ever.
 IN_NATIVE_CODE = """
 import atexit, ctypes, sys
-from hmsa_ros import ending, entry
+from hmsa import ending, entry
 ending._LAST_SECONDS = 1
 atexit.register(ctypes.PyDLL(None).pause)
 sys.exit(entry.main({arguments!r}))
@@ -78,7 +78,7 @@ sys.exit(entry.main({arguments!r}))
 # A call that returns when a line comes, and may take half a second.
 IN_A_CALL = """
 import sys
-from hmsa_ros.ending import Deadline, encoded
+from hmsa.ending import Deadline, encoded
 deadline = Deadline()
 deadline.set_text(encoded('it takes too long'))
 deadline.set(0.5)
@@ -144,7 +144,7 @@ def test_no_thread_of_fast_dds_outlives_a_node(ros_env, node):
 
 
 def test_a_process_that_goes_on_is_not_stopped_from_the_keyboard():
-    code = ('import os, signal; from hmsa_ros.ending import ENDING; ENDING.go_on(); '
+    code = ('import os, signal; from hmsa.ending import ENDING; ENDING.go_on(); '
             'os.kill(os.getpid(), signal.SIGTSTP); print("goes on")')
     done = subprocess.run(
         [sys.executable, '-c', code], capture_output=True, text=True, timeout=60, check=True)
@@ -158,7 +158,7 @@ def test_an_interrupt_that_python_drops_still_ends_a_command(ros_env):
     assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
 
 
-@pytest.mark.parametrize('module', ['hmsa_ros.ending', 'hmsa_ros._deadline'])
+@pytest.mark.parametrize('module', ['hmsa.ending', 'hmsa._deadline'])
 def test_an_end_is_in_order_before_anything_of_ours_is_imported(module):
     code = AT_IMPORT.replace('entry.{entry}()', "entry.main(['plan', '1.1:10'])")
     done = subprocess.run(

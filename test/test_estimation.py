@@ -6,14 +6,15 @@ import identification_oracle as oracle
 import numpy as np
 import pytest
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.estimation import Estimator, Options, Prior
-from hmsa_ros.estimation.motion import follow, Levels
-from hmsa_ros.estimation.suspects import Look, Suspects
-from hmsa_ros.estimation.words import confounded, sentence
-from hmsa_ros.identification.files import read_belief
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.planning.planner import Options as PlannerOptions
+from hmsa.errors import BadInputError
+from hmsa.identification.files import read_belief
+from hmsa.model.creep import Creep
+from hmsa.planning.planner import Options as PlannerOptions
+from hmsa_lab.adapt.estimator import Estimator, Options
+from hmsa_lab.adapt.motion import follow, Levels
+from hmsa_lab.adapt.prior import Prior
+from hmsa_lab.adapt.suspects import Look, Suspects
+from hmsa_lab.adapt.words import confounded, sentence
 
 # Rest without field, a push, rest near 1.4, and back to rest near 1.1; in s and T.
 TIMES = np.array([0.0, 0.03, 0.036, 0.09])

@@ -6,9 +6,9 @@ from identification_oracle import BLOCK, simulate
 import numpy as np
 import pytest
 
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.excitation import Bounds, excite
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.identification.excitation import Bounds, excite
 
 PERIOD = 2.56 * BLOCK.time_unit
 

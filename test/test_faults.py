@@ -15,7 +15,7 @@ from benchmarks import bench_soak
 from benchmarks.faults import memory, rows
 from benchmarks.faults.rig import Rig, settled
 from benchmarks.faults.table import inject, markdown, Outcome, Seen
-from hmsa_ros.bag.writer import BagWriter, Topic
+from hmsa.bag.writer import BagWriter, Topic
 
 MIB = 2**20
 

@@ -11,7 +11,7 @@ from std_srvs.srv import Trigger
 import yaml
 
 from benchmarks.bench_feedback import GRAPHS, judge, run
-from hmsa_ros.interfaces import topics
+from hmsa.interfaces import topics
 
 pytestmark = pytest.mark.ros
 # On a busy machine the start of the nodes takes a while.

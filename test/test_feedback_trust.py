@@ -7,10 +7,8 @@ from bench_oracle import Bench, MS, paper, Plant
 import numpy as np
 import pytest
 
-from hmsa_ros.control import joint
-from hmsa_ros.estimation import estimator, window
-from hmsa_ros.estimation.motion import follow
-from hmsa_ros.planning.drafting import finish
+from hmsa_lab.adapt import estimator, joint, window
+from hmsa_lab.adapt.motion import follow
 
 MOVES = (1.4, 1.1, 1.4, 1.1, 1.4)
 
@@ -140,7 +138,7 @@ def test_moves_that_get_worse_end_feedback_and_what_it_did_is_taken_back(monkeyp
     assert 'feedback_ended' in it.codes
     # Nor does it ring where another level takes the place of what was learnt.
     assert 'vibrating' not in it.codes
-    it.runtime.feedback.reset()
+    it.runtime.follower.reset()
     it.pass_time(300 * MS)
     assert it.estimates[-1].values['ended'] is False
 
@@ -151,10 +149,10 @@ def test_a_move_from_a_learnt_level_leaves_no_more_than_open_loop_once_it_is_for
         it = bench(False, factors={'shear_modulus': 0.85}, feedback=mode)
         moves(it, MOVES[:1])
         if mode == 'adapt':
-            it.runtime.feedback.reset()
+            it.runtime.follower.reset()
         # A first point that repeats the setpoint is accepted as before.
-        assert finish(it.planner.draft_request(
-            [(MOVES[0], 0), (MOVES[1], 400 * MS)], None, it.now)) is not None
+        assert it.planner.draft_request(
+            [(MOVES[0], 0), (MOVES[1], 400 * MS)], None, it.now) is not None
         left[mode] = moves(it, MOVES[1:2])[0]
     assert left['adapt'][0] < left['off'][0] + 0.5
 

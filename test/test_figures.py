@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 
-from hmsa_ros.cli import main
-from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.planning.two_step import plan_two_step
-from hmsa_ros.report.paper import SCREEN
+from hmsa.cli import main
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.planning.two_step import plan_two_step
+from hmsa.report.paper import SCREEN
 from hmsa_studies import claims, paper_data
 from hmsa_studies.paper import FIGURES, write_figure
 

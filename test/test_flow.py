@@ -10,22 +10,22 @@ import pytest
 from test_core_creep_plan import left
 from test_estimation import LEVELS, measured, run, SAMPLED, TIMES
 
-from hmsa_ros import motion
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.estimation.estimator import Options
-from hmsa_ros.estimation.prior import Prior
-from hmsa_ros.identification.identify import identify
-from hmsa_ros.identification.recording import Recording
-from hmsa_ros.interfaces.actuator import creep_from
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.delivery import Delivery, IDEAL
-from hmsa_ros.model.flows import FLOWS
-from hmsa_ros.model.moves import Level, State
-from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation, follow, sampled, with_followed
-from hmsa_ros.planning.sequence import plan_sequence
-from hmsa_ros.planning.setpoint import Setpoint
-from hmsa_ros.planning.shapers.request import Request
+from hmsa import motion
+from hmsa.errors import BadInputError
+from hmsa.identification.identify import identify
+from hmsa.identification.recording import Recording
+from hmsa.interfaces.actuator import creep_from
+from hmsa.model.creep import Creep
+from hmsa.model.delivery import Delivery, IDEAL
+from hmsa.model.flows import FLOWS
+from hmsa.model.moves import Level, State
+from hmsa.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa.model.simulation import ActuatorSimulation, follow, sampled, with_followed
+from hmsa.planning.sequence import plan_sequence
+from hmsa.planning.setpoint import Setpoint
+from hmsa.planning.shapers.request import Request
+from hmsa_lab.adapt.estimator import Options
+from hmsa_lab.adapt.prior import Prior
 
 MS = 1_000_000
 ONE = NondimensionalParameters(creep=Creep((0.2,), (2.0,), 'power_law', ((4.0,), (0.3,))))

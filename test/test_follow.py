@@ -7,11 +7,11 @@ from rclpy.action import ActionClient
 from rclpy.duration import Duration
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from hmsa_ros.control.goals import ErrorCode
-from hmsa_ros.interfaces import topics
+from hmsa.interfaces import topics
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
+from hmsa_ros.runtime.goals import ErrorCode
 
 pytestmark = pytest.mark.ros
 INSTALLED = importlib.util.find_spec('control_msgs') is not None

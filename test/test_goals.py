@@ -6,15 +6,15 @@ import math
 import numpy as np
 import pytest
 
-from hmsa_ros.control.environment import Environment
-from hmsa_ros.control.goals import ErrorCode, Goals
-from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.records import Send, Settings, StatusChanged, Stop, Target, Trajectory
+from hmsa.model.actuators import Setup
+from hmsa.model.parameters import paper_actuator
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.model.actuators import Setup
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa_ros.runtime.environment import Environment
+from hmsa_ros.runtime.goals import ErrorCode, Goals
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import Send, Settings, StatusChanged, Stop, Target, Trajectory
 
 MS = 1_000_000
 START = 1000 * MS

@@ -8,6 +8,7 @@ from conftest import wait_until
 import numpy as np
 import pytest
 
+from hmsa.errors import BadInputError, HmsaError
 from hmsa_ros.device import StateLostError
 from hmsa_ros.device.clock_map import ClockMap
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
@@ -16,7 +17,6 @@ from hmsa_ros.device.health import judge_hardware
 from hmsa_ros.device.protocol import Kind
 from hmsa_ros.device.watchdog import Fallback
 from hmsa_ros.device.worker import HardwareWorker
-from hmsa_ros.errors import BadInputError, HmsaError
 
 MS = 1_000_000
 START = 1000 * MS

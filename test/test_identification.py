@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 from benchmarks.bench_identification import levels_of
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.identify import identify
-from hmsa_ros.identification.intervals import profile
-from hmsa_ros.identification.quantities import (
+from hmsa.errors import BadInputError
+from hmsa.identification.identify import identify
+from hmsa.identification.intervals import profile
+from hmsa.identification.quantities import (
     DEFAULT_FREE,
     from_coordinate,
     to_coordinate,
     values_of,
 )
-from hmsa_ros.identification.recording import Recording
-from hmsa_ros.identification.response import respond
-from hmsa_ros.planning.two_step import plan_two_step
+from hmsa.identification.recording import Recording
+from hmsa.identification.response import respond
+from hmsa.planning.two_step import plan_two_step
 
 T = BLOCK.time_unit
 SPAN = 10.0 * T

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import yaml
 
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.identify import identify
-from hmsa_ros.identification.known import Known
-from hmsa_ros.identification.quantities import check_free
-from hmsa_ros.identification.recording import Recording
-from hmsa_ros.interfaces.actuator import actuator_from, parameters_of
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.identification.identify import identify
+from hmsa.identification.known import Known
+from hmsa.identification.quantities import check_free
+from hmsa.identification.recording import Recording
+from hmsa.interfaces.actuator import actuator_from, parameters_of
 
 NOISE = 1e-3
 REST = ('damping_coefficient', 'remanence', 'stretch_bias')

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import yaml
 
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces.quantities import BY_KEY, DAMPING, number_of, OPTIONAL, QUANTITIES
-from hmsa_ros.model.equations import elastic_force, natural_frequency
-from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters, paper_actuator
-from hmsa_ros.model.simulation import simulate
-from hmsa_ros.planning.scales import scales
-from hmsa_ros.planning.two_step import plan_two_step
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.interfaces.quantities import BY_KEY, DAMPING, number_of, OPTIONAL, QUANTITIES
+from hmsa.model.equations import elastic_force, natural_frequency
+from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters, paper_actuator
+from hmsa.model.simulation import simulate
+from hmsa.planning.scales import scales
+from hmsa.planning.two_step import plan_two_step
 
 ROOT = Path(__file__).resolve().parent.parent
 PAPER = paper_actuator()
@@ -315,7 +315,7 @@ def test_usual_numbers_are_not_warned_of():
 
 def test_numbers_are_taken_in_the_range_that_the_nodes_take():
     needs('rclpy')
-    from hmsa_ros.interfaces.parameters import ACTUATOR
+    from hmsa.interfaces.parameters import ACTUATOR
     from hmsa_ros.nodes.planning import SPECS
     declared = {x.name: x for x in (*ACTUATOR, *SPECS)}
     for quantity in (*QUANTITIES, DAMPING):
@@ -349,8 +349,8 @@ def test_planner_and_plant_take_the_file_and_arrive_when_it_says(start, tmp_path
     send = start.hmsa('send', f'{target}:0.2', '--joint', 'finger', '--wait')
     assert send.wait(60.0) == 0, send.output
     assert recorder.stop() == 0, recorder.output
-    from hmsa_ros.recordings.bags import read_runs
-    from hmsa_ros.report.evaluation import evaluate
+    from hmsa.report.evaluation import evaluate
+    from hmsa.runs.bags import read_runs
 
     run_, = read_runs(tmp_path / 'bag')
     result, = evaluate(run_).results

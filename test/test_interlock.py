@@ -10,14 +10,14 @@ from std_msgs.msg import Bool
 from test_runtime_hosts import BEATING, Bench, MS, START
 from test_runtime_planner import Rig, trajectory
 
-from hmsa_ros.control.records import Stop, Target
+from hmsa.errors import BadInputError
+from hmsa.interfaces import topics
 from hmsa_ros.device import StateLostError
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.interlock import Interlock
 from hmsa_ros.device.protocol import Kind
 from hmsa_ros.device.watchdog import Fallback
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces import topics
+from hmsa_ros.runtime.records import Stop, Target
 
 SECOND = 1000 * MS
 A, B, C = b'a', b'b', b'c'

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from benchmarks.laboratory import Iron
-from hmsa_ros.cli import main
-from hmsa_ros.device.assembly import Assembly, CoilModel, parts
-from hmsa_ros.device.calibration import loop
-from hmsa_ros.device.iron_core import fit_core, IronCore
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.recordings.parameters import entries_of
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.runs.parameters import entries_of
+from hmsa_lab.bench.assembly import Assembly, CoilModel, parts
+from hmsa_lab.bench.calibration import loop
+from hmsa_lab.bench.iron_core import fit_core, IronCore
 
 LARGEST, SLOPE = 0.14, 0.05
 MS = 1_000_000

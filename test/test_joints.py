@@ -5,9 +5,9 @@ import re
 import pytest
 from rclpy.parameter import Parameter
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.parameters import ACTUATOR, INITIAL_STRETCH, JOINT, ParameterSpec
+from hmsa.errors import BadInputError
+from hmsa.interfaces import topics
+from hmsa.interfaces.parameters import ACTUATOR, INITIAL_STRETCH, JOINT, ParameterSpec
 from hmsa_ros.nodes.parameters import checked, declare_joints, joint_names, JOINTS
 
 OWN = (*ACTUATOR, INITIAL_STRETCH)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.special import stdtrit
 
-from hmsa_ros.judge.fit import student_quantile
-from hmsa_ros.judge.judging import judge
-from hmsa_ros.judge.records import missed, Sensor, Setpoint, Tolerances, worst
+from hmsa.judge.fit import student_quantile
+from hmsa.judge.judging import judge
+from hmsa.judge.records import missed, Sensor, Setpoint, Tolerances, worst
 
 MS = 1_000_000
 OMEGA, DECAY = 540.0, 54.0

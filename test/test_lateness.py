@@ -8,13 +8,13 @@ from core_oracle import follow
 import numpy as np
 import pytest
 
-from hmsa_ros.control.environment import Environment
-from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.records import Note, Send, Settings, Severity, StatusChanged, Trajectory
-from hmsa_ros.control.weighing import worthwhile
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa.model.parameters import paper_actuator
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
+from hmsa_ros.runtime.environment import Environment
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import Note, Send, Settings, Severity, StatusChanged, Trajectory
+from hmsa_ros.runtime.weighing import worthwhile
 
 MS = 1_000_000
 START = 1000 * MS
@@ -175,10 +175,10 @@ def _policies(kind, seed, monkeypatch, case=None):
     for policy in ('nothing', 'decide', 'always'):
         with monkeypatch.context() as patch:
             if policy == 'always':
-                patch.setattr('hmsa_ros.control.following.expected', lambda *_: np.ones(1))
-                patch.setattr('hmsa_ros.control.following.worthwhile', lambda *_, **__: True)
-                patch.setattr('hmsa_ros.control.lateness.Lateness.expected', 0)
-                patch.setattr('hmsa_ros.control.lateness.Lateness.unsure', False)
+                patch.setattr('hmsa_ros.runtime.following.expected', lambda *_: np.ones(1))
+                patch.setattr('hmsa_ros.runtime.following.worthwhile', lambda *_, **__: True)
+                patch.setattr('hmsa_ros.runtime.lateness.Lateness.expected', 0)
+                patch.setattr('hmsa_ros.runtime.lateness.Lateness.unsure', False)
             left[policy] = sequence(
                 unit, lead * MS, _delays(kind, largest, seed), shaper=shaper,
                 settings=replace(QUIET, replan_late=policy != 'nothing')).mean()

@@ -5,7 +5,6 @@ ROS 2's launch is not on the package index. The decisions of the files are in a 
 package; if launch is installed, it also runs the files.
 """
 
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 import re
@@ -14,10 +13,11 @@ import sys
 
 import pytest
 
-from hmsa_ros.bag.reader import BagReader
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.lab.launching import DEMO, failure, REPLAY
-from hmsa_ros.recordings.verify import verify
+from hmsa.bag.reader import BagReader
+from hmsa.errors import BadInputError
+from hmsa.plugins import NODES, registered
+from hmsa.runs.verify import verify
+from hmsa_ros.clients.launching import DEMO, failure, REPLAY
 
 ROOT = Path(__file__).resolve().parent.parent
 FILES = {'demo': (DEMO, {}), 'replay': (REPLAY, {'bag': 'some_bag'})}
@@ -72,7 +72,7 @@ def test_bag_to_replay_must_be_given_and_the_rate_be_a_number():
 
 def test_only_parameters_that_the_nodes_declare_are_set(started):
     for process in started().nodes:
-        module = import_module(f'hmsa_ros.nodes.{process.name}')
+        module = registered(NODES)[process.name].load()
         declared = {spec.name: spec for spec in module.PARAMETERS}
         assert set(process.parameters) <= set(declared) | EVERY_NODE
         for name, value in process.parameters.items():

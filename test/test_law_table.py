@@ -9,27 +9,27 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 from scipy.interpolate import CubicSpline, make_interp_spline
 
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.excitation import excite
-from hmsa_ros.identification.files import read_belief
-from hmsa_ros.interfaces.actuator import actuator_from, parameters_of
-from hmsa_ros.interfaces.parameters import BLOCK
-from hmsa_ros.model.equations import (
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.identification.excitation import excite
+from hmsa.identification.files import read_belief
+from hmsa.interfaces.actuator import actuator_from, parameters_of
+from hmsa.interfaces.parameters import BLOCK
+from hmsa.model.equations import (
     elastic_energy,
     elastic_force,
     elastic_stiffness,
     equilibrium_stretch,
     stretch_limits,
 )
-from hmsa_ros.model.laws.curve import fitted
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.simulation import simulate
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.sequence import plan_sequence
-from hmsa_ros.planning.setpoint import Setpoint
-from hmsa_ros.planning.two_step import plan_two_step
-from hmsa_ros.recordings.bags import read_runs
+from hmsa.model.laws.curve import fitted
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import simulate
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.sequence import plan_sequence
+from hmsa.planning.setpoint import Setpoint
+from hmsa.planning.two_step import plan_two_step
+from hmsa.runs.bags import read_runs
 
 GENT = paper_actuator()
 UNIT = GENT.flux_density_unit

@@ -8,12 +8,12 @@ from bench_oracle import Plant, slow
 import numpy as np
 import pytest
 
-from hmsa_ros import Actuator
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.learning import learn, Target, Trial
-from hmsa_ros.identification.sequences import levels_in
-from hmsa_ros.model.parameters import paper_actuator
+from hmsa import Actuator
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.identification.learning import learn, Target, Trial
+from hmsa.identification.sequences import levels_in
+from hmsa.model.parameters import paper_actuator
 
 NOMINAL = slow(paper_actuator())
 SETPOINTS = ((1.15, 1.2), (1.3, 1.2), (1.05, 1.2))

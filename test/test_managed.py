@@ -6,8 +6,8 @@ import pytest
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces.parameters import ParameterSpec
+from hmsa.errors import BadInputError
+from hmsa.interfaces.parameters import ParameterSpec
 from hmsa_ros.nodes.capture import RawSubscription
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare

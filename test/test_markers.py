@@ -9,11 +9,11 @@ import pytest
 from std_msgs.msg import Float64
 from visualization_msgs.msg import Marker, MarkerArray
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces import parameters as declared
-from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.actuator import actuator_from
-from hmsa_ros.model.parameters import paper_actuator
+from hmsa.errors import BadInputError
+from hmsa.interfaces import parameters as declared
+from hmsa.interfaces import topics
+from hmsa.interfaces.actuator import actuator_from
+from hmsa.model.parameters import paper_actuator
 from hmsa_ros.nodes.markers import BLOCK, Block, FIELD, LABEL, MAGNETISATION, Scene, State, TARGET
 
 ACTUATOR = paper_actuator()

@@ -10,16 +10,16 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, linprog, minimize
 import yaml
 
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.delivery import Delivery, IDEAL
-from hmsa_ros.model.equations import acceleration, elastic_force
-from hmsa_ros.model.mismatch import Ellipsoid, Errors
-from hmsa_ros.model.moves import Limits, State
-from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.model.status import Code
-from hmsa_ros.planning.shapers import get_shaper
-from hmsa_ros.planning.shapers.minimax import (
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.model.delivery import Delivery, IDEAL
+from hmsa.model.equations import acceleration, elastic_force
+from hmsa.model.mismatch import Ellipsoid, Errors
+from hmsa.model.moves import Limits, State
+from hmsa.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa.model.status import Code
+from hmsa.planning.shapers import get_shaper
+from hmsa.planning.shapers.minimax import (
     _cases,
     _command,
     _frame,
@@ -28,8 +28,8 @@ from hmsa_ros.planning.shapers.minimax import (
     least_largest,
     left,
 )
-from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.planning.timeline import Model, Options
+from hmsa.planning.shapers.request import Request
+from hmsa.planning.timeline import Model, Options
 
 PAPER = NondimensionalParameters()
 WIDE = Limits(-20.0, 20.0)

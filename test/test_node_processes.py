@@ -11,9 +11,9 @@ import pytest
 from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool
 
-from hmsa_ros.cli import main
-from hmsa_ros.interfaces import topics
-from hmsa_ros.model.residual import residual_vibration
+from hmsa.cli import main
+from hmsa.interfaces import topics
+from hmsa.model.residual import residual_vibration
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
 
 pytestmark = pytest.mark.ros

@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-import hmsa_ros
-from hmsa_ros.cli import main
-from hmsa_ros.errors import AssumedWarning
-from hmsa_ros.identification.files import read_belief
+import hmsa
+from hmsa.cli import main
+from hmsa.errors import AssumedWarning
+from hmsa.identification.files import read_belief
 
 NOTE = 'hmsa: note: without --params-file the actuator is the example block: 20 mm x 20 mm x 20 mm'
 COMMANDS = {
@@ -95,7 +95,7 @@ def test_an_identification_says_which_values_are_those_of_the_example(here, caps
         'half_length, half_thickness, density are not given: 0.01 m, 0.01 m, 1900 kg/m^3 of the '
         'example block')
     assert found[3][0].startswith('half_thickness, density are not given')
-    found = hmsa_ros.identify('samples.csv', 'levels.csv')
+    found = hmsa.identify('samples.csv', 'levels.csv')
     assert any('example block' in x for x in found.result.warnings)
-    found = hmsa_ros.identify('samples.csv', 'levels.csv', actuator=hmsa_ros.Actuator())
+    found = hmsa.identify('samples.csv', 'levels.csv', actuator=hmsa.Actuator())
     assert not any('example block' in x for x in found.result.warnings)

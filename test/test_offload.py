@@ -11,9 +11,8 @@ from bench_oracle import Bench, Plant
 import numpy as np
 import pytest
 
-from hmsa_ros.control.offload import goes_on, here, Offload
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.planning.drafting import finish
+from hmsa.model.parameters import paper_actuator
+from hmsa.offload import finish, goes_on, here, Offload
 
 MS = 1_000_000
 
@@ -35,7 +34,7 @@ def ends(parent):
 @pytest.fixture
 def offload():
     told = []
-    found = Offload(told.append)
+    found = Offload(told.append, 'hmsa_lab.adapt.feedback')
     found.told = told
     yield found
     found.close()
@@ -71,7 +70,7 @@ def test_a_process_that_ends_is_done_without_and_said_once(offload):
 def test_a_process_that_does_not_answer_is_done_without(offload, monkeypatch):
     _, process = finish(offload(whose, 1))
     os.kill(process, signal.SIGSTOP)
-    monkeypatch.setattr('hmsa_ros.control.offload._PATIENCE', 0)
+    monkeypatch.setattr('hmsa.offload._PATIENCE', 0)
     assert finish(offload(whose, 2)) == (2, os.getpid())
     assert 'does not answer' in offload.told[0]
 
@@ -80,10 +79,10 @@ def test_it_ends_with_the_planner_however_that_ends_and_not_by_ctrl_c(tmp_path):
     script = tmp_path / 'planner.py'
     script.write_text(
         'import time\n'
-        'from hmsa_ros.control.offload import Offload\n'
-        'from hmsa_ros.planning.drafting import finish\n'
+        'from hmsa.offload import Offload\n'
+        'from hmsa.offload import finish\n'
         'from test_offload import whose\n'
-        'offload = Offload(print)\n'
+        'offload = Offload(print, "os")\n'
         'print(finish(offload(whose, 1))[1], flush=True)\n'
         'time.sleep(600)\n')
     with subprocess.Popen(
@@ -108,7 +107,7 @@ def test_what_is_learnt_is_the_same_in_either_process(offload):
         block = paper_actuator()
         stiffer = replace(block, shear_modulus=1.1 * block.shear_modulus)
         bench = Bench(Plant(stiffer), block, 1e-3, seed=1)
-        bench.runtime.feedback.doing = at_once
+        bench.runtime.follower.doing = at_once
         for target in (1.3, 1.1, 1.25):
             bench.move(target, 200 * MS)
         assert 'plans use it' in bench.message

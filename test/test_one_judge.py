@@ -10,9 +10,19 @@ import random
 import numpy as np
 import pytest
 
-from hmsa_ros.control.environment import Environment
-from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.records import (
+from hmsa.judge.records import Sensor
+from hmsa.model.actuators import Setup
+from hmsa.model.parameters import paper_actuator
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
+from hmsa.report.outcome import findings_of
+from hmsa.runs.levels import Level
+from hmsa.runs.record import LearntSensor, RecordedRequest, Run, Verdict
+from hmsa_ros.device.sensor import SensorErrors
+from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
+from hmsa_ros.runtime.environment import Environment
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import (
     EstimateChanged,
     PlanChanged,
     Send,
@@ -20,16 +30,6 @@ from hmsa_ros.control.records import (
     StatusChanged,
     Trajectory,
 )
-from hmsa_ros.device.sensor import SensorErrors
-from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.judge.records import Sensor
-from hmsa_ros.model.actuators import Setup
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options, Planner
-from hmsa_ros.recordings.levels import Level
-from hmsa_ros.recordings.record import LearntSensor, RecordedRequest, Run, Verdict
-from hmsa_ros.report.outcome import findings_of
 
 MS = 1_000_000
 START = 1000 * MS

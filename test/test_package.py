@@ -16,10 +16,11 @@ from packaging.specifiers import SpecifierSet
 import pytest
 import yaml
 
-import hmsa_ros
+import hmsa
 
 ROOT = Path(__file__).resolve().parent.parent
-SOURCES = [x for y in ('hmsa_ros', 'hmsa_studies') for x in (ROOT / y).rglob('*.py')]
+PACKAGES = ('hmsa', 'hmsa_ros', 'hmsa_lab', 'hmsa_studies')
+SOURCES = [x for y in PACKAGES for x in (ROOT / y).rglob('*.py')]
 PYTHONS = ('3.10', '3.11', '3.12', '3.13', '3.14')
 # Where the key of a requirement is not python3- and its name in lower case.
 # mcap, lz4 and zstandard come along with mcap-ros2-support.
@@ -94,7 +95,7 @@ def imported() -> set[str]:
                 modules |= {alias.name.partition('.')[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module:
                 modules.add(node.module.partition('.')[0])
-    return modules - set(sys.stdlib_module_names) - {'hmsa_ros', 'hmsa_studies'}
+    return modules - set(sys.stdlib_module_names) - {*PACKAGES}
 
 
 def test_package_xml_and_setup_py_describe_the_same_package(setup, manifest):
@@ -108,10 +109,10 @@ def test_package_xml_and_setup_py_describe_the_same_package(setup, manifest):
 
 
 def test_version_is_the_same_in_the_package_and_the_changelog(setup):
-    assert setup['version'] == hmsa_ros.__version__
+    assert setup['version'] == hmsa.__version__
     versions = re.findall(
         r'^(\d+\.\d+\.\d+) \(.+\)\n-+$', (ROOT / 'CHANGELOG.rst').read_text(), re.M)
-    assert versions[0] == hmsa_ros.__version__
+    assert versions[0] == hmsa.__version__
 
 
 def test_licence_is_the_one_in_the_licence_file(setup, manifest):
@@ -156,11 +157,15 @@ def test_every_module_of_the_package_is_installed(setup):
     assert set(setup['packages']) == found
 
 
-def test_every_other_file_of_the_package_is_installed(setup):
-    found = [str(path.relative_to(ROOT / 'hmsa_ros')) for path in (ROOT / 'hmsa_ros').rglob('*')
-             if path.is_file() and path.suffix not in ('.py', '.pyc', '.so', '.c', '.cpp')
-             and '__pycache__' not in path.parts]
-    assert sorted(setup['package_data']['hmsa_ros']) == sorted(found)
+def test_every_other_file_of_the_packages_is_installed(setup):
+    for package in PACKAGES:
+        folder = ROOT / package
+        found = {path for path in folder.rglob('*')
+                 if path.is_file() and path.suffix not in ('.py', '.pyc', '.so', '.c', '.cpp')
+                 and '__pycache__' not in path.parts}
+        patterns = setup['package_data'].get(package, ())
+        assert all([*folder.glob(x)] for x in patterns)
+        assert {path for x in patterns for path in folder.glob(x)} == found
 
 
 def test_every_launch_and_parameter_file_is_installed_where_ros_looks(setup):

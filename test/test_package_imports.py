@@ -1,4 +1,4 @@
-"""Permitted imports: physics and bags do not depend on ROS, and help is quick."""
+"""Permitted imports: walls between packages and rooms, no ROS in physics, and quick help."""
 
 import ast
 from pathlib import Path
@@ -9,9 +9,11 @@ import sys
 from extras import needs
 import pytest
 
-from hmsa_ros.cli.node import NODES
+from hmsa import plugins
+from hmsa.plugins import registered
 
 ROOT = Path(__file__).resolve().parent.parent
+NODES = registered(plugins.NODES)
 ROS = ('rclpy', 'rcl_interfaces', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs',
        'geometry_msgs', 'rosgraph_msgs', 'rosidl_runtime_py', 'sensor_msgs', 'std_msgs',
        'std_srvs', 'trajectory_msgs')
@@ -44,14 +46,25 @@ def modules(package: str) -> list[str]:
             if path.stem not in {'__init__', '__main__'}]
 
 
-PACKAGES = (
-    'bag', 'control', 'device', 'estimation', 'identification', 'interfaces', 'judge', 'model',
-    'motion', 'planning', 'recordings', 'report')
+# Each imports those before it, and none after it.
+PACKAGES = ('hmsa', 'hmsa_ros', 'hmsa_lab', 'hmsa_studies')
+# Rooms that import ROS.
+WITH_ROS = {
+    'hmsa_ros.nodes', 'hmsa_ros.clients', 'hmsa_lab.nodes', 'hmsa_lab.experiments',
+    'hmsa_lab.watch', 'hmsa_lab.panel'}
+
+
+def rooms(package: str) -> list[str]:
+    """Return the names of the rooms of a package, the folders with modules."""
+    return sorted(f'{package}.{x.parent.name}' for x in (ROOT / package).glob('*/__init__.py'))
+
+
+WITHOUT_ROS = [
+    *PACKAGES, *(x for package in PACKAGES for x in rooms(package) if x not in WITH_ROS)]
 
 
 def test_physics_runtime_bags_and_studies_import_without_ros():
-    names = [name for package in PACKAGES for name in modules(f'hmsa_ros.{package}')]
-    names += modules('hmsa_studies') + modules('hmsa_studies.commands')
+    names = [name for place in WITHOUT_ROS for name in modules(place)]
     result = run(BLOCKED.format(blocked=ROS) + f"""
 import importlib
 for name in {names!r}:
@@ -60,43 +73,47 @@ for name in {names!r}:
     assert (result.returncode, result.stderr) == (0, '')
 
 
-def imported(package: str) -> set[str]:
-    """Return the other packages of this project that a package's modules import."""
+def imported(place: str) -> set[str]:
+    """Return the modules of this project that the modules of a package or room import."""
     found = set()
-    for path in (ROOT / 'hmsa_ros' / package).rglob('*.py'):
+    for path in (ROOT / place.replace('.', '/')).rglob('*.py'):
         for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, (ast.Import, ast.ImportFrom)):
-                assert 'hmsa_studies' not in ast.unparse(node), path
-            if isinstance(node, ast.ImportFrom) and node.module == 'hmsa_ros':
+            if isinstance(node, ast.ImportFrom) and node.module:
+                found |= {f'{node.module}.{x.name}' for x in node.names}
+            elif isinstance(node, ast.Import):
                 found |= {x.name for x in node.names}
-            elif isinstance(node, (ast.Import, ast.ImportFrom)):
-                found |= {x.partition('.')[0] for x in re.findall(
-                    r'\bhmsa_ros\.([\w.]+)', ast.unparse(node))}
-    return {x for x in found if (ROOT / 'hmsa_ros' / x).is_dir()} - {package}
+    return {x for x in found if x.partition('.')[0] in PACKAGES}
 
 
-def test_table_of_the_layout_has_every_package_with_what_it_imports_and_goes_downhill():
-    rows = re.findall(
-        r'^\| `(\w+)` \| [^|]+ \| ([^|]+) \|$', (ROOT / 'CONTRIBUTING.md').read_text().partition(
-            '## Where to add')[0], re.M)
-    names = {x.parent.name for x in (ROOT / 'hmsa_ros').glob('*/__init__.py')}
+@pytest.mark.parametrize('package', PACKAGES)
+def test_packages_import_only_those_before_them(package):
+    allowed = PACKAGES[:PACKAGES.index(package) + 1]
+    assert {x.partition('.')[0] for x in imported(package)} <= {*allowed}
+
+
+@pytest.mark.parametrize('package', PACKAGES[:3])
+def test_table_of_a_package_has_every_room_with_what_it_imports_and_goes_downhill(package):
+    text = (ROOT / 'CONTRIBUTING.md').read_text().partition('## Where to add')[0]
+    rows = re.findall(rf'^\| `{package}\.(\w+)` \| [^|]+ \| ([^|]+) \|$', text, re.M)
+    names = {x.rpartition('.')[2] for x in rooms(package)}
     assert {x for x, _ in rows} == names
     above: set[str] = set()
     for name, said in rows:
         listed = set(re.findall(r'`(\w+)`', said))
-        found = imported(name)
+        found = {x.split('.')[1] for x in imported(f'{package}.{name}')
+                 if x.startswith(f'{package}.')} & names - {name}
         assert not found & listed if said.startswith('all but') else found == listed, name
-        assert found <= above, f'{name} imports {found - above}: expected packages above it'
+        assert found <= above, f'{name} imports {found - above}: expected rooms above it'
         above.add(name)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('package', PACKAGES)
-def test_each_module_imports_by_itself(package):
+@pytest.mark.parametrize('place', WITHOUT_ROS)
+def test_each_module_imports_by_itself(place):
     result = run(f"""
 import importlib, sys
-for name in {modules(f'hmsa_ros.{package}')!r}:
-    for loaded in [x for x in sys.modules if x.startswith('hmsa_ros')]:
+for name in {modules(place)!r}:
+    for loaded in [x for x in sys.modules if x.startswith('hmsa')]:
         del sys.modules[loaded]
     importlib.import_module(name)
 """)
@@ -118,7 +135,7 @@ def test_commands_that_need_ros_say_how_to_get_it_where_there_is_none(tmp_path):
     result = run(BLOCKED.format(blocked=ROS) + f"""
 import os
 os.chdir({str(tmp_path)!r})
-from hmsa_ros.entry import main
+from hmsa.entry import main
 for arguments in {commands!r}:
     # Each is a process, but Python starts once.
     if not os.fork():
@@ -138,9 +155,9 @@ def test_command_that_needs_no_ros_works_without_it(tmp_path):
     result = run(BLOCKED.format(blocked=ROS) + f"""
 import os
 os.chdir({str(tmp_path)!r})
-from hmsa_ros.cli import main
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
+from hmsa.cli import main
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
 plant, rows = ActuatorSimulation(paper_actuator()), ['time,stretch,flux_density']
 for i in range(300):
     level = 0.01 * (i // 60 % 3)
@@ -162,15 +179,35 @@ assert main(['report', 'run.csv']) == 2
 
 def test_nodes_start_without_scipy_which_takes_longer_to_load_than_all_else():
     result = run(BLOCKED.format(blocked=('scipy',)) + ''.join(
-        f'import hmsa_ros.nodes.{x}\n' for x in NODES)
+        f'import {x.module}\n' for x in NODES.values())
         # What `hmsa run` evaluates its bag with.
-        + 'import hmsa_ros.report.comparison, hmsa_ros.report.evaluation')
+        + 'import hmsa.report.comparison, hmsa.report.evaluation')
+    assert (result.returncode, result.stderr) == (0, '')
+
+
+def test_a_planner_without_feedback_imports_none_of_it():
+    result = run(BLOCKED.format(blocked=('hmsa_lab',)) + """
+from hmsa.model.actuators import Setup
+from hmsa.model.parameters import paper_actuator
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
+from hmsa_ros.runtime.loop import Loop
+from hmsa_ros.runtime.records import Settings, Target
+from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
+import hmsa_ros.nodes.planner
+group = PlannerGroup({'a': Planner(paper_actuator(), Options())})
+loop = Loop(group, Settings(takeover_timeout=0), SimulatedDevice(
+    [SimulatedJoint(Setup(paper_actuator()))], period=10**6, time=10**9))
+assert loop.runtime.request(Target('a', 1.2)).code == 'accepted'
+loop.run(11 * 10**8)
+assert abs(loop.device.stretch[0] - 1.2) < 1e-6
+""")
     assert (result.returncode, result.stderr) == (0, '')
 
 
 def test_a_plan_without_a_file_imports_no_reader_of_files():
     result = run(BLOCKED.format(blocked=('scipy', 'mcap', 'yaml')) + """
-from hmsa_ros.cli import main
+from hmsa.cli import main
 sys.exit(main(['plan', '1.1:10']))
 """)
     assert (result.returncode, result.stderr) == (0, '')
@@ -180,7 +217,7 @@ sys.exit(main(['plan', '1.1:10']))
 def test_help_imports_nothing_slow(arguments):
     result = run(BLOCKED.format(blocked=SLOW) + f"""
 sys.argv[1:] = {arguments!r}
-from hmsa_ros.cli import main
+from hmsa.cli import main
 sys.exit(main())
 """)
     assert (result.returncode, result.stderr) == (0, '')
@@ -193,7 +230,7 @@ def test_every_command_of_the_interface_answers_help():
         'report', 'robustness', 'sweep', 'identify', 'excite', 'panel')
     result = run(f"""
 import os, sys
-from hmsa_ros.cli import main
+from hmsa.cli import main
 for command in {commands!r}:
     if not os.fork():
         sys.argv[1:] = [command, '--help']

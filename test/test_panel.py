@@ -14,13 +14,13 @@ import pytest
 from test_driver_node import TUTORIALS
 from test_package_imports import BLOCKED, run
 
-from hmsa_ros.errors import BadInputError
+from hmsa.errors import BadInputError
 
 websocket = needs('tornado.websocket')
 
 from tornado.httpclient import HTTPError, HTTPRequest  # noqa: E402
 
-from hmsa_ros.panel.server import Server  # noqa: E402
+from hmsa_lab.panel.server import Server  # noqa: E402
 
 WAIT_SECONDS = 60.0
 UPGRADE = {
@@ -199,7 +199,7 @@ def test_no_option_has_it_listen_elsewhere():
 
 def test_without_tornado_it_says_what_to_install():
     done = run(BLOCKED.format(blocked=('tornado',)) + """
-from hmsa_ros.cli import main
+from hmsa.cli import main
 sys.exit(main(['panel']))
 """)
     assert done.returncode == 2

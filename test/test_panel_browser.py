@@ -12,7 +12,7 @@ import pytest
 
 needs('tornado')
 
-from hmsa_ros.panel.server import Server  # noqa: E402
+from hmsa_lab.panel.server import Server  # noqa: E402
 
 pytestmark = pytest.mark.skipif(
     find_browser() is None,

@@ -1,10 +1,8 @@
 """Parameters: declared once, described, and consistent with the files under config/."""
 
 from dataclasses import replace
-from importlib import import_module
 import math
 from pathlib import Path
-import pkgutil
 import re
 import subprocess
 import sys
@@ -17,14 +15,14 @@ from rclpy.node import Node
 from rclpy.parameter import get_parameter_value, Parameter, parameter_value_to_python
 import yaml
 
-from hmsa_ros import Actuator
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces.actuator import actuator_from
-from hmsa_ros.interfaces.parameters import ACTUATOR, BLOCK, ParameterSpec
-from hmsa_ros.interfaces.sections import is_for, sections_of
-from hmsa_ros.interfaces.topics import NODES
-from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
-import hmsa_ros.nodes
+from hmsa import Actuator, plugins
+from hmsa.errors import BadInputError
+from hmsa.interfaces.actuator import actuator_from
+from hmsa.interfaces.parameters import ACTUATOR, BLOCK, ParameterSpec
+from hmsa.interfaces.sections import is_for, sections_of
+from hmsa.interfaces.topics import NODES
+from hmsa.model.parameters import ActuatorParameters, paper_actuator
+from hmsa.plugins import registered
 from hmsa_ros.nodes import planning, plant
 from hmsa_ros.nodes.parameters import check_names, declare, declare_joints, type_of, unread_files
 from hmsa_ros.nodes.planner import PlannerNode
@@ -32,9 +30,8 @@ from hmsa_ros.nodes.plant import PlantNode
 
 CONFIG = Path(__file__).resolve().parent.parent / 'config'
 DECLARED: dict[str, tuple[ParameterSpec, ...]] = {
-    module.name: declared for module in pkgutil.iter_modules(hmsa_ros.nodes.__path__)
-    if not module.name.endswith('_parameters') and (declared := getattr(
-        import_module(f'hmsa_ros.nodes.{module.name}'), 'PARAMETERS', None))}
+    name: node.load().PARAMETERS for name, node in registered(plugins.NODES).items()
+    if name in NODES}
 # Numbers that are a ratio or a count.
 DIMENSIONLESS = {
     'creep_tolerance', 'marker_scale', 'max_points', 'minimax_errors', 'path_tolerance',

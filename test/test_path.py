@@ -11,17 +11,16 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
 
-from hmsa_ros import Actuator
-from hmsa_ros.cli import main
-from hmsa_ros.control.environment import Environment
-from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.records import Settings, Severity, Trajectory
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.drafting import finish
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa import Actuator
+from hmsa.cli import main
+from hmsa.model.creep import Creep
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
+from hmsa_ros.runtime.environment import Environment
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import Settings, Severity, Trajectory
 
 SECOND = 1_000_000_000
 # The paper's block: units of time (s) and load (T), damping, shape and chain limit.
@@ -90,7 +89,7 @@ def drafted(points, stamp=None, actuator=None, planner=None, **options):
     """Return the draft of a path that begins at 1 s, and its planner."""
     planner = planner or Planner(actuator or paper_actuator(), Options(**{
         'flux_density_min': -0.5, 'flux_density_max': 0.5, 'lead_time': 0, **options}))
-    return finish(planner.draft_path(points, stamp, SECOND)), planner
+    return planner.draft_path(points, stamp, SECOND), planner
 
 
 def sent(draft):
@@ -170,7 +169,7 @@ def test_a_path_that_began_is_joined_where_it_is():
     draft, planner = drafted(points)
     planner.take(draft, SECOND)
     later = SECOND + SECOND // 25
-    again = finish(planner.draft_path(points, SECOND, later))
+    again = planner.draft_path(points, SECOND, later)
     assert again.begin == later
     times = np.linspace(0.0, 0.15, 3001)
     levels = [x for x in sent(draft) if x[0] < 0.04] + [(t + 0.04, x) for t, x in sent(again)]
@@ -183,7 +182,7 @@ def test_from_beside_the_path_the_actuator_goes_to_it_within_a_period():
     points = dense(goal=1.3)
     draft, planner = drafted([((1.0, 0.0, NAN), 0), ((1.02, 0.0, NAN), SECOND // 50)])
     planner.take(draft, SECOND)
-    draft = finish(planner.draft_path(points, None, 2 * SECOND))
+    draft = planner.draft_path(points, None, 2 * SECOND)
     assert draft.warning is None
     times = np.linspace(0.0, 0.15, 3001)
     away = np.abs(moved(sent(draft), times, start=1.02) - np.where(
@@ -199,7 +198,7 @@ def test_from_beside_the_path_the_actuator_goes_to_it_within_a_period():
 def test_what_follows_in_the_middle_of_a_path_ends_at_rest(make):
     draft, planner = drafted(dense())
     planner.take(draft, SECOND)
-    after = finish(make(planner, SECOND + SECOND // 25))
+    after = make(planner, SECOND + SECOND // 25)
     levels = [x for x in sent(draft) if x[0] < 0.04] + [(t + 0.04, x) for t, x in sent(after)]
     segment = after.segments[-1]
     arrival = (segment.arrival - SECOND) / SECOND

@@ -14,16 +14,16 @@ import pytest
 from scipy.integrate import solve_ivp
 from test_report import ACTUATOR, one, parameters, simulated
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces.topics import FLUX_DENSITY_COMMAND
-from hmsa_ros.model.residual import percent
-from hmsa_ros.report import style
-from hmsa_ros.report.bands import draw_bands
-from hmsa_ros.report.charts import commanded
-from hmsa_ros.report.curves import Curve, decimate, through
-from hmsa_ros.report.looks import case, CASES, Look, SHAPERS
-from hmsa_ros.report.paper import KINDS, named, Paper
-from hmsa_ros.report.picture import draw
+from hmsa.errors import BadInputError
+from hmsa.interfaces.topics import FLUX_DENSITY_COMMAND
+from hmsa.model.residual import percent
+from hmsa.report import style
+from hmsa.report.bands import draw_bands
+from hmsa.report.charts import commanded
+from hmsa.report.curves import Curve, decimate, through
+from hmsa.report.looks import case, CASES, Look, SHAPERS
+from hmsa.report.paper import KINDS, named, Paper
+from hmsa.report.picture import draw
 from hmsa_studies.sweep_pictures import label_of, worded
 
 # What deuteranopia and protanopia leave of linear red, green and blue (Machado and others, IEEE

@@ -18,11 +18,11 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.interfaces import topics
-from hmsa_ros.model.equations import natural_frequency
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
+from hmsa.interfaces import topics
+from hmsa.model.equations import natural_frequency
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
+from hmsa.planning.planner import Options, Planner
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import (
     from_command,
@@ -33,7 +33,7 @@ from hmsa_ros.nodes.conversions import (
     to_trajectory,
 )
 from hmsa_ros.nodes.planner import PlannerNode
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa_ros.runtime.planner import PlannerRuntime
 from hmsa_ros.timekeeping import StepWatch
 
 pytestmark = pytest.mark.ros

@@ -17,17 +17,16 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from hmsa_ros.errors import HmsaError
-from hmsa_ros.identification.files import errors_from
-from hmsa_ros.interfaces import topics
-from hmsa_ros.model.parameters import paper_actuator
+from hmsa.errors import HmsaError
+from hmsa.identification.files import errors_from
+from hmsa.interfaces import topics
+from hmsa.model.parameters import paper_actuator
+from hmsa.planning.planner import Options, Planner
+from hmsa.planning.shapers.pace import Pace
+from hmsa.planning.timeline import PlannedLevel
 from hmsa_ros.nodes.capture import Taken
 from hmsa_ros.nodes.conversions import from_command, from_time, to_time, to_trajectory
 from hmsa_ros.nodes.planner import PlannerNode
-from hmsa_ros.planning.drafting import finish
-from hmsa_ros.planning.planner import Options, Planner
-from hmsa_ros.planning.shapers.pace import Pace
-from hmsa_ros.planning.timeline import PlannedLevel
 
 pytestmark = pytest.mark.ros
 
@@ -291,7 +290,7 @@ def test_velocities_are_followed_in_mode_path_which_can_be_set_while_it_runs(ben
     assert [(x.successful, x.reason) for x in results] == [(True, '')]
     points = [((*x, math.nan), y) for *x, y in zip(
         stretches.tolist(), rates.tolist(), times, strict=True)]
-    planner.core.take(finish(planner.core.draft_path(points, None, planner.now)), planner.now)
+    planner.core.take(planner.core.draft_path(points, None, planner.now), planner.now)
     planner.send(message)
     planner.take()
     planner.run(START + LEAD + 150 * MS)

@@ -13,9 +13,9 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool
 
-from hmsa_ros.interfaces import topics
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
+from hmsa.interfaces import topics
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import from_time, to_clock, to_command, to_time
 from hmsa_ros.nodes.endpoints import interface_class

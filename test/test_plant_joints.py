@@ -7,10 +7,10 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces import topics
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
+from hmsa.errors import BadInputError
+from hmsa.interfaces import topics
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
 from hmsa_ros.nodes.conversions import from_time, to_command
 from hmsa_ros.nodes.plant import PlantNode
 

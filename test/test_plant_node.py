@@ -12,13 +12,13 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
 
-from hmsa_ros.interfaces import topics
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.residual import residual_vibration
-from hmsa_ros.model.simulation import simulate
+from hmsa.interfaces import topics
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.residual import residual_vibration
+from hmsa.model.simulation import simulate
+from hmsa.planning.planner import Options, Planner
 from hmsa_ros.nodes.conversions import from_time, to_clock, to_command
 from hmsa_ros.nodes.plant import PlantNode
-from hmsa_ros.planning.planner import Options, Planner
 
 pytestmark = pytest.mark.ros
 

@@ -17,14 +17,14 @@ from sensor_msgs.msg import JointState, MagneticField
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from hmsa_ros.bag.definitions import message_definition, type_hash
-from hmsa_ros.bag.info import summarize
-from hmsa_ros.bag.qos import Qos
-from hmsa_ros.bag.transport import Transport
-from hmsa_ros.bag.writer import BagWriter, Topic
-from hmsa_ros.cli import main
-from hmsa_ros.interfaces import topics
-from hmsa_ros.lab.launching import REPLAY
+from hmsa.bag.definitions import message_definition, type_hash
+from hmsa.bag.info import summarize
+from hmsa.bag.qos import Qos
+from hmsa.bag.writer import BagWriter, Topic
+from hmsa.cli import main
+from hmsa.interfaces import topics
+from hmsa_ros.clients.launching import REPLAY
+from hmsa_ros.recording.transport import Transport
 
 pytestmark = pytest.mark.ros
 FLOAT = 'std_msgs/msg/Float64'

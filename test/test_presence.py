@@ -6,15 +6,15 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import pytest
 from sensor_msgs.msg import JointState
 
-from hmsa_ros.cli import main
-from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.status import Verdict
+from hmsa.cli import main
+from hmsa.interfaces import topics
+from hmsa.interfaces.status import Verdict
+from hmsa_lab.watch.listener import Listener
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import to_trajectory
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 from hmsa_ros.nodes.presence import Active
-from hmsa_ros.watch.listener import Listener
 
 pytestmark = pytest.mark.ros
 

@@ -10,11 +10,11 @@ from mcap_ros2.decoder import DecoderFactory
 import numpy as np
 import pytest
 
-from hmsa_ros.cli import main
-from hmsa_ros.identification.excitation import Bounds, excite
-from hmsa_ros.identification.tables import read_levels
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa.cli import main
+from hmsa.identification.excitation import Bounds, excite
+from hmsa.identification.tables import read_levels
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.planner import Options, Planner
 
 SECOND = 1_000_000_000
 RUN_SECONDS = 300.0
@@ -25,8 +25,7 @@ def planned(levels, **options):
     planner = Planner(BLOCK, Options(**{'flux_density_min': -0.5, 'flux_density_max': 0.5,
                                         **options}))
     points = [(y, round(x * SECOND)) for x, y in levels]
-    from hmsa_ros.planning.drafting import finish
-    return planner.take(finish(planner.draft_levels(points, None, SECOND)), SECOND)
+    return planner.take(planner.draft_levels(points, None, SECOND), SECOND)
 
 
 def followed(plan, end=0.3):

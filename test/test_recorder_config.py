@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from hmsa_ros.errors import BadInputError
+from hmsa.errors import BadInputError
 from hmsa_ros.nodes import player, recorder
 from hmsa_ros.nodes.selection import Filter, Selection
 

@@ -17,14 +17,14 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from hmsa_ros.bag import metadata
-from hmsa_ros.bag.definitions import message_definition, type_hash
-from hmsa_ros.bag.info import missing_messages, summarize, to_text
-from hmsa_ros.bag.qos import Qos
-from hmsa_ros.bag.reader import BagReader, read_messages
-from hmsa_ros.bag.recover import recover
-from hmsa_ros.bag.writer import BagWriter, Topic
-from hmsa_ros.cli import main
+from hmsa.bag import metadata
+from hmsa.bag.definitions import message_definition, type_hash
+from hmsa.bag.info import missing_messages, summarize, to_text
+from hmsa.bag.qos import Qos
+from hmsa.bag.reader import BagReader, read_messages
+from hmsa.bag.recover import recover
+from hmsa.bag.writer import BagWriter, Topic
+from hmsa.cli import main
 from hmsa_ros.nodes.capture import RawSubscription
 from hmsa_ros.nodes.recorder import Recorder as Recording
 

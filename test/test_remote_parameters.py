@@ -7,9 +7,9 @@ from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters, GetParameterTypes, ListParameters
 from rclpy.parameter import Parameter
 
-from hmsa_ros.bag.experiment import parameter_key
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.lab.remote import RemoteNode
+from hmsa.bag.experiment import parameter_key
+from hmsa.errors import BadInputError
+from hmsa_ros.clients.remote import RemoteNode
 from hmsa_ros.nodes.service_call import RemoteParameters
 
 pytestmark = pytest.mark.ros

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from test_report import ACTUATOR, parameters, simulated, write
 
-import hmsa_ros
-from hmsa_ros.cli import main
-from hmsa_ros.report.repeats import repeats_in
+import hmsa
+from hmsa.cli import main
+from hmsa.report.repeats import repeats_in
 
 MODULI = {'before': (1.02, 1.04, 1.06), 'after': (0.999, 1.0, 1.001)}
 
@@ -33,7 +33,7 @@ def test_repeats_are_compared_by_mean_and_spread_and_drawn_as_bands(folders, cap
     assert main(['compare', *words, '--picture', str(picture), '--data', '--json']) == 0
     found = {(x['run'], x['setpoint']): x
              for x in json.loads(capsys.readouterr().out)['setpoints']}
-    alone = [hmsa_ros.read(folders / 'before' / str(i) / 'run').report()['offset'][1]
+    alone = [hmsa.read(folders / 'before' / str(i) / 'run').report()['offset'][1]
              for i in range(1, 4)]
     second = found['before', 2]
     assert second['repeats'] == 3

@@ -18,25 +18,32 @@ import plotly.graph_objects
 import pytest
 from scipy.io import loadmat
 
-import hmsa_ros
-from hmsa_ros.bag.definitions import message_definition
-from hmsa_ros.bag.writer import BagWriter, Topic
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.runs import recording_of
-from hmsa_ros.interfaces.actuator import parameters_of
-from hmsa_ros.interfaces.parameters import ACTUATOR_FIELDS
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.model.residual import percent, residual_vibration
-from hmsa_ros.model.simulation import ActuatorSimulation, simulate
-from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.planning.drafting import finish
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options, Planner
-from hmsa_ros.recordings.bags import read_run, read_runs
-from hmsa_ros.recordings.levels import in_force, Level, without_repeats
-from hmsa_ros.recordings.topics import (
+import hmsa
+from hmsa.bag.definitions import message_definition
+from hmsa.bag.writer import BagWriter, Topic
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.identification.runs import recording_of
+from hmsa.interfaces.actuator import parameters_of
+from hmsa.interfaces.parameters import ACTUATOR_FIELDS
+from hmsa.model.creep import Creep
+from hmsa.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa.model.residual import percent, residual_vibration
+from hmsa.model.simulation import ActuatorSimulation, simulate
+from hmsa.model.units import NANOSECONDS
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
+from hmsa.report.arrivals import Part, timing
+from hmsa.report.charts import MOST_PANELS
+from hmsa.report.curves import BUCKETS, decimate
+from hmsa.report.evaluation import evaluate, plan_points
+from hmsa.report.looks import RUNS
+from hmsa.report.outcome import level_results
+from hmsa.report.page import page
+from hmsa.report.picture import draw
+from hmsa.runs.bags import read_run, read_runs
+from hmsa.runs.levels import in_force, Level, without_repeats
+from hmsa.runs.topics import (
     APPLIED,
     COMMAND,
     JOINT_STATES,
@@ -46,15 +53,7 @@ from hmsa_ros.recordings.topics import (
     TRAJECTORY,
     TYPES,
 )
-from hmsa_ros.recordings.verify import verify
-from hmsa_ros.report.arrivals import Part, timing
-from hmsa_ros.report.charts import MOST_PANELS
-from hmsa_ros.report.curves import BUCKETS, decimate
-from hmsa_ros.report.evaluation import evaluate, plan_points
-from hmsa_ros.report.looks import RUNS
-from hmsa_ros.report.outcome import level_results
-from hmsa_ros.report.page import page
-from hmsa_ros.report.picture import draw
+from hmsa.runs.verify import verify
 
 rosbag2, typesys = needs('rosbags.rosbag2'), needs('rosbags.typesys')
 STORE = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
@@ -150,7 +149,7 @@ def fresh(
     asked = [(end, x) for x, end in points]
     if path:
         ends, asked = [path[-1][1]], [(end, x, rate) for (x, rate, _), end in path]
-        plan = planner.take(finish(planner.draft_path(path, None, START)), START)
+        plan = planner.take(planner.draft_path(path, None, START), START)
     else:
         plan = planner.request(points, None, START)
     levels = [x for x in plan.levels if x.stamp >= 0]
@@ -1356,7 +1355,7 @@ def test_joints_that_are_moved_in_turn_keep_their_setpoints(tmp_path, late, topi
     messages = [(START - 1, '/planner/status', TYPES[STATUS], status(0, 'none', '', plan='0'))]
     for number, (joint, target) in enumerate(asked, 1):
         time = START + number * pause
-        group.take(finish(group.draft_setpoint(joint, target, time)), time)
+        group.take(group.draft_setpoint(joint, target, time), time)
         stamps, samples = group.preview(time, 100)
         plan = trajectory(stamps[0], [(x - stamps[0],) for x in stamps])
         plan.joint_names = list(joints)
@@ -1492,7 +1491,7 @@ class Blocker:
         if name.partition('.')[0] in ('rclpy', 'sensor_msgs', 'std_msgs', 'rosgraph_msgs'):
             raise ModuleNotFoundError('blocked: ' + name, name=name)
 sys.meta_path.insert(0, Blocker())
-from hmsa_ros.cli import main
+from hmsa.cli import main
 sys.exit(main(sys.argv[1:]))
 """
     done = subprocess.run(
@@ -1514,7 +1513,7 @@ def test_runs_are_compared_in_numbers_and_read_and_exported_without_ros(bag, tmp
     assert (first['run'], second['run']) == ('run', 'other')
     assert (first['verdict'], second['verdict']) == ('arrived', 'off target')
     # 10 % more stiffness at the same level: the same as the runs say one by one.
-    read = [hmsa_ros.read(x) for x in (bag, other)]
+    read = [hmsa.read(x) for x in (bag, other)]
     single = read[1].report()
     assert second['offset'] == pytest.approx(single['offset'][0])
     # Both were sampled at the same times, so that the samples differ by no more than the curves.

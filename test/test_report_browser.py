@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from test_report import ACTUATOR, applied, parameters, parts_of, simulated, write
 
-from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.recordings.bags import read_runs
-from hmsa_ros.report.arrivals import Part, timing
-from hmsa_ros.report.evaluation import evaluate
-from hmsa_ros.report.page import page
+from hmsa.model.units import NANOSECONDS
+from hmsa.report.arrivals import Part, timing
+from hmsa.report.evaluation import evaluate
+from hmsa.report.page import page
+from hmsa.runs.bags import read_runs
 
 pytestmark = pytest.mark.skipif(
     find_browser() is None,

@@ -10,13 +10,13 @@ import pytest
 from sensor_msgs.msg import JointState
 import yaml
 
-from hmsa_ros.control.loop import Loop
-from hmsa_ros.control.records import Settings, Target
+from hmsa.model.actuators import Setup
+from hmsa.model.parameters import paper_actuator
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.model.actuators import Setup
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa_ros.runtime.loop import Loop
+from hmsa_ros.runtime.records import Settings, Target
 
 FOLDER = Path(__file__).resolve().parent.parent / 'examples' / 'ros2_control'
 MS = 1_000_000

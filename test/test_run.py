@@ -8,8 +8,8 @@ from mcap.reader import make_reader
 import numpy as np
 import pytest
 
-from hmsa_ros.recordings.bags import read_runs
-from hmsa_ros.recordings.levels import without_repeats
+from hmsa.runs.bags import read_runs
+from hmsa.runs.levels import without_repeats
 
 RUN_SECONDS = 300.0
 SETPOINTS = ('1.10:0.1', '1.20:0.1', '1.00:0.1')
@@ -124,7 +124,7 @@ def test_a_block_arrives_and_stays_though_it_creeps(start, tmp_path, feedback):
 
 @pytest.mark.slow
 def test_an_interrupted_experiment_brings_the_running_actuator_to_rest(start, ros, tmp_path):
-    from hmsa_ros.interfaces import topics
+    from hmsa.interfaces import topics
 
     statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
     # Far enough ahead for a busy machine, and no time passes where that stops the plant.
@@ -212,7 +212,7 @@ def test_a_simulated_experiment_with_feedback_arrives_and_records_what_is_believ
 
 @pytest.mark.slow
 def test_a_simulated_experiment_never_commands_nodes_that_run_already(start, ros, tmp_path):
-    from hmsa_ros.interfaces import topics
+    from hmsa.interfaces import topics
 
     asked = ros.collect(
         topics.JOINT_TRAJECTORY.type, 'planner/joint_trajectory', topics.JOINT_TRAJECTORY.qos)

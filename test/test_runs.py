@@ -10,23 +10,23 @@ from beam_oracle import silicone
 import numpy as np
 import pytest
 
-from hmsa_ros.bag.info import BagSummary
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import json_text, replacing, write_text
-from hmsa_ros.interfaces.actuator import parameters_of
-from hmsa_ros.interfaces.parameters import number_of
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
-from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.recordings import bags
-from hmsa_ros.recordings.levels import lateness_of, Level
-from hmsa_ros.recordings.parameters import actuators, read_parameter_file, recorded, values_of
-from hmsa_ros.recordings.record import Run
-from hmsa_ros.recordings.tables import levels_of, samples_of, write_table
-from hmsa_ros.recordings.topics import APPLIED, COMMAND
-from hmsa_ros.recordings.verify import verify_run
+from hmsa.bag.info import BagSummary
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.files import json_text, replacing, write_text
+from hmsa.interfaces.actuator import parameters_of
+from hmsa.interfaces.parameters import number_of
+from hmsa.model.creep import Creep
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
+from hmsa.model.units import NANOSECONDS
+from hmsa.runs import bags
+from hmsa.runs.levels import lateness_of, Level
+from hmsa.runs.parameters import actuators, read_parameter_file, recorded, values_of
+from hmsa.runs.record import Run
+from hmsa.runs.tables import levels_of, samples_of, write_table
+from hmsa.runs.topics import APPLIED, COMMAND
+from hmsa.runs.verify import verify_run
 
 BEGIN = NANOSECONDS
 STEP = 1_000_000
@@ -169,7 +169,7 @@ def test_a_table_has_the_samples_in_full_precision_and_the_levels_at_their_times
 def test_parameter_files_that_are_none_are_refused_in_a_sentence(tmp_path, text):
     file = tmp_path / 'bad.yaml'
     file.write_text(text)
-    from hmsa_ros.interfaces.parameters import ACTUATOR
+    from hmsa.interfaces.parameters import ACTUATOR
     with pytest.raises(BadInputError, match='expected'):
         values_of(read_parameter_file(file), 'plant', ACTUATOR)
 
@@ -240,17 +240,17 @@ def test_json_has_null_for_what_is_no_number():
 def test_what_is_not_verified_whole_is_no_success(tmp_path, monkeypatch, capsys, fault):
     run = moved(applied=fault != 'nobody')
     problems = ('run_0.mcap: a chunk is damaged and passed over',) if fault == 'chunk' else ()
-    run = replace(run, summary=BagSummary(
-        'run', (), None, None, (), {}, {}, 0, True, not problems, problems))
+    run = replace(run, summary=BagSummary('run', (), None, None, (), {}, {}, True, problems))
     if fault == 'nan':
         stretch = run.stretch.copy()
         stretch[50] = math.nan
         run = replace(run, stretch=stretch)
     monkeypatch.setattr(bags, 'read_runs', lambda *_, **__: [run])
     assert main(['bag', 'verify', 'run', '--json']) == 1
-    found = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    said = capsys.readouterr()
+    found = json.loads(said.out, parse_constant=pytest.fail)
     assert not found['passed']
     actuator, = found['actuators']
-    assert found['problems'] == [*problems]
+    assert (fault in said.err) is (found['problems'] != [])
     assert (actuator['unapplied_count'], actuator['largest_difference'] is None) == (
         int(fault == 'nobody'), fault == 'nan')

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 from test_runtime_watch import Loop, MS, START
 
-from hmsa_ros.control.records import (
+from hmsa.errors import BadInputError
+from hmsa.identification.files import read_belief
+from hmsa.identification.known import Known
+from hmsa.model.creep import Creep
+from hmsa.model.parameters import paper_actuator
+from hmsa.planning.planner import Options
+from hmsa.planning.timeline import Model
+from hmsa_lab.adapt.estimator import Estimator
+from hmsa_ros.runtime.records import (
     EstimateChanged,
     Send,
     Settings,
@@ -17,14 +25,6 @@ from hmsa_ros.control.records import (
     StatusChanged,
     Target,
 )
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.estimation import Estimator
-from hmsa_ros.identification.files import read_belief
-from hmsa_ros.identification.known import Known
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.planning.planner import Options
-from hmsa_ros.planning.timeline import Model
 from hmsa_studies.scenario import SCENARIOS
 
 
@@ -251,7 +251,7 @@ def test_a_sensor_that_fails_leaves_the_plan_in_force_and_is_named():
 
 def test_what_was_learnt_is_saved_and_the_next_run_begins_with_it(tmp_path):
     loop = Loop(1.2, 1e-3, feedback='adapt')
-    feedback = loop.runtime.feedback
+    feedback = loop.runtime.follower
     with pytest.raises(BadInputError, match='feedback_file is empty'):
         feedback.save(by_joint=False)
     settings = Settings(
@@ -298,11 +298,11 @@ def test_what_was_learnt_can_be_frozen_and_forgotten():
     loop.run((1.1, 300 * MS), (1.4, 300 * MS))
     assert planner.model.actuator == learnt
     assert estimates(loop)[-1].values['learning'] is False
-    assert 'discarded' in loop.runtime.feedback.reset()
+    assert 'discarded' in loop.runtime.follower.reset()
     assert planner.model.actuator.shear_modulus == 1e4
     loop.runtime.change(
         Settings(takeover_timeout=0), {'a': planner.model}, simultaneous=False)
-    for call in (loop.runtime.feedback.reset, partial(loop.runtime.feedback.save, by_joint=True)):
+    for call in (loop.runtime.follower.reset, partial(loop.runtime.follower.save, by_joint=True)):
         with pytest.raises(BadInputError, match='feedback is off'):
             call()
 

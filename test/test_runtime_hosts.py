@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 from test_runtime_planner import HOLD, LEAD, MS, PATIENT, QUIET, Rig, SEQUENCE, START, trajectory
 
-from hmsa_ros.control.environment import Seen
-from hmsa_ros.control.records import Severity, Stop, Target
+from hmsa_ros.runtime.environment import Seen
+from hmsa_ros.runtime.records import Severity, Stop, Target
 
 BEATING = replace(QUIET, heartbeat_period=200 * MS)
 

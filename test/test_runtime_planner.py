@@ -2,12 +2,20 @@
 
 from dataclasses import replace
 import math
+from threading import Semaphore, Thread
 
 import pytest
 
-from hmsa_ros.control.environment import Environment
-from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.records import (
+from hmsa.errors import HmsaError
+from hmsa.model.equations import natural_frequency
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
+from hmsa_ros.runtime.environment import Environment
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import (
     Note,
     PlanChanged,
     Send,
@@ -18,13 +26,7 @@ from hmsa_ros.control.records import (
     Target,
     Trajectory,
 )
-from hmsa_ros.errors import HmsaError
-from hmsa_ros.model.equations import natural_frequency
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa_ros.runtime.worker import Job
 
 MS = 1_000_000
 START = 1000 * MS
@@ -41,6 +43,42 @@ def trajectory(*points, joints=('a',), stamp=None, name=''):
     """Return a request of the same stretches for all joints."""
     return Trajectory(
         tuple(joints), [((x,) * len(joints), t) for x, t in points], len(points), stamp, name)
+
+
+class Sliced(Job):
+    """Work in a thread that goes on only while the loop waits for it, by the clock of a rig."""
+
+    def __init__(self, work, look):
+        super().__init__(work)
+        self._look, self._goes, self._pauses = look, Semaphore(0), Semaphore(0)
+        Thread(target=self._begin, daemon=True).start()
+
+    def _begin(self):
+        self._goes.acquire()
+        self.run(self._pause)
+        self._pauses.release()
+
+    def _pause(self):
+        self._pauses.release()
+        self._goes.acquire()
+        self.check()
+
+    def done(self, seconds=0.0):
+        end = self._look() + seconds * 1e9
+        while not super().done() and self._look() < end:
+            self._goes.release()
+            self._pauses.acquire()
+        return super().done()
+
+
+class SlicedWorker:
+    """A worker whose work takes the time of a rig."""
+
+    def __init__(self, look):
+        self._look = look
+
+    def submit(self, work):
+        return Sliced(work, self._look)
 
 
 class Rig:
@@ -62,8 +100,9 @@ class Rig:
             x: Planner(block, self.options) for x, block in self.blocks.items()})
         self.runtime = PlannerRuntime(
             self.group, settings, Environment(
-                clock=self.clock, steady=self.look, observable=lambda: self.observable,
-                unheard=lambda: self.unheard, found=lambda joint: self.found))
+                clock=self.clock, steady=self.look, worker=SlicedWorker(self.look),
+                observable=lambda: self.observable, unheard=lambda: self.unheard,
+                found=lambda joint: self.found))
         self.runtime.active = True
         self.plants = {
             x: ActuatorSimulation(block, time=START) for x, block in self.blocks.items()}
@@ -199,7 +238,6 @@ def test_request_while_inactive_or_without_time_is_refused():
 def test_plan_that_cannot_be_computed_is_a_refusal_too(monkeypatch):
     def fails(*_):
         raise HmsaError('the integration ran out of steps')
-        yield
 
     rig = Rig()
     rig.runtime.request(trajectory(*SEQUENCE))
@@ -244,7 +282,7 @@ def test_what_is_done_with_a_plan_before_it_is_taken_makes_no_command_late(monke
     def cautious(drafts):
         rig.now += 2 * LEAD
         return drafts
-    monkeypatch.setattr(rig.runtime.planning._corrections, 'cautious', cautious)
+    monkeypatch.setattr(rig.runtime.follower, 'cautious', cautious)
     rig.runtime.request(trajectory(*SEQUENCE))
     rig.run(rig.now + 20 * LEAD)
     assert len(rig.sent) >= 2 * len(SEQUENCE)
@@ -261,11 +299,11 @@ def zigzag(count, name='long', hold=HOLD, **more):
         name=name, **more)
 
 
-def test_long_trajectory_is_planned_in_slices_with_signs_of_life_in_between():
+def test_long_trajectory_is_planned_beside_the_loop_with_signs_of_life_in_between():
     rig = Rig(settings=replace(QUIET, heartbeat_period=20 * MS))
     rig.runtime.request(Target('a', 1.05))
     rig.run(START + LEAD + HOLD)
-    rig.effort = MS // 5
+    rig.effort = MS // 10
     plan = rig.planner.plan
     assert rig.runtime.request(zigzag(1000)).code == 'waiting'
     spent = []

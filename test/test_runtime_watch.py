@@ -6,18 +6,17 @@ import math
 import numpy as np
 import pytest
 
-from hmsa_ros.control import holds
-from hmsa_ros.control.environment import Environment
-from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.records import Note, Send, Settings, StatusChanged, Trajectory
+from hmsa.judge import holds, judging
+from hmsa.judge.records import Setpoint
+from hmsa.model.actuators import Setup
+from hmsa.model.parameters import paper_actuator
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.judge import judging
-from hmsa_ros.judge.records import Setpoint
-from hmsa_ros.model.actuators import Setup
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa_ros.runtime.environment import Environment
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import Note, Send, Settings, StatusChanged, Trajectory
 
 MS = 1_000_000
 START = 1000 * MS

@@ -6,9 +6,9 @@ from threading import Thread
 from extras import needs
 import pytest
 
+from hmsa_lab.bench.scpi_supply import ScpiSupply, SimulatedSupply, Supply, SupplyError
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.protocol import Kind
-from hmsa_ros.device.scpi_supply import ScpiSupply, SimulatedSupply, Supply, SupplyError
 from hmsa_ros.device.watchdog import Fallback
 
 START = 10**18
@@ -81,7 +81,7 @@ def test_what_a_supply_refuses_or_does_not_understand_is_said(tcp, monkeypatch):
     supply = Supply(port)
     with pytest.raises(SupplyError, match='refuses CURR 11 .error -222 "Data out of range"'):
         supply.write(11.0, 0)
-    monkeypatch.setattr('hmsa_ros.device.scpi_supply._PATIENCE', 0.05)
+    monkeypatch.setattr('hmsa_lab.bench.scpi_supply._PATIENCE', 0.05)
     faults += [lambda x: b'hello\n'] * 100_000
     with pytest.raises(SupplyError, match="answers 'hello' to CURR 1;:CURR"):
         supply.write(1.0, 0)

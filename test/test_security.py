@@ -16,7 +16,7 @@ from conftest import RosSide
 import pytest
 from std_msgs.msg import Float64
 
-from hmsa_ros.interfaces import topics
+from hmsa.interfaces import topics
 from hmsa_ros.nodes import endpoints
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -17,15 +17,15 @@ from extras import needs
 import numpy as np
 import pytest
 
-from hmsa_ros.cli import main
-from hmsa_ros.device import _board, serial_board
+from hmsa.cli import main
+from hmsa.errors import HmsaError
+from hmsa.interfaces import topics
+from hmsa_lab.bench import _board, serial_board
+from hmsa_lab.bench.serial_board import Board, BoardError, framed, SerialBoard
+from hmsa_lab.bench.simulated_board import REST_LENGTH, SimulatedBoard, TESLA_PER_AMPERE
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.protocol import Kind
-from hmsa_ros.device.serial_board import Board, BoardError, framed, SerialBoard
-from hmsa_ros.device.simulated_board import REST_LENGTH, SimulatedBoard, TESLA_PER_AMPERE
 from hmsa_ros.device.watchdog import Fallback
-from hmsa_ros.errors import HmsaError
-from hmsa_ros.interfaces import topics
 
 FIRMWARE = Path(_board.__file__).with_name('hmsa_board')
 SETTINGS = {'coil.tesla_per_ampere': TESLA_PER_AMPERE, 'sensor.rest_length': REST_LENGTH}
@@ -340,7 +340,7 @@ def test_without_pyserial_it_says_how_to_install_it(monkeypatch):
     def missing(name):
         raise ImportError(errno.ENOENT, name)
 
-    monkeypatch.setattr('hmsa_ros.device.line.import_module', missing)
+    monkeypatch.setattr('hmsa_lab.bench.line.import_module', missing)
     with pytest.raises(HmsaError, match='pip install pyserial'):
         Board('/dev/ttyACM0')
 

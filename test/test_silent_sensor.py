@@ -7,7 +7,7 @@ import pytest
 from test_runtime_hosts import BEATING, Bench
 from test_runtime_planner import MS, START, trajectory
 
-from hmsa_ros.control.records import Severity, Target
+from hmsa_ros.runtime.records import Severity, Target
 
 
 class Watched(Bench):

@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.delivery import Delivery
-from hmsa_ros.model.laws.record import Elastic, OGDEN, POLYNOMIAL
-from hmsa_ros.model.moves import Limits, State
-from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.planner import Options, Planner
-from hmsa_ros.planning.sequence import plan_sequence
-from hmsa_ros.planning.setpoint import Setpoint
-from hmsa_ros.planning.shapers import get_shaper
-from hmsa_ros.planning.shapers.pace import Pace
-from hmsa_ros.planning.shapers.request import Request
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.model.creep import Creep
+from hmsa.model.delivery import Delivery
+from hmsa.model.laws.record import Elastic, OGDEN, POLYNOMIAL
+from hmsa.model.moves import Limits, State
+from hmsa.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa.model.status import Code, RefusedError
+from hmsa.planning.planner import Options, Planner
+from hmsa.planning.sequence import plan_sequence
+from hmsa.planning.setpoint import Setpoint
+from hmsa.planning.shapers import get_shaper
+from hmsa.planning.shapers.pace import Pace
+from hmsa.planning.shapers.request import Request
 
 MS = 1_000_000
 ZETA, C1 = 0.2, 2.0

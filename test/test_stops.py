@@ -7,9 +7,9 @@ import pytest
 from test_runtime_hosts import BEATING, Bench
 from test_runtime_planner import HOLD, MS, QUIET, Rig, SEQUENCE, START, trajectory
 
-from hmsa_ros.control.records import Severity, StatusChanged, Stop, Target
-from hmsa_ros.interfaces.status import Verdict
+from hmsa.interfaces.status import Verdict
 from hmsa_ros.nodes.conversions import to_planner_status
+from hmsa_ros.runtime.records import Severity, StatusChanged, Stop, Target
 
 SECOND = 1000 * MS
 LONG = ((1.1, HOLD), (1.2, 2 * HOLD), (1.3, 20 * SECOND))

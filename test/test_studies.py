@@ -12,20 +12,20 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.delivery import Delivery
-from hmsa_ros.model.equations import (
+from hmsa.errors import BadInputError, HmsaError
+from hmsa.model.creep import Creep
+from hmsa.model.delivery import Delivery
+from hmsa.model.equations import (
     acceleration_si,
     critical_zeta,
     elastic_force,
     natural_frequency,
 )
-from hmsa_ros.model.moves import Level, Limits, Move
-from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters, paper_actuator
-from hmsa_ros.model.residual import percent
-from hmsa_ros.model.status import Code
-from hmsa_ros.planning.two_step import plan_two_step
+from hmsa.model.moves import Level, Limits, Move
+from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters, paper_actuator
+from hmsa.model.residual import percent
+from hmsa.model.status import Code
+from hmsa.planning.two_step import plan_two_step
 from hmsa_studies.__main__ import tables
 from hmsa_studies.axes import MOST_VALUES, parse_grid, read_cases
 from hmsa_studies.damped import damped_study, settling_time

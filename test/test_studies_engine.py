@@ -12,8 +12,8 @@ import sys
 from extras import needs
 import pytest
 
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa.cli import main
+from hmsa.errors import BadInputError, HmsaError
 from hmsa_studies import chunks as chunk_module
 from hmsa_studies import executors
 from hmsa_studies.chunks import Chunks, LEAST_ROWS
@@ -254,7 +254,7 @@ def test_a_missing_dask_is_said_with_how_to_get_it(run, monkeypatch):
 
 
 def test_chunks_of_other_code_have_other_names(sweep, tmp_path, monkeypatch):
-    for name in ('hmsa_ros', 'hmsa_studies'):
+    for name in ('hmsa', 'hmsa_ros', 'hmsa_studies'):
         shutil.copytree(
             Path(chunk_module.__file__).parent.parent / name, tmp_path / name,
             ignore=shutil.ignore_patterns('__pycache__'))
@@ -262,7 +262,7 @@ def test_chunks_of_other_code_have_other_names(sweep, tmp_path, monkeypatch):
     monkeypatch.setattr(chunk_module, '__file__', str(tmp_path / 'hmsa_studies' / 'chunks.py'))
     for change in (False, True):
         if change:
-            with (tmp_path / 'hmsa_ros' / 'motion' / 'hmsa' / 'law.hpp').open('a') as source:
+            with (tmp_path / 'hmsa' / 'motion' / 'hmsa' / 'law.hpp').open('a') as source:
                 source.write('// changed\n')
         chunk_module.code.cache_clear()
         assert (Chunks.of(sweep, tmp_path).digest == before) is not change

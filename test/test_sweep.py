@@ -11,17 +11,17 @@ import pytest
 from scipy.integrate import solve_ivp
 import yaml
 
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces.parameters import PLANNED
-from hmsa_ros.model.equations import acceleration_si
-from hmsa_ros.model.laws import LAWS
-from hmsa_ros.model.moves import State
-from hmsa_ros.model.parameters import ActuatorParameters
-from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.planning.shapers.two_step import two_step
-from hmsa_ros.planning.two_step import Groups, plan_two_step_batch
-from hmsa_ros.recordings.parameters import read_parameter_file, values_of
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.interfaces.parameters import PLANNED
+from hmsa.model.equations import acceleration_si
+from hmsa.model.laws import LAWS
+from hmsa.model.moves import State
+from hmsa.model.parameters import ActuatorParameters
+from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.two_step import two_step
+from hmsa.planning.two_step import Groups, plan_two_step_batch
+from hmsa.runs.parameters import read_parameter_file, values_of
 from hmsa_studies.axes import Belief, draw, NOTHING, parse_values, Spread
 from hmsa_studies.residual import Actual, Errors
 from hmsa_studies.settings import InSI, Nondimensional
@@ -188,8 +188,8 @@ def test_chunks_of_samples_shapers_and_laws_merge_to_the_table_of_one_process(ru
 
 
 def test_a_law_of_many_constants_takes_no_room_for_each_row(monkeypatch):
-    from hmsa_ros.model import law
-    from hmsa_ros.planning import two_step
+    from hmsa.model import law
+    from hmsa.planning import two_step
 
     sizes = []
     pack = law.pack

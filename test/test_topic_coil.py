@@ -5,9 +5,9 @@ import signal
 import pytest
 from std_msgs.msg import Bool
 
+from hmsa.errors import BadInputError
+from hmsa.interfaces import topics
 from hmsa_ros.device.hardware import load
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces import topics
 from hmsa_ros.nodes.conversions import from_time, to_command
 
 ARRAY, VECTOR, FIELD = (
@@ -142,7 +142,7 @@ def test_a_topic_that_nobody_subscribes_to_and_a_field_of_two_joints_are_refused
     with pytest.raises(BadInputError, match="'data.0.' for joints left and right"):
         load('topic', 'right', {'topic': '/coils'})
     left.close()
-    monkeypatch.setattr('hmsa_ros.nodes.topic_coil._PATIENCE', 0.2)
+    monkeypatch.setattr('hmsa_lab.nodes.topic_coil._PATIENCE', 0.2)
     # Another type under the same name reaches nobody.
     for settings in ({'topic': '/nowhere'}, {'topic': '/coils', 'type': VECTOR}):
         with pytest.raises(BadInputError, match='no node subscribes to'):

@@ -10,18 +10,18 @@ from identification_oracle import simulate, steps
 import numpy as np
 import pytest
 
-import hmsa_ros
-from hmsa_ros.api.choice import choose, compare_shapers, Expected
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.files import read_belief
-from hmsa_ros.identification.identify import identify
-from hmsa_ros.identification.known import Known
-from hmsa_ros.identification.recording import Recording
-from hmsa_ros.lab.tuning import chosen, Tuning
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.recordings.bags import read_run
-from hmsa_ros.recordings.parameters import read_parameter_file
+import hmsa
+from hmsa.api.choice import choose, compare_shapers, Expected
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.identification.files import read_belief
+from hmsa.identification.identify import identify
+from hmsa.identification.known import Known
+from hmsa.identification.recording import Recording
+from hmsa.model.parameters import paper_actuator
+from hmsa.runs.bags import read_run
+from hmsa.runs.parameters import read_parameter_file
+from hmsa_lab.experiments.tuning import chosen, Tuning
 
 RUN_SECONDS = 300.0
 MOVES = ((1.1, 0.3), (1.0, 0.3), (1.2, 0.3))
@@ -51,7 +51,7 @@ def known(std: float) -> Known:
 
 
 def test_what_is_well_known_moves_quickly_and_what_is_not_moves_robustly():
-    block = hmsa_ros.Actuator()
+    block = hmsa.Actuator()
     well, badly = (compare_shapers(block, MOVES, known(x)) for x in (1e-3, 3e-2))
     assert choose(well, 0.01).shaper == 'two_step'
     assert choose(badly, 0.01).shaper == 'robust'
@@ -59,7 +59,7 @@ def test_what_is_well_known_moves_quickly_and_what_is_not_moves_robustly():
 
 
 def test_a_shaper_that_cannot_plan_the_moves_is_not_chosen():
-    found = compare_shapers(hmsa_ros.Actuator(), [(1.1, 0.007)], known(3e-2))
+    found = compare_shapers(hmsa.Actuator(), [(1.1, 0.007)], known(3e-2))
     assert {x.shaper for x in found if x.reason} >= {'robust', 'smooth'}
     assert choose(found, 1e-6).shaper == 'two_step'
     with pytest.raises(BadInputError, match='no shaper plans the setpoints: too short'):

@@ -10,8 +10,8 @@ import signal
 import numpy as np
 import pytest
 
-from hmsa_ros.interfaces.status import Verdict
-from hmsa_ros.watch.scene import as_json, History, Joint, line, Report, Scene, SLOTS
+from hmsa.interfaces.status import Verdict
+from hmsa_lab.watch.scene import as_json, History, Joint, line, Report, Scene, SLOTS
 
 WAIT_SECONDS = 60.0
 
@@ -97,10 +97,10 @@ def test_each_joint_has_its_own_target_command_and_history(ros, ros_env, wait_un
     from sensor_msgs.msg import JointState, MagneticField
     from std_msgs.msg import Header
 
-    from hmsa_ros.interfaces import topics
+    from hmsa.interfaces import topics
+    from hmsa_lab.watch.listener import Listener
     from hmsa_ros.nodes import endpoints
     from hmsa_ros.nodes.conversions import to_time
-    from hmsa_ros.watch.listener import Listener
 
     def status(name, level, joint, **values):
         return DiagnosticStatus(
@@ -156,10 +156,10 @@ def test_garbage_on_its_topics_neither_ends_nor_misleads_it(ros, ros_env, wait_u
     from trajectory_msgs.msg import JointTrajectory
 
     from benchmarks.faults import garbage
-    from hmsa_ros.interfaces import topics
+    from hmsa.interfaces import topics
+    from hmsa_lab.watch.listener import Listener
     from hmsa_ros.nodes import endpoints
     from hmsa_ros.nodes.conversions import to_command
-    from hmsa_ros.watch.listener import Listener
 
     dice = random.Random(7)
     senders = [
@@ -229,7 +229,7 @@ def test_once_waits_for_what_is_missing_and_says_so(start, ros_domain_id):
     (['--namespace', '9 bad'], "namespace '9 bad'"),
 ])
 def test_bad_input_is_answered_in_one_line_with_status_2(words, said, capsys, ros_env):
-    from hmsa_ros.cli import main
+    from hmsa.cli import main
 
     assert main(['watch', *words]) == 2
     captured = capsys.readouterr()

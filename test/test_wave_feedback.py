@@ -7,14 +7,14 @@ import pytest
 from scipy.integrate import solve_ivp
 from test_path import C1, force, LOAD, TIME, ZETA
 
-from hmsa_ros import Actuator
-from hmsa_ros.api.paths import smooth_points, wave_of, wave_path, wave_points
-from hmsa_ros.control.environment import Environment
-from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.records import Send, Settings, StatusChanged, Stop, Trajectory
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options, Planner
+from hmsa import Actuator
+from hmsa.api.paths import smooth_points, wave_of, wave_path, wave_points
+from hmsa.model.parameters import paper_actuator
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
+from hmsa_ros.runtime.environment import Environment
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import Send, Settings, StatusChanged, Stop, Trajectory
 
 MS, SECOND = 1_000_000, 1_000_000_000
 AMPLITUDE, LEAD = 0.1, 20 * MS

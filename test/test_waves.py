@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from test_path import C1, moved, TIME
 
-from hmsa_ros import Actuator, UnusualWarning
-from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.status import RefusedError
+from hmsa import Actuator, UnusualWarning
+from hmsa.cli import main
+from hmsa.errors import BadInputError
+from hmsa.model.status import RefusedError
 
 AMPLITUDE = 0.1
 # Of small motion about 1, where psi'' is 3.

@@ -11,7 +11,7 @@ from benchmarks.faults.common import Register
 from benchmarks.faults.hosts import ACROSS, Hosts, hosts, unavailable
 from benchmarks.faults.rig import Child, PATIENCE, Rig, ROOT
 from benchmarks.faults.table import Seen
-from hmsa_ros.errors import HmsaError
+from hmsa.errors import HmsaError
 
 FAULTS = Register()
 _ONLOOKER = ROOT / 'test' / 'onlooker.py'

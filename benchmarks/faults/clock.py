@@ -13,8 +13,8 @@ from time import monotonic, sleep
 
 import rclpy
 
-from hmsa_ros.interfaces import topics
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.interfaces import topics
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import to_clock
 

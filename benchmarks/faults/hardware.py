@@ -15,7 +15,7 @@ from benchmarks.faults.board import Board
 from benchmarks.faults.common import Register
 from benchmarks.faults.rig import Child, Rig
 from benchmarks.faults.table import Seen
-from hmsa_ros.interfaces import topics
+from hmsa.interfaces import topics
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import CUT_OFF, from_time, to_command
 

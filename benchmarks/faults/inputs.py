@@ -11,7 +11,7 @@ from benchmarks.faults import garbage
 from benchmarks.faults.common import jump, LIMIT, move, moves, pair, Register, share
 from benchmarks.faults.rig import hushed, Rig
 from benchmarks.faults.table import Seen
-from hmsa_ros.interfaces import topics
+from hmsa.interfaces import topics
 from hmsa_ros.nodes.conversions import to_command
 from hmsa_ros.nodes.endpoints import interface_class
 

@@ -8,9 +8,9 @@ import numpy as np
 from benchmarks.faults.common import await_change, LIMIT, moves, pair, Register, share
 from benchmarks.faults.rig import Rig, settled
 from benchmarks.faults.table import Seen
-from hmsa_ros.interfaces import topics
-from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
+from hmsa.interfaces import topics
+from hmsa.model.parameters import ActuatorParameters, paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
 
 FAULTS = Register()
 _SHARES = (0.01, 0.05, 0.1, 0.2)

@@ -20,9 +20,9 @@ from benchmarks.faults.common import (
 )
 from benchmarks.faults.rig import Rig, settled
 from benchmarks.faults.table import Seen
-from hmsa_ros.bag.reader import BagReader
-from hmsa_ros.bag.recover import recover
-from hmsa_ros.interfaces import topics
+from hmsa.bag.reader import BagReader
+from hmsa.bag.recover import recover
+from hmsa.interfaces import topics
 
 FAULTS = Register()
 _TIMEOUT = 0.5

@@ -22,7 +22,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import MagneticField
 
-from hmsa_ros.interfaces import topics
+from hmsa.interfaces import topics
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.runner import spin
 

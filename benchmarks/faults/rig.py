@@ -21,9 +21,9 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState, MagneticField
 from std_msgs.msg import Float64
 
-from hmsa_ros.errors import HmsaError
-from hmsa_ros.interfaces import topics
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.errors import HmsaError
+from hmsa.interfaces import topics
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
 from hmsa_ros.nodes.endpoints import interface_class

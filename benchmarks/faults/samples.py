@@ -5,7 +5,7 @@ import signal
 from benchmarks.faults.common import await_change, jump, move, pair, Register, share
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.table import Seen
-from hmsa_ros.interfaces import topics
+from hmsa.interfaces import topics
 from hmsa_ros.nodes import endpoints
 
 FAULTS = Register()

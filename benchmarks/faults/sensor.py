@@ -20,7 +20,7 @@ import rclpy
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from hmsa_ros.interfaces import topics
+from hmsa.interfaces import topics
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.runner import spin
 

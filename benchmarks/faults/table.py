@@ -6,7 +6,7 @@ from pathlib import Path
 import tempfile
 
 from benchmarks.faults.rig import Rig
-from hmsa_ros.errors import HmsaError
+from hmsa.errors import HmsaError
 
 
 @dataclass(frozen=True)

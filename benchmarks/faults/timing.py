@@ -3,7 +3,7 @@
 from benchmarks.faults.common import LIMIT, moves, pair, Register, share
 from benchmarks.faults.rig import Rig, settled
 from benchmarks.faults.table import Seen
-from hmsa_ros.interfaces import topics
+from hmsa.interfaces import topics
 
 FAULTS = Register()
 _FOLLOWS = {'use_sim_time': True}

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from hmsa_ros.model.status import Code
+from hmsa.model.status import Code
 
 #: What each code means and what to do about it.
 EXPLANATIONS: Mapping[Code, tuple[str, str]] = {

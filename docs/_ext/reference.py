@@ -27,10 +27,11 @@ from sphinx.application import Sphinx
 from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 
-from hmsa_ros import errors
-from hmsa_ros.cli import build_parser
-from hmsa_ros.interfaces import topics
-from hmsa_ros.model.status import Code
+from hmsa import errors
+from hmsa.cli import build_parser
+from hmsa.interfaces import topics
+from hmsa.model.status import Code
+from hmsa.plugins import NODES, registered
 
 LOGGER = logging.getLogger(__name__)
 PACKAGES = Path(errors.__file__).parent.parent
@@ -50,7 +51,7 @@ def declared(kind: type) -> list[Any]:
 
 def parameters(node: str) -> tuple[Any, ...]:
     """Return the parameters that a node declares."""
-    found: tuple[Any, ...] = import_module(f'hmsa_ros.nodes.{node}').PARAMETERS
+    found: tuple[Any, ...] = registered(NODES)[node].load().PARAMETERS
     return found
 
 
@@ -210,7 +211,7 @@ class Topics(Generated):
         for topic in declared(topics.Topic):
             if not topic.meaning or not (topic.publishers or topic.subscribers):
                 self.missing(
-                    f'topic {topic.name} in hmsa_ros.interfaces.topics has no meaning, or no '
+                    f'topic {topic.name} in hmsa.interfaces.topics has no meaning, or no '
                     'publishers and subscribers: expected both beside its name')
             rows.append((
                 f'`{topic.name}`',
@@ -229,7 +230,7 @@ class Services(Generated):
         for service in services:
             if not service.meaning:
                 self.missing(
-                    f'service {service.name} in hmsa_ros.interfaces.topics has no meaning: '
+                    f'service {service.name} in hmsa.interfaces.topics has no meaning: '
                     'expected one for each node that serves it')
         return table(
             ('node', 'name', 'meaning'),
@@ -287,7 +288,7 @@ class Codes(Generated):
         for code in Code:
             if code not in EXPLANATIONS:
                 self.missing(
-                    f'code {code} in hmsa_ros.model.status is not explained: expected an entry '
+                    f'code {code} in hmsa.model.status is not explained: expected an entry '
                     'in docs/_ext/codes.py')
         return table(
             ('code', 'meaning', 'what to do'),

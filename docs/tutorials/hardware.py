@@ -2,8 +2,8 @@
 
 from time import time_ns
 
-from hmsa_ros.model.parameters import paper_actuator
-from hmsa_ros.model.simulation import ActuatorSimulation
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
 
 
 class Bench:

@@ -14,10 +14,10 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from hmsa_ros.cli.options import add_command, show
-from hmsa_ros.cli.progress import PATIENCE, progress
-from hmsa_ros.ending import ENDING
-from hmsa_ros.table import Column, Table
+from hmsa.cli.options import add_command, show
+from hmsa.cli.progress import PATIENCE, progress
+from hmsa.ending import ENDING
+from hmsa.table import Column, Table
 
 
 def add_parser(subparsers: Any) -> None:
@@ -30,12 +30,12 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo."""
-    from hmsa_ros.lab.processes import dated, stay_local
+    from hmsa_ros.clients.processes import dated, stay_local
 
     folder = arguments.out or dated('hmsa_demo')
     stay_local()
-    from hmsa_ros.lab.demo import run_demo
-    from hmsa_ros.lab.experiment import prepare
+    from hmsa_ros.clients.demo import run_demo
+    from hmsa_ros.clients.experiment import prepare
 
     prepare(folder)
     ENDING.note()

@@ -1,41 +1,41 @@
 """``hmsa planner`` and similar: run a node, or planner and device in one process."""
 
 import argparse
-from importlib import import_module
 from typing import Any
 
-from hmsa_ros.ending import ENDING
+from hmsa.ending import ENDING
+from hmsa.plugins import NODES, registered
 
-NODES = {
-    'planner': 'plan shaped commands for setpoint sequences',
-    'plant': 'simulate the actuator',
-    'driver': 'operate a physical actuator in place of the plant',
-    'recorder': 'record topics to a bag',
-    'player': 'replay a bag',
-    'sense': 'publish the stretch that a camera or another sensor measures',
-    'controller': 'planner and plant, or driver, in one process and one loop',
-}
-_EXAMPLES = {
-    'planner': '-r __ns:=/left',
-    'plant': '-p publish_rate:=500.0',
-    'driver': '-p hardware:=my_lab:Coil',
-    'recorder': '-p storage.uri:=my_run -p record.all_topics:=true',
-    'player': '-p storage.uri:=my_run',
-    'sense': '-p topic:=/block/pose -p sensor.rest_length:=0.02',
-    'controller': '--params-file actuator.yaml -p lead_time:=0.003',
+# Summary and example of each node.
+_NODES = {
+    'planner': ('plan shaped commands for setpoint sequences', '-r __ns:=/left'),
+    'plant': ('simulate the actuator', '-p publish_rate:=500.0'),
+    'driver': (
+        'operate a physical actuator in place of the plant', '-p hardware:=my_lab:Coil'),
+    'recorder': (
+        'record topics to a bag', '-p storage.uri:=my_run -p record.all_topics:=true'),
+    'player': ('replay a bag', '-p storage.uri:=my_run'),
+    'controller': (
+        'planner and plant, or driver, in one process and one loop',
+        '--params-file actuator.yaml -p lead_time:=0.003'),
 }
 
 
 def add_parser(subparsers: Any) -> None:
     """Add one command for each node."""
-    for name, summary in NODES.items():
-        parser = subparsers.add_parser(
-            name, help=f'run the {name} node: {summary}',
-            description=f'Run the {name} node: {summary}.',
-            usage=f'hmsa {name} [-h] [--ros-args ...]',
-            epilog='ROS arguments are parameters (-p NAME:=VALUE, --params-file FILE) and '
-                   f'remappings (-r FROM:=TO). example: hmsa {name} --ros-args {_EXAMPLES[name]}')
-        parser.set_defaults(node=name)
+    for name, (summary, example) in _NODES.items():
+        add_node(subparsers, name, summary, example)
+
+
+def add_node(subparsers: Any, name: str, summary: str, example: str) -> None:
+    """Add the command that runs a node, registered as an entry point of ``hmsa_ros.nodes``."""
+    parser = subparsers.add_parser(
+        name, help=f'run the {name} node: {summary}',
+        description=f'Run the {name} node: {summary}.',
+        usage=f'hmsa {name} [-h] [--ros-args ...]',
+        epilog='ROS arguments are parameters (-p NAME:=VALUE, --params-file FILE) and '
+               f'remappings (-r FROM:=TO). example: hmsa {name} --ros-args {example}')
+    parser.set_defaults(node=name, is_node=True)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -45,6 +45,5 @@ def run(arguments: argparse.Namespace) -> int:
         ENDING.leave(1, 'the recorder was told to end before its bag was open: no bag is written')
     else:
         ENDING.leave(0)
-    module = import_module(f'hmsa_ros.nodes.{arguments.node}')
-    status: int = module.main(arguments.ros_args)
+    status: int = registered(NODES)[arguments.node].load().main(arguments.ros_args)
     return status

@@ -9,12 +9,12 @@ example: hmsa param set planner shaper robust
 import argparse
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, JSON, NAMESPACE, show, TIMEOUT, timeout_of
-from hmsa_ros.ending import ENDING
-from hmsa_ros.files import yaml_text
+from hmsa.cli.options import add_command, JSON, NAMESPACE, show, TIMEOUT, timeout_of
+from hmsa.ending import ENDING
+from hmsa.files import yaml_text
 
 if TYPE_CHECKING:
-    from hmsa_ros.lab.remote import RemoteNode
+    from hmsa_ros.clients.remote import RemoteNode
 
 
 def add_parser(subparsers: Any) -> None:
@@ -60,7 +60,7 @@ def _set(arguments: argparse.Namespace) -> int:
 
 def _node(arguments: argparse.Namespace) -> 'RemoteNode':
     timeout = timeout_of(arguments)
-    from hmsa_ros.lab.remote import RemoteNode
+    from hmsa_ros.clients.remote import RemoteNode
 
     ENDING.note()
     return RemoteNode(arguments.node, arguments.namespace, timeout)

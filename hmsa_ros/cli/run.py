@@ -17,22 +17,22 @@ from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.notes import show_notes, with_notes
-from hmsa_ros.cli.options import add_command, assume_example, JOINTS, NAMESPACE
-from hmsa_ros.cli.progress import PATIENCE, progress
+from hmsa.cli.notes import show_notes, with_notes
+from hmsa.cli.options import add_command, assume_example, JOINTS, NAMESPACE
+from hmsa.cli.progress import PATIENCE, progress
+from hmsa.cli.setpoints import SEQUENCE, sequence_of
+from hmsa.ending import ENDING
+from hmsa.errors import BadInputError
+from hmsa.files import json_text, write_text
 from hmsa_ros.cli.send import SLOW
-from hmsa_ros.cli.setpoints import SEQUENCE, sequence_of
-from hmsa_ros.ending import ENDING
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import json_text, write_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from hmsa_ros.judge.records import Finding, Tolerances
-    from hmsa_ros.lab.experiment import Conducted, Experiment
-    from hmsa_ros.report.arrivals import Part
-    from hmsa_ros.report.outcome import LevelResult
+    from hmsa.judge.records import Finding, Tolerances
+    from hmsa.report.arrivals import Part
+    from hmsa.report.outcome import LevelResult
+    from hmsa_ros.clients.experiment import Conducted, Experiment
 
 NOT_MEASURED = 'predicted, not measured'
 _MOST_REPEATS = 10_000
@@ -71,14 +71,14 @@ def run(arguments: argparse.Namespace) -> int:
     if not 1 <= arguments.repeat <= _MOST_REPEATS:
         raise BadInputError(
             f'--repeat is {arguments.repeat}: expected 1 to {_MOST_REPEATS}')
-    from hmsa_ros.lab.processes import dated, stay_local
+    from hmsa_ros.clients.processes import dated, stay_local
 
     folder = arguments.out or dated('hmsa_run')
     if arguments.simulate:
         stay_local()
         if arguments.params_file is None:
             assume_example()
-    from hmsa_ros.lab.experiment import prepare
+    from hmsa_ros.clients.experiment import prepare
 
     # Each repeat has its own folder.
     folders = [folder] if arguments.repeat == 1 else [
@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
             so_far = f'; the bag so far: {experiment.bag}' if experiment.bag.exists() else ''
             print(f'interrupted{so_far}', file=sys.stderr)
             return ENDING.status
-        from hmsa_ros.report.outcome import level_results
+        from hmsa.report.outcome import level_results
 
         levels = [y for x in parts for y in level_results(x.run)] if experiment.levels else []
         findings = [y for x in parts for y in x.evaluation.findings] if (
@@ -112,7 +112,7 @@ def run(arguments: argparse.Namespace) -> int:
             'notes': done.notes, 'exits': done.exits, 'bag': experiment.bag, 'report': report})
         if not arguments.json:
             _print(experiment, parts, levels, reason, done, report)
-    from hmsa_ros.report.repeats import statistics, statistics_table
+    from hmsa.report.repeats import statistics, statistics_table
     if arguments.json:
         print(json_text(with_notes(records[0] if arguments.repeat == 1 else {
             'repeats': records, 'statistics': statistics(each)})))
@@ -126,21 +126,21 @@ def _carried_out(
         update: 'Callable[[str, float | None], None]'
 ) -> 'tuple[Conducted, list[Part], Path | None]':
     """Conduct an experiment, and judge the setpoints of each joint from its bag."""
-    from hmsa_ros.lab.experiment import conduct
+    from hmsa_ros.clients.experiment import conduct
 
     done = conduct(experiment, partial(_show, update))
     ENDING.check()
     if not done.measured:
         return done, [], None
     update('evaluating the bag', None)
-    from hmsa_ros.recordings.bags import read_runs
-    from hmsa_ros.report.arrivals import Part
+    from hmsa.report.arrivals import Part
+    from hmsa.runs.bags import read_runs
 
     parts = [Part.of(x, tolerances=tolerances) for x in read_runs(
         experiment.bag, joints=experiment.joints if len(experiment.joints) > 1 else ())]
     if not arguments.report or not parts:
         return done, parts, None
-    from hmsa_ros.report.page import page
+    from hmsa.report.page import page
 
     report = experiment.folder / 'report.html'
     write_text(report, page(parts))
@@ -151,13 +151,13 @@ def _show(update: 'Callable[[str, float | None], None]', what: str, share: float
     """Show the current activity; import modules of the evaluation during the sequence."""
     update(what, share)
     if share > 0.0:
-        import_module('hmsa_ros.report.outcome')
-        import_module('hmsa_ros.report.comparison')
+        import_module('hmsa.report.outcome')
+        import_module('hmsa.report.comparison')
 
 
 def _tolerances(arguments: argparse.Namespace) -> 'Tolerances | None':
     """Return the tolerances, None for the planner's; raise `BadInputError` if invalid."""
-    from hmsa_ros.judge.records import Tolerances
+    from hmsa.judge.records import Tolerances
 
     tolerance = arguments.tolerance
     if tolerance is None:
@@ -173,8 +173,8 @@ def _tolerances(arguments: argparse.Namespace) -> 'Tolerances | None':
 
 
 def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
-    from hmsa_ros.lab.experiment import Experiment, simulated_node
-    from hmsa_ros.recordings.parameters import read_parameter_file
+    from hmsa.runs.parameters import read_parameter_file
+    from hmsa_ros.clients.experiment import Experiment, simulated_node
 
     expected = {} if arguments.params_file is None else dict(read_parameter_file(
         arguments.params_file))
@@ -194,8 +194,8 @@ def _verdict(
         experiment: 'Experiment', findings: 'list[Finding]', done: 'Conducted',
         parts: 'list[Part]') -> tuple[str, str]:
     """Return the verdict on all setpoints, or on the end of levels, and its reason."""
-    from hmsa_ros.judge.records import worst
-    from hmsa_ros.report.comparison import ringing
+    from hmsa.judge.records import worst
+    from hmsa.report.comparison import ringing
 
     if not experiment.setpoints or not done.measured:
         reason = ('the levels or the path end at rest' if done.measured
@@ -220,8 +220,8 @@ def _verdict(
 def _print(
         experiment: 'Experiment', parts: 'list[Part]', levels: 'list[LevelResult]', reason: str,
         done: 'Conducted', report: Path | None) -> None:
-    from hmsa_ros.report.comparison import setpoints
-    from hmsa_ros.report.outcome import level_table
+    from hmsa.report.comparison import setpoints
+    from hmsa.report.outcome import level_table
 
     if levels:
         print(level_table(levels))

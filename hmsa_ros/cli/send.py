@@ -11,14 +11,14 @@ import argparse
 import sys
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.notes import show_notes
-from hmsa_ros.cli.options import add_command, JOINTS, NAMESPACE, timeout_of
-from hmsa_ros.cli.setpoints import SEQUENCE, sequence_of
-from hmsa_ros.ending import ENDING
-from hmsa_ros.errors import HmsaError
+from hmsa.cli.notes import show_notes
+from hmsa.cli.options import add_command, JOINTS, NAMESPACE, timeout_of
+from hmsa.cli.setpoints import SEQUENCE, sequence_of
+from hmsa.ending import ENDING
+from hmsa.errors import HmsaError
 
 if TYPE_CHECKING:
-    from hmsa_ros.lab.client import PlannerClient
+    from hmsa_ros.clients.client import PlannerClient
 
 # Fraction of real time below which simulated time is reported as slow.
 SLOW = 0.9
@@ -42,7 +42,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Send and, if requested, wait; raise `HmsaError` if the sequence is not carried out."""
-    from hmsa_ros.lab.client import PlannerClient
+    from hmsa_ros.clients.client import PlannerClient
 
     timeout = timeout_of(arguments)
     levels, path = sequence_of(arguments)

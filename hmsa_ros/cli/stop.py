@@ -12,8 +12,8 @@ example: hmsa stop
 import argparse
 from typing import Any
 
-from hmsa_ros.cli.options import add_command, NAMESPACE, TIMEOUT, timeout_of
-from hmsa_ros.ending import ENDING
+from hmsa.cli.options import add_command, NAMESPACE, TIMEOUT, timeout_of
+from hmsa.ending import ENDING
 
 
 def add_parser(subparsers: Any) -> None:
@@ -24,7 +24,7 @@ def add_parser(subparsers: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Stop and wait; raise `HmsaError` if that is not acknowledged."""
     timeout = timeout_of(arguments)
-    from hmsa_ros.lab.link import Link
+    from hmsa_ros.clients.link import Link
 
     ENDING.note()
     with Link(arguments.namespace, timeout) as link:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.model.units import NANOSECONDS
 
 # Number of answers stored, and number of initial queries.
 _KEPT, ENOUGH = 64, 8

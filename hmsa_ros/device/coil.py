@@ -7,12 +7,12 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 import math
 
+from hmsa.errors import BadInputError
+from hmsa.model.schedule import CommandSchedule
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.hardware import Calls, Hardware, HardwareError, Instrument
 from hmsa_ros.device.protocol import Change, Kind, Notice, StateLostError
 from hmsa_ros.device.watchdog import Fallback, GuardedJoint
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.schedule import CommandSchedule
-from hmsa_ros.model.units import NANOSECONDS
 
 # Number of recent levels stored to determine the level at the time of an older sample.
 _REMEMBERED = 64

@@ -6,12 +6,12 @@ from time import time_ns
 
 import numpy as np
 
+from hmsa.errors import BadInputError
+from hmsa.model.equations import Array
 from hmsa_ros.device.coil import Coil, HardwareJoint
 from hmsa_ros.device.hardware import Calls, HardwareError
 from hmsa_ros.device.protocol import Kind, Sample
 from hmsa_ros.device.watchdog import Device
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.equations import Array
 from hmsa_ros.timekeeping import clock_set_words
 
 

@@ -13,20 +13,16 @@ import sys
 from time import monotonic
 from typing import Any, NamedTuple, Protocol, TypeVar
 
+from hmsa.ending import Deadline, encoded
+from hmsa.errors import BadInputError, excerpt, HmsaError
+from hmsa.model.units import NANOSECONDS
+from hmsa.plugins import HARDWARE, registered
 from hmsa_ros.device.clock_map import ClockMap, ENOUGH
 from hmsa_ros.device.protocol import StateLostError
 from hmsa_ros.device.watchdog import ANOTHER_CLOCK
-from hmsa_ros.ending import Deadline, encoded
-from hmsa_ros.errors import BadInputError, excerpt, HmsaError
-from hmsa_ros.model.units import NANOSECONDS
 
 T = TypeVar('T')
 
-#: Hardware of this package, by the short names that `load` also accepts.
-SHIPPED = {
-    'serial_board': 'hmsa_ros.device.serial_board:SerialBoard',
-    'scpi_supply': 'hmsa_ros.device.scpi_supply:ScpiSupply',
-    'topic': 'hmsa_ros.nodes.topic_coil:TopicCoil'}
 # Arguments of the methods; all methods except the first two are optional.
 _TAKES: dict[str, tuple[str, ...]] = {
     'write': ('level', 'now'), 'read': ('now',), 'open': (), 'close': (),
@@ -112,7 +108,7 @@ def imported(text: str) -> Any:
 
 def load(text: str, joint: str, settings: Mapping[str, Any]) -> Hardware:
     """
-    Create the hardware of a joint by its name, ``'MODULE:NAME'`` or one of `SHIPPED`.
+    Create the hardware of a joint by its name, ``'MODULE:NAME'`` or registered.
 
     The settings are its keyword arguments.
 
@@ -122,11 +118,12 @@ def load(text: str, joint: str, settings: Mapping[str, Any]) -> Hardware:
         If it does not exist, or fails.
 
     """
-    path = SHIPPED.get(text, text)
+    shipped = {} if ':' in text else registered(HARDWARE)
+    path = shipped[text].value if text in shipped else text
     if not all(path.partition(':')[::2]):
         raise BadInputError(
             f'hardware is {text!r}: expected MODULE:NAME of what makes the hardware of a joint, '
-            f'as in hardware:=my_lab:Coil, or {", ".join(SHIPPED)}')
+            f'as in hardware:=my_lab:Coil, or {", ".join(registered(HARDWARE))}')
     try:
         make = imported(path)
     except BaseException as error:  # any error of the module, including sys.exit

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from hmsa_ros.errors import listed
+from hmsa.errors import listed
 
 _OK, _WARN, _ERROR = 0, 1, 2
 

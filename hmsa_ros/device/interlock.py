@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Collection
 
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.model.units import NANOSECONDS
 
 # Minimum time open in ns, for planners to receive that state or to stop sending.
 _LEAST = NANOSECONDS

@@ -3,7 +3,7 @@
 from enum import Enum
 from typing import NamedTuple
 
-from hmsa_ros.model.equations import Array
+from hmsa.model.equations import Array
 
 
 class StateLostError(Exception):

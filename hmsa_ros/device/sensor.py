@@ -8,8 +8,8 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from hmsa.errors import BadInputError
 from hmsa_ros.device.protocol import Sample
-from hmsa_ros.errors import BadInputError
 
 T = TypeVar('T')
 

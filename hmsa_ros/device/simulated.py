@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from hmsa.model.actuators import Actuators, Setup
+from hmsa.model.equations import Array
+from hmsa.model.simulation import too_large
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.protocol import Change, Kind, Sample
 from hmsa_ros.device.sensor import Sensor, SensorErrors, Transport
 from hmsa_ros.device.watchdog import Device, Fallback, GuardedJoint
-from hmsa_ros.model.actuators import Actuators, Setup
-from hmsa_ros.model.equations import Array
-from hmsa_ros.model.simulation import too_large
-from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.timekeeping import clock_set_words
 
 # Gap of the clock above which time is skipped instead of simulated.

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import math
 from typing import TypeVar
 
+from hmsa.errors import BadInputError
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.units import NANOSECONDS
 
 T = TypeVar('T')
 

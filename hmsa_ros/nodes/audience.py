@@ -12,8 +12,8 @@ from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.parameter import parameter_value_to_python
 
-from hmsa_ros.errors import BadInputError, listed
-from hmsa_ros.interfaces import topics
+from hmsa.errors import BadInputError, listed
+from hmsa.interfaces import topics
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.cdr import stamp_of
 from hmsa_ros.nodes.selection import Selection

@@ -22,7 +22,7 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.type_support import check_is_valid_msg_type
 
-from hmsa_ros.errors import BadInputError
+from hmsa.errors import BadInputError
 
 # Maximum number of messages taken from one subscription before the next.
 _BATCH = 2000

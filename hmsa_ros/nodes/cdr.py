@@ -13,10 +13,10 @@ import math
 import struct
 from typing import Any
 
-from hmsa_ros.control.records import Trajectory
-from hmsa_ros.errors import BadInputError, excerpt
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.errors import BadInputError, excerpt
+from hmsa.model.status import Code, RefusedError
+from hmsa.model.units import NANOSECONDS
+from hmsa_ros.runtime.records import Trajectory
 
 # Length of the preamble: the representation identifier and two bytes of options.
 _PREAMBLE = 4

@@ -7,13 +7,13 @@ from rclpy.node import Node
 from sensor_msgs.msg import MagneticField, TimeReference
 from std_msgs.msg import Float64
 
-from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.records import Send, Target
-from hmsa_ros.control.throttle import Throttle
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces import topics
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.errors import BadInputError
+from hmsa.interfaces import topics
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import Send, Target
+from hmsa_ros.runtime.throttle import Throttle
 
 # Time in ns after which all topics of a device that runs are discovered.
 _DISCOVERY = 2 * NANOSECONDS

@@ -13,18 +13,18 @@ import gc
 
 from rclpy.node import Node
 
-from hmsa_ros.control.cycles import Cycles
-from hmsa_ros.control.environment import Seen
-from hmsa_ros.control.records import Output, Send
+from hmsa.interfaces import topics
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.protocol import Change, Sample
-from hmsa_ros.interfaces import topics
-from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.device_node import DeviceNode, TICK_SECONDS
 from hmsa_ros.nodes.driver import DriverNode, HARDWARE, SHORT
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 from hmsa_ros.nodes.runner import run
+from hmsa_ros.runtime.cycles import Cycles
+from hmsa_ros.runtime.environment import Seen
+from hmsa_ros.runtime.records import Output, Send
 from hmsa_ros.timekeeping import steady_ns
 
 # Time in ns that must remain of a period to publish one more message; limit on waiting messages.

@@ -1,4 +1,4 @@
-"""Conversion between messages and the records of `hmsa_ros.planning`."""
+"""Conversion between messages and the records of `hmsa.planning`."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import zip_longest
@@ -14,14 +14,14 @@ from sensor_msgs.msg import JointState, MagneticField, TimeReference
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.schedule import obeyed
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.errors import BadInputError
+from hmsa.model.schedule import obeyed
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes.capture import decode
 
 if TYPE_CHECKING:
     # Imported with the planner, which a recorder does not need.
-    from hmsa_ros.control.records import StatusChanged
+    from hmsa_ros.runtime.records import StatusChanged
 
 #: Contents of a receipt while commands from before a cut-off, or all commands, are rejected.
 CUT_OFF, INTERLOCK = 'cut_off', 'interlock'

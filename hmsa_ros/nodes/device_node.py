@@ -12,21 +12,21 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState, MagneticField
 
-from hmsa_ros.control.throttle import Throttle
+from hmsa.errors import BadInputError
+from hmsa.interfaces import topics
+from hmsa.interfaces.parameters import JOINT, ParameterSpec
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.health import judge_commands
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.device.watchdog import Fallback, SAFE_FLUX
 from hmsa_ros.device.worker import STALL
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.parameters import JOINT, ParameterSpec
-from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.managed import ManagedNode, silence
 from hmsa_ros.nodes.outlet import Outlet
 from hmsa_ros.nodes.parameters import JointParameters, JOINTS
 from hmsa_ros.nodes.presence import Presence
+from hmsa_ros.runtime.throttle import Throttle
 from hmsa_ros.timekeeping import steady_ns
 
 #: Behaviour of a joint without commands; each joint may have its own values.

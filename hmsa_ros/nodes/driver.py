@@ -11,17 +11,17 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import ParameterDescriptor
 from std_msgs.msg import Bool
 
+from hmsa.ending import Deadline, ENDING
+from hmsa.errors import BadInputError, HmsaError, listed
+from hmsa.interfaces import topics
+from hmsa.interfaces.parameters import ParameterSpec, PUBLISH_RATE
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.coil import HardwareJoint
 from hmsa_ros.device.driven import HardwareDevice
 from hmsa_ros.device.hardware import Calls, load, OPTIONAL
 from hmsa_ros.device.health import judge_hardware, judge_interlock
 from hmsa_ros.device.interlock import Interlock
 from hmsa_ros.device.worker import HardwareWorker
-from hmsa_ros.ending import Deadline, ENDING
-from hmsa_ros.errors import BadInputError, HmsaError, listed
-from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.parameters import ParameterSpec, PUBLISH_RATE
-from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.capture import decode
 from hmsa_ros.nodes.device_node import COMMON, DeviceJoint, DeviceNode, FALLBACK, fallback_from

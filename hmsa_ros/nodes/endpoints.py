@@ -1,4 +1,4 @@
-"""Topics and services of `hmsa_ros.interfaces.topics` on an rclpy node."""
+"""Topics and services of `hmsa.interfaces.topics` on an rclpy node."""
 
 from collections.abc import Callable, Iterable
 from importlib import import_module
@@ -16,9 +16,9 @@ from rclpy.qos import (
 )
 from rclpy.subscription import Subscription
 
-from hmsa_ros.bag.definitions import is_interface_package
-from hmsa_ros.errors import BagError
-from hmsa_ros.interfaces.topics import from_outside, Quality, Service, Topic
+from hmsa.bag.definitions import is_interface_package
+from hmsa.errors import BagError
+from hmsa.interfaces.topics import from_outside, Quality, Service, Topic
 from hmsa_ros.nodes.capture import RawSubscription
 from hmsa_ros.nodes.service_call import ServiceCall
 

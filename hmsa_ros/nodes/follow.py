@@ -1,7 +1,7 @@
 """
 The action FollowJointTrajectory, and the state that clients of a controller read.
 
-Requires the package control_msgs. The logic is in `hmsa_ros.control.goals`.
+Requires the package control_msgs. The logic is in `hmsa_ros.runtime.goals`.
 """
 
 from collections.abc import Callable
@@ -18,16 +18,16 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectoryPoint
 
-from hmsa_ros.control.goals import ErrorCode, Goals, Outcome
-from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.records import Severity, StatusChanged, Trajectory
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces import topics
+from hmsa.errors import BadInputError
+from hmsa.interfaces import topics
+from hmsa.planning import path
 from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.capture import RawSubscription
 from hmsa_ros.nodes.cdr import read_trajectory
 from hmsa_ros.nodes.managed import ManagedNode
-from hmsa_ros.planning import path
+from hmsa_ros.runtime.goals import ErrorCode, Goals, Outcome
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import Severity, StatusChanged, Trajectory
 
 # Rate of feedback and states in Hz, as for a joint_trajectory_controller.
 _RATE = 20.0

@@ -20,9 +20,9 @@ from rclpy.parameter_service import ParameterService
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
-from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.parameters import ParameterSpec
+from hmsa.errors import BadInputError, HmsaError
+from hmsa.interfaces import topics
+from hmsa.interfaces.parameters import ParameterSpec
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.address import AddressWatch
 from hmsa_ros.nodes.conversions import to_diagnostics, to_status

@@ -27,13 +27,13 @@ from rclpy.node import Node
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.actuator import actuator_from
-from hmsa_ros.interfaces.parameters import ParameterSpec
-from hmsa_ros.model.laws.bending import centreline, tangent
-from hmsa_ros.model.parameters import ActuatorParameters
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.errors import BadInputError
+from hmsa.interfaces import topics
+from hmsa.interfaces.actuator import actuator_from
+from hmsa.interfaces.parameters import ParameterSpec
+from hmsa.model.laws.bending import centreline, tangent
+from hmsa.model.parameters import ActuatorParameters
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import to_duration, to_time
 from hmsa_ros.nodes.managed import ManagedNode

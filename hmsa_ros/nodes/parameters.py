@@ -10,7 +10,6 @@ override has no value until it is set.
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import difflib
-from importlib import import_module
 import math
 from pathlib import Path
 import re
@@ -22,13 +21,14 @@ from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from hmsa_ros.bag.limits import load_yaml
-from hmsa_ros.errors import BadInputError, HmsaError, listed
-from hmsa_ros.files import read_at_most
-from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.actuator import completed
-from hmsa_ros.interfaces.parameters import FIXED, JOINT, LAW, ParameterSpec, present_name
-from hmsa_ros.interfaces.sections import is_for, sections_of
+from hmsa.bag.limits import load_yaml
+from hmsa.errors import BadInputError, HmsaError, listed
+from hmsa.files import read_at_most
+from hmsa.interfaces import topics
+from hmsa.interfaces.actuator import completed
+from hmsa.interfaces.parameters import FIXED, JOINT, LAW, ParameterSpec, present_name
+from hmsa.interfaces.sections import is_for, sections_of
+from hmsa.plugins import NODES, registered
 
 # A parameter file that is larger is not looked at again.
 _LARGEST_FILE = 1 << 20
@@ -198,8 +198,8 @@ def check_names(node: Node) -> None:
                and 'hardware' not in x.split('.')[:2]]
     if not strange:
         return
-    others = {spec.name for name in topics.NODES
-              for spec in import_module(f'hmsa_ros.nodes.{name}').PARAMETERS} | _ONCE
+    nodes = registered(NODES)
+    others = {spec.name for name in topics.NODES for spec in nodes[name].load().PARAMETERS} | _ONCE
     joints = node.get_parameter('joints').value or () if node.has_parameter('joints') else None
     for name in strange:
         joint, _, rest = name.partition('.')

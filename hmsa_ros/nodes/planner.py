@@ -12,16 +12,14 @@ from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rosgraph_msgs.msg import Clock
 
-from hmsa_ros.control import records
-from hmsa_ros.control.environment import Environment, Seen
-from hmsa_ros.control.offload import Offload
-from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.errors import BadInputError, BagError
-from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.actuator import actuator_from
-from hmsa_ros.model.actuators import unheld
-from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.errors import BadInputError, BagError
+from hmsa.interfaces import topics
+from hmsa.interfaces.actuator import actuator_from
+from hmsa.model.actuators import unheld
+from hmsa.model.status import Code, RefusedError
+from hmsa.model.units import NANOSECONDS
+from hmsa.offload import Offload
+from hmsa.plugins import FOLLOWER, registered
 from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
 from hmsa_ros.nodes.cdr import read_trajectory, stamp_of
@@ -32,6 +30,10 @@ from hmsa_ros.nodes.parameters import declare_joints
 from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from, SPECS
 from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.runner import run
+from hmsa_ros.runtime import records
+from hmsa_ros.runtime.environment import Environment, Seen
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.worker import PlanningThread
 from hmsa_ros.timekeeping import steady_ns, StepWatch
 
 if TYPE_CHECKING:
@@ -55,7 +57,7 @@ _READ_NS, _AT_ONCE = 10_000_000, 25
 
 
 class PlannerNode(ManagedNode):
-    """Connect `hmsa_ros.control.planner.PlannerRuntime` to topics, services and the clock."""
+    """Connect `hmsa_ros.runtime.planner.PlannerRuntime` to topics, services and the clock."""
 
     #: Whether a linked device in the same process serves the runtime.
     linked = False
@@ -63,7 +65,9 @@ class PlannerNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__(topics.PLANNER)
         self._settings = declare_joints(self, PARAMETERS, OWN)
-        self._offload = Offload(self.get_logger().warning)
+        self._worker = PlanningThread()
+        self._offload = Offload(
+            self.get_logger().warning, registered(FOLLOWER)['adapt'].module)
         # The executor would store an event for each message on /clock, without limit if the node
         # cannot keep up. This subscription, read by `now`, only keeps the newest. It is unsuitable
         # for a node that must process commands before the time published after them.
@@ -87,13 +91,14 @@ class PlannerNode(ManagedNode):
     def _new_runtime(self) -> PlannerRuntime:
         runtime = PlannerRuntime(
             group_from(self._settings), settings_from(self._settings), Environment(
-                self.now, one_clock=self._one_clock, observable=self._observable,
-                unheard=self._unheard, found=lambda joint: self._channels[joint].found,
+                self.now, worker=self._worker, one_clock=self._one_clock,
+                observable=self._observable, unheard=self._unheard,
+                found=lambda joint: self._channels[joint].found,
                 reports=lambda joint: self._channels[joint].reports,
                 reporters=lambda joint: self._channels[joint].reporters, glance=self._glance))
         runtime.devices.deliver = lambda command: self._take((command,))
-        runtime.feedback.doing = self._offload
-        if runtime.feedback.on:
+        runtime.follower.doing = self._offload
+        if runtime.follower.on:
             self._offload.start()
         return runtime
 
@@ -115,9 +120,9 @@ class PlannerNode(ManagedNode):
         self._targets = TargetMarkers(self, self._settings)
         endpoints.subscribe(self, topics.JOINT_TRAJECTORY, self._on_trajectory, raw=True)
         self.offer(topics.STOP, self._on_stop)
-        self.offer(topics.RESET_ESTIMATE, lambda: (True, self._runtime.feedback.reset()))
+        self.offer(topics.RESET_ESTIMATE, lambda: (True, self._runtime.follower.reset()))
         self.offer(topics.SAVE_ESTIMATE, lambda: (
-            True, self._runtime.feedback.save(by_joint=bool(self._settings['joints']))))
+            True, self._runtime.follower.save(by_joint=bool(self._settings['joints']))))
         # Timers on simulated time fire at most once for each /clock message, and the node's clock
         # decides what is due.
         self._poll = self.every(_POLL_NS / NANOSECONDS, self._serve)

@@ -1,4 +1,4 @@
-"""Parameters of the planner node, and their conversion for `hmsa_ros.planning`."""
+"""Parameters of the planner node, and their conversion for `hmsa.planning`."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -6,27 +6,31 @@ from functools import partial
 import math
 from typing import Any
 
-from hmsa_ros.control.feedback import MODES
-from hmsa_ros.control.records import AFTER_CUT_OFF, Settings, TRAJECTORY_MODES
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.files import errors_from
-from hmsa_ros.identification.known import Known
-from hmsa_ros.identification.quantities import check_free
-from hmsa_ros.interfaces import parameters as shared
-from hmsa_ros.interfaces.actuator import planned_from
-from hmsa_ros.interfaces.parameters import ParameterSpec
-from hmsa_ros.judge.records import Tolerances
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.errors import BadInputError
+from hmsa.identification.files import errors_from
+from hmsa.identification.known import Known
+from hmsa.identification.quantities import check_free
+from hmsa.interfaces import parameters as shared
+from hmsa.interfaces.actuator import planned_from
+from hmsa.interfaces.parameters import ParameterSpec
+from hmsa.judge.records import Tolerances
+from hmsa.model.units import NANOSECONDS
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
+from hmsa.planning.sequence import SHORT_SPELL
+from hmsa.planning.shapers import SHAPERS
+from hmsa.planning.shapers.pace import LEAST_PERIODS, MOST_PERIODS, Pace
+from hmsa.planning.shapers.request import ERRORS, LARGEST_ERROR, MOST_ORDER
+from hmsa.planning.timeline import Model
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.markers import MARKER_SCALE
 from hmsa_ros.nodes.parameters import JointParameters, JOINTS
-from hmsa_ros.planning.group import PlannerGroup
-from hmsa_ros.planning.planner import Options, Planner
-from hmsa_ros.planning.sequence import SHORT_SPELL
-from hmsa_ros.planning.shapers import SHAPERS
-from hmsa_ros.planning.shapers.pace import LEAST_PERIODS, MOST_PERIODS, Pace
-from hmsa_ros.planning.shapers.request import ERRORS, LARGEST_ERROR, MOST_ORDER
-from hmsa_ros.planning.timeline import Model
+from hmsa_ros.runtime.records import (
+    AFTER_CUT_OFF,
+    FEEDBACK_MODES,
+    Settings,
+    TRAJECTORY_MODES,
+)
 
 _OPTIONS = Options()
 _SETTINGS = Settings()
@@ -141,7 +145,7 @@ SPECS = (
         'also extends moves whose predicted error exceeds feedback_tolerance, to correct them on '
         'the way: three times (five times for six estimated parameters, and up to twice that for '
         'large noise).',
-        choices=MODES),
+        choices=FEEDBACK_MODES),
     ParameterSpec(
         'feedback_parameters', list(_SETTINGS.feedback_parameters),
         'Parameters that feedback estimates: shear_modulus, damping_coefficient, '

@@ -9,17 +9,17 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 
+from hmsa.errors import BadInputError
+from hmsa.interfaces import parameters as shared
+from hmsa.interfaces import topics
+from hmsa.interfaces.actuator import planned_from
+from hmsa.interfaces.parameters import ParameterSpec
+from hmsa.model.actuators import check_stretch, Setup, unheld
+from hmsa.model.pacer import Pacer
+from hmsa.model.sampling import too_few_samples
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces import parameters as shared
-from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.actuator import planned_from
-from hmsa_ros.interfaces.parameters import ParameterSpec
-from hmsa_ros.model.actuators import check_stretch, Setup, unheld
-from hmsa_ros.model.pacer import Pacer
-from hmsa_ros.model.sampling import too_few_samples
-from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.device_node import COMMON, DeviceJoint, DeviceNode, FALLBACK, fallback_from
 from hmsa_ros.nodes.managed import AUTOSTART

@@ -23,12 +23,10 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.duration import Duration
 from rclpy.expand_topic_name import expand_topic_name
 
-from hmsa_ros.bag.reader import BagReader
-from hmsa_ros.bag.sender import CLOCK_WHILE_WAITING_SECONDS, ClockOut, Excerpt, Sender
-from hmsa_ros.bag.transport import Transport
-from hmsa_ros.errors import BadInputError, BagError, HmsaError, listed
-from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.parameters import duration_from, duration_specs, ParameterSpec
+from hmsa.bag.reader import BagReader
+from hmsa.errors import BadInputError, BagError, HmsaError, listed
+from hmsa.interfaces import topics
+from hmsa.interfaces.parameters import duration_from, duration_specs, ParameterSpec
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.audience import Audience, Followers
 from hmsa_ros.nodes.conversions import to_clock, to_status
@@ -37,6 +35,8 @@ from hmsa_ros.nodes.parameters import declare
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.selection import Filter
 from hmsa_ros.nodes.senders import create_senders, full_name, latched, NAMED_AT_MOST
+from hmsa_ros.recording.sender import CLOCK_WHILE_WAITING_SECONDS, ClockOut, Excerpt, Sender
+from hmsa_ros.recording.transport import Transport
 
 _POLL_SECONDS = 0.02
 # Reliable messages that found the receiver's queue full are sent again when a heartbeat of Fast

@@ -17,9 +17,9 @@ from time import time_ns
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces import topics
-from hmsa_ros.model.units import NANOSECONDS
+from hmsa.errors import BadInputError
+from hmsa.interfaces import topics
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.capture import RawSubscription, Taken
 from hmsa_ros.nodes.conversions import from_samples

@@ -5,8 +5,8 @@ from collections.abc import Iterable, Sequence
 from rclpy.duration import Duration
 from rclpy.qos import LivelinessPolicy, QoSProfile
 
-from hmsa_ros.bag.qos import Qos
-from hmsa_ros.interfaces.topics import Quality
+from hmsa.bag.qos import Qos
+from hmsa.interfaces.topics import Quality
 from hmsa_ros.nodes import endpoints
 
 # Depth of a republished topic whose recorded depth is unknown, as for publishers discovered over

@@ -23,14 +23,12 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import ParameterEvent
 from rosgraph_msgs.msg import Clock
 
-from hmsa_ros import __version__
-from hmsa_ros.bag.output import PRESETS
-from hmsa_ros.bag.reception import figures, judge, RecordedTopic
-from hmsa_ros.bag.recording import Limits, lost_by_topic, Recording, Status
-from hmsa_ros.bag.writer import BagWriter, parse_custom_data
-from hmsa_ros.errors import BadInputError, BagError
-from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.parameters import duration_from, duration_specs, ParameterSpec
+from hmsa import __version__
+from hmsa.bag.output import PRESETS
+from hmsa.bag.writer import BagWriter, parse_custom_data
+from hmsa.errors import BadInputError, BagError
+from hmsa.interfaces import topics
+from hmsa.interfaces.parameters import duration_from, duration_specs, ParameterSpec
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.capture import Capture, decode, SimulatedTime, Taken
 from hmsa_ros.nodes.conversions import from_time, to_status
@@ -40,6 +38,8 @@ from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.selection import Selection
 from hmsa_ros.nodes.service_call import RemoteParameters
 from hmsa_ros.nodes.subscribing import Subscriptions
+from hmsa_ros.recording.reception import figures, judge, RecordedTopic
+from hmsa_ros.recording.recording import Limits, lost_by_topic, Recording, Status
 
 PARAMETERS = (
     ParameterSpec(

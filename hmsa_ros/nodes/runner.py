@@ -19,8 +19,8 @@ from rclpy.logging import get_logger_level, LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.task import Future
 
-from hmsa_ros.ending import ENDING
-from hmsa_ros.errors import BadInputError, complain, HmsaError
+from hmsa.ending import ENDING
+from hmsa.errors import BadInputError, complain, HmsaError
 from hmsa_ros.nodes.parameters import unread_files
 from hmsa_ros.nodes.visitor import start_ros
 

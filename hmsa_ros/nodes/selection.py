@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.interfaces import topics
+from hmsa.errors import BadInputError
+from hmsa.interfaces import topics
 
 
 def _last(name: str) -> str:

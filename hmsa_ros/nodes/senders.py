@@ -6,9 +6,9 @@ from typing import Any
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 
-from hmsa_ros.bag.reader import BagReader, Topic
-from hmsa_ros.errors import BadInputError, BagError, listed, printable
-from hmsa_ros.interfaces import topics
+from hmsa.bag.reader import BagReader, Topic
+from hmsa.errors import BadInputError, BagError, listed, printable
+from hmsa.interfaces import topics
 from hmsa_ros.nodes.endpoints import interface_class
 from hmsa_ros.nodes.qos import publisher
 from hmsa_ros.nodes.selection import Filter, is_full_name

@@ -10,7 +10,7 @@ from rcl_interfaces.srv import GetParameters, GetParameterTypes, ListParameters
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 
-from hmsa_ros.bag.experiment import parameter_key
+from hmsa.bag.experiment import parameter_key
 
 
 class ServiceCall:

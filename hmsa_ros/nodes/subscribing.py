@@ -6,16 +6,16 @@ from collections.abc import Iterable, Sequence
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from hmsa_ros.bag.definitions import message_definition, type_hash
-from hmsa_ros.bag.qos import Qos
-from hmsa_ros.bag.reception import RecordedTopic
-from hmsa_ros.bag.recording import Recording
-from hmsa_ros.bag.writer import Topic
-from hmsa_ros.errors import BagError
+from hmsa.bag.definitions import message_definition, type_hash
+from hmsa.bag.qos import Qos
+from hmsa.bag.writer import Topic
+from hmsa.errors import BagError
 from hmsa_ros.nodes.capture import Capture, RawSubscription
 from hmsa_ros.nodes.endpoints import interface_class
 from hmsa_ros.nodes.qos import stored, subscription
 from hmsa_ros.nodes.selection import Selection
+from hmsa_ros.recording.reception import RecordedTopic
+from hmsa_ros.recording.recording import Recording
 
 # Share of the memory for waiting messages that the queues of the middleware may take: these serve
 # while the recorder gets no processor, its own queue while the disk is slow.

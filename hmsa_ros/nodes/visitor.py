@@ -16,8 +16,8 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_namespace import validate_namespace
 
-from hmsa_ros.ending import ENDING
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa.ending import ENDING
+from hmsa.errors import BadInputError, HmsaError
 from hmsa_ros.middleware import prepare_middleware
 from hmsa_ros.nodes.service_call import ServiceCall
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
-from hmsa_ros.cli.options import Row
-from hmsa_ros.errors import BadInputError
+from hmsa.cli.options import Row
+from hmsa.errors import BadInputError
 
 if TYPE_CHECKING:
     from hmsa_studies.chunks import Chunks, Study
@@ -59,7 +59,7 @@ def compute_chunks(
         study: 'Study', folder: Path, arguments: argparse.Namespace, start: 'Start', words: str,
         finish: 'Callable[[Chunks, Outcome], int]') -> int:
     """Compute the requested chunks of a study, and `finish` it if all chunks exist."""
-    from hmsa_ros.files import require_arrow
+    from hmsa.files import require_arrow
     from hmsa_studies.chunks import Chunks
     from hmsa_studies.engine import compute
 

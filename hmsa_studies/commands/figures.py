@@ -11,10 +11,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from hmsa_ros.cli.options import add_command
-from hmsa_ros.cli.pictures import formats_of, paper_of, picture_options
-from hmsa_ros.cli.progress import progress
-from hmsa_ros.files import make_folder
+from hmsa.cli.options import add_command
+from hmsa.cli.pictures import formats_of, paper_of, picture_options
+from hmsa.cli.progress import progress
+from hmsa.files import make_folder
 
 
 def add_parser(subparsers: Any) -> None:

@@ -18,11 +18,11 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, MATERIAL
-from hmsa_ros.cli.pictures import formats_of, paper_of, picture_options
-from hmsa_ros.cli.plan import nominal
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import json_text, make_folder
+from hmsa.cli.options import add_command, MATERIAL
+from hmsa.cli.pictures import formats_of, paper_of, picture_options
+from hmsa.cli.plan import nominal
+from hmsa.errors import BadInputError
+from hmsa.files import json_text, make_folder
 from hmsa_studies.commands import chunked
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ def _write(
         folder: Path, studies: 'list[tuple[Case, list[Result]]]',
         arguments: argparse.Namespace) -> list[Path]:
     """Write the numbers and the figures."""
-    from hmsa_ros.report.paper import named
+    from hmsa.report.paper import named
     from hmsa_studies.pictures import draw_front, draw_robustness
     from hmsa_studies.robustness import write_csv
 
@@ -217,7 +217,7 @@ def _print_table(case: 'Case', results: 'list[Result]', unit: float | None) -> N
     from rich.console import Console
     from rich.table import Table
 
-    from hmsa_ros.model.residual import percent
+    from hmsa.model.residual import percent
 
     error = f'{100.0 * case.box:g}'
     table = Table(
@@ -261,7 +261,7 @@ def _print_table(case: 'Case', results: 'list[Result]', unit: float | None) -> N
 
 def _feedback(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> int:
     """Compare open loop with feedback."""
-    from hmsa_ros.identification.files import read_belief
+    from hmsa.identification.files import read_belief
     from hmsa_studies.executors import in_order
     from hmsa_studies.feedback import trial
     from hmsa_studies.matrix import left_of, Matrix

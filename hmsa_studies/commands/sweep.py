@@ -18,14 +18,14 @@ from pathlib import Path
 import shutil
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_command, MATERIAL
-from hmsa_ros.cli.pictures import formats_of, paper_of, picture_options
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.report.paper import named, Paper
+from hmsa.cli.options import add_command, MATERIAL
+from hmsa.cli.pictures import formats_of, paper_of, picture_options
+from hmsa.errors import BadInputError
+from hmsa.report.paper import named, Paper
 from hmsa_studies.commands import chunked
 
 if TYPE_CHECKING:
-    from hmsa_ros.model.equations import Array
+    from hmsa.model.equations import Array
     from hmsa_studies.chunks import Chunks
     from hmsa_studies.engine import Outcome
     from hmsa_studies.sweep import Sweep
@@ -163,11 +163,11 @@ def _sweep(arguments: argparse.Namespace) -> 'Sweep':
     system: System = Nondimensional()
     belief = NOTHING
     if arguments.params_file is not None:
-        from hmsa_ros.identification.files import errors_of, read_belief
-        from hmsa_ros.interfaces.parameters import PLANNED, VISCOELASTIC
-        from hmsa_ros.interfaces.topics import PLANNER
-        from hmsa_ros.planning.shapers.request import ERRORS
-        from hmsa_ros.recordings.parameters import entries_of, read_parameter_file, values_of
+        from hmsa.identification.files import errors_of, read_belief
+        from hmsa.interfaces.parameters import PLANNED, VISCOELASTIC
+        from hmsa.interfaces.topics import PLANNER
+        from hmsa.planning.shapers.request import ERRORS
+        from hmsa.runs.parameters import entries_of, read_parameter_file, values_of
 
         path = arguments.params_file
         entries = entries_of(path)
@@ -267,7 +267,7 @@ def _plan_at_once(sweep: 'Sweep', out: Path | None, picture: _Picture) -> int:
 
 def _plan_in_chunks(
         sweep: 'Sweep', arguments: argparse.Namespace, picture: _Picture) -> int:
-    from hmsa_ros.files import require_arrow
+    from hmsa.files import require_arrow
     from hmsa_studies.executors import cores
 
     require_arrow()

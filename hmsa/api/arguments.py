@@ -1,0 +1,279 @@
+"""Checks of the arguments of public functions: numbers, columns and actuator parameters."""
+
+from collections.abc import Mapping
+import math
+from numbers import Real
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hmsa.errors import BadInputError, excerpt
+from hmsa.interfaces.parameters import ACTUATOR, COIL_TIME_CONSTANT, LAW_NAME
+from hmsa.model.equations import Array
+from hmsa.model.laws import LAWS
+from hmsa.planning.setpoint import impossible
+
+#: Arguments of `Actuator` of which one describes the damping.
+DAMPED = ('zeta', 'damping_ratio', 'damping_coefficient')
+# Arguments of `Actuator` that are single numbers, and those that may be None.
+_NUMBERS = {x.name.rpartition('.')[2]: x for x in (*ACTUATOR, COIL_TIME_CONSTANT)}
+_OPTIONAL = ('shear_modulus', 'half_thickness', *DAMPED, 'constants')
+# Shortest period of a command grid in s.
+_FINEST = 1e-9
+#: Alternative names of columns.
+_ALIASES = {'duration': ('span', 'seconds'), 'stretch': ('deflection', 'position')}
+
+
+def columns_of(value: Any, names: tuple[str, str], what: str) -> tuple[Array, Array]:
+    """
+    Return two columns of numbers, each of shape (n,).
+
+    Parameters
+    ----------
+    value : pairs, tuple of two arrays, array of shape (n, 2), mapping or DataFrame
+        The numbers; a mapping contains the columns by name.
+    names : tuple of str
+        Names of the columns.
+    what : str
+        Description of the numbers, for messages.
+
+    Returns
+    -------
+    tuple of ndarray
+        Both columns.
+
+    Raises
+    ------
+    BadInputError
+        If the value has none of these forms.
+
+    """
+    expected = (
+        f'expected pairs of {names[0]} and {names[1]}, two arrays, or columns of these names')
+    if isinstance(value, Mapping) or hasattr(value, 'columns') and hasattr(value, '__getitem__'):
+        pair = [_column(value, x, what) for x in names]
+    elif isinstance(value, tuple) and len(value) == 2 and all(
+            isinstance(x, np.ndarray) for x in value):
+        pair = list(value)
+    else:
+        rows = numbers(value, what, expected)
+        if rows.ndim != 2 or rows.shape[1] != 2:
+            raise BadInputError(
+                f'{what} have the shape {rows.shape}: {expected}, as in '
+                f'[({", ".join(names)}), ({", ".join(names)})]')
+        pair = [rows[:, 0], rows[:, 1]]
+    one, other = (np.ascontiguousarray(numbers(x, what, expected)) for x in pair)
+    if one.ndim != 1 or one.shape != other.shape or not len(one):
+        raise BadInputError(
+            f'{what} have {names[0]} of shape {one.shape} and {names[1]} of shape {other.shape}: '
+            'expected two rows of one length, of at least 1')
+    return one, other
+
+
+def setpoints_of(value: Any, rest: float) -> tuple[Array, Array]:
+    """
+    Return stretches and durations in s, each of shape (n,).
+
+    Raises
+    ------
+    BadInputError
+        If the value has no such columns, a stretch is impossible for an actuator with this rest,
+        a duration is not above 0, or one before the last is infinite.
+
+    """
+    stretches, durations = columns_of(value, ('stretch', 'duration'), 'setpoints')
+    for stretch, duration in zip(stretches.tolist(), durations.tolist(), strict=True):
+        if reason := impossible(stretch, rest):
+            raise BadInputError(reason)
+        if not duration > 0.0:
+            raise BadInputError(f'duration is {duration:g} s: expected a number greater than 0')
+    if np.any(np.isinf(durations[:-1])):
+        raise BadInputError('duration is inf s: only that of the last setpoint may be')
+    return stretches, durations
+
+
+def file_of(value: Any, what: str = 'the path of a file') -> Path:
+    """Return a path, or raise `BadInputError`."""
+    if not isinstance(value, (str, os.PathLike)) or '\0' in os.fsdecode(value):
+        raise BadInputError(f'path is {excerpt(value)}: expected {what}')
+    return Path(value)
+
+
+def grid_of(period: Any) -> float:
+    """Return the period of a command grid in s, 0 for none, or raise `BadInputError`."""
+    if 0.0 < number(period, 'period', 's', least=0.0) < _FINEST:
+        raise BadInputError(
+            f'period is {period:g} s: expected 0 for any time, or at least {_FINEST:g} s')
+    return float(period)
+
+
+def mapping_of(value: Any, what: str, example: str) -> Mapping[str, Any]:
+    """Return values by name, none for None, or raise `BadInputError`."""
+    if value is None:
+        return {}
+    if not isinstance(value, Mapping):
+        raise BadInputError(
+            f'{what} are {excerpt(value)}: expected values by name, as in {{{example}}}')
+    return value
+
+
+def names_of(value: Any, what: str) -> list[str]:
+    """Return names of parameters, or raise `BadInputError`."""
+    if isinstance(value, str) or not np.iterable(value) or not all(
+            isinstance(x, str) for x in value):
+        raise BadInputError(
+            f"{what} is {excerpt(value)}: expected names of parameters, as in ['remanence']")
+    return list(value)
+
+
+def whole(value: Any, what: str, least: float = -math.inf) -> int:
+    """Return a whole number of at least ``least``, or raise `BadInputError`."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise BadInputError(
+            f'{what} is {excerpt(value)}: expected a whole number'
+            + (f' of at least {least:g}' if least > -math.inf else ''))
+    return int(value)
+
+
+def _column(value: Any, name: str, what: str) -> Any:
+    found = [name] if name in value else [x for x in _ALIASES.get(name, ()) if x in value]
+    if len(found) != 1:
+        raise BadInputError(
+            f'{what} have the columns {", ".join(map(str, value))}: expected one named {name}')
+    return value[found[0]]
+
+
+def numbers(value: Any, what: str, expected: str = 'expected numbers') -> Array:
+    """Return numbers of any shape, or raise `BadInputError`."""
+    try:
+        if np.iscomplexobj(value):
+            raise TypeError  # NumPy would drop the imaginary parts
+        found: Array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise BadInputError(f'{what} are {excerpt(value)}: {expected}') from error
+    return found
+
+
+def number(
+        value: Any, what: str, unit: str = '', *, least: float = -math.inf,
+        above: float = -math.inf, most: float = math.inf) -> float:
+    """
+    Return a number, checked against the bounds ``least``, ``above`` (exclusive) and ``most``.
+
+    Raises
+    ------
+    BadInputError
+        If the value is no number or out of range, or not finite although it has a lower bound.
+
+    """
+    units = f' {unit}' if unit else ''
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
+        raise BadInputError(
+            f'{what} is {excerpt(value)}: expected a number' + (f' in {unit}' if unit else ''))
+    try:
+        found = float(value)
+    except OverflowError:
+        found = math.inf
+    bounded = least > -math.inf or above > -math.inf
+    if bounded and not (least <= found and above < found <= most and found < math.inf):
+        raise BadInputError(
+            f'{what} is {found:g}{units}: expected a finite number '
+            + (f'of at least {least:g}' if least > -math.inf else f'above {above:g}')
+            + (f' and at most {most:g}' if most < math.inf else '') + units)
+    return found
+
+
+def several(value: Any) -> list[Any]:
+    """Return the items as a list; a single item becomes a list of one."""
+    return list(value) if np.iterable(value) and not isinstance(value, str) else [value]
+
+
+def parameters_in(given: Mapping[str, Any], law: str = 'gent') -> dict[str, Any]:
+    """
+    Return the node parameters for arguments of `Actuator`, except zeta and the damping ratio.
+
+    The constants belong to the model in ``given``, else to ``law``.
+
+    Raises
+    ------
+    BadInputError
+        If an argument has the wrong type, or some of them exclude each other.
+
+    """
+    given = {x: y for x, y in given.items() if y is not None or x not in _OPTIONAL}
+    damped = [x for x in DAMPED if x in given]
+    if len(damped) > 1:
+        raise BadInputError(f'both {" and ".join(damped)} are given: expected one of them')
+    values: dict[str, Any] = {
+        x.name: number(given[name], name, x.unit) for name, x in _NUMBERS.items() if name in given}
+    values |= _law_values(
+        given.get('law', law), given.get('constants'), 'shear_modulus' in given)
+    if 'creep' in given:
+        values |= _creep_values(given['creep'])
+    if 'flux_density_limits' in given:
+        values['flux_density_min'], values['flux_density_max'] = limits_of(
+            given['flux_density_limits'])
+    if 'slew_limit' in given:
+        slew = number(given['slew_limit'], 'slew_limit', 'T/s')
+        if not slew > 0.0:
+            raise BadInputError(
+                f'slew_limit is {slew:g} T/s: expected more than 0, or inf for steps')
+        values['slew_limit'] = 0.0 if math.isinf(slew) else slew
+    return values
+
+
+def _law_values(name: Any, constants: Any, modulus_given: bool) -> dict[str, Any]:
+    """Return the parameters of a model; a number is accepted for a constant that is a list."""
+    if not isinstance(name, str) or name not in LAWS:
+        raise BadInputError(f'law is {excerpt(name)}: expected one of {", ".join(LAWS)}')
+    law = LAWS[name]
+    constants = mapping_of(constants, 'constants', "'mu': 5e3")
+    names = {x.name.partition('.')[2]: x for x in law.constants}
+    unknown = [x for x in constants if x not in names]
+    if unknown:
+        raise BadInputError(
+            f'law {name} has no constant {unknown[0]!r}: expected '
+            + (', '.join(names) or 'none'))
+    if modulus_given and law.scaled is not None:
+        raise BadInputError(
+            f'shear_modulus is given with law {name}, whose constants it follows from: expected '
+            f'constants={{...}} of {", ".join(names)} alone')
+    values: dict[str, Any] = {LAW_NAME.name: name}
+    for key, value in constants.items():
+        kind = names[key].kind
+        values[names[key].name] = (
+            number(value, key, names[key].unit) if kind is float
+            else [number(x, key) for x in several(value)] if kind is list else str(value))
+    return values
+
+
+def _creep_values(creep: Any) -> dict[str, Any]:
+    """Return the parameters of viscoelastic branches, pairs of stiffness ratio and time."""
+    if isinstance(creep, (tuple, list)) and not creep:
+        return {}
+    ratios, times = columns_of(creep, ('ratio', 'time'), 'branches of creep')
+    return {'viscoelastic.ratio': ratios.tolist(), 'viscoelastic.time': times.tolist()}
+
+
+def limits_of(limits: Any) -> tuple[float, float]:
+    """
+    Return the minimum and the maximum flux density in T.
+
+    Raises
+    ------
+    BadInputError
+        If they are no numbers or not in increasing order.
+
+    """
+    given = [number(x, 'a flux density limit', 'T') for x in several(limits)]
+    if len(given) not in (1, 2):
+        raise BadInputError(
+            f'limits are {excerpt(limits)}: expected the least and the largest flux density '
+            'in T, or one number for both directions')
+    low, high = given if len(given) == 2 else (-given[0], given[0])
+    if not low < high:
+        raise BadInputError(
+            f'flux densities from {low:g} to {high:g} T: expected the least below the largest')
+    return low, high

@@ -1,0 +1,187 @@
+"""The file ``metadata.yaml`` of a bag: writes version 9 (Jazzy), reads versions 1 to 9."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+import os
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from hmsa.bag import limits, qos
+from hmsa.errors import BadInputError, BagError
+
+FILE_NAME = 'metadata.yaml'
+VERSION = 9
+# The start time that rosbag2 writes for a bag without messages.
+NO_TIME = 9223372036854775807
+#: Key of custom data while a bag is being written, which a killed writer leaves behind.
+NOT_ENDED = 'hmsa_ros.not_ended'
+_Dumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag; ``metadata.yaml`` does not contain its definition."""
+
+    name: str  #: for example ``'/joint_states'``
+    type: str  #: for example ``'sensor_msgs/msg/JointState'``; empty if unknown
+    definition: str = ''  #: with its dependencies; empty if unknown
+    definition_encoding: str = 'ros2msg'  #: or ``'ros2idl'``, empty
+    profiles: tuple[qos.Qos, ...] = ()  #: offered by the publishers
+    type_hash: str = ''  #: RIHS01 hash; empty if unknown
+    encoding: str = 'cdr'  #: of the messages
+    message_count: int = 0  #: as the metadata say
+
+    def check(self) -> None:
+        """Raise `BadInputError` if name or type is empty."""
+        if not self.name:
+            raise BadInputError('a topic has an empty name: expected a name such as /stretch')
+        if not self.type:
+            raise BadInputError(f'topic {self.name} has an empty type: expected a message type')
+
+
+@dataclass(frozen=True)
+class FileMetadata:
+    """One file of a bag: path in its folder, first log time and length in ns (see `NO_TIME`)."""
+
+    path: str
+    start_ns: int = NO_TIME
+    duration_ns: int = 0
+    message_count: int = 0
+
+
+@dataclass(frozen=True)
+class BagMetadata:
+    """The content of ``metadata.yaml``."""
+
+    start_ns: int = NO_TIME  #: first log time; `NO_TIME` without a message
+    duration_ns: int = 0
+    message_count: int = 0
+    topics: tuple[Topic, ...] = ()
+    files: tuple[FileMetadata, ...] = ()  #: in order of writing
+    #: Notes of the user and the recorder.
+    custom_data: Mapping[str, str] = field(default_factory=dict)
+    ros_distro: str = 'jazzy'  #: that wrote it
+    version: int = VERSION  #: of the file's layout
+    storage: str = 'mcap'
+    compression_mode: str = ''  #: of rosbag2 itself, none if empty; not MCAP's of chunks
+
+
+def to_map(metadata: BagMetadata) -> dict[str, Any]:
+    """Return metadata as dictionaries in rosbag2's order of keys, without the outer key."""
+    return {
+        'version': VERSION,
+        'storage_identifier': metadata.storage,
+        'duration': {'nanoseconds': metadata.duration_ns},
+        'starting_time': {'nanoseconds_since_epoch': metadata.start_ns},
+        'message_count': metadata.message_count,
+        'topics_with_message_count': [{
+            'topic_metadata': {
+                'name': topic.name,
+                'type': topic.type,
+                'serialization_format': topic.encoding,
+                'offered_qos_profiles': qos.to_maps(topic.profiles),
+                'type_description_hash': topic.type_hash,
+            },
+            'message_count': topic.message_count,
+        } for topic in metadata.topics],
+        'compression_format': '',
+        'compression_mode': metadata.compression_mode,
+        'relative_file_paths': [file.path for file in metadata.files],
+        'files': [{
+            'path': file.path,
+            'starting_time': {'nanoseconds_since_epoch': file.start_ns},
+            'duration': {'nanoseconds': file.duration_ns},
+            'message_count': file.message_count,
+        } for file in metadata.files],
+        'custom_data': dict(metadata.custom_data) or None,
+        'ros_distro': metadata.ros_distro,
+    }
+
+
+def to_yaml(metadata: BagMetadata, *, outer_key: bool = True) -> str:
+    """Return metadata as YAML: with the outer key for the file, without for MCAP's record."""
+    content = to_map(metadata)
+    text: str = yaml.dump(
+        {'rosbag2_bagfile_information': content} if outer_key else content, Dumper=_Dumper,
+        sort_keys=False, allow_unicode=True, width=10**6)
+    return text
+
+
+def write(folder: Path, metadata: BagMetadata) -> None:
+    """Replace a bag's metadata file in one step; on an OSError the old file is unchanged."""
+    path = folder / FILE_NAME
+    # Renaming is atomic: neither a reader nor a crash gets a partial file.
+    temporary = folder / f'.{FILE_NAME}.new'
+    try:
+        with temporary.open('w', encoding='utf-8') as file:
+            file.write(to_yaml(metadata))
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def read(path: Path) -> BagMetadata:
+    """Read a file of version 1 to 9, with defaults for what it lacks, or raise `BagError`."""
+    try:
+        # In a foreign bag it may be a pipe, a device, or a link to one.
+        if not path.is_file():
+            raise BagError(f'{path} is no file: expected the metadata of a bag')
+        with path.open('rb') as file:
+            data = file.read(limits.YAML_SIZE + 1)
+        text = data.decode('utf-8')
+    except (OSError, UnicodeDecodeError) as error:
+        raise BagError(f'{path} cannot be read: {error}') from error
+    try:
+        content = limits.load_yaml(text)
+    except BagError as error:
+        raise BagError(f'{path} cannot be used ({error}): expected the metadata of a '
+                       'bag') from error
+    if not isinstance(content, dict) or 'rosbag2_bagfile_information' not in content:
+        raise BagError(f'{path} has no key rosbag2_bagfile_information: expected the metadata '
+                       'of a bag')
+    return from_map(content['rosbag2_bagfile_information'], str(path))
+
+
+def from_map(content: Any, source: str) -> BagMetadata:
+    """Read maps without the outer key, or raise a `BagError` that names their source."""
+    try:
+        version = int(content['version'])
+        if version > VERSION:
+            raise BagError(
+                f'{source} is of version {version}: expected at most {VERSION}')
+        topics = tuple(map(_topic, content['topics_with_message_count'] or ()))
+        start = int(content['starting_time']['nanoseconds_since_epoch'])
+        duration = int(content['duration']['nanoseconds'])
+        count = int(content['message_count'])
+        paths = [str(path) for path in content['relative_file_paths'] or ()]
+        files = tuple(FileMetadata(
+            str(entry['path']), int(entry['starting_time']['nanoseconds_since_epoch']),
+            int(entry['duration']['nanoseconds']), int(entry['message_count']))
+            for entry in content.get('files') or ())
+        # Up to version 8 a path could carry the folder's name; it never leads out of it.
+        return BagMetadata(
+            start, duration, count, topics, files or tuple(map(FileMetadata, paths)),
+            {str(key): str(value) for key, value in (content.get('custom_data') or {}).items()},
+            str(content.get('ros_distro') or ''), version, str(content['storage_identifier']),
+            str(content.get('compression_mode') or ''))
+    except BagError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        what = f'key {error} is missing' if isinstance(error, KeyError) else str(error)
+        raise BagError(f'{source} cannot be understood ({what}): expected the metadata of a '
+                       'bag') from error
+
+
+def _topic(entry: Any) -> Topic:
+    """Read one topic."""
+    topic = entry['topic_metadata']
+    return Topic(
+        str(topic['name']), str(topic['type']),
+        profiles=qos.from_stored(topic.get('offered_qos_profiles')),
+        type_hash=str(topic.get('type_description_hash') or ''),
+        encoding=str(topic['serialization_format']), message_count=int(entry['message_count']))

@@ -1,0 +1,344 @@
+"""
+Read a bag, a folder or a single ``.mcap`` file, of this package or of rosbag2.
+
+For analysis without ROS, use one function::
+
+    read_messages(path, topics=None, *, start=None, end=None)
+        -> iterator of DecodedMessage(topic, log_time_ns, publish_time_ns, message)
+
+in order of log time over all files of the bag, messages with equal times in the order written.
+``message`` has the fields of the message type as attributes (``message.header.stamp.sec``). For
+raw payloads use `BagReader`.
+
+Unreadable parts are skipped and reported in `BagReader.problems`, one sentence each: a truncated
+file is read up to its end, a damaged chunk is skipped.
+
+Bags can come from untrusted sources: sizes are checked against `hmsa.bag.limits` before memory
+is allocated, only files in the bag's folder are read, and no content is executed.
+"""
+
+from collections.abc import Callable, Collection, Iterator
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from hmsa.bag import limits, metadata
+from hmsa.bag.definitions import make_decoder
+from hmsa.bag.folder import find
+from hmsa.bag.merge import Cursor, merge, Message
+from hmsa.bag.metadata import Topic
+from hmsa.bag.output import EXPERIMENT
+from hmsa.bag.records import Block
+from hmsa.bag.scan import Intake, ScannedFile
+from hmsa.bag.topics import topics_of
+from hmsa.errors import BadInputError, BagError, HmsaError
+
+__all__ = ['BagReader', 'DecodedMessage', 'Message', 'Topic', 'read_messages']
+# Later than any log time.
+_NEVER = 2**64
+
+
+class DecodedMessage(NamedTuple):
+    """A decoded message: topic, times in ns, and the message."""
+
+    topic: str
+    log_time_ns: int
+    publish_time_ns: int
+    message: Any
+
+
+class BagReader:
+    """
+    Reads a bag.
+
+    Parameters
+    ----------
+    path : path
+        Folder of a bag, or one ``.mcap`` file.
+    max_chunk_size : int
+        Largest content of a chunk, and largest message, in bytes; larger ones are skipped. Reading
+        takes at most a few times as much memory.
+
+    Attributes
+    ----------
+    path : pathlib.Path
+        As given.
+    files : tuple of pathlib.Path
+        The files read, in order.
+    topics : mapping of str to Topic
+        By name, in order of appearance.
+    metadata : hmsa.bag.metadata.BagMetadata or None
+        Content of ``metadata.yaml``; None if it is missing or unreadable.
+    custom_data : mapping of str to str
+        From ``metadata.yaml``, or else from the files.
+    records : mapping of str to mapping
+        Metadata records by name. Records of the same name are combined, later values replacing
+        earlier ones.
+    problems : list of str
+        Unreadable parts found so far, one sentence each; grows while messages are read.
+
+    Raises
+    ------
+    BadInputError
+        If no file can be read.
+
+    """
+
+    def __init__(
+            self, path: str | os.PathLike[str], *,
+            max_chunk_size: int = limits.CHUNK_SIZE) -> None:
+        if max_chunk_size < 1:
+            raise BadInputError(
+                f'largest chunk is {max_chunk_size} bytes: expected at least 1')
+        self.path = Path(path)
+        self._max_chunk_size = max_chunk_size
+        intake = Intake(max_chunk_size)
+        self.problems = intake.problems
+        paths, self.metadata = find(self.path, intake.problem)
+        self._files: list[ScannedFile] = []
+        for file_path in paths:
+            try:
+                self._files.append(ScannedFile(intake, file_path, len(self._files)))
+            except HmsaError as error:
+                if len(paths) == 1 and isinstance(error, BadInputError):
+                    raise
+                intake.problem(str(error))
+        if not self._files:
+            raise BadInputError(f'no file of {self.path} can be read: ' + self.problems[0])
+        self.files = tuple(file.path for file in self._files)
+        self.records: dict[str, dict[str, str]] = {}
+        for file in self._files:
+            for name, values in file.metadata.items():
+                self.records.setdefault(name, {}).update(values)
+        noted = {} if self.metadata is None else dict(self.metadata.custom_data)
+        self._ended = metadata.NOT_ENDED not in noted
+        noted.pop(metadata.NOT_ENDED, None)
+        if not self._ended:
+            intake.problem(f'{self.path} was not closed by its recorder: it was killed, or '
+                           'is still at work')
+        self.custom_data = noted or {
+            key: value for key, value in self.records.get(EXPERIMENT, {}).items()
+            if key != 'version'}
+        # Messages by file; of old versions of the metadata, 0.
+        self._listed = {} if self.metadata is None else {
+            Path(x.path).name: x.message_count for x in self.metadata.files}
+        read = {x.name for x in self.files}
+        self._missing = sum(
+            max(1, count) for name, count in self._listed.items() if name not in read)
+        described = {} if self.metadata is None else {x.name: x for x in self.metadata.topics}
+        self.topics = topics_of(self._files, described, self.custom_data, intake.problem)
+
+    @property
+    def complete(self) -> bool:
+        """Return whether the bag was closed, and no damage of it has been found so far."""
+        return self.closed and not self._missing and all(file.complete for file in self._files)
+
+    @property
+    def closed(self) -> bool:
+        """Return whether every file, and the bag as a whole, was closed by its writer."""
+        return self._ended and all(file.closed for file in self._files)
+
+    def unreadable(self) -> int:
+        """Return how many messages cannot be read that the files or ``metadata.yaml`` list."""
+        said = sum(max(file.said or 0, self._listed.get(file.path.name, 0))
+                   for file in self._files) + self._missing
+        if self.metadata is not None and self._ended:
+            said = max(said, self.metadata.message_count)
+        return max(0, said - sum(self.counts().values()))
+
+    @property
+    def start_time(self) -> int | None:
+        """Return the first log time in nanoseconds, None without a message."""
+        return min((block.start for block in self._filled_blocks()), default=None)
+
+    @property
+    def end_time(self) -> int | None:
+        """Return the last log time in nanoseconds, None without a message."""
+        return max((block.end for block in self._filled_blocks()), default=None)
+
+    def _filled_blocks(self) -> Iterator[Block]:
+        """Return the blocks with messages."""
+        for file in self._files:
+            for block in file.blocks:
+                # A chunk without messages has the times 0, and so may messages recorded without
+                # a clock.
+                if block.size and (block.end or self._has_messages(block)):
+                    yield block
+
+    def _has_messages(self, block: Block) -> bool:
+        """Return whether a block has messages, by reading it."""
+        cursor = self._cursor(block)
+        return cursor is not None and cursor.left
+
+    def messages(
+            self, topics: Collection[str] | None = None, *, start: int | None = None,
+            end: int | None = None,
+            cancelled: Callable[[], bool] = lambda: False) -> Iterator[Message]:
+        """
+        Return the messages in order of log time.
+
+        Parameters
+        ----------
+        topics : collection of str, optional
+            Only these topics; default all.
+        start, end : int, optional
+            Only log times of at least ``start`` and less than ``end``, in nanoseconds.
+        cancelled : callable
+            Called before each chunk; the iteration ends when it returns True.
+
+        Yields
+        ------
+        Message
+            Messages with equal times in the order written.
+
+        """
+        blocks = sorted(
+            (block for block in self._filled_blocks()
+             if (start is None or block.end >= start) and (end is None or block.start < end)),
+            key=lambda block: (block.start, block.file, block.offset))
+        wanted = None if topics is None else frozenset(topics)
+        most = limits.CHUNKS_AT_ONCE * self._max_chunk_size
+        active: list[Cursor] = []
+        for i, block in enumerate(blocks):
+            if cancelled():
+                return
+            if sum(len(cursor.content) for cursor in active) + block.size > most:
+                # All active chunks overlap with this one.
+                self._files[block.file].problem(
+                    f': more than {most} bytes of chunks overlap in time, at byte '
+                    f'{block.offset}: skipped')
+            else:
+                cursor = self._cursor(
+                    block, wanted, 0 if start is None else start, _NEVER if end is None else end)
+                if cursor is not None:
+                    cursor.sort()
+                    active.append(cursor)
+            yield from merge(active, blocks[i + 1].start if i + 1 < len(blocks) else _NEVER)
+            active = [cursor for cursor in active if cursor.left]
+
+    def stored_messages(self) -> Iterator[Message]:
+        """Yield all messages in the order stored."""
+        for file in self._files:
+            for block in file.blocks:
+                cursor = self._cursor(block)
+                if cursor is not None:
+                    yield from cursor.take(_NEVER)
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of messages by topic, counting them if the statistics may be wrong."""
+        result = dict.fromkeys(self.topics, 0)
+        for file in self._files:
+            for number, count in file.counts().items():
+                name = self._topic_of(file, number) or ''
+                if name in result:
+                    result[name] += count
+        return result
+
+    def _cursor(
+            self, block: Block, topics: Collection[str] | None = None, start: int = 0,
+            end: int = _NEVER) -> Cursor | None:
+        """Return the messages of a chunk or run in the order stored; report damage."""
+        file = self._files[block.file]
+
+        def topic_of(channel: int) -> str | None:
+            name = self._topic_of(file, channel)
+            return name if topics is None or name in topics else None
+
+        try:
+            with file.path.open('rb') as stream:
+                content = block.content(stream.fileno())
+        except (BagError, OSError) as error:
+            file.problem(f': {error}, at byte {block.offset}: skipped')
+            return None
+        cursor = Cursor((block.file, block.offset), content, topic_of, start, end)
+        if cursor.problem:
+            file.problem(f': {cursor.problem}, at byte {block.offset}: skipped')
+        return cursor
+
+    def _topic_of(self, file: ScannedFile, number: int) -> str | None:
+        """Return the topic of a channel, None if its messages are skipped."""
+        channel = file.channels.get(number)
+        if channel is None:
+            file.problem(f': channel {number} is not declared: its messages are skipped')
+            return None
+        known = self.topics.get(channel.topic)
+        schema = file.schemas.get(channel.schema_id)
+        if known is None or schema is not None and schema.name != known.type:
+            return None
+        return channel.topic
+
+    def decoder(self, topic: str) -> Callable[[bytes], Any]:
+        """
+        Return the function that decodes a topic's payloads.
+
+        Parameters
+        ----------
+        topic : str
+            Name of a topic of the bag.
+
+        Returns
+        -------
+        callable
+            Takes a payload, returns an object with the message's fields as attributes. It
+            raises `BagError` for a payload that does not fit the type.
+
+        Raises
+        ------
+        BadInputError
+            If the bag has no such topic.
+        BagError
+            If the bag has no definition that can be read.
+
+        """
+        info = self.topics.get(topic)
+        if info is None:
+            raise BadInputError(
+                f'{self.path} has no topic {topic}: expected one of '
+                + (', '.join(sorted(self.topics)) or 'none, the bag is empty'))
+        return make_decoder(info)
+
+
+def read_messages(
+        path: str | os.PathLike[str], topics: Collection[str] | None = None, *,
+        start: int | None = None, end: int | None = None) -> Iterator[DecodedMessage]:
+    """
+    Return the decoded messages of a bag in order of log time.
+
+    Parameters
+    ----------
+    path : path
+        Folder of a bag, or one ``.mcap`` file.
+    topics : collection of str, optional
+        Only these topics; default all that can be decoded. A name that the bag does not have
+        gives no messages.
+    start, end : int, optional
+        Only log times of at least ``start`` and less than ``end``, in nanoseconds.
+
+    Yields
+    ------
+    DecodedMessage
+        ``(topic, log_time_ns, publish_time_ns, message)``.
+
+    Raises
+    ------
+    BadInputError
+        If there is no bag.
+    BagError
+        If a topic that was asked for by name cannot be decoded.
+
+    """
+    reader = BagReader(path)
+    decoders: dict[str, Callable[[bytes], Any] | None] = {}
+    for message in reader.messages(topics, start=start, end=end):
+        topic = message.topic
+        if topic not in decoders:
+            try:
+                decoders[topic] = reader.decoder(topic)
+            except BagError:
+                if topics is not None:
+                    raise
+                decoders[topic] = None
+        decode = decoders[topic]
+        if decode is not None:
+            yield DecodedMessage(
+                topic, message.log_time, message.publish_time, decode(message.data))

@@ -1,0 +1,187 @@
+"""
+Parse MCAP records from untrusted files.
+
+See https://mcap.dev/spec. Little endian; a record consists of its opcode (1 byte), the length of
+its content (8 bytes) and the content. The classes of the mcap package parse the content; this
+module checks lengths, and limits the memory of decompressed chunks.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import io
+import os
+import struct
+from typing import Any, TypeVar
+import zlib
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import (
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.writer import MCAP0_MAGIC
+
+from hmsa.bag import limits
+from hmsa.errors import BagError
+
+#: Begin and end of a file.
+MAGIC = MCAP0_MAGIC
+PREFIX = struct.Struct('<BQ')
+# Opcode, length, channel, sequence, log time, publish time; the payload follows.
+MESSAGE_HEAD = struct.Struct('<BQHIQQ')
+#: A plain int, since comparing an enum for every message is slow.
+MESSAGE = int(Opcode.MESSAGE)
+MESSAGE_FIXED = MESSAGE_HEAD.size - PREFIX.size
+#: Maximum size of a chunk's fields before its data: the name of the compression is short.
+CHUNK_HEAD_SIZE = 64
+_CHUNK_HEAD = struct.Struct('<QQQII')
+_Record = TypeVar('_Record', bound=McapRecord)
+
+_CLASSES: dict[int, type[Any]] = {
+    Opcode.HEADER: Header, Opcode.FOOTER: Footer, Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel, Opcode.CHUNK_INDEX: ChunkIndex, Opcode.STATISTICS: Statistics,
+    Opcode.METADATA: Metadata, Opcode.METADATA_INDEX: MetadataIndex, Opcode.DATA_END: DataEnd,
+    Opcode.SUMMARY_OFFSET: SummaryOffset}
+
+
+@dataclass(frozen=True)
+class Block:
+    """A chunk, or a run of messages outside chunks, and its position in the file."""
+
+    file: int  #: number of the file
+    offset: int
+    length: int
+    size: int  #: of the content
+    start: int  #: lowest log time
+    end: int  #: highest log time
+    compression: str = ''  #: ``''``, ``'lz4'`` or ``'zstd'``
+    crc: int = 0  #: CRC-32 of the content; 0 for none
+
+    @classmethod
+    def of_chunk(cls, file: int, offset: int, head: bytes, length: int) -> 'Block':
+        """Read the fields before the data of a chunk record of a length, or raise `BagError`."""
+        try:
+            start, end, size, crc, name = _CHUNK_HEAD.unpack_from(head)
+            begin = _CHUNK_HEAD.size + name + 8
+            compression = head[_CHUNK_HEAD.size:begin - 8].decode()
+            stored, = struct.unpack_from('<Q', head, begin - 8)
+        except (struct.error, UnicodeDecodeError) as error:
+            raise BagError('a chunk record ends early') from error
+        if begin + stored != length:
+            raise BagError(f'a chunk record has {length} bytes: it says {begin + stored}')
+        return cls(
+            file, offset + PREFIX.size + begin, stored, size, start, end, compression, crc)
+
+    def content(self, descriptor: int) -> bytes:
+        """Return the content, or raise `BagError` if it is damaged."""
+        content = decompress(
+            read_exactly(descriptor, self.length, self.offset), self.compression, self.size)
+        if self.crc and zlib.crc32(content) != self.crc:
+            raise BagError('a chunk is damaged (its CRC differs)')
+        return content
+
+
+class _Content(ReadDataStream):
+    """The content of a record: reads to its end only, and limits the number of fields."""
+
+    def __init__(self, data: bytes, what: str) -> None:
+        super().__init__(io.BytesIO(data))
+        self._size = len(data)
+        self._what = what
+        self._fields = 0
+
+    def read(self, length: int) -> bytes:
+        """Return the next bytes; raise `BagError` beyond the end, or for too many fields."""
+        self._fields += 1
+        if self._fields > 4 * limits.MAP_ENTRIES:
+            raise BagError(
+                f'a {self._what} record has more than {limits.MAP_ENTRIES} entries')
+        if self.count + length > self._size:
+            raise BagError(f'a {self._what} record ends early')
+        return super().read(length)
+
+    def read_prefixed_string(self) -> str:
+        return self.read(self.read4()).decode('utf-8', 'backslashreplace')
+
+
+def parse(kind: type[_Record], content: bytes) -> _Record:
+    """Parse a record by the mcap package, escaping invalid UTF-8; raise `BagError` if damaged."""
+    what = kind.__name__.lower()
+    stream = _Content(content, what)
+    try:
+        record: _Record = kind.read(stream)  # type: ignore[attr-defined]
+    except (McapError, struct.error) as error:
+        raise BagError(f'a {what} record ends early') from error
+    if stream.count != len(content):
+        raise BagError(f'a {what} record is longer than what it holds')
+    return record
+
+
+def parse_any(opcode: int, content: bytes) -> McapRecord | None:
+    """Return the record, None if of unknown kind; see `parse`."""
+    kind = _CLASSES.get(opcode)
+    return None if kind is None else parse(kind, content)
+
+
+def decompress(data: bytes, compression: str, size: int) -> bytes:
+    """Return the ``size`` bytes of a chunk's content, or raise `BagError` if damaged."""
+    if not compression:
+        content = data
+    elif compression == 'zstd':
+        import zstandard
+        try:
+            # A frame may contain its size, which must be that of the chunk: decompression never
+            # allocates more.
+            if zstandard.frame_content_size(data) not in (size, -1):
+                raise BagError('a chunk does not decompress to the size it says')
+            content = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+        except zstandard.ZstdError as error:
+            raise BagError(f'a chunk does not decompress: {error}') from error
+    elif compression == 'lz4':
+        import lz4.frame
+        try:
+            content = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+        except RuntimeError as error:
+            raise BagError(f'a chunk does not decompress: {error}') from error
+    else:
+        raise BagError(f'a chunk is compressed with {compression!r}: expected lz4 or zstd')
+    if len(content) != size:
+        raise BagError(f'a chunk has {len(content)} bytes of content: it says {size}')
+    return content
+
+
+def split(content: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode, start and end of each record's content; raise `BagError` if truncated."""
+    offset, size = 0, len(content)
+    prefix_size, unpack = PREFIX.size, PREFIX.unpack_from
+    while offset < size:
+        if offset + prefix_size > size:
+            raise BagError('a record in a chunk ends early')
+        opcode, length = unpack(content, offset)
+        start = offset + prefix_size
+        offset = start + length
+        if offset > size or (opcode == MESSAGE and length < MESSAGE_FIXED):
+            raise BagError('a record in a chunk ends early')
+        yield opcode, start, offset
+
+
+def read_exactly(descriptor: int, length: int, offset: int) -> bytes:
+    """Return ``length`` bytes from an offset; raise `BagError` if the file has fewer."""
+    data = os.pread(descriptor, length, offset)
+    while len(data) < length:
+        more = os.pread(descriptor, length - len(data), offset + len(data))
+        if not more:
+            raise BagError('the file has become shorter')
+        data += more
+    return data

@@ -1,0 +1,278 @@
+r"""
+Write a parameter file for your own actuator.
+
+Write a parameter file of your own actuator for planner and plant (--params-file), and print the
+resulting times, damping, flux densities and reachable stretches. Numbers are
+in SI units unless a unit follows: 10mm, "50 kPa".
+
+example: hmsa init --half-length 5mm --half-thickness 5mm --density 1.9g/cm3 \
+    --shear-modulus 30kPa --j-lim 20 --zeta 0.1 --remanence 80mT \
+    --flux-max 200mT --out my_actuator.yaml
+"""
+
+import argparse
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict
+import math
+from pathlib import Path
+from shlex import quote
+import sys
+from typing import Any, cast, TYPE_CHECKING
+
+from hmsa.cli.options import (
+    add_command,
+    argument,
+    JSON,
+    law_of,
+    LAW_OPTION,
+    Row,
+    show,
+)
+from hmsa.errors import BadInputError
+from hmsa.files import check_targets, write_text, yaml_text
+from hmsa.interfaces.parameters import LAW, LAW_NAME, PUBLISH_RATE
+from hmsa.interfaces.quantities import (
+    DAMPING,
+    default_of,
+    EVERY,
+    FORMS,
+    joint_names,
+    OPTIONAL,
+    QUANTITIES,
+    Quantity,
+)
+
+if TYPE_CHECKING:
+    from hmsa.api.actuator import Actuator
+    from hmsa.model.parameters import ActuatorParameters
+
+_JOINT = 'actuator'
+_NODES = ('plant', 'planner')  # that read the file
+# Quantities of the coil, and those with another name in `Actuator`.
+_COIL = ('flux_max', 'flux_min', 'slew_limit')
+# Forms with their own sizes and constants.
+_OF_THEIR_OWN = ('beam',)
+_ARGUMENTS = {'j_lim': 'chain_limit', 'damping': 'damping_coefficient'}
+# The damping coefficient may be given instead of these.
+_DAMPED = ('zeta', 'damping_ratio')
+_FILE = Path('actuator.yaml')
+_FOLLOWS = {'half_thickness': 'as --half-length', 'flux_min': 'minus --flux-max'}
+# Full sizes, of a beam or a block, and the quantities of a block whose doubles they are.
+_FULL = {'length': 'half_length', 'thickness': 'half_thickness'}
+# Sample rate in Hz that one plant sustains, together with its planner, on two cores.
+_KEPT_UP = 4000.0
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command."""
+    add_command(
+        subparsers, __name__, __doc__,
+        ('--beam',
+         'a beam that is clamped at one end, magnetised along its length, in a field across it; '
+         'its setpoints are deflections of the tip over the length'),
+        *map(_option, (*QUANTITIES, *(x for x in EVERY if x not in QUANTITIES), DAMPING)),
+        LAW_OPTION,
+        ('--joint', 'NAME', str,
+         f'joint name (default {_JOINT}), or several separated by commas for identical actuators',
+         {'default': ''}),
+        ('--out', 'FILE', Path, f'file to write (default {_FILE})', {'default': _FILE}),
+        ('--force', 'replace an existing file'),
+        ('--yes', 'use the defaults for values without an option, as guesses'),
+        JSON)
+
+
+def _option(quantity: Quantity) -> Row:
+    """Return the option of a quantity."""
+    note = ', in place of --zeta; with --beam of its tip, in place of --damping-ratio'
+    if quantity is not DAMPING:
+        note = f' (default {_FOLLOWS.get(quantity.key) or format(quantity.default, "g")})'
+        if quantity not in QUANTITIES:
+            note += ', with ' + ' or '.join(
+                f'--{x}' for x in _OF_THEIR_OWN if quantity.key in {y.key for y in FORMS[x]})
+        if quantity.key in _FULL:
+            note += f'; of a block, twice --{_FULL[quantity.key].replace("_", "-")}'
+    unit = f' [{quantity.unit}]' if quantity.unit else ''
+    return quantity.option, 'X', argument(quantity.parse), f'{quantity.text}{unit}{note}'
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write and print; raise `BadInputError` for invalid input."""
+    path: Path = arguments.out
+    if not arguments.force and path.exists():
+        raise BadInputError(f'{path} exists: name another file with --out, or add --force')
+    check_targets(path)
+    form, wanted = _wanted(arguments)
+    given = _given(arguments, form, wanted)
+    joints = joint_names(arguments.joint) or [_JOINT]
+    missing = [x for x in wanted if x.key not in OPTIONAL and not _known(x.key, given)]
+    if missing and not arguments.yes:
+        raise BadInputError(
+            f'{", ".join(x.option for x in missing)} {"is" if len(missing) == 1 else "are"} not '
+            f'given: expected {"it" if len(missing) == 1 else "them"}, or --yes for the defaults')
+    for quantity in wanted:
+        if not _known(quantity.key, given):
+            given[quantity.key] = default_of(quantity, given)
+    from hmsa.api.doubts import doubts as doubts_of
+    from hmsa.api.facts import facts
+
+    made = _actuator(form, given, arguments.law)
+    found = made.scales
+    given.setdefault('shear_modulus', made.block.shear_modulus)
+    doubts = doubts_of(made)
+    if missing:
+        shown = [f'{x.words} {x.show(given[x.key])}' + (
+            ', as the half length' if x.key == 'half_thickness' else '') for x in missing]
+        doubts.append(
+            f'{"; ".join(shown)} {"is a guess" if len(missing) == 1 else "are guesses"}: a plan '
+            'is only as exact as its parameters; measure them and pass the values')
+    parameters = _parameters(made)
+    table = [f'{name:<26} {value}' for name, value in facts(found, made.block)]
+    write_text(path, '\n'.join([
+        '# Parameters of an actuator for planner and plant, written by hmsa init:',
+        *(f'#   hmsa {x} --ros-args --params-file {quote(path.name)}' for x in _NODES),
+        '#', '# What follows from them (computed by hmsa init when it wrote this file):',
+        *(f'#   {line}' for line in table), '/**:', '  ros__parameters:',
+        *_lines(form, parameters, {x.parameter or DAMPING.parameter for x in missing}),
+        *_joints(joints, made.block), *_sampling(made.block)]) + '\n')
+    for doubt in doubts:
+        print(f'hmsa: warning: {doubt}', file=sys.stderr)
+    return show(
+        arguments, {
+            'file': path, 'joints': joints, 'parameters': parameters,
+            'scales': asdict(found), 'warnings': doubts},
+        *table, f'\n{path} written; to use it:',
+        *(f'  hmsa {x} --ros-args --params-file {quote(str(path))}' for x in _NODES))
+
+
+def _wanted(arguments: argparse.Namespace) -> tuple[str, tuple[Quantity, ...]]:
+    """Return form and quantities of the actuator; a hyperelastic model has its own constants."""
+    form = 'beam' if arguments.beam else 'block'
+    if arguments.law is None:
+        return form, FORMS[form]
+    from hmsa.model.laws import LAWS
+
+    law = LAWS[law_of(arguments.law)[0]]
+    if form != 'block' or law.name in _OF_THEIR_OWN:
+        own = law.name if form == 'block' else form
+        raise BadInputError(
+            f'--law {law.name} is given{"" if form == "block" else f" with --{form}"}: expected '
+            f'--{own} for a {own}, which has a law of its own, and --law for a block')
+    none = ('shear_modulus', 'j_lim') if law.scaled else ('j_lim',) if law.endless else ()
+    return form, tuple(x for x in QUANTITIES if x.key not in none)
+
+
+def _given(
+        arguments: argparse.Namespace, form: str,
+        wanted: Sequence[Quantity]) -> dict[str, float]:
+    """Return the values of the options, after checking their combination."""
+    given = {x.key: value for x in (*EVERY, DAMPING)
+             if (value := getattr(arguments, x.key)) is not None}
+    for full, half in _FULL.items() if form == 'block' else ():
+        if full in given and half in given:
+            raise BadInputError(
+                f'both --{full} and --{half.replace("_", "-")} are given: expected one of them')
+        if full in given:
+            given[half] = 0.5 * given.pop(full)
+    for key in _DAMPED:
+        if key in given and DAMPING.key in given:
+            raise BadInputError(
+                f'both --{key.replace("_", "-")} and --damping are given: expected one of them')
+    if form == 'beam' and 'shear_modulus' in given:
+        if 'youngs_modulus' in given:
+            raise BadInputError(
+                'both --shear-modulus and --youngs-modulus are given: expected one of them, '
+                'since E is 3 G')
+        given['youngs_modulus'] = 3.0 * given.pop('shear_modulus')
+    if others := given.keys() - {x.key for x in wanted} - {DAMPING.key}:
+        own = [x for x in _OF_THEIR_OWN if others <= {y.key for y in FORMS[x]}]
+        raise BadInputError(
+            f'{", ".join(sorted("--" + x.replace("_", "-") for x in others))} is given: expected '
+            + (f'constants of --law {arguments.law.partition(":")[0]} in its place'
+               if arguments.law is not None and others <= {x.key for x in QUANTITIES}
+               else f'--{own[0]} with it' if form == 'block' and own
+               else f'sizes of a {form}, or others of {", ".join(x.option for x in wanted)}'))
+    return given
+
+
+def _known(key: str, given: Mapping[str, float]) -> bool:
+    """Return whether a value is given, or the damping coefficient instead."""
+    return key in given or (key in _DAMPED and DAMPING.key in given)
+
+
+def _actuator(form: str, given: Mapping[str, float], law: str | None) -> 'Actuator':
+    """Return the actuator with its coil."""
+    from hmsa.api.actuator import Actuator
+    from hmsa.api.doubts import unquestioned
+
+    # Only the one that is given.
+    damping = (DAMPING.key,) if DAMPING.key in given else _DAMPED
+    values: dict[str, Any] = {
+        _ARGUMENTS.get(x, x): given[x]
+        for x in (*(y.key for y in FORMS[form] if y.key not in (*_COIL, *_DAMPED)), *damping)
+        if x in given}
+    values |= {'flux_density_limits': (given['flux_min'], given['flux_max']),
+               'slew_limit': given['slew_limit'] or math.inf}
+    if law is not None:
+        values['law'], values['constants'] = law_of(law)
+    with unquestioned():  # of which `run` prints the doubts
+        return (Actuator.beam if form == 'beam' else Actuator)(**values)
+
+
+def _lines(form: str, parameters: Mapping[str, Any], guessed: Collection[str]) -> list[str]:
+    """Return the nodes' parameters in YAML, each below its description, which marks guesses."""
+    texts = {x.name: (x.description.rstrip('.'), x.unit) for x in LAW} | {
+        x.parameter: (x.text, x.unit) for x in (*QUANTITIES, DAMPING)}
+    if form == 'beam':
+        texts |= {
+            x.parameter: (('half of the ' if 'half_' in x.parameter else '') + x.text, x.unit)
+            for x in FORMS['beam']} | {
+            LAW_NAME.name: ('a beam: positions are deflections of the tip over the length', ''),
+            DAMPING.parameter: ('damping coefficient of the tip', DAMPING.unit)}
+    lines = []
+    for name, value in parameters.items():
+        text, unit = texts[name]
+        lines += [f'    # {text[0].upper()}{text[1:]}{f" [{unit}]" if unit else ""}'
+                  f'{", a guess" if name in guessed else ""}.',
+                  f'    {name}: {yaml_text(value)}']
+    return lines
+
+
+def _joints(joints: list[str], block: 'ActuatorParameters') -> list[str]:
+    """Return the lines with the joint names."""
+    if len(joints) == 1:
+        return ['    # Name of the joint in trajectories and joint states.',
+                f'    joint: {yaml_text(joints[0])}']
+    return [
+        '    # Names of the joints; all are identical except for what is set for one, such as',
+        f'    # {joints[0]}.actuator.remanence: {yaml_text(block.remanence)}',
+        f'    joints: {yaml_text(joints)}']
+
+
+def _sampling(actuator: 'ActuatorParameters') -> list[str]:
+    """Return lines with the plant's sample rate if the default misses the actuator's peaks."""
+    from hmsa.model.sampling import enough_samples
+
+    default, largest = cast(float, PUBLISH_RATE.default), cast(float, PUBLISH_RATE.maximum)
+    # Twice the rate that just resolves the peaks, if a plant sustains it in real time.
+    least = enough_samples(actuator)
+    enough = max(least, min(2.0 * least, _KEPT_UP))
+    if enough <= default:
+        return []
+    digits = 10 ** (math.floor(math.log10(enough)) - 1)
+    rate = min(math.ceil(enough / digits) * digits, largest)
+    slower = [] if rate <= 1.1 * _KEPT_UP else [
+        '    # A plant may not keep up with it in real time: set publish_clock and',
+        '    # real_time_factor to simulate more slowly.']
+    return [
+        '    # Sample rate of the plant: at least 10 samples per period of the actuator [Hz].',
+        *slower, f'    publish_rate: {rate:.1f}']
+
+
+def _parameters(made: 'Actuator') -> dict[str, Any]:
+    """Return the nodes' parameters by name."""
+    values = made.parameters
+    del values['coil_time_constant']
+    if made.block.law is not None:
+        # They follow from other parameters, or have no effect.
+        del values['actuator.shear_modulus'], values['actuator.chain_limit']
+    return values

@@ -1,0 +1,186 @@
+"""Options of commands as table rows."""
+
+import argparse
+from collections.abc import Callable, Iterable
+import inspect
+from pathlib import Path
+from typing import Any, TYPE_CHECKING, TypeVar
+
+from hmsa.errors import assume, BadInputError, excerpt
+
+if TYPE_CHECKING:
+    from hmsa.api.actuator import Actuator
+
+T = TypeVar('T')
+#: Names, metavar, type, help and any further settings of argparse; for a flag, name and help; for
+#: a group, its title and a list of its rows.
+Row = tuple[Any, ...]
+
+JSON: Row = ('--json', 'print one JSON object')
+NAMESPACE: Row = ('--namespace', 'NS', str, 'namespace of the planner', {'default': ''})
+JOINTS: Row = (
+    '--joint', 'NAMES', str, 'joint, or several separated by commas (default actuator)',
+    {'default': 'actuator'})
+EXAMPLE: Row = (
+    '--params-file', 'YAML', Path, 'parameter file of the actuator (default: the example block)')
+TIMEOUT: Row = (
+    '--timeout', 'S', float, 'seconds to wait for a reply (default 10 s)', {'default': 10.0})
+#: Dimensionless parameters of a block: option, metavar and description.
+MATERIAL = (
+    ('--zeta', 'Z', 'dimensionless damping, at least 0 (default 0.2)'),
+    ('--j-lim', 'J', 'Gent limiting extensibility J_lim, above 0 (default 5)'),
+    ('--c1', 'C', 'shape 2 H^2/L^2, above 0 (default 2)'))
+
+LAW_OPTION: Row = (
+    '--law', 'NAME:KEY=VALUE,...', str,
+    'hyperelastic model and its constants (moduli in Pa or with a unit, in dimensionless plans in '
+    'any common unit; values of a list separated by /), such as yeoh:c10=15kPa,c20=500 or '
+    'ogden:mu=6e3/100,alpha=1.3/5')
+
+
+def law_of(text: str) -> tuple[str, dict[str, Any]]:
+    """Return name and constants of `LAW_OPTION`; raise `BadInputError` if invalid."""
+    from hmsa.interfaces.quantities import number_of
+    from hmsa.model.laws import LAWS
+
+    name, _, rest = text.partition(':')
+    if name not in LAWS:
+        raise BadInputError(f'--law is {excerpt(name)}: expected one of {", ".join(LAWS)}')
+    known = {x.name.partition('.')[2]: x for x in LAWS[name].constants}
+    constants: dict[str, Any] = {}
+    for part in filter(None, rest.split(',')):
+        key, equals, value = (x.strip() for x in part.partition('='))
+        if not equals or key not in known:
+            raise BadInputError(
+                f'--law {name} has {excerpt(part)}: expected KEY=VALUE with a key of '
+                f'{", ".join(known) or "none, since it has no constants"}')
+        kind, unit = known[key].kind, known[key].unit
+        constants[key] = value if kind is str else [
+            number_of(x, unit, key) for x in value.split('/')] if kind is list else number_of(
+                value, unit, key)
+    # Other constants, such as those of a beam, are in a parameter file.
+    if known and not constants and {x.unit for x in known.values()} <= {'Pa', ''}:
+        raise BadInputError(
+            f'--law {name} has no constants: expected {", ".join(known)}, as in --law '
+            f'{name}:{next(iter(known))}=VALUE')
+    return name, constants
+
+
+def argument(read: Callable[[str], T]) -> Callable[[str], T]:
+    """Return an argument type for argparse that shows a `BadInputError` unchanged."""
+    def read_argument(text: str) -> T:
+        try:
+            return read(text)
+        except BadInputError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return read_argument
+
+
+def of_unit(option: str, unit: str, text: str) -> Row:
+    """Return an option for a number above 0, in SI or with another unit."""
+    def read(words: str) -> float:
+        from hmsa.interfaces.quantities import number_of
+
+        value = number_of(words, unit, option.removeprefix('--').replace('-', ' '))
+        if not value > 0.0:
+            raise BadInputError(f'{value:g} {unit}: expected more than 0 {unit}')
+        return value
+
+    return option, 'X', argument(read), f'{text} [{unit}]'
+
+
+def frequency(option: str, text: str, **settings: Any) -> Row:
+    """Return an option for a frequency in Hz or with a unit."""
+    def read(words: str) -> float:
+        from hmsa.interfaces.quantities import number_of
+
+        return number_of(words, 'Hz', option.removeprefix('--'))
+
+    return option, 'HZ', argument(read), text, settings
+
+
+def actuator_of(path: Path | None) -> 'Actuator':
+    """Return the actuator of a parameter file, or the example block, which is said."""
+    from hmsa.api.actuator import Actuator
+
+    if path is not None:
+        return Actuator.from_yaml(path)
+    assume_example()
+    return Actuator()
+
+
+def assume_example() -> None:
+    """State that a command without a parameter file assumes the example block."""
+    from hmsa.model.parameters import paper_actuator
+
+    block = paper_actuator()
+    assume(
+        'without --params-file the actuator is the example block: '
+        f'{2e3 * block.half_length:g} mm x {2e3 * block.half_length:g} mm x '
+        f'{2e3 * block.half_thickness:g} mm, shear modulus {1e-3 * block.shear_modulus:g} kPa, '
+        f'remanence {1e3 * block.remanence:g} mT, natural frequency about '
+        f'{1.0 / block.period:.3g} Hz')
+
+
+def timeout_of(arguments: argparse.Namespace) -> float:
+    """Return the time limit in s; raise `BadInputError` if invalid."""
+    timeout: float = arguments.timeout
+    if not timeout > 0.0:
+        raise BadInputError(f'timeout is {timeout:g}: expected a number of seconds above 0')
+    return timeout
+
+
+def add_command(
+        subparsers: Any, name: str, text: str | None, *rows: Row,
+        run: Callable[[argparse.Namespace], int] | None = None) -> Any:
+    """
+    Add a command described by a docstring, and return its parser.
+
+    ``run`` carries out a subcommand; a module has a function of that name.
+
+    The first line of the docstring is the help in the list of commands. Its last paragraph, which
+    begins with ``example:``, keeps its line breaks. ``name`` may be the name of a module.
+    """
+    what, _, rest = inspect.cleandoc(text or '').partition('\n\n')
+    description, _, example = rest.rpartition('example: ')
+    what = what.rstrip('.')
+    parser = subparsers.add_parser(
+        name.rpartition('.')[2].replace('_', '-'), help=what[:1].lower() + what[1:],
+        description=description or f'{what}.', epilog=f'example: {example}')
+    add_options(parser, *rows)
+    if run is not None:
+        parser.set_defaults(parser=parser, run=run)
+    return parser
+
+
+def bags(name: str) -> Row:
+    """Return the argument for one or more bags."""
+    return name, 'BAG', Path, 'folder of a bag, or an .mcap file', {'nargs': '+'}
+
+
+def add_options(parser: Any, *rows: Row) -> None:
+    """Add arguments in the order of the help."""
+    for names, *texts in rows:
+        if isinstance(texts[0], list):
+            add_options(parser.add_argument_group(names), *texts[0])
+        elif len(texts) == 1:
+            parser.add_argument(names, action='store_true', help=texts[0])
+        else:
+            metavar, kind, text, *settings = texts
+            parser.add_argument(
+                *names.split(), metavar=metavar, type=kind, help=text, **dict(*settings))
+
+
+def show(
+        arguments: argparse.Namespace, record: dict[str, Any], *lines: object,
+        written: Iterable[Path | None] = ()) -> int:
+    """Print a result as JSON with --json, otherwise as lines with the files written; return 0."""
+    from hmsa.cli.notes import show_notes, with_notes
+    from hmsa.files import json_text
+
+    show_notes()
+    for line in [json_text(with_notes(record))] if arguments.json else [
+            *lines, *(f'{x} written' for x in written if x is not None)]:
+        print(line)
+    return 0

@@ -1,0 +1,107 @@
+"""
+Errors shown to the user.
+
+Every message is one sentence with the problem, the value found, the value expected and, if not
+obvious, the remedy.
+"""
+
+from collections.abc import Iterable
+import reprlib
+import sys
+import warnings
+
+# Long enough for a mistyped value, short enough not to flood a log.
+_EXCERPT = reprlib.Repr()
+_EXCERPT.maxstring = _EXCERPT.maxother = 80
+_EXCERPT.maxlist = 4
+_PACKAGES = ('hmsa.', 'hmsa_ros.', 'hmsa_lab.', 'hmsa_studies.')
+
+
+class HmsaError(Exception):
+    """
+    Base class of all errors raised by this package.
+
+    A run that fails for a reason other than its input raises this class or a subclass other than
+    `BadInputError`; the exit status of the command line is 1.
+    """
+
+
+class BadInputError(HmsaError, ValueError):
+    """
+    Invalid input.
+
+    The exit status of the command line is 2.
+    """
+
+
+class BagError(HmsaError):
+    """A recording that cannot be read or written."""
+
+
+class AssumedWarning(UserWarning):
+    """
+    An assumption that the input leaves open, such as which of its columns is the time.
+
+    ``warnings.simplefilter('ignore', hmsa.AssumedWarning)`` accepts all of them; commands show
+    each as one line.
+    """
+
+
+class UnusualWarning(UserWarning):
+    """
+    A parameter that is possible but unusual, such as 45 Pa where 45 kPa may be meant.
+
+    ``warnings.simplefilter('ignore', hmsa.UnusualWarning)`` accepts all of them.
+    """
+
+
+class MissingWarning(UserWarning):
+    """
+    Messages that are missing from a recording, which is used without them.
+
+    ``warnings.simplefilter('ignore', hmsa_ros.MissingWarning)`` accepts all of them.
+    """
+
+
+def assume(text: str, kind: type[Warning] = AssumedWarning) -> None:
+    """State an assumption or a doubt, as a warning at the line outside this package behind it."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_globals.get('__name__', '').startswith(
+            _PACKAGES):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(text, kind, stacklevel=level)
+
+
+def complain(
+        error: Exception, status: int | None = None, *, notes: Iterable[str] = ()) -> int:
+    """
+    Print an error, with notes, as one line.
+
+    Return the exit status, by default 2 for bad input, else 1.
+    """
+    line = ' '.join('; note: '.join((str(error), *notes)).split())
+    print(f'hmsa: error: {printable(line)}', file=sys.stderr)
+    if status is None:
+        return 2 if isinstance(error, BadInputError) else 1
+    return status
+
+
+def printable(text: str) -> str:
+    """Return a text with control and invalid characters replaced by escape codes."""
+    if text.isprintable():
+        return text
+    return ''.join(
+        character if character.isprintable()
+        else character.encode('unicode_escape').decode() for character in text)
+
+
+def listed(names: Iterable[str], most: int = 4) -> str:
+    """Return the first names of a list for a message, and the number of the others."""
+    every = list(names)
+    more = f' and {len(every) - most} more' if len(every) > most else ''
+    return ', '.join(every[:most]) + more
+
+
+def excerpt(value: object) -> str:
+    """Return a value's ``repr`` in one line, shortened in the middle."""
+    return ' '.join(_EXCERPT.repr(value).split())

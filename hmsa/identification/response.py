@@ -1,0 +1,219 @@
+"""Simulated measurement of a recording, with derivatives by the free parameters."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmsa import motion
+from hmsa.errors import BadInputError
+from hmsa.identification import quantities
+from hmsa.identification.recording import Course, pieces, Recording
+from hmsa.model.creep import Creep
+from hmsa.model.equations import Array
+from hmsa.model.law import KIND, pack
+from hmsa.model.laws.record import Elastic, GENT
+from hmsa.model.units import MU_0
+from hmsa.motion import SPEED
+from hmsa.motion import theta as places
+
+#: Relative tolerance of the integration: far below the noise of any sensor.
+RTOL = 1e-8
+_NOTHING: Array = np.empty(0)
+_SENSOR = ('stretch_bias', 'stretch_gain', 'sensor_latency')
+# Parameters to which values of theta are proportional, by index.
+_LINEAR = {
+    'shear_modulus': places.STIFFNESS, 'damping_coefficient': places.DAMPING,
+    'remanence': places.DRIVE, 'constant_force': places.FORCE}
+# Parameters that are values of theta, by index.
+_PLACES = {
+    'coil_time_constant': places.LAG, 'initial_stretch': places.STRETCH,
+    'initial_rate': places.RATE,
+    **{x: places.FIRST_BRANCH + places.BRANCH * i + j
+       for i, z in enumerate(quantities.BRANCHES) for j, x in enumerate(z)},
+    **{x: places.FIRST_BRANCH + places.BRANCH * i + places.FLOW_CONSTANT + j
+       for i, z in enumerate(quantities.FLOWING) for j, x in enumerate(z)}}
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """Simulated reading of the sensor."""
+
+    values: dict[str, Any]  # of all quantities, as `quantities.complete` returns them
+    stretch: Array  # measured, shape (n,)
+    rate: Array  # of the block in 1/s
+    # Of the measured stretch by the coordinates of the free parameters, shape (n, p).
+    jacobian: Array
+    by_switch: Array  # by the uncertain times of switches, shape (n, u)
+
+
+def _chain(
+        values: Mapping[str, Any], branches: int, free: Sequence[str]
+) -> tuple[Array, dict[str, dict[int, float]]]:
+    """Return theta of the motion and, by name, its derivatives by the free parameters."""
+    geometry, density = quantities.geometry_of(values), values['density']
+    inertia = density * geometry.half_length ** 2
+    modulus, remanence = values['shear_modulus'], values['remanence']
+    a, k = modulus / inertia, remanence / (MU_0 * inertia)
+    per_damping = 0.5 * geometry.c1 * geometry.half_length / geometry.damped / inertia
+    per_force = 1.0 / (geometry.loaded * inertia)
+    theta = np.zeros(places.FIRST_BRANCH + places.BRANCH * branches)
+    theta[:places.LAG] = (
+        a, per_damping * values['damping_coefficient'], k, per_force * values['constant_force'])
+    by_value = dict(zip(
+        _LINEAR.values(), (a / modulus, per_damping, k / remanence, per_force), strict=True))
+    for name, i in _PLACES.items():
+        if i < len(theta):
+            theta[i] = values[name]
+    if 'creep' in values:
+        rows = np.array(values['creep'].rows())
+        rows[:, SPEED] = values['creep'].times
+        theta[places.FIRST_BRANCH:] = rows[:, :places.BRANCH].ravel()
+    else:
+        theta[places.FIRST_BRANCH + places.FLOW::places.BRANCH] = quantities.flow_of(
+            values, free).kind
+    per_density = {i: -float(theta[i]) / density for i in by_value}
+    chain: dict[str, dict[int, float]] = {}
+    for name in free:
+        if name in _PLACES:
+            chain[name] = {_PLACES[name]: 1.0}
+        elif name in _LINEAR:
+            chain[name] = {_LINEAR[name]: by_value[_LINEAR[name]]}
+            if name == 'shear_modulus' and 'time_unit' in free:
+                # The density changes with the time unit, L sqrt(rho/G).
+                for i, x in per_density.items():
+                    chain[name][i] = chain[name].get(i, 0.0) + x * density / values[name]
+        elif name == 'time_unit':
+            chain[name] = {i: 2.0 * x * density / values[name] for i, x in per_density.items()}
+        elif name == 'density':
+            chain[name] = per_density
+        elif name == 'chain_limit':
+            chain[name] = {places.CONSTANT: -1.0 / values[name] ** 2}
+        elif name not in _SENSOR:
+            constant, i = quantities.constants_of(values['law'])[name]
+            # The scale of the model stays: constants in Pa change its force in proportion.
+            chain[name] = {places.CONSTANT + constant.place + 2 * i: (
+                1.0 / values['shear_modulus'] if constant.unit == 'Pa' else 1.0)}
+    return theta, chain
+
+
+@lru_cache(maxsize=32)
+def _packed(limit: float, c1: float, law: Elastic | None) -> Array:
+    """Return the packed material; computing its limits is slow."""
+    return pack(0.0, limit, c1, law)
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """Arguments of the motion for some values, and the chain rule to the free parameters."""
+
+    theta: Array  # with indices as in `hmsa.motion.theta`
+    material: Array  # the packed material
+    branches: int  # number of viscoelastic branches
+    # Indices in theta, or of constants of the model, to differentiate by, shape (w,).
+    wanted: NDArray[np.int64]
+    # Derivatives of these by the coordinates of the free parameters; 0 for the sensor's.
+    mixing: Array
+
+    @classmethod
+    def of(
+            cls, values: Mapping[str, Any], free: Sequence[str], more: Sequence[int] = ()
+    ) -> 'Setup':
+        """
+        Return the setup for values from `quantities.complete`, with its own arrays.
+
+        Maxwell branches may be given as ``creep``. Indices in ``more`` to differentiate by come
+        last, with a column each.
+        """
+        given: Creep | None = values.get('creep')
+        branches = len(given.ratios) if given else max((
+            i for i, names in enumerate(quantities.BRANCHES, 1)
+            if values[names[0]] > 0.0 or set(names) & set(free)
+        ), default=len(values.get('behind', ())))
+        theta, chain = _chain(values, branches, free)
+        inner = sorted({i for x in chain.values() for i in x})
+        rows = {x: i for i, x in enumerate(inner)}
+        material = _packed(
+            values['chain_limit'], quantities.geometry_of(values).c1, values['law']).copy()
+        if 'chain_limit' in free:
+            material[KIND] = GENT
+        mixing = np.zeros((len(inner) + len(more), len(free) + len(more)))
+        for j, name in enumerate(free):
+            for i, x in chain.get(name, {}).items():
+                mixing[rows[i], j] = quantities.derivative(name, values[name]) * x
+        for j in range(1, len(more) + 1):
+            mixing[-j, -j] = 1.0
+        return cls(theta, material, branches, np.array([*inner, *more], dtype=np.int64), mixing)
+
+
+def respond(
+        recording: Recording | Course, values: Mapping[str, float], free: Sequence[str], *,
+        rtol: float = RTOL, shifts: Array | None = None, more: Sequence[int] = ()
+) -> Response | None:
+    """
+    Simulate the reading of the sensor; None if the motion meets the limits of the chains.
+
+    The motion begins at rest at its first level, or else with ``initial_stretch`` and
+    ``initial_rate`` at the first sample. ``shifts``, shape (u,), are the delays in s of uncertain
+    switches after their recorded times; default minus half their uncertainty. Indices in ``more``
+    give columns of the Jacobian after those of the free parameters.
+    """
+    try:
+        values = quantities.complete(values, free)
+    except BadInputError:
+        return None
+    setup = Setup.of(values, free, more)
+    theta, material, wanted = setup.theta, setup.material, setup.wanted
+    times = recording.time - values['sensor_latency']
+    begin = float(recording.time[0])
+    if recording.at_rest:
+        begin = min(begin, float(recording.level_times[0]), float(times[0]))
+    level_times, uncertain = recording.level_times, recording.uncertain
+    if len(uncertain):
+        level_times = level_times.copy()
+        level_times[uncertain] += -0.5 * recording.earlier if shifts is None else shifts
+    begins, levels, slopes = pieces(level_times, recording.levels, recording.slew_limit, begin)
+    inner_count = len(wanted)
+    if len(uncertain) and free:
+        # Steps: a piece begins with each level.
+        place = np.searchsorted(begins, level_times[uncertain])
+        wanted = np.append(wanted, places.SWITCH + place)
+    start = np.zeros(len(wanted))
+    if recording.at_rest:
+        theta[places.STRETCH] = motion.rest(theta, material, float(levels[0]), wanted, start)
+        theta[places.RATE] = 0.0
+        if math.isnan(theta[places.STRETCH]):
+            return None
+    else:
+        start[wanted == places.STRETCH] = 1.0
+    n = len(times)
+    stretch, rate, raw = np.empty(n), np.empty(n), np.empty((n, len(wanted)))
+    if not motion.respond(
+            theta, material, setup.branches, wanted, start, begins, levels, slopes,
+            float(levels[0]), 0.0, times, rtol, stretch, rate, raw, _NOTHING, _NOTHING, _NOTHING):
+        return None
+    raw *= values['stretch_gain']
+    shown, jacobian = sensed(values, free, stretch, rate, raw[:, :inner_count] @ setup.mixing)
+    return Response(values, shown, rate, jacobian, raw[:, inner_count:])
+
+
+def sensed(
+        values: Mapping[str, float], free: Sequence[str], stretch: Array, rate: Array, by: Array
+) -> tuple[Array, Array]:
+    """
+    Return the reading of the sensor for a motion, and its derivatives.
+
+    ``by`` contains those by parameters of the motion; columns of sensor parameters are filled in.
+    """
+    gain = values['stretch_gain']
+    by_sensor: dict[str, float | Array] = {
+        'stretch_bias': 1.0, 'stretch_gain': quantities.derivative('stretch_gain', gain) * stretch,
+        'sensor_latency': -gain * rate}
+    for j, name in enumerate(free):
+        if name in by_sensor:
+            by[:, j] = by_sensor[name]
+    return gain * stretch + values['stretch_bias'], by

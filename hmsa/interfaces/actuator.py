@@ -1,0 +1,97 @@
+"""The actuator described by a set of parameters."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+import math
+from typing import Any, TYPE_CHECKING
+
+from hmsa.interfaces.parameters import ACTUATOR_FIELDS, LAW, LAW_NAME, VISCOELASTIC
+from hmsa.model.creep import Creep
+from hmsa.model.flows import FLOWS
+from hmsa.model.laws import LAWS
+from hmsa.model.parameters import ActuatorParameters
+
+if TYPE_CHECKING:
+    from hmsa.planning.timeline import Model
+
+
+def completed(values: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return the constants of a law from a file named by the parameters, if any.
+
+    Raises
+    ------
+    BadInputError
+        If the file cannot be used.
+
+    """
+    values = {**{x.name: x.default for x in LAW}, **values}
+    law = LAWS[values[LAW_NAME.name]]
+    return law.completed(values) if law.completed is not None else {}
+
+
+def actuator_from(
+        values: Mapping[str, Any], modulus: float | None = None) -> ActuatorParameters:
+    """
+    Return the block of ``actuator.*``, times any ``mismatch.*``, with its law unless Gent.
+
+    ``modulus`` replaces the shear modulus that follows from the constants of a law.
+    """
+    numbers = {name: values[f'actuator.{name}'] for name in ACTUATOR_FIELDS}
+    law, elastic = LAWS[values.get(LAW_NAME.name, 'gent')], None
+    if law.endless:
+        numbers['chain_limit'] = math.inf
+    if law.scaled is not None:
+        numbers['shear_modulus'], elastic = law.scaled(
+            {**{x.name: x.default for x in LAW}, **values})
+        if modulus is not None:
+            numbers['shear_modulus'] = modulus
+    return ActuatorParameters(law=elastic, **{
+        name: value * values.get(f'mismatch.{name}', 1.0) for name, value in numbers.items()})
+
+
+def model_from(
+        values: Mapping[str, Any], modulus: float | None = None, period: int = 0) -> 'Model':
+    """Return the planning model of the parameters `PLANNED`, on a command grid in ns."""
+    from hmsa.planning.timeline import Model, Options  # not always needed
+
+    return Model(planned_from(values, modulus), Options(
+        flux_density_min=values['flux_density_min'], flux_density_max=values['flux_density_max'],
+        period=period, slew_limit=values['slew_limit'] or math.inf,
+        coil_time_constant=values['coil_time_constant'],
+        creep_tolerance=values.get('creep_tolerance', Options.creep_tolerance)))
+
+
+def planned_from(
+        values: Mapping[str, Any], modulus: float | None = None) -> ActuatorParameters:
+    """Return the block for planning, including its viscoelastic branches."""
+    return replace(actuator_from(values, modulus), creep=creep_from(values))
+
+
+def creep_from(values: Mapping[str, Any]) -> Creep:
+    """Return the branches of ``viscoelastic.*``; none if there are no such values."""
+    given = {x.name: values.get(x.name, x.default) for x in VISCOELASTIC}
+    flow = given['viscoelastic.flow']
+    constants = FLOWS[flow].constants if flow in FLOWS else ()
+    return Creep(
+        tuple(given['viscoelastic.ratio']), tuple(given['viscoelastic.time']), flow,
+        tuple(tuple(given[f'viscoelastic.{x.name}']) for x in constants))
+
+
+def parameters_of(actuator: ActuatorParameters) -> dict[str, Any]:
+    """Return the parameters of a block, the inverse of `actuator_from`."""
+    values: dict[str, Any] = {
+        f'actuator.{name}': value for name, value in actuator.numbers.items()}
+    if actuator.law is None:
+        return values
+    units = {x.name: x.unit for x in LAWS[actuator.law.law].constants}
+    scales = {'Pa': actuator.shear_modulus, 'T': actuator.flux_density_unit}
+
+    def in_si(name: str, value: Any) -> Any:
+        factor = scales.get(units[name], 1.0)
+        if isinstance(value, tuple):
+            return [factor * x for x in value]
+        return value if isinstance(value, str) else factor * value
+
+    return values | {LAW_NAME.name: actuator.law.law} | {
+        name: in_si(name, value) for name, value in actuator.law.given}

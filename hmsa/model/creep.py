@@ -1,0 +1,111 @@
+"""Viscoelasticity: up to three branches in parallel with the hyperelastic model."""
+
+from dataclasses import dataclass, replace
+import math
+from typing import Any
+
+from hmsa.errors import BadInputError, excerpt
+from hmsa.model.flows import FLOWS
+from hmsa.model.flows.record import Flow, FLOW_CONSTANTS, MAXWELL
+
+#: Maximum number of branches.
+MOST = 3
+# Minimum relaxation time, in time scales: a faster branch is equivalent to damping.
+_FASTEST = 1e-3
+_STIFFEST = 1e3
+
+
+@dataclass(frozen=True)
+class Creep:
+    """
+    Up to three viscoelastic branches of an elastomer.
+
+    The hyperelastic model gives the force for long times; branch i adds h_i = ratio_i x_i, with
+    x_i' = (dW/dl)' - flow(x_i), in units of G. With the Maxwell flow, x_i/time_i, the branches are
+    a Prony series.
+    """
+
+    ratios: tuple[float, ...] = ()  #: stiffness relative to the hyperelastic model, 0 to 1000
+    times: tuple[float, ...] = ()  #: relaxation times in s
+    flow: str = MAXWELL.name  #: one of `hmsa.model.flows.FLOWS`
+    constants: tuple[tuple[float, ...], ...] = ()  #: of the flow, each with one value per branch
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.flow not in FLOWS:
+            raise BadInputError(
+                f'viscoelastic.flow is {excerpt(self.flow)}: expected one of {", ".join(FLOWS)}')
+        named, constants = self._named, self.law.constants
+        for one, other in (('ratio', 'time'), *((x.name, 'ratio') for x in constants)):
+            if len(named[one]) != len(named[other]):
+                raise BadInputError(
+                    f'viscoelastic.{one} has {len(named[one])} values and viscoelastic.{other} '
+                    f'{len(named[other])}: expected one of each for every branch with '
+                    f'viscoelastic.flow {self.flow}')
+        if len(self.ratios) > MOST:
+            raise BadInputError(
+                f'viscoelastic.ratio and viscoelastic.time have {len(self.ratios)} values: '
+                f'expected at most {MOST} branches')
+        for name, least, most in (
+                ('ratio', 0.0, _STIFFEST), *((x.name, x.minimum, x.maximum) for x in constants)):
+            for value in named[name]:
+                if not least <= value <= most:
+                    raise BadInputError(
+                        f'viscoelastic.{name} has {value:g}: expected {least:g} to {most:g}')
+        for time in self.times:
+            if not 0.0 < time < math.inf:
+                raise BadInputError(
+                    f'viscoelastic.time has {time:g} s: expected finite numbers above 0')
+
+    @property
+    def _named(self) -> dict[str, tuple[float, ...]]:
+        names = [x.name for x in self.law.constants]
+        return {'ratio': self.ratios, 'time': self.times, **dict(
+            zip(names, self.constants or ((),) * len(names), strict=True))}
+
+    @property
+    def law(self) -> Flow:
+        """Flow rule of the branches."""
+        return FLOWS[self.flow]
+
+    @property
+    def held(self) -> 'Creep':
+        """The branches with a stiffness above 0."""
+        kept = [i for i, x in enumerate(self.ratios) if x > 0.0]
+
+        def of(values: tuple[float, ...]) -> tuple[float, ...]:
+            return tuple(values[i] for i in kept)
+
+        return replace(
+            self, ratios=of(self.ratios), times=of(self.times),
+            constants=tuple(map(of, self.constants)) if kept else ())
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Parameters that describe the branches; none without branches."""
+        if not self:
+            return {}
+        flow = {'viscoelastic.flow': self.flow} if self.law is not MAXWELL else {}
+        return {f'viscoelastic.{x}': list(y) for x, y in self._named.items()} | flow
+
+    def rows(self) -> list[list[float]]:
+        """Return the branches with a stiffness above 0 as arguments of `hmsa.motion`."""
+        held, rest = self.held, [0.0] * (FLOW_CONSTANTS - len(self.law.constants) + 1)
+        return [
+            [ratio, 1.0 / time, float(self.law.kind), *constants, *rest]
+            for ratio, time, *constants in zip(
+                held.ratios, held.times, *held.constants, strict=True)]
+
+    def __bool__(self) -> bool:
+        """Return whether any branch has a stiffness above 0."""
+        return any(self.ratios)
+
+    def check(self, time_unit: float) -> None:
+        """Raise `BadInputError` for branches that only damp, with a time scale in s."""
+        for time, *constants in zip(self.times, *self.constants, strict=True):
+            least = _FASTEST * time_unit * self.law.hastens(*constants)
+            if time < least:
+                raise BadInputError(
+                    f'viscoelastic.time has {time:g} s: expected at least '
+                    f'{least:.3g} s, {_FASTEST:g} of L sqrt(rho/G); a faster '
+                    'branch is damping, which actuator.damping_coefficient has')

@@ -1,0 +1,21 @@
+"""
+Hyperelastic models: a table, and one module for each model with its constants and source.
+
+These modules are not compiled; forces and energies are in `hmsa/motion/hmsa/law.hpp`.
+"""
+
+from hmsa.model.laws import (
+    arruda_boyce,
+    beam,
+    gent,
+    mooney_rivlin,
+    ogden,
+    table,
+    yeoh,
+)
+from hmsa.model.laws.record import Law
+
+#: Models by name; the first is the default.
+LAWS: dict[str, Law] = {x.name: x for x in (
+    gent.GENT, gent.NEO_HOOKEAN, mooney_rivlin.LAW, yeoh.LAW, ogden.LAW, arruda_boyce.LAW,
+    table.LAW, beam.LAW)}

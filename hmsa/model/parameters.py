@@ -1,0 +1,318 @@
+"""Parameters of an actuator, in SI units and as the dimensionless group of Eq. 11."""
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+import math
+import sys
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmsa.errors import BadInputError
+from hmsa.model.creep import Creep
+from hmsa.model.laws.coordinate import Coordinate, coordinate_of
+from hmsa.model.laws.record import Elastic
+from hmsa.model.units import MU_0, Units
+
+_ZERO_ALLOWED = ('zeta', 'damping_coefficient')
+# Infinite for neo-Hookean.
+_INFINITE_ALLOWED = ('j_lim', 'chain_limit')
+_NO_NUMBERS = ('law', 'creep')
+# Scales and groups beyond this and its inverse belong to no block, and overflow in the equations.
+_SMALLEST = 1e-100
+
+
+def _check(record: object) -> None:
+    """Raise `BadInputError` if a field of a record is out of range."""
+    for field in fields(record):  # type: ignore[arg-type]
+        name, value = field.name, getattr(record, field.name)
+        if name in _NO_NUMBERS:
+            continue
+        if not isinstance(value, (int, float)) or isinstance(value, bool):
+            raise BadInputError(f'{name} is {value!r}: expected a number')
+        zero, endless = name in _ZERO_ALLOWED, name in _INFINITE_ALLOWED
+        # Compared first, since an integer may be too large to convert.
+        if not (0.0 < value <= sys.float_info.max or zero and value == 0.0
+                or endless and value == math.inf):
+            raise BadInputError(
+                f'{name} is {value!r}: expected a finite number '
+                f'{"of at least 0" if zero else "greater than 0"}{", or inf" if endless else ""}')
+        object.__setattr__(record, name, float(value))
+
+
+@dataclass(frozen=True)
+class NondimensionalParameters:
+    """
+    The dimensionless parameters of Eq. 11.
+
+    Attributes
+    ----------
+    zeta : float
+        Damping coefficient c/8 sqrt(1/(L^2 H^2 rho G)), at least 0. This is not a damping
+        ratio: about a stretch of 1.1 critical damping is near 2.16 for J_lim 5.
+    j_lim : float
+        Limiting extensibility J_lim of the Gent model (Eq. 4), greater than 0; infinite for the
+        neo-Hookean model.
+    c1 : float
+        Shape 2 H^2/L^2, greater than 0. The paper does not state it; the damping that it calls
+        critical implies 2 (H = L).
+    law : Elastic, optional
+        Elastic energy in units of G. It replaces the Gent model, and J_lim has no effect.
+    creep : Creep
+        Viscoelastic branches, with times in time scales; default none.
+
+    Raises
+    ------
+    BadInputError
+        If a value is not finite or out of range.
+
+    """
+
+    zeta: float = 0.2
+    j_lim: float = 5.0
+    c1: float = 2.0
+    law: Elastic | None = None
+    creep: Creep = Creep()
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        _check(self)
+
+    @property
+    def coordinate(self) -> Coordinate:
+        """Kind of position, such as a stretch or the deflection of a beam."""
+        return coordinate_of(self.law)
+
+    @property
+    def rest(self) -> float:
+        """Stretch (or deflection of a beam) at rest without a field."""
+        return self.coordinate.rest
+
+    @cached_property
+    def packed(self) -> NDArray[np.float64]:
+        """The material argument of compiled functions, see `hmsa.model.law`."""
+        from hmsa.model import law  # imports NumPy, which not all users of parameters need
+
+        return law.pack(self.zeta, self.j_lim, self.c1, self.law)
+
+    @cached_property
+    def branches(self) -> NDArray[np.float64]:
+        """Branches with a stiffness above 0 for `hmsa.motion`, shape (n, 6)."""
+        from hmsa.motion import BRANCH  # as above
+
+        return np.array(self.creep.rows()).reshape(-1, BRANCH)
+
+    @cached_property
+    def elastic(self) -> 'NondimensionalParameters':
+        """The group without branches."""
+        return replace(self, creep=Creep()) if self.creep else self
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Geometric factors of parameters in SI units, from sizes (m) and model, for block or beam."""
+
+    half_length: float
+    half_thickness: float
+    law: Elastic | None = None
+
+    @property
+    def c1(self) -> float:
+        """Shape 2 H^2/L^2 of a block, or of the block with the inertia of a beam."""
+        shape = None if self.law is None else self.law.shape
+        return shape or 2.0 * (self.half_thickness / self.half_length) ** 2
+
+    @property
+    def loaded(self) -> float:
+        """Area in m^2 on which a force acts: a face of a block, or the section of a beam."""
+        section = self.law.section if self.law is not None and self.law.section else 1.0
+        return 4.0 * section * self.half_length ** 2
+
+    @property
+    def damped(self) -> float:
+        """Damping coefficient for zeta 1 over sqrt(rho G), in m^2: 8 L H for a block."""
+        if self.law is not None and self.law.section:
+            return 1.25 * self.loaded
+        return 8.0 * self.half_length * self.half_thickness
+
+    def damping_unit(self, density: float, shear_modulus: float) -> float:
+        """Return the damping coefficient for zeta 1 in N s/m; arguments are in SI units."""
+        return self.damped * math.sqrt(density * shear_modulus)
+
+
+@dataclass(frozen=True)
+class ActuatorParameters:
+    """
+    A block of 2L x 2L x 2H of hard-magnetic elastomer, in SI units.
+
+    Attributes
+    ----------
+    shear_modulus : float
+        G in Pa, greater than 0.
+    density : float
+        rho in kg/m^3, greater than 0.
+    half_length : float
+        L in m, greater than 0.
+    half_thickness : float
+        H in m, along the field, greater than 0.
+    remanence : float
+        Residual flux density Br in T, greater than 0.
+    chain_limit : float
+        J_lim, dimensionless, greater than 0; infinite for neo-Hookean.
+    damping_coefficient : float
+        c of Eq. 9 in N s/m, at least 0.
+    law : Elastic, optional
+        Elastic energy in units of G. It replaces the Gent model, and J_lim has no effect.
+    creep : Creep
+        Viscoelastic branches, for planning; default none.
+
+    Raises
+    ------
+    BadInputError
+        If a value is not finite or out of range.
+
+    """
+
+    shear_modulus: float
+    density: float
+    half_length: float
+    half_thickness: float
+    remanence: float
+    chain_limit: float
+    damping_coefficient: float
+    law: Elastic | None = None
+    creep: Creep = Creep()
+
+    def __post_init__(self) -> None:
+        """Check the values, and that they give usable scales."""
+        _check(self)
+        try:
+            scales = self.time_unit, self.flux_density_unit, self.nondimensional.c1
+        except ArithmeticError:
+            scales = math.nan, math.nan, math.nan
+        if not all(_SMALLEST < x < 1.0 / _SMALLEST for x in scales):
+            raise BadInputError(
+                f'the parameters of the actuator give a unit of time of {scales[0]:g} s, of flux '
+                f'density of {scales[1]:g} T and c1 of {scales[2]:g}: expected values of a block, '
+                'in SI units')
+        self.creep.check(scales[0])
+
+    @classmethod
+    def from_nondimensional(
+            cls, material: NondimensionalParameters, *, shear_modulus: float, density: float,
+            half_length: float, remanence: float) -> 'ActuatorParameters':
+        """
+        Return the actuator with a dimensionless group at a given scale.
+
+        Parameters
+        ----------
+        material : NondimensionalParameters
+            zeta, J_lim and c1, and the hyperelastic model.
+        shear_modulus, density, half_length, remanence : float
+            The scale, in Pa, kg/m^3, m and T.
+
+        Returns
+        -------
+        ActuatorParameters
+            With H = L sqrt(c1/2) and c = 8 zeta L H sqrt(rho G).
+
+        Raises
+        ------
+        BadInputError
+            If a value is not finite or out of range.
+
+        """
+        # Checked before the square root, which a negative product does not have.
+        cube = cls(shear_modulus, density, half_length, half_length, remanence,
+                   material.j_lim, 0.0)
+        made = replace(
+            cube, half_thickness=half_length * math.sqrt(material.c1 / 2.0), law=material.law,
+            creep=replace(material.creep, times=tuple(
+                x * cube.time_unit for x in material.creep.times)))
+        return replace(made, damping_coefficient=material.zeta * made.damping_unit)
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """All numeric values, by name."""
+        return {x.name: getattr(self, x.name) for x in fields(self) if x.name not in _NO_NUMBERS}
+
+    @property
+    def coordinate(self) -> Coordinate:
+        """Kind of position, such as a stretch or the deflection of a beam."""
+        return coordinate_of(self.law)
+
+    @property
+    def rest(self) -> float:
+        """Stretch (or deflection of a beam) at rest without a field."""
+        return self.coordinate.rest
+
+    @property
+    def geometry(self) -> Geometry:
+        """Geometric factors from sizes and model."""
+        return Geometry(self.half_length, self.half_thickness, self.law)
+
+    @property
+    def time_unit(self) -> float:
+        """Time scale L sqrt(rho/G) in s."""
+        return self.half_length * math.sqrt(self.density / self.shear_modulus)
+
+    @cached_property
+    def period(self) -> float:
+        """Period in s of small undamped motion about rest without a field."""
+        from hmsa.model import law  # imports NumPy, which not all users of parameters need
+
+        frequency = law.natural_frequency(self.rest, self.nondimensional.packed)
+        return 2.0 * math.pi * self.time_unit / frequency
+
+    @property
+    def flux_density_unit(self) -> float:
+        """Flux density of load 1, mu0 G/Br in T."""
+        return MU_0 * self.shear_modulus / self.remanence
+
+    @cached_property
+    def units(self) -> Units:
+        """Scales of time in s, and of the flux density in T."""
+        return Units(
+            self.time_unit, self.flux_density_unit, ' s', ' T', self.coordinate.name)
+
+    @property
+    def damping_unit(self) -> float:
+        """Damping coefficient in N s/m for zeta 1: 8 L H sqrt(rho G), or that of a beam's tip."""
+        return self.geometry.damping_unit(self.density, self.shear_modulus)
+
+    @property
+    def load_per_newton(self) -> float:
+        """Load of a force of 1 N on both faces of a block, or on the tip of a beam."""
+        return 1.0 / (self.geometry.loaded * self.shear_modulus)
+
+    @cached_property
+    def nondimensional(self) -> NondimensionalParameters:
+        """The dimensionless group of Eq. 11."""
+        return NondimensionalParameters(
+            zeta=self.damping_coefficient / self.damping_unit,
+            j_lim=self.chain_limit,
+            c1=self.geometry.c1,
+            law=self.law,
+            creep=replace(self.creep, times=tuple(x / self.time_unit for x in self.creep.times)))
+
+
+def paper_actuator(material: NondimensionalParameters | None = None) -> ActuatorParameters:
+    """
+    Return a soft silicone block with the paper's dimensionless parameters.
+
+    G = 10 kPa, rho = 1900 kg/m^3, L = 10 mm, Br = 0.1 T: a time scale of 4.4 ms.
+
+    Parameters
+    ----------
+    material : NondimensionalParameters, optional
+        Default: zeta 0.2, J_lim 5, c1 2.
+
+    Returns
+    -------
+    ActuatorParameters
+        In SI units.
+
+    """
+    return ActuatorParameters.from_nondimensional(
+        material or NondimensionalParameters(), shear_modulus=1.0e4, density=1900.0,
+        half_length=0.01, remanence=0.1)

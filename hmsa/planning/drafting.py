@@ -1,0 +1,413 @@
+"""
+Drafts: requests planned without changing the running plan.
+
+Each function calls ``check`` after a bounded amount of work, which abandons the draft by raising.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+import math
+from typing import Any
+
+import numpy as np
+
+from hmsa.errors import BadInputError
+from hmsa.model.moves import Level, Move, State
+from hmsa.model.status import Code, RefusedError
+from hmsa.model.units import NANOSECONDS
+from hmsa.planning.history import agree
+from hmsa.planning.path import along, ON_PATH, Path
+from hmsa.planning.sequence import Segment, segments
+from hmsa.planning.setpoint import impossible, Setpoint
+from hmsa.planning.shapers import get_shaper
+from hmsa.planning.shapers.free import through
+from hmsa.planning.shapers.request import Request, Shaper
+from hmsa.planning.stopping import brake, holdable
+from hmsa.planning.timeline import Draft, Model, Plan, PlannedLevel, PlannedSegment
+
+#: Stretch, rate in 1/s and acceleration in 1/s^2; the acceleration is NaN if not given.
+PathPoint = tuple[float, float, float]
+#: Called after each bounded amount of work; raises to abandon it.
+Check = Callable[[], None]
+
+# Fractions of the hardest braking to try, in this order, if that leads to no plan.
+_BRAKE_SHARES = (0.5, 0.1, 0.02, 0.0)
+# Natural periods by which to delay another attempt if resuming at once is impossible.
+_PATIENCE = (0.0, 0.15, 0.3, 0.45, 0.6)
+# Deviation of the field from the holding load that counts as settled, as a fraction of the load.
+_SETTLED = 1e-6
+# Rates up to this, in 1/s, count as rest at the end of a path.
+_STOPPED = 1e-7
+# Duration of the return to a path, in natural periods; in a longer one, vibration swings farther
+# than without correction.
+_BACK = 0.4
+# Minimum tolerance of a corrected path, as a fraction of its range.
+_ANEW = 1e-4
+# Setpoints between two checks, in about 0.1 ms; levels take longer.
+_CHECKED = 200
+
+
+def proceed() -> None:
+    """Go on, as a `Check` that abandons nothing."""
+
+
+@dataclass(frozen=True)
+class Outset:
+    """Start of a draft: a state predicted at a time in ns."""
+
+    plan: Plan
+    model: Model
+    begin: int  #: earliest time in ns
+    state: State
+    #: Index of the first level of the plan whose prediction is no longer valid.
+    stale: int | None = None
+    check: Check = field(default=proceed, compare=False)
+
+
+def check_points(
+        points: Sequence[tuple[float, int]], rest: float, check: Check = proceed) -> None:
+    """Check points (stretch, end in ns from the start); raise `RefusedError` if invalid."""
+    for begin in range(0, max(len(points), 1), _CHECKED):
+        part = points[begin:begin + _CHECKED]
+        for stretch, _ in part:
+            check_target(stretch, rest)
+        check_times(part, 'point', begin, points[begin - 1][1] if begin else -1)
+        check()
+
+
+def check_times(
+        points: Sequence[tuple[Any, int]], name: str, first: int = 0, previous: int = -1) -> None:
+    """Raise `RefusedError` if there are no points, or times in ns do not increase."""
+    if not points:
+        raise RefusedError(
+            Code.BAD_INPUT, 'the trajectory has no points: expected at least one')
+    for number, (_, time) in enumerate(points, first):
+        if time <= previous:
+            raise RefusedError(
+                Code.NOT_INCREASING,
+                f'time_from_start of {name} {number} is {time / NANOSECONDS:g} s'
+                + (f' after {previous / NANOSECONDS:g} s: expected strictly increasing '
+                   'times' if number else ': expected at least 0 s'))
+        previous = time
+
+
+def check_target(stretch: float, rest: float) -> None:
+    """Raise `RefusedError` if the stretch is impossible for an actuator with this rest."""
+    if reason := impossible(stretch, rest):
+        raise RefusedError(Code.BAD_INPUT, reason)
+
+
+def draft_sequence(
+        outset: Outset, points: Sequence[tuple[float, int]], base: int,
+        now: int) -> Draft | None:
+    """
+    Draft checked points (stretch, end in ns) from a start in ns; None if they change nothing.
+
+    Raise `RefusedError` if the sequence cannot be carried out.
+    """
+    begin = outset.begin
+    if points[0][1] == 0 and len(points) > 1 and base == begin:
+        # A first point at time 0 that repeats the planned position is ignored.
+        here = outset.plan.level(begin).at(begin).stretch
+        if abs(points[0][0] - here) > 1e-6:
+            raise RefusedError(
+                Code.SPELL_TOO_SHORT,
+                f'the first point asks for {outset.model.units.coordinate} {points[0][0]:g} at '
+                f'time_from_start 0, the actuator is at {here:.6g}: expected enough time for the '
+                'move')
+    if base + points[-1][1] <= begin:
+        raise _over(points, base, now, outset.model.units.coordinate)
+    setpoints = []
+    left = begin
+    for number, (stretch, time) in enumerate(points):
+        if base + time > begin:
+            end = outset.model.on_grid(base + time)
+            if end == left:
+                raise RefusedError(
+                    Code.SPELL_TOO_SHORT,
+                    f'{outset.model.units.coordinate} {stretch:g} begins and ends within one '
+                    f'command period of {outset.model.options.period / NANOSECONDS:g} s: expected '
+                    'a longer duration')
+            setpoints.append(Setpoint(stretch, outset.model.time(end - left)))
+            left = end
+        if number % _CHECKED == _CHECKED - 1:
+            outset.check()
+    return draft_setpoints(outset, setpoints)
+
+
+def check_path(points: Sequence[tuple[PathPoint, int]], rest: float) -> None:
+    """Raise `RefusedError` if points, with times in ns, are no path that ends at rest."""
+    check_times(points, 'point')
+    given = math.isnan(points[0][0][2])
+    for number, ((stretch, *more), _) in enumerate(points):
+        check_target(stretch, rest)
+        # Either all points have an acceleration, or none has.
+        if not (math.isfinite(more[0]) and math.isnan(more[1]) is given
+                and not math.isinf(more[1])):
+            raise RefusedError(
+                Code.BAD_INPUT,
+                f'point {number} has velocity {more[0]:g} and acceleration {more[1]:g}: expected '
+                'finite velocities, and accelerations in all points or in none')
+    if abs(points[-1][0][1]) > _STOPPED:
+        raise RefusedError(
+            Code.BAD_INPUT,
+            f'the last point has velocity {points[-1][0][1]:g}: expected 0, a path ends at rest')
+
+
+def draft_path(
+        outset: Outset, points: Sequence[tuple[PathPoint, int]], base: int,
+        now: int) -> Draft:
+    """
+    Draft a checked path from a start in ns, or join it if it has begun.
+
+    An actuator that is not on the path moves to its first point, or to the first point that is at
+    least a natural period ahead. Raise `RefusedError` if the path cannot be followed.
+    """
+    model, state, unit = outset.model, outset.state, outset.model.units.time
+    ended, last = points[-1]
+    if base + last <= outset.begin:
+        raise _over([(ended[0], last)], base, now, model.units.coordinate)
+    times = np.array([model.time(base + x - outset.begin) for _, x in points])
+    rows = np.array([x for x, _ in points]).T * np.array([[1.0], [unit], [unit * unit]])
+    given = None if np.isnan(rows[2, 0]) else rows[2]
+    path = None
+    if times[0] <= 0.0 and len(times) > 1:
+        path = Path.through(times, rows[0], rows[1], given).since(0.0)
+        stretch, rate, _ = (float(x[0]) for x in path.course(np.zeros(1)))
+        frequency = model.frequency(state.stretch)
+        if abs(state.stretch - stretch) > ON_PATH or abs(
+                state.rate - rate) > ON_PATH * frequency:
+            path = None
+    if path is None:
+        soon = 0.0 if times[0] > 0.0 else min(
+            2.0 * math.pi / model.frequency(rows[0, -1]), float(times[-1]) * (1.0 - 1e-9))
+        ahead = times > soon
+        here = np.array([state.stretch, state.rate, model.acceleration(state)])
+        times = np.append(0.0, times[ahead])
+        rows = np.column_stack([here, rows[:, ahead]])
+        path = Path.through(times, rows[0], rows[1], None if given is None else rows[2])
+    outset.check()
+    return _along(
+        outset, path, float(rows[0, -1]), model.options.path_tolerance,
+        path=path.scaled(1.0 / unit))
+
+
+def draft_path_anew(outset: Outset) -> Draft:
+    """
+    Draft the rest of the running path again, with a return to it within half a natural period.
+
+    Raise `RefusedError` if the path cannot be followed.
+    """
+    model, state, place = outset.model, outset.state, outset.plan.under_way(outset.begin)
+    segment = outset.plan.segments[place]
+    if segment.path is None:
+        raise ValueError('the setpoint under way is no path')
+    left = segment.path.scaled(model.units.time).since(model.time(outset.begin - segment.since))
+    span = min(_BACK * 2.0 * math.pi / model.frequency(segment.stretch), float(left.breaks[-1]))
+    return replace((_along(
+        outset, left.joined(state.stretch, state.rate, span), segment.stretch,
+        max(model.options.path_tolerance, _ANEW), since=segment.since, path=segment.path)),
+        resumed=place)
+
+
+def _along(
+        outset: Outset, wanted: Path, target: float, tolerance: float,
+        **known: Any) -> Draft:
+    """Follow a path to rest at a target; further fields of its segment are given."""
+    move = along(
+        replace(_frame(outset.model, outset.state), target=target), wanted, tolerance,
+        outset.check)
+    draft = draft_moves(
+        outset, [Setpoint(target, math.inf)], first=lambda request: move)
+    return replace(draft, segments=(replace(draft.segments[0], **known),))
+
+
+def draft_setpoints(outset: Outset, setpoints: Sequence[Setpoint]) -> Draft | None:
+    """Draft setpoints; None if the only one is the last of the plan and has begun."""
+    planned = outset.plan.segments
+    if len(setpoints) == 1 and planned and planned[-1].stretch == setpoints[0].stretch \
+            and planned[-1].since <= outset.begin:
+        return None
+    return draft_moves(outset, setpoints)
+
+
+def draft_stop(outset: Outset) -> Draft:
+    """Draft a stop: rest as near as the flux density limits allow."""
+    # A two-step command with the hardest braking load as beta_p: that load up to the first turning
+    # point, then the load that holds this point. If a single brake is impossible (on a command
+    # grid, with ramps or at a limit), plan a move to a stretch near by.
+    model, state = outset.model, outset.state
+    found = brake(model, state)
+    # A coil that must not step brakes as the shaper smooth does, from the turning point on.
+    smooth = model.options.shaper == 'smooth'
+    if (not smooth and holdable(model, found.stretch) == found.stretch
+            and not model.material.creep
+            and (model.delivery.ideal or found.duration == 0.0 and _settled(model, state))):
+        move = Move(Code.HOLD, tuple(
+            [Level(0.0, found.load)] * (found.duration > 0.0)
+            + [Level(found.duration, model.holding(found.stretch))]),
+            found.duration, 'stopped')
+        end = State(found.stretch, 0.0, move.levels[-1].load)
+        levels, placed = _placed(model, outset.begin, outset.check, Segment(
+            Setpoint(found.stretch, math.inf), 0.0, state, end, move, end.load))
+        return Draft(outset.begin, tuple(levels), (placed,))
+    ways = [(0.0, 'smooth')] * smooth + [(x, 'two_step') for x in _BRAKE_SHARES]
+    for share, shaper in ways:
+        stretch = holdable(model, brake(model, state, share).stretch)
+        try:
+            return draft_moves(outset, [Setpoint(stretch, math.inf)], shaper)
+        except BadInputError:
+            outset.check()
+    # No command stops the motion at once: let it settle.
+    return draft_moves(
+        outset, [Setpoint(holdable(model, state.stretch), math.inf)], 'step')
+
+
+def _settled(model: Model, state: State) -> bool:
+    """Return whether the field of a lagging coil already holds the stretch."""
+    return model.delivery.lag == 0.0 or math.isclose(
+        state.load, model.holding(state.stretch), rel_tol=_SETTLED, abs_tol=_SETTLED)
+
+
+def later_starts(model: Model, stretch: float, begin: int) -> Iterator[int]:
+    """Yield times in ns at which to try in turn; ``stretch`` is that at the first of them."""
+    period = 2.0 * math.pi / model.frequency(stretch)
+    for share in _PATIENCE:
+        yield model.on_grid(begin + model.ns(share * period))
+
+
+def draft_resumption(outset: Outset, arrival: int | None = None) -> Draft | None:
+    """
+    Draft the rest of the running plan again, up to where both agree; None if nothing is left.
+
+    The current setpoint is reached at ``arrival`` in ns, or as soon as its shaper can. Raise
+    `RefusedError` if the rest cannot be carried out.
+    """
+    # Setpoints end when planned before; one without time left is skipped. Where the new plan meets
+    # the running one, the running one continues.
+    planned = outset.plan.segments
+    begun = max(outset.plan.under_way(outset.begin), 0)
+    first = None if arrival is None else partial(
+        through, duration=outset.model.time(arrival - outset.begin))
+    refusal: RefusedError | None = None
+    for index in range(begun, len(planned)):
+        # A skipped setpoint leaves its time to the next one, to which the move starts at once.
+        try:
+            draft = draft_moves(
+                outset, _left(outset, index), first=first, index=index)
+        except RefusedError as error:
+            refusal = refusal or error
+            if error.code is not Code.SPELL_TOO_SHORT or arrival is not None:
+                break
+            outset.check()
+            continue
+        anew = replace(
+            draft.segments[0], since=min(planned[index].since, draft.segments[0].since))
+        return replace(
+            draft, segments=(anew, *draft.segments[1:]), resumed=begun, missed=index - begun)
+    if refusal is not None:
+        raise refusal
+    return None
+
+
+def _left(outset: Outset, index: int) -> Iterator[Setpoint]:
+    """Yield the setpoints of the running plan from an index on, with their remaining durations."""
+    planned = outset.plan.segments
+    left = outset.begin
+    for place in range(index, len(planned) - 1):
+        end = planned[place + 1].since
+        yield Setpoint(planned[place].stretch, outset.model.time(end - left))
+        left = end
+    yield Setpoint(planned[-1].stretch, math.inf)
+
+
+def _meeting(outset: Outset, state: State, following: int) -> int | None:
+    """Return the index of the level at which the running plan continues a state, else None."""
+    planned = outset.plan.segments[following]
+    place = outset.plan.place(planned.begin)
+    level = outset.plan.levels[place]
+    if (level.stamp != planned.begin or level.model is not outset.model
+            or outset.stale is not None and place < outset.stale):
+        return None
+    here = PlannedLevel(level.stamp, level.flux_density, state, level.model)
+    return place if agree(here, level) else None
+
+
+def draft_moves(
+        outset: Outset, setpoints: Iterable[Setpoint], shaper: str = '',
+        first: Shaper | None = None, index: int | None = None) -> Draft:
+    """
+    Draft setpoints on the timeline; the default shaper is that of the options.
+
+    With ``index``, they are those of the running plan from there on, which continues once met.
+    """
+    model, planned = outset.model, outset.plan.segments
+    levels: list[PlannedLevel] = []
+    placed: list[PlannedSegment] = []
+    for segment in segments(
+            _frame(model, outset.state), setpoints, get_shaper(shaper or model.options.shaper),
+            model.options.short_spell, first=first):
+        more, one = _placed(model, outset.begin, outset.check, segment)
+        levels += more
+        placed.append(one)
+        following = len(planned) if index is None else index + len(placed)
+        place = _meeting(outset, segment.end, following) if following < len(planned) else None
+        if place is not None:
+            levels += outset.plan.levels[place:]
+            placed += planned[following:]
+            break
+        outset.check()
+    return Draft(outset.begin, tuple(levels), tuple(placed))
+
+
+def _frame(model: Model, state: State) -> Request:
+    """Return the request to stay in a state."""
+    options = model.options
+    return Request(
+        state, state.stretch, model.material, model.limits, model.delivery, options.order,
+        model.units, options.errors, model.pace)
+
+
+def _placed(
+        model: Model, begin: int, check: Check,
+        segment: Segment) -> tuple[list[PlannedLevel], PlannedSegment]:
+    """Place a planned move on the timeline, in SI units."""
+    start = begin + model.ns(segment.begin)
+    state = segment.start
+    if math.isnan(state.load):
+        raise ValueError('a segment on the timeline must contain its initial load')
+    levels = []
+    time = 0.0
+    known = len(segment.move.levels) - len(segment.move.tail)
+    for number, level in enumerate(segment.move.levels):
+        if number >= known:
+            state = segment.move.tail[number - known]
+        elif number:
+            state = model.follow(state, segment.move.levels[number - 1].load, level.time - time)
+        time = level.time
+        levels.append(PlannedLevel(
+            start + model.ns(time), model.flux_density(level.load), state, model))
+        if number % _CHECKED == _CHECKED - 1:
+            check()
+    duration = segment.move.duration
+    return levels, PlannedSegment(
+        segment.setpoint.stretch, start,
+        None if math.isinf(duration) else start + model.ns(duration),
+        segment.move.code, segment.move.reason, start, segment.move.vibration,
+        None if math.isinf(segment.setpoint.span) else start + model.ns(segment.setpoint.span))
+
+
+def _over(
+        points: Sequence[tuple[float, int]], base: int, now: int, coordinate: str) -> RefusedError:
+    """Return the error for a sequence that has already ended."""
+    stretch, last = points[-1]
+    if last == 0:
+        return RefusedError(
+            Code.SPELL_TOO_SHORT,
+            f'{coordinate} {stretch:g} is due at time_from_start 0: expected time for the move')
+    return RefusedError(
+        Code.IN_THE_PAST,
+        f'the sequence stamped {base / NANOSECONDS:.3f} s ends at '
+        f'{(base + last) / NANOSECONDS:.3f} s, now is {now / NANOSECONDS:.3f} s: expected an '
+        'end more than lead_time ahead; do sender and planner use the same clock (use_sim_time)?')

@@ -1,0 +1,215 @@
+"""Record of the levels that took effect, and its merge into the levels of a plan."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+import math
+from typing import Any
+
+from hmsa.planning.timeline import Plan, PlannedLevel
+
+# Tolerance within which a prediction agrees with the planned one, so that the rest of the plan
+# remains valid: rounding timestamps by half a nanosecond changes the stretch by about 1e-8 at full
+# speed. The rate is relative to the natural frequency.
+_AS_PLANNED = 3e-8
+# Levels that differ by less than this fraction of the largest one are equal for the hardware,
+# which rounds: a few steps of a 14-bit converter.
+_RESOLUTION = 2e-4
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Difference between the level that took effect and the plan."""
+
+    late: int = 0  #: ns by which a change was late; negative if early
+    lost: int = 0  #: earlier planned changes that never took effect
+    foreign: bool = False  #: whether the level was not planned
+    asked: float | None = None  #: level in T that the coil did not reach; None if it did
+    change: float = field(default=0.0, compare=False)  #: of the level in T
+    #: Unplanned amplitude of stretch, beyond that of the expected lateness.
+    effect: float = field(default=0.0, compare=False)
+
+    def beyond(self, tolerance: int) -> bool:
+        """Return whether it is more than a change that is late within the tolerance in ns."""
+        return bool(
+            self.foreign or self.lost or self.asked is not None or abs(self.late) > tolerance)
+
+
+@dataclass(frozen=True)
+class History:
+    """A plan, and the part of it that has happened."""
+
+    plan: Plan
+    sent: int = 1  #: number of levels sent, from the first on; at least 1
+    known: int = 0  #: index of the last level known to have taken effect
+    #: Index of the first level, not sent yet, whose prediction is no longer valid.
+    stale: int | None = None
+
+    @property
+    def levels(self) -> tuple[PlannedLevel, ...]:
+        """The levels of the plan."""
+        return self.plan.levels
+
+    def _with(self, levels: tuple[PlannedLevel, ...], **known: Any) -> 'History':
+        return replace(self, plan=replace(self.plan, levels=levels), **known)
+
+    def unheard(self, now: int, lost: int) -> int:
+        """
+        Count the levels after the last known one that never took effect.
+
+        ``now`` is the time in ns up to which changes are known. Levels before a time ``lost``
+        cannot take effect any more.
+        """
+        # Only changes are reported. Commands that arrive so late that they apply all at once cause
+        # no change if the last of them equals the present level: those before it never applied.
+        levels, first = self.levels, self.known + 1
+        for i in reversed(range(first, self.sent)):
+            if (levels[i].stamp <= now
+                    and (levels[i].stamp <= lost or self._near(
+                        levels[i].flux_density, levels[self.known].flux_density))
+                    and self._changes(range(first, i + 1))):
+                return i + 1 - first
+        return 0
+
+    def without(self, start: int, end: int) -> 'History':
+        """Return the history without levels ``start`` to ``end``, which never took effect."""
+        sent = self.sent - max(min(self.sent, end) - start, 0)
+        return self._with(
+            self.levels[:start] + self.levels[end:], sent=sent, stale=start).predicted(sent)
+
+    def with_news(
+            self, stamp: int, flux_density: float,
+            tolerance: int) -> tuple['History', Deviation | None]:
+        """Return the history with a level (T) in effect from a time (ns), and its deviation."""
+        # Changes take effect in the order of sending. Levels before the reported one have already
+        # been in effect or never will; later ones come no earlier.
+        levels, known = self.levels, self.known
+        if stamp < levels[known].stamp or stamp == levels[known].stamp and self._near(
+                flux_density, levels[known].flux_density):
+            return self, None
+        sent = range(known + 1, self.sent)
+        found = self._find(sent, stamp, flux_density, tolerance)
+        short = None
+        if found is None:
+            found = short = self._short(sent, stamp, flux_density, tolerance)
+        if found is not None:
+            rest, taken = found + 1, replace(levels[found], sent_for=None)
+            deviation = Deviation(
+                stamp - levels[found].due, self._changes(range(known + 1, found)),
+                asked=None if short is None else taken.flux_density)
+        else:
+            rest = known + 1 + sum(levels[i].stamp < stamp for i in sent)
+            taken = levels[rest - 1]
+            if self._near(taken.flux_density, flux_density):
+                return self, None
+            # A command from another publisher, or a watchdog.
+            deviation = Deviation(lost=self._changes(range(known + 1, rest)), foreign=True)
+        # The level as the hardware rounds it.
+        news = replace(taken, stamp=stamp, flux_density=flux_density)
+        deviation = replace(deviation, change=flux_density - levels[known].flux_density)
+        after = tuple(
+            replace(x, stamp=stamp, sent_for=x.due) if x.stamp < stamp else x
+            for x in levels[rest:self.sent])
+        changed = (*levels[:known + 1], news, *after, *levels[self.sent:])
+        count = known + 2 + len(after)
+        stale: int | None = known + 1
+        if short is not None:
+            # The coil will not reach higher levels to come either.
+            changed = (*changed[:known + 2], *(
+                replace(x, flux_density=flux_density) if _beyond(x.flux_density, flux_density)
+                else x for x in changed[known + 2:]))
+        elif deviation == Deviation() and _same(flux_density, taken.flux_density):
+            stale = None if self.stale is None else self.stale + count - self.sent
+        return self._with(
+            changed, sent=count, known=known + 1, stale=stale).predicted(count), deviation
+
+    def predicted(self, end: int) -> 'History':
+        """
+        Predict stale levels again up to an index, or until a prediction agrees with the plan.
+
+        After a deviation, only levels that have been sent are predicted again, so that the work
+        does not grow with the plan. This method catches up as far as needed.
+        """
+        if self.stale is None or self.stale >= end:
+            return self
+        anew: list[PlannedLevel] = []
+        for place in range(self.stale, end):
+            before = anew[-1] if anew else self.levels[place - 1]
+            anew.append(self.levels[place].after(before))
+            if place >= self.sent and agree(anew[-1], self.levels[place]):
+                break
+        stop = self.stale + len(anew)
+        settled = stop < end or stop == len(self.levels) or (
+            stop > self.sent and agree(anew[-1], self.levels[stop - 1]))
+        return self._with(
+            self.levels[:self.stale] + tuple(anew) + self.levels[stop:],
+            stale=None if settled else stop)
+
+    def _find(
+            self, sent: range, stamp: int, flux_density: float, tolerance: int) -> int | None:
+        """Return the index of the sent level that has taken effect, else None."""
+        levels = self.levels
+        # Almost always the next one, among perhaps hundreds along a path.
+        for i in sent:
+            if abs(levels[i].stamp - stamp) <= tolerance and self._near(
+                    levels[i].flux_density, flux_density):
+                return i
+        same = [i for i in sent if self._near(levels[i].flux_density, flux_density)]
+        for i in same:
+            if levels[i].stamp < stamp and levels[i].flux_density != levels[i - 1].flux_density:
+                return i
+        if _same(flux_density, levels[self.known].flux_density):
+            return None  # already in effect, and not the early start of a slow path
+        # A driver that rounds to its own steps may be early, but not by skipping a change.
+        return next((i for i in same if not self._changes(range(self.known + 1, i))), None)
+
+    def _short(
+            self, sent: range, stamp: int, flux_density: float, tolerance: int) -> int | None:
+        """Return the index of the sent level that the amplifier did not reach, else None."""
+        due = [i for i in sent if self.levels[i].stamp <= stamp + tolerance]
+        if not due:
+            return None
+        level = self.levels[due[-1]]
+        asked, options = level.flux_density, level.model.options
+        # Levels of a watchdog or another publisher come later, or are 0 T.
+        soon = stamp - level.stamp <= max(options.lead_time, level.model.ns(1.0))
+        short = _beyond(asked, flux_density) and not (
+            self._near(asked, flux_density) or self._near(0.0, flux_density))
+        return due[-1] if soon and short else None
+
+    def _changes(self, places: Sequence[int]) -> int:
+        """Return how many of the levels differ from the one before."""
+        return sum(not self._near(
+            self.levels[i].flux_density, self.levels[i - 1].flux_density) for i in places)
+
+    def _near(self, one: float, other: float) -> bool:
+        """Return whether two levels in T are equal for hardware that rounds them."""
+        if _same(one, other):
+            return True
+        options = self.levels[-1].model.options
+        largest = max(abs(options.flux_density_min), abs(options.flux_density_max))
+        if math.isinf(largest):
+            largest = max(abs(one), abs(other), abs(self.levels[self.sent - 1].flux_density))
+        return abs(one - other) <= _RESOLUTION * largest
+
+
+def agree(one: PlannedLevel, other: PlannedLevel) -> bool:
+    """Return whether two predictions agree to rounding."""
+    x, y, level = one.state, other.state, one.model.units.level
+    return (
+        abs(x.stretch - y.stretch) <= _AS_PLANNED
+        and abs(x.rate - y.rate) <= _AS_PLANNED * one.model.frequency(x.stretch)
+        and (x.amplifier is None) is (y.amplifier is None)
+        and _same(level(x.load), level(y.load))
+        and _same(level(x.ramps_from), level(y.ramps_from))
+        and len(x.followed) == len(y.followed)
+        and all(abs(a - b) <= _AS_PLANNED for a, b in zip(x.followed, y.followed, strict=True)))
+
+
+def _beyond(level: float, limit: float) -> bool:
+    """Return whether a level in T exceeds the limit that a coil reaches in its direction."""
+    return level * limit > 0.0 and abs(level) > abs(limit)
+
+
+def _same(one: float, other: float) -> bool:
+    """Return whether two flux densities in T are equal to rounding."""
+    return math.isclose(one, other, rel_tol=1e-9, abs_tol=1e-12)

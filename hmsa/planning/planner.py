@@ -1,0 +1,238 @@
+"""
+The planner over time: requests in, a timeline of timestamped flux densities out.
+
+Times are integer nanoseconds of the caller's clock. A request first becomes a draft
+(`hmsa.planning.drafting`), which changes nothing, and is then taken. Several planners can thus
+take all of a request or none of it (`hmsa.planning.group`).
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from copy import copy
+from dataclasses import replace
+import math
+
+from hmsa.errors import BadInputError
+from hmsa.model.equations import equilibrium_stretch
+from hmsa.model.parameters import ActuatorParameters
+from hmsa.model.simulation import check_stretch
+from hmsa.model.status import Code, RefusedError
+from hmsa.model.units import NANOSECONDS
+from hmsa.planning import drafting
+from hmsa.planning.drafting import Check, Outset, PathPoint, proceed
+from hmsa.planning.raw import check_levels, draft_levels
+from hmsa.planning.running import RunningPlan
+from hmsa.planning.setpoint import Setpoint
+from hmsa.planning.timeline import Draft, Model, Options, Plan
+
+__all__ = ['Options', 'Planner']
+
+#: Stretch, rate in 1/s and branch states.
+Believed = tuple[float, float, tuple[float, ...]]
+
+
+class Planner(RunningPlan):
+    """Planner that keeps one timeline and replaces its future on request."""
+
+    def __init__(
+            self, actuator: ActuatorParameters, options: Options, *,
+            stretch: float | None = None) -> None:
+        """Start at rest."""
+        super().__init__(
+            Model(actuator, options), actuator.rest if stretch is None else stretch)
+        #: Returns the estimate of stretch, rate in 1/s and branch states at a time in ns; None to
+        #: use the prediction.
+        self.believed: Callable[[int], Believed | None] = lambda time: None
+        #: Called after each bounded amount of work on a draft.
+        self.check: Check = proceed
+
+    def snapshot(self, starts: Iterable[int]) -> 'Planner':
+        """Return a planner with the present plan, to draft from starts in ns in another thread."""
+        planner = copy(self)
+        planner.believed = {
+            x + self.delay: self.believed(x + self.delay) for x in starts}.__getitem__
+        return planner
+
+    def checked(self, check: Check) -> 'Planner':
+        """Return a planner with the same plan whose drafts call ``check``."""
+        planner = copy(self)
+        planner.check = check
+        return planner
+
+    @property
+    def options(self) -> Options:
+        """Options of the next request."""
+        return self.model.options
+
+    def set_options(
+            self, options: Options, actuator: ActuatorParameters | None = None) -> None:
+        """Plan the next requests with other options or for another block, after checks."""
+        self.take_model(self.checked_model(options, actuator or self.model.actuator))
+
+    def checked_model(self, options: Options, actuator: ActuatorParameters) -> Model:
+        """
+        Return the model of options and an actuator that can hold the present position.
+
+        Raise `BadInputError` if it cannot, or if its position is another quantity.
+        """
+        if (options, actuator) == (self.model.options, self.model.actuator):
+            return self.model
+        was, made = self.model.actuator.coordinate.plural, actuator.coordinate.plural
+        if was != made:
+            raise BadInputError(
+                f'parameter law.name would turn {was} into {made}: expected a law that has {was}, '
+                'or a planner that is started with the other')
+        model = Model(actuator, options)
+        segments = self.plan.segments
+        check_stretch(
+            segments[-1].stretch if segments else self.plan.levels[-1].stretch,
+            model.material, 'the stretch that is held')
+        return model
+
+    def take_model(self, model: Model) -> None:
+        """Plan the next requests with a model; the running plan does not change."""
+        if model is not self.model:
+            self.model = model
+            self.revision += 1
+
+    # -- requests ------------------------------------------------------------------------------
+
+    def request(
+            self, points: Sequence[tuple[float, int]], stamp: int | None, now: int) -> Plan:
+        """Plan and take a setpoint sequence; see `draft_request`."""
+        return self.take(self.draft_request(points, stamp, now), now)
+
+    def setpoint(self, stretch: float, now: int) -> Plan:
+        """Move to one stretch as soon as possible and hold it."""
+        return self.take(self.draft_setpoint(stretch, now), now)
+
+    def stop(self, now: int) -> Plan:
+        """Drop the rest of the plan and come to rest as near as the flux density limits allow."""
+        return self.take(self.draft_stop(now), now)
+
+    def draft_request(
+            self, points: Sequence[tuple[float, int]], stamp: int | None,
+            now: int) -> Draft | None:
+        """
+        Draft a sequence of points (stretch, end in ns from the start), strictly increasing.
+
+        ``stamp`` is the start in ns, or None for now. Until a future start the running plan
+        continues; with a past one the sequence is joined in the middle. The draft is None if the
+        request changes nothing. Raise `RefusedError` if it cannot be carried out.
+        """
+        drafting.check_points(points, self.model.material.rest, self.check)
+        base, outset = self._begin(stamp, now)
+        return drafting.draft_sequence(outset, points, base, now)
+
+    def draft_levels(
+            self, points: Sequence[tuple[float, int]], stamp: int | None,
+            now: int) -> Draft:
+        """
+        Draft levels in T with start times in ns, counted from a timestamp or from now.
+
+        Raise `RefusedError` if they cannot be carried out.
+        """
+        check_levels(points, self.model)
+        soonest = self.soonest(now)
+        begin = self.model.on_grid((soonest if stamp is None else stamp) + points[0][1])
+        if begin < soonest:
+            raise RefusedError(
+                Code.IN_THE_PAST, f'the first level applies {(now - begin) / NANOSECONDS:.3f} s '
+                'ago: expected levels more than lead_time ahead')
+        return draft_levels(self._outset(begin), points)
+
+    def draft_path(
+            self, points: Sequence[tuple[PathPoint, int]], stamp: int | None,
+            now: int) -> Draft:
+        """
+        Draft a path of points (stretch, rate in 1/s, acceleration in 1/s^2 or NaN), times in ns.
+
+        ``stamp`` and errors are those of `draft_request`. Where limits keep the actuator from the
+        path, it follows as near as they allow, and the draft has a warning.
+        """
+        drafting.check_path(points, self.model.material.rest)
+        base, outset = self._begin(stamp, now)
+        return drafting.draft_path(outset, points, base, now)
+
+    def draft_setpoint(self, stretch: float, now: int) -> Draft | None:
+        """Draft a move to one stretch; None if it changes nothing."""
+        drafting.check_target(stretch, self.model.material.rest)
+        outset = self._outset(self.soonest(now))
+        return drafting.draft_setpoints(outset, [Setpoint(stretch, math.inf)])
+
+    def draft_stop(self, now: int) -> Draft:
+        """Draft a stop."""
+        return drafting.draft_stop(self._outset(self.soonest(now)))
+
+    def draft_resumption(self, now: int, arrival: int | None = None) -> Draft | None:
+        """Draft the rest of the plan again from the present motion, to arrive in time if given."""
+        # None if nothing is left. Start at the earliest time that a command can reach or, if no
+        # plan is possible from the motion then, a fraction of a period later.
+        begin, *more = self.resumptions(now)
+        outset = self._outset(begin)
+        if arrival is not None:
+            return drafting.draft_resumption(outset, arrival)
+        for later in (begin, *more):
+            try:
+                return drafting.draft_resumption(self._outset(later))
+            except RefusedError:
+                # Another phase of the motion may allow it.
+                self.check()
+        return drafting.draft_resumption(outset)
+
+    def draft_path_anew(
+            self, begin: int, model: Model, believed: Believed | None) -> Draft:
+        """Draft the rest of the running path again with a model, from an estimated state."""
+        return drafting.draft_path_anew(self._from(begin, model, believed))
+
+    def draft_trim(self, now: int, flux_density: float) -> Draft:
+        """Draft a corrected level in T that holds the current setpoint, from rest."""
+        model, begin = self.model, self.soonest(now)
+        state, place = self.state(begin), self.plan.under_way(begin)
+        # The model does not account for the steady-state error: use its own equilibrium stretches.
+        held, wanted = (float(equilibrium_stretch(model.load(x), model.material)) for x in (
+            self.plan.level(begin).flux_density, flux_density))
+        draft = drafting.draft_moves(
+            Outset(self.plan, model, begin, replace(state, stretch=held, rate=0.0)),
+            [Setpoint(wanted, math.inf)])
+        segment = self.plan.segments[place]
+        anew = replace(draft.segments[0], stretch=segment.stretch, since=segment.since)
+        return replace(draft, segments=(anew,), resumed=place)
+
+    def resumptions(self, now: int) -> tuple[int, ...]:
+        """Return the times in ns from which the rest of the plan may be planned again."""
+        begin = self.soonest(now)
+        if self.plan.segments:
+            begin = max(begin, self.plan.segments[0].since)
+        return tuple(dict.fromkeys(drafting.later_starts(
+            self.model, self._outset(begin).state.stretch, begin)))
+
+    def start(self, stamp: int | None, now: int) -> int:
+        """Return the earliest start in ns of a request for a timestamp; None for now."""
+        soonest = self.soonest(now)
+        return soonest if stamp is None else self.model.on_grid(max(stamp, soonest))
+
+    def _begin(self, stamp: int | None, now: int) -> tuple[int, Outset]:
+        """Return the start of a request in ns, and the earliest outset for it."""
+        begin = self.start(stamp, now)
+        return begin if stamp is None else stamp, self._outset(begin)
+
+    def _outset(self, begin: int) -> Outset:
+        return self._from(begin, self.model, self.believed(begin + self.delay))
+
+    def _from(self, begin: int, model: Model, believed: Believed | None) -> Outset:
+        state = model.taken_from(self._delayed(begin), self.model)
+        if believed is not None:
+            state = replace(
+                state, stretch=believed[0], rate=believed[1] * model.units.time,
+                followed=believed[2] or state.followed)
+        return Outset(self.plan, model, begin, state, self._history.stale, self.check)
+
+    def as_sent(self, time: int) -> bool:
+        """Return whether the level at a time in ns belongs to commanded levels or a path."""
+        found = self.segment(time)
+        return found is not None and found[1].code in (Code.LEVELS, Code.PATH) and (
+            found[1].arrival is None or time < found[1].arrival)
+
+    def soonest(self, now: int) -> int:
+        """Return the earliest time that a command can still reach."""
+        return self.model.on_grid(now + self.model.options.lead_time)

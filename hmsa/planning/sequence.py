@@ -1,0 +1,236 @@
+"""Plans for a sequence of setpoints (Eq. 14), each from the true end state of the previous one."""
+
+from bisect import bisect_right
+from collections.abc import Generator, Iterable, Sequence
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+
+from hmsa.errors import BadInputError, excerpt, HmsaError
+from hmsa.model.delivery import Delivery, ramps
+from hmsa.model.equations import elastic_force, natural_frequency, stretch_limits
+from hmsa.model.laws.record import ENDLESS
+from hmsa.model.moves import Level, Move, State
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.simulation import check_stretch, follow, longest_motion, sampled
+from hmsa.model.status import Code, RefusedError
+from hmsa.motion import STRETCH
+from hmsa.planning.setpoint import Setpoint
+from hmsa.planning.shapers import creeping, get_shaper
+from hmsa.planning.shapers.request import Request, Shaper, Work
+
+#: Options for a setpoint that ends before the move to it.
+SHORT_SPELL = ('refuse', 'continue')
+# Samples of a motion, and their tolerance, for the check against the limits of its model.
+_LOOK, _LOOK_RTOL = 300, 1e-7
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One setpoint of a plan."""
+
+    setpoint: Setpoint
+    begin: float  #: start of the move, from the start of the sequence
+    start: State  #: predicted at begin
+    end: State  #: predicted at the end of the setpoint, or after the last change of level
+    move: Move  #: its times count from begin
+    holding: float  #: load that holds the stretch after creep
+
+    @property
+    def shaped(self) -> bool:
+        """Whether another level comes before the one that holds the target."""
+        return len(self.move.levels) > max(len(self.move.tail), 1)
+
+    @property
+    def held(self) -> float:
+        """Load at the end of the move; with creep, its limit for long times."""
+        return self.holding if self.move.tail else self.move.levels[-1].load
+
+    def notes(self) -> list[str]:
+        """Return deviations from the request, one sentence each."""
+        move = self.move
+        found = [move.reason] if move.reason else []
+        if move.tail:
+            step = abs(self.setpoint.stretch - self.start.stretch) or 1.0
+            found.append(
+                f'{len(move.tail)} levels follow creep at stretch {self.setpoint.stretch:g}; they '
+                f'leave a vibration of at most {100.0 * move.vibration / step:.2g} % of the move')
+        return found
+
+
+def plan_sequence(
+        setpoints: Sequence[Setpoint], frame: Request | NondimensionalParameters,
+        shaper: str | Shaper = 'two_step', short_spell: str = 'refuse') -> tuple[Segment, ...]:
+    """
+    Plan a sequence of setpoints.
+
+    Parameters
+    ----------
+    setpoints : sequence of Setpoint
+        At least one.
+    frame : Request or NondimensionalParameters
+        Common data of all moves, with the initial state; or only a material, to start at rest
+        without a field on ideal hardware. With a command period, durations must be multiples of
+        it. Each move starts from the state that the rounded command reaches.
+    shaper : str or Shaper
+        A shaper or its name.
+    short_spell : {'refuse', 'continue'}
+        For a duration that ends before the move: refuse, or plan the next move from the state
+        reached by then; the last move is completed after its duration.
+
+    Returns
+    -------
+    tuple of Segment
+        One per setpoint.
+
+    Raises
+    ------
+    RefusedError
+        If a setpoint cannot be reached; the message names it.
+    BadInputError
+        If an argument is out of range.
+
+    """
+    if not setpoints:
+        raise RefusedError(Code.BAD_INPUT, 'no setpoint given: expected at least one')
+    check_short_spell(short_spell)
+    begin = frame if isinstance(frame, Request) else Request.of(frame)
+    shape = get_shaper(shaper) if isinstance(shaper, str) else shaper
+    return tuple(segments(begin, setpoints, shape, short_spell))
+
+
+def check_short_spell(value: str) -> None:
+    """Raise `BadInputError` if the value is not in `SHORT_SPELL`."""
+    if value not in SHORT_SPELL:
+        raise BadInputError(
+            f'short_spell is {excerpt(value)}: expected one of {", ".join(SHORT_SPELL)}')
+
+
+def segments(
+        frame: Request, setpoints: Iterable[Setpoint], shaper: Shaper, short_spell: str, *,
+        first: Shaper | None = None) -> Generator[Segment, None, None]:
+    """
+    Plan one setpoint after another; the first may have its own shaper.
+
+    The frame gives the initial state and all fields of the moves except state and target. Raise
+    `RefusedError` if a setpoint cannot be reached, `BadInputError` if an argument is out of range.
+    """
+    shape = first or shaper
+    units, state = frame.units, frame.state
+    check_stretch(state.stretch, frame.material, 'start stretch')
+    begin = 0.0
+    upcoming = iter(setpoints)
+    setpoint = next(upcoming, None)
+    while setpoint is not None:
+        following = next(upcoming, None)
+        request = replace(frame, state=state, target=setpoint.stretch, work=Work())
+        move = creeping.held(
+            request, _rounded(shape(request), frame.delivery),
+            math.inf if following is None else setpoint.span)
+        # Both are rounded: a duration that the move fills exactly is long enough.
+        if setpoint.span * (1.0 + 1e-12) < move.duration < math.inf:
+            if short_spell == 'refuse':
+                raise RefusedError(
+                    Code.SPELL_TOO_SHORT,
+                    f'the move from {units.coordinate} {state.stretch:.6g} to '
+                    f'{setpoint.stretch:g} takes {units.time_text(move.duration)}, its setpoint '
+                    f'lasts {units.time_text(setpoint.span)}: expected a duration at least as '
+                    'long as the move')
+            move = _cut(request, move, setpoint.span, last=following is None)
+        end = _follow(request, move, setpoint.span)
+        if following is not None and move.tail:
+            move = move.until(setpoint.span)
+        yield Segment(
+            setpoint, begin, state, end, move,
+            float(elastic_force(setpoint.stretch, frame.material)))
+        begin += setpoint.span
+        state = end
+        setpoint = following
+        shape = shaper
+
+
+def _cut(request: Request, move: Move, span: float, *, last: bool) -> Move:
+    """Return a move that is cut at the end of its setpoint; the last one is completed."""
+    units = request.units
+    return replace(
+        move if last else move.until(span), code=Code.SPELL_TOO_SHORT,
+        duration=move.duration if last else math.inf,
+        reason=f'the duration {units.time_text(span)} ends before {request.named_target} is '
+        f'reached, which takes {units.time_text(move.duration)}')
+
+
+def _rounded(move: Move, delivery: Delivery) -> Move:
+    """Return a move with times rounded to those that commands can have."""
+    return Move(
+        move.code, tuple(Level(delivery.rounded(x.time), x.load) for x in move.levels),
+        delivery.rounded(move.duration), move.reason)
+
+
+def _follow(request: Request, move: Move, span: float) -> State:
+    """Return the state at the end of a duration, or at the end of the last ramp."""
+    material, delivery = request.material, request.delivery
+    end = move.levels[-1].time if math.isinf(move.duration) else move.duration
+    if math.isfinite(span):
+        end = max(end, span)
+    if move.tail:
+        # The motion of the branches after the arrival is known.
+        if move.duration > 0.0:
+            _check_known(request, move.until(move.duration).levels, (move.duration,) * 2)
+        place = bisect_right(move.levels, end, key=lambda x: x.time) - 1
+        level = move.levels[place]
+        return follow(
+            (replace(level, time=0.0),), move.tail[place - len(move.levels)], end - level.time,
+            material, delivery)
+    parts, last = ramps(move.levels, request.load, end, delivery.slew)
+    ramped = max(parts[-1][0], 0.0)
+    # A move held without an end also vibrates after the last level.
+    _check_known(request, move.levels, (ramped, max(end, span)))
+    if not material.creep:
+        end = min(end, ramped + longest_motion(last, material) + delivery.settling(0.0))
+    return follow(move.levels, request.start, end, material, delivery)
+
+
+def _check_known(request: Request, levels: Sequence[Level], ends: tuple[float, float]) -> None:
+    """
+    Refuse a move that leaves the range of the elastic model, or collapses.
+
+    ``ends`` are the times of the last ramp and of the end of the check.
+    """
+    material, target = request.material, request.target
+    elastic, limits = material.law, stretch_limits(material)
+    if elastic is None or limits == ENDLESS:
+        return
+    # Stretches from which the elastic force decreases, unless the range of the model ends there.
+    falls = [x if x != y else z for x, y, z in zip(
+        limits, elastic.limits, (-math.inf, math.inf), strict=True)]
+    where = f'{material.coordinate.name} {request.state.stretch:.6g}'
+    # The first swing about the last level is the widest.
+    swing = 2.0 * math.pi / float(natural_frequency(target, material))
+    times = np.linspace(
+        levels[0].time, min(ends[1], ends[0] + swing), _LOOK, dtype=np.float64)
+    try:
+        stretch = sampled(
+            levels, request.start, times, material, request.delivery, _LOOK_RTOL)[STRETCH]
+        # Where the elastic force decreases below the last load, nothing brings it back.
+        after = stretch[times >= ends[0]]
+        pull = levels[-1].load - elastic_force(after, material)
+        lost = bool(np.any(
+            (after > falls[1]) & (pull > 0.0) | (after < falls[0]) & (pull < 0.0)))
+    except HmsaError:
+        # Without limiting extensibility, the motion diverges.
+        lost = True
+    if lost:
+        raise RefusedError(
+            Code.OUT_OF_RANGE,
+            f'the move from {where} to {target:g} overshoots and cannot be followed: '
+            'expected a smaller move, or a shaper that does not overshoot, such as two_step')
+    for widest, beyond in ((np.min(stretch), -1.0), (np.max(stretch), 1.0)):
+        limit = elastic.limits[beyond > 0.0]
+        if beyond * (widest - limit) > 0.0:
+            raise RefusedError(
+                Code.OUT_OF_RANGE,
+                f'the move from {where} to {target:g} '
+                f'swings to {widest:.4f}: expected a motion between the limits '
+                f'{elastic.limits[0]:.4f} and {elastic.limits[1]:.4f} of law {elastic.law}, '
+                'beyond which nothing is known')

@@ -1,0 +1,39 @@
+"""
+Shapers, which command one move, in a registry by name.
+
+A shaper takes a `Request` and returns a `Move`, or raises `RefusedError` with a reason. All
+quantities are dimensionless; `Units` only format the messages.
+"""
+
+import math
+
+from hmsa.errors import BadInputError
+from hmsa.planning.shapers.advice import advised
+from hmsa.planning.shapers.linear import ei, step, zv, zvd
+from hmsa.planning.shapers.minimax import minimax
+from hmsa.planning.shapers.minimum_time import minimum_time
+from hmsa.planning.shapers.request import Shaper
+from hmsa.planning.shapers.robust import robust
+from hmsa.planning.shapers.smooth import smooth
+from hmsa.planning.shapers.two_step import two_step
+from hmsa.planning.shapers.umzv import umzv
+
+#: Shapers by name.
+SHAPERS: dict[str, Shaper] = {
+    'two_step': advised(two_step),
+    # These find a plan whenever two_step does.
+    **{x.__name__: advised(x, sooner=two_step) for x in (robust, minimax)},
+    'minimum_time': advised(minimum_time),
+    # A failed search for a path takes long: advise which limits to relax, but not by how much.
+    'smooth': advised(smooth, (math.inf,)),
+    **{x.__name__: x for x in (step, zv, zvd, ei, umzv)},
+}
+
+
+def get_shaper(name: str) -> Shaper:
+    """Return a shaper by its name in `SHAPERS`; raise `BadInputError` for another name."""
+    try:
+        return SHAPERS[name]
+    except KeyError:
+        raise BadInputError(
+            f'shaper {name!r} is unknown: expected one of {", ".join(SHAPERS)}') from None

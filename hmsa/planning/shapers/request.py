@@ -1,0 +1,175 @@
+"""The input of a shaper, and checks that all shapers share."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+import math
+from typing import Any
+
+import numpy as np
+
+from hmsa.errors import BadInputError, excerpt
+from hmsa.model import law
+from hmsa.model.delivery import Delivery, IDEAL
+from hmsa.model.equations import Array
+from hmsa.model.mismatch import Ellipsoid, Uncertainty
+from hmsa.model.moves import Level, Limits, Move, State
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.simulation import check_stretch, followed_by
+from hmsa.model.status import Code, RefusedError
+from hmsa.model.units import Units
+from hmsa.planning.shapers.pace import PACE, Pace
+
+#: Default relative errors of G, damping coefficient and J_lim.
+ERRORS = (0.1, 0.1, 0.1)
+#: Maximum relative error.
+LARGEST_ERROR = 0.9
+#: Maximum order of robust, its number of chained two-step commands.
+MOST_ORDER = 16
+#: Tolerance within which a state is at rest: of stretch and load, and of rate over frequency.
+AT_REST = 1e-9
+
+
+def as_errors(values: Sequence[float] | Ellipsoid) -> Uncertainty:
+    """
+    Return errors of G, damping coefficient and J_lim; an ellipsoid has already been checked.
+
+    Raise `BadInputError` for values other than three numbers of 0 to 0.9.
+    """
+    if isinstance(values, Ellipsoid):
+        return values
+    try:
+        if np.iscomplexobj(values):
+            raise TypeError
+        modulus, damping, limit = (float(x) for x in values)
+    except (TypeError, ValueError, OverflowError):
+        modulus = damping = limit = math.nan
+    if not all(0.0 <= x <= LARGEST_ERROR for x in (modulus, damping, limit)):
+        raise BadInputError(
+            f'errors of G, damping coefficient and J_lim are {excerpt(values)}: expected three '
+            f'shares of 0 to {LARGEST_ERROR:g}')
+    return modulus, damping, limit
+
+
+@dataclass
+class Work:
+    """
+    Remaining work of a request, in integration steps times the number of variables.
+
+    Its searches share it and end when none is left. Results therefore do not depend on the speed
+    or load of the machine.
+    """
+
+    left: int = 700_000
+    #: Whether it is for a search for advice, which shares this limit among all its attempts.
+    advising: bool = False
+
+    def more(self, left: int) -> 'Work':
+        """Return the work limit of another method for the same target."""
+        return self if self.advising else Work(left)
+
+
+@dataclass(frozen=True)
+class Request:
+    """One move to command, from a state in motion or at rest to rest at a target."""
+
+    state: State
+    target: float
+    material: NondimensionalParameters
+    limits: Limits = field(default_factory=Limits)
+    delivery: Delivery = IDEAL
+    order: int = 2  #: number of chained two-step commands of robust; minimax takes as long
+    units: Units = field(default_factory=Units)  #: for the messages
+    #: Relative errors of G, damping coefficient and J_lim from `as_errors`, for minimax.
+    errors: Uncertainty = ERRORS
+    pace: Pace = PACE  #: of smooth; dimensionless rate
+    work: Work = field(default_factory=Work, compare=False)
+
+    @classmethod
+    def of(
+            cls, material: NondimensionalParameters, start: State | None = None,
+            **more: Any) -> 'Request':
+        """Return a request to stay in a state, by default at rest without a field."""
+        state = start or State(material.rest)
+        return cls(state, state.stretch, material, **more)
+
+    @property
+    def named_target(self) -> str:
+        """The target in a message, as in ``'stretch 1.4'``."""
+        return f'{self.units.coordinate} {self.target:g}'
+
+    @property
+    def named_state(self) -> str:
+        """The state in a message, as in ``'stretch 1.2 at rate 0.5'``."""
+        return (f'{self.units.coordinate} {self.state.stretch:.6g} at rate '
+                f'{self.state.rate / self.units.time:.4g}')
+
+    @property
+    def load(self) -> float:
+        """Output of the amplifier before the move."""
+        return self.field if self.state.amplifier is None else self.state.amplifier
+
+    @property
+    def field(self) -> float:
+        """Load before the move."""
+        if math.isfinite(self.state.load):
+            return self.state.load
+        return float(law.elastic_force(self.state.stretch, self.material.packed))
+
+    @property
+    def start(self) -> State:
+        """The state, with the holding load if the load is not given."""
+        return replace(self.state, load=self.field)
+
+    @property
+    def frequency(self) -> float:
+        """Undamped angular frequency of small motion about the target."""
+        return float(law.natural_frequency(self.target, self.material.packed))
+
+    @property
+    def still(self) -> bool:
+        """Whether the actuator does not move, even if it is not in equilibrium."""
+        return abs(self.state.rate) <= AT_REST * self.frequency
+
+    @property
+    def unknowns(self) -> int:
+        """Number of free values of a command: for stretch, rate and a field that lags."""
+        return 2 + (self.delivery.lag > 0.0)
+
+    def keeps(self, levels: Sequence[Level]) -> bool:
+        """Return whether levels are inside the load limits."""
+        return all(self.limits.minimum <= x.load <= self.limits.maximum for x in levels)
+
+    def holding_load(self) -> float:
+        """Return the load that holds the target, beta_1; `RefusedError` outside the limits."""
+        try:
+            check_stretch(self.target, self.material, 'target stretch')
+        except BadInputError as error:
+            raise RefusedError(Code.OUT_OF_RANGE, str(error)) from error
+        load = float(law.elastic_force(self.target, self.material.packed))
+        self.limits.check(load, self.target, self.units)
+        return load
+
+    def behind(self, stretch: float) -> Array:
+        """Return the force at a stretch minus the initial branch states."""
+        force = float(law.elastic_force(stretch, self.material.packed))
+        return np.array([force - x for x in followed_by(self.state, self.material)])
+
+    def balance(self, followed: Sequence[float]) -> float:
+        """Return the load that keeps the target at rest for given branch states."""
+        load = float(law.elastic_force(self.target, self.material.packed))
+        return load + float(sum(
+            ratio * (load - force) for (ratio, *_), force in zip(
+                self.material.branches.tolist(), followed, strict=True)))
+
+    def check(self, levels: Sequence[Level]) -> None:
+        """Raise `RefusedError` with `Code.FLUX_LIMIT` for levels outside the load limits."""
+        for level in levels:
+            self.limits.check(level.load, self.target, self.units)
+
+    def plain(self, code: Code, reason: str) -> Move:
+        """Return the unshaped step, which approaches the target, with code and reason."""
+        return Move(code, (Level(0.0, self.holding_load()),), math.inf, reason)
+
+
+#: Returns a move for a request, or raises `RefusedError` with a reason.
+Shaper = Callable[[Request], Move]

@@ -1,0 +1,160 @@
+"""
+Commands with free parameters, solved for rest at the target.
+
+The two-step command on ideal hardware has its own search, `hmsa.motion.two_step`. All other
+commands (on a command grid, with ramps, or with two intermediate levels of given loads) have two
+unknowns as well. They meet the same two conditions when the last level applies: stretch at the
+target, rate zero. If the field lags, it must also reach its final value, which needs a third
+unknown. Newton's method solves them with derivatives from the integration.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+import math
+from operator import itemgetter
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hmsa import motion
+from hmsa.model.delivery import Delivery
+from hmsa.model.equations import Array
+from hmsa.model.moves import Level
+from hmsa.model.simulation import followed_by
+
+if TYPE_CHECKING:
+    from hmsa.planning.shapers.request import Request
+
+# Factor on the guessed duration of the last ramp, for the period that follows it.
+_MORE = 1.25
+
+#: A command and the time at which it is at rest; None if there is none.
+Attempt = tuple[tuple[Level, ...], float] | None
+
+
+@dataclass(frozen=True)
+class Template:
+    """Levels and their derivatives with respect to the two or, with a lag, three unknowns."""
+
+    times: Array  #: (n,), the first is 0
+    loads: Array  #: (n,), the last holds the target
+    d_times: Array  #: (n, 2) or (n, 3)
+    d_loads: Array  #: (n, 2) or (n, 3)
+
+    @classmethod
+    def of(cls, levels: Sequence[Level], unknowns: Sequence[tuple[str, int]]) -> 'Template':
+        """Return the template of a guess, with unknowns ``('load', i)`` and ``('time', i)``."""
+        return cls(
+            np.array([x.time for x in levels]), np.array([x.load for x in levels]),
+            *_derivatives(len(levels), tuple(unknowns)))
+
+
+def heights(levels: Sequence[Level]) -> Template:
+    """Return the template of a guess in which all loads except the last are free."""
+    return Template.of(levels, [('load', i) for i in range(len(levels) - 1)])
+
+
+@lru_cache(maxsize=256)
+def _derivatives(count: int, unknowns: tuple[tuple[str, int], ...]) -> tuple[Array, Array]:
+    """Return the derivatives of times and loads, which are cached and must not be changed."""
+    d_times, d_loads = np.zeros((2, count, len(unknowns)))
+    for column, (kind, index) in enumerate(unknowns):
+        if kind == 'load':
+            d_loads[index, column] = 1.0
+        else:
+            d_times[index:, column] = 1.0
+    return d_times, d_loads
+
+
+def solve(
+        template: Template, request: 'Request', delivery: Delivery | None = None, *,
+        wait: float = 0.0) -> Attempt:
+    """
+    Solve a template for rest at the target; the default delivery is that of the request.
+
+    With creep and ramps, rest is at the end of the last ramp, or at least ``wait`` after the start
+    of the last level; on a command grid, after whole periods.
+    """
+    delivery = delivery or request.delivery
+    times, loads = template.times.copy(), template.loads.copy()
+    d_times, d_loads = template.d_times, template.d_loads
+    state, material = request.state, request.material
+    if material.creep and delivery.slew < math.inf:
+        # The tail begins with the load at the end of the last ramp.
+        d_times, d_loads = (np.pad(x, ((0, 0), (0, 1))) for x in (d_times, d_loads))
+        d_loads[-1, -1] = 1.0
+        if delivery.period > 0.0:
+            ramp = _MORE * delivery.ramp(loads[-1] - loads[-2] if len(loads) > 1 else 0.0)
+            wait = max(math.ceil(ramp / delivery.period), 1) * delivery.period
+        if wait > 0.0:
+            times, loads = np.append(times, times[-1] + wait), np.append(loads, loads[-1])
+            d_times, d_loads = (np.concatenate([x, x[-1:]]) for x in (d_times, d_loads))
+    solved, duration, done = motion.solve(
+        times, loads, np.ascontiguousarray(d_times), np.ascontiguousarray(d_loads), state.stretch,
+        state.rate, request.field, request.load, request.target, delivery.slew, delivery.lag,
+        material.packed, material.branches, np.array(followed_by(state, material)),
+        request.work.left)
+    request.work.left -= done
+    if not solved:
+        return None
+    levels = tuple(Level(t, x) for t, x in zip(times.tolist(), loads.tolist(), strict=True))
+    return levels, duration
+
+
+def kept(found: Attempt, request: 'Request') -> Attempt:
+    """Return a command if it keeps the load limits, else None."""
+    return found if found is not None and request.keeps(found[0]) else None
+
+
+def first_kept(guesses: Iterable[Template], request: 'Request') -> Attempt:
+    """Return the first solution among the guesses that keeps the load limits, else None."""
+    return next(filter(None, (kept(solve(x, request), request) for x in guesses)), None)
+
+
+def soonest_kept(guesses: Iterable[tuple[float, Template]], request: 'Request') -> Attempt:
+    """
+    Return the solution with the earliest rest that keeps the load limits, else None.
+
+    Guesses come with their durations; guesses longer than a solution are skipped.
+    """
+    best: Attempt = None
+    for duration, guess in sorted(guesses, key=itemgetter(0)):
+        if best is not None and duration >= best[1]:
+            break
+        found = kept(solve(guess, request), request)
+        if found is not None and (best is None or found[1] < best[1]):
+            best = found
+    return best
+
+
+def approach(
+        ideal: tuple[Level, ...],
+        closer: Callable[[tuple[Level, ...], float, float], Attempt], shortest: float) -> Attempt:
+    """Follow levels from ideal to real hardware, in strides down to a given fraction."""
+    # closer(levels, share, aim) solves for hardware at the fraction aim, from levels that solve
+    # it at the fraction share.
+    found: Attempt = None
+    levels, share, stride = ideal, 0.0, 1.0
+    while share < 1.0:
+        aim = min(1.0, share + stride)
+        attempt = closer(levels, share, aim)
+        if attempt is not None:
+            found, levels, share = attempt, attempt[0], aim
+        elif stride > shortest:
+            stride *= 0.5
+        else:
+            return None
+    return found
+
+
+def on_time(found: Attempt, request: 'Request') -> Attempt:
+    """Solve again for the first loads, with times rounded to those that commands can have."""
+    if found is None or request.delivery.resolution == 0.0:
+        return found
+    # Delay later levels slightly more, so that ramps still fit.
+    resolution = request.delivery.resolution
+    rounded = [Level(request.delivery.rounded(x.time) + i * resolution, x.load)
+               for i, x in enumerate(found[0])]
+    return solve(Template.of(
+        rounded, [('load', i) for i in range(request.unknowns)]), request) or found

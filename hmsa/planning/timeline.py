@@ -1,0 +1,333 @@
+"""
+Records of a plan over time, and predictions along them.
+
+Times are integer nanoseconds and levels are flux densities in tesla, as in messages. Each level
+contains the model with which it was planned, so that predictions of a running plan do not change
+with the parameters.
+"""
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+import math
+from typing import Any
+
+import numpy as np
+
+from hmsa.errors import BadInputError
+from hmsa.model import law
+from hmsa.model.delivery import Delivery, IDEAL
+from hmsa.model.equations import acceleration
+from hmsa.model.mismatch import Uncertainty
+from hmsa.model.moves import Level, Limits, State
+from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
+from hmsa.model.simulation import follow, longest_motion, sampled
+from hmsa.model.status import Code
+from hmsa.model.units import NANOSECONDS, Units
+from hmsa.planning.path import Path
+from hmsa.planning.sequence import check_short_spell
+from hmsa.planning.shapers import creeping, get_shaper
+from hmsa.planning.shapers.pace import PACE, Pace
+from hmsa.planning.shapers.request import as_errors, ERRORS
+
+#: Options that describe coil and block, and can be estimated.
+ESTIMATED = ('coil_time_constant', 'constant_force')
+# Codes of plans that deviate from the request.
+_WARNINGS = (Code.TOO_DAMPED, Code.INDISTINGUISHABLE, Code.SPELL_TOO_SHORT)
+#: Timestamp of a level that has always been in effect, at rest.
+ALWAYS = -2**62
+
+
+@dataclass(frozen=True)
+class Options:
+    """How requests are planned."""
+
+    shaper: str = 'two_step'  #: a name in `hmsa.planning.shapers.SHAPERS`
+    short_spell: str = 'refuse'  #: for a duration that ends before the move: refuse or continue
+    flux_density_min: float = -math.inf  #: in T
+    flux_density_max: float = math.inf  #: in T
+    lead_time: int = 50_000_000  #: in ns, time from sending a command to its timestamp
+    period: int = 0  #: of the command grid, in ns; 0 for any time
+    slew_limit: float = math.inf  #: in T/s; infinite for steps
+    order: int = 2  #: of the shapers robust and minimax
+    coil_time_constant: float = 0.0  #: of a first-order lag, in s; 0 for none
+    constant_force: float = 0.0  #: in N, in addition to that of the field
+    #: Vibration that levels of the creep tail may leave, as a fraction of the move.
+    creep_tolerance: float = IDEAL.ripple
+    #: Deviation from a path that levels may leave, as a fraction of its range.
+    path_tolerance: float = 1e-6
+    #: Relative errors of G, damping coefficient and J_lim that minimax must tolerate.
+    errors: Uncertainty = ERRORS
+    pace: Pace = PACE  #: of the shaper smooth; the rate in 1/s
+
+
+@dataclass(frozen=True)
+class Model:
+    """All data of a prediction: the block and how commands reach it."""
+
+    actuator: ActuatorParameters
+    options: Options
+    material: NondimensionalParameters = field(init=False)
+    units: Units = field(init=False)  #: scales of the dimensionless time and load
+    limits: Limits = field(init=False)
+    delivery: Delivery = field(init=False)  #: dimensionless, like limits and pace
+    pace: Pace = field(init=False)
+    pull: float = field(init=False)  #: load of the constant force
+
+    def __post_init__(self) -> None:
+        """Compute the dimensionless data."""
+        actuator, options = self.actuator, self.options
+        get_shaper(options.shaper)
+        as_errors(options.errors)
+        check_short_spell(options.short_spell)
+        if options.lead_time < 0:
+            raise BadInputError(
+                f'lead_time is {options.lead_time / NANOSECONDS:g} s: expected at least 0 s')
+        units, pull = actuator.units, options.constant_force * actuator.load_per_newton
+        time, load = units.time, units.load
+        least, largest = map(units.of_level, (options.flux_density_min, options.flux_density_max))
+        worked_out = {
+            'material': actuator.nondimensional,
+            'units': units,
+            'limits': Limits(least + pull, largest + pull),
+            'delivery': Delivery(
+                options.period / NANOSECONDS / time, options.slew_limit / load * time,
+                1.0 / NANOSECONDS / time, options.coil_time_constant / time,
+                options.creep_tolerance),
+            'pace': replace(options.pace, rate=options.pace.rate * time),
+            'pull': pull,
+        }
+        for name, value in worked_out.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def others(self) -> dict[str, Any]:
+        """Parameters that can be estimated besides those of the block, by name."""
+        return {x: getattr(self.options, x) for x in ESTIMATED}
+
+    def ns(self, time: float) -> int:
+        """Return a nondimensional time in ns."""
+        return round(time * self.units.time * NANOSECONDS)
+
+    def time(self, ns: int) -> float:
+        """Return the dimensionless time of a time in ns."""
+        return ns / NANOSECONDS / self.units.time
+
+    def load(self, flux_density: float) -> float:
+        """Return the load of a flux density in T plus the constant force."""
+        return float(self.units.of_level(flux_density)) + self.pull
+
+    def flux_density(self, load: float) -> float:
+        """Return the flux density in T of a load."""
+        return float(self.units.level(load - self.pull))
+
+    def holding(self, stretch: float) -> float:
+        """Return the load that holds a stretch."""
+        return float(law.elastic_force(stretch, self.material.packed))
+
+    def frequency(self, stretch: float) -> float:
+        """Return the nondimensional natural frequency about a stretch."""
+        return float(law.natural_frequency(stretch, self.material.packed))
+
+    def acceleration(self, state: State) -> float:
+        """Return the nondimensional acceleration in a state whose branches have relaxed."""
+        return float(acceleration(state.stretch, state.rate, state.load, self.material))
+
+    def on_grid(self, time: int) -> int:
+        """Return the earliest time in ns, not before the given one, that a command may have."""
+        period = self.options.period
+        return time if period == 0 else -(-time // period) * period
+
+    def follow(self, state: State, load: float, duration: float) -> State:
+        """Predict the state after a load has been commanded for a dimensionless time."""
+        return follow((Level(0.0, load),), state, duration, self.material, self.delivery)
+
+    def taken_from(self, state: State, other: 'Model') -> State:
+        """Return a state of another model in the units of this one."""
+        if other is self:
+            return state
+        loads = float(self.units.of_level(other.units.load))
+
+        def taken(load: float) -> float:
+            return (load - other.pull) * loads + self.pull
+
+        return State(
+            state.stretch, state.rate / other.units.time * self.units.time, taken(state.load),
+            None if state.amplifier is None else taken(state.amplifier),
+            creeping.carried(state, other.material, self.material))
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedLevel:
+    """A change of level, and the prediction at its timestamp."""
+
+    stamp: int  #: start time in ns
+    flux_density: float  #: in T
+    state: State  #: in the units of the model
+    model: Model = field(repr=False)  #: of the motion from the timestamp on
+    #: Timestamp in ns with which it was sent, if it was delayed by an earlier, late level.
+    sent_for: int | None = None
+
+    @property
+    def stretch(self) -> float:
+        """Stretch at the timestamp."""
+        return self.state.stretch
+
+    @property
+    def rate(self) -> float:
+        """Stretch rate at the timestamp in 1/s."""
+        return self.state.rate / self.model.units.time
+
+    @property
+    def in_force(self) -> float:
+        """Flux density in T at the timestamp, from which a slew limit ramps to the level."""
+        return self.model.flux_density(self.state.load)
+
+    @property
+    def load(self) -> float:
+        """The level as a dimensionless load."""
+        return self.model.load(self.flux_density)
+
+    @property
+    def due(self) -> int:
+        """Timestamp in ns with which it is sent."""
+        return self.stamp if self.sent_for is None else self.sent_for
+
+    def shifted(self, span: int) -> 'PlannedLevel':
+        """Return the level with its times shifted by some ns."""
+        return replace(
+            self, stamp=self.stamp if self.stamp == ALWAYS else self.stamp + span,
+            sent_for=None if self.sent_for is None else self.sent_for + span)
+
+    def at(self, time: int) -> State:
+        """Predict the dimensionless state at a time in ns, or at the timestamp if it is later."""
+        if self.stamp == ALWAYS:
+            return self.state
+        return self.model.follow(
+            self.state, self.load,
+            min(max(self.model.time(time - self.stamp), 0.0),
+                math.inf if self.model.material.creep else self._settled()))
+
+    @property
+    def ramped(self) -> float:
+        """Dimensionless time in which the field reaches the level."""
+        return self.model.delivery.settling(self.load - self.state.ramps_from)
+
+    def _settled(self) -> float:
+        """Return the time after which the motion has ended, except for creep."""
+        return self.ramped + longest_motion(self.load, self.model.material)
+
+    def sample(self, times: Sequence[int]) -> list[tuple[float, float]]:
+        """Predict stretch and rate (1/s) at times in ns, not decreasing, from the timestamp on."""
+        if self.stamp == ALWAYS or all(x == self.stamp for x in times):
+            return [(self.stretch, self.rate)] * len(times)
+        model, settled = self.model, self._settled()
+        after = np.array([model.time(x - self.stamp) for x in times])
+        # After settling, creep may continue.
+        count = int(np.searchsorted(after, settled)) if model.material.creep else len(after)
+        stretch, rate, *_ = sampled(
+            (Level(0.0, self.load),), self.state, np.minimum(after[:count], settled),
+            model.material, model.delivery) if count else np.empty((2, 0))
+        found = [*zip(stretch.tolist(), rate.tolist(), strict=True),
+                 *((x.stretch, x.rate) for x in map(self.at, times[count:]))]
+        return [(x, y / model.units.time) for x, y in found]
+
+    def after(self, level: 'PlannedLevel') -> 'PlannedLevel':
+        """Return this level with the prediction at its timestamp after another level."""
+        return replace(self, state=self.model.taken_from(level.at(self.stamp), level.model))
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedSegment:
+    """One setpoint on the timeline, times in ns."""
+
+    stretch: float  #: target
+    begin: int  #: start of the move
+    arrival: int | None  #: time of rest at the target; None if only approached
+    code: Code
+    reason: str  #: why the command is not the requested one; empty if it is
+    since: int  #: start of the setpoint; the move may start later
+    #: Upper bound of the vibration that levels of the creep tail leave in stretch, peak to peak.
+    vibration: float = 0.0
+    until: int | None = None  #: end as requested; None if it is held on
+    carried_out: bool = True  #: whether its commands were sent and took effect, as far as known
+    #: Path to follow, in s from ``since`` on; None for a move.
+    path: Path | None = field(default=None, compare=False, repr=False)
+
+    def shifted(self, span: int) -> 'PlannedSegment':
+        """Return the segment with its times shifted by some ns."""
+        return replace(
+            self, begin=self.begin + span, since=self.since + span,
+            arrival=None if self.arrival is None else self.arrival + span,
+            until=None if self.until is None else self.until + span)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The plan from the present level on."""
+
+    number: int  #: counts accepted requests from 1; 0 before the first
+    levels: tuple[PlannedLevel, ...]  #: by stamp; the first ones may lie in the past
+    segments: tuple[PlannedSegment, ...]  #: by time
+    kept: int = 0  #: number of segments, from the first on, that belong to earlier requests
+
+    def shifted(self, span: int) -> 'Plan':
+        """Return the plan with all times shifted by some ns."""
+        return replace(
+            self, levels=tuple(x.shifted(span) for x in self.levels),
+            segments=tuple(x.shifted(span) for x in self.segments))
+
+    def ahead(self, now: int, limit: int | None = None) -> tuple[PlannedLevel, ...]:
+        """Return the levels from the present one on, without the one that always applied."""
+        first = self.place(now)
+        first += self.levels[first].stamp < 0
+        return self.levels[first:None if limit is None else first + limit]
+
+    def level(self, time: int) -> PlannedLevel:
+        """Return the level at a time; before all levels, the first one."""
+        return self.levels[self.place(time)]
+
+    def place(self, time: int) -> int:
+        """Return the index of the level at a time; before all levels, that of the first one."""
+        return max(bisect_right(self.levels, time, key=lambda x: x.stamp) - 1, 0)
+
+    def under_way(self, time: int) -> int:
+        """Return the index of the setpoint at a time, -1 before the first."""
+        return bisect_right(self.segments, time, key=lambda x: x.since) - 1
+
+    def step(self, place: int) -> float:
+        """Return the distance in stretch of a setpoint from the previous one, by index."""
+        before = self.segments[place - 1] if place else self.levels[0]
+        return abs(self.segments[place].stretch - before.stretch)
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A plan that has not been taken yet."""
+
+    begin: int  #: in ns, the start of the part of the plan that it replaces
+    levels: tuple[PlannedLevel, ...]
+    segments: tuple[PlannedSegment, ...]
+    #: Index of the first setpoint of the running plan that is planned again; None for a request.
+    resumed: int | None = None
+    missed: int = 0  #: number of setpoints skipped because their time is over
+
+    @property
+    def warning(self) -> PlannedSegment | None:
+        """The first setpoint reached only roughly, by another command than the requested one."""
+        return next((x for x in self.segments if x.code in _WARNINGS
+                     or x.code is Code.PATH and x.reason), None)
+
+    def delayed(self, delays: Sequence[int]) -> 'Draft':
+        """Return the draft with the move of each segment delayed by its delay in ns."""
+        begins = [x.begin for x in self.segments]
+        levels = tuple(
+            replace(x, stamp=x.stamp + delays[bisect_right(begins, x.stamp) - 1])
+            for x in self.levels)
+        segments = tuple(
+            x if not delay else replace(
+                x, begin=x.begin + delay,
+                arrival=None if x.arrival is None else x.arrival + delay)
+            for x, delay in zip(self.segments, delays, strict=True))
+        return replace(self, levels=levels, segments=segments)
+

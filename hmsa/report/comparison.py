@@ -1,0 +1,130 @@
+"""Tables that compare runs."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+import math
+
+import numpy as np
+
+from hmsa.errors import BadInputError
+from hmsa.report.arrivals import around, Part
+from hmsa.report.evaluation import judged_from, result_of, verdict_on
+from hmsa.report.looks import RUNS
+from hmsa.runs.record import Run
+from hmsa.table import Column, DEVIATION, Table
+
+
+def labelled(runs: list[Run]) -> list[Run]:
+    """Return the runs with unique labels."""
+    labels = [x.label for x in runs]
+    # Bags with the same name are in different folders, unless a bag is given twice.
+    labels = [
+        f'{run.path.resolve().parent.name}/{run.label}'
+        if labels.count(run.label) > 1 and run.origin == 'recorded'
+        else run.label for run in runs]
+    return [
+        replace(run, label=label if labels.count(label) == 1 else f'{label} ({i})')
+        for i, (run, label) in enumerate(zip(runs, labels, strict=True), 1)]
+
+
+def parts_of(runs: list[Run]) -> list[Part]:
+    """Return evaluated runs with unique labels and, for several runs, different colours."""
+    return [Part.of(run, RUNS[i % len(RUNS)] if len(runs) > 1 else '')
+            for i, run in enumerate(labelled(runs))]
+
+
+def comparison(parts: Sequence[Part]) -> Table:
+    """
+    Return the results of each setpoint in each run, and its distance from the first run's curve.
+
+    Raises
+    ------
+    BadInputError
+        If no run has a setpoint.
+
+    """
+    count = max(len(x.evaluation.findings) for x in parts)
+    if not count:
+        raise BadInputError(
+            f'{", ".join(x.run.label for x in parts)} have no setpoint: expected runs with '
+            'requests or levels that hold a stretch')
+    labels = [x.label for x in labelled([x.run for x in parts])]
+    rows = [
+        (number + 1, label, *_measured(part, number), _apart(parts[0], part, number))
+        for number in range(count) for label, part in zip(labels, parts, strict=True)
+        if number < len(part.evaluation.findings)]
+    return Table(
+        (Column('setpoint'), Column('run'), *_MEASURED, Column('apart', '%', '%')), tuple(rows),
+        f'{_CAPTION}; apart: largest distance from the curve of {labels[0]}, from the start of '
+        'the move on; in % of the step', tuple(
+            f'{label}, {note}' for label, part in zip(labels, parts, strict=True)
+            for note in _open(part)))
+
+
+def setpoints(parts: Sequence[Part]) -> Table:
+    """Return the results of each setpoint of a run; ``parts`` are its joints."""
+    return Table(
+        (Column('setpoint'), *_MEASURED, Column('frequency', 'Hz', '.3g', 'f')),
+        tuple((
+            f'{x.setpoint.joint} {x.setpoint.number}' if x.setpoint.joint else x.setpoint.number,
+            *_measured(part, number), x.frequency)
+            for part in parts for number, x in enumerate(part.evaluation.findings)),
+        f'{_CAPTION}; f: frequency of the vibration; in % of the step',
+        tuple(note for part in parts for note in _open(part)))
+
+
+def _open(part: Part) -> list[str]:
+    """Return why setpoints of a run have no verdict."""
+    return [x.message for x in part.evaluation.findings if x.open]
+
+
+def ringing(parts: Sequence[Part]) -> str:
+    """Return how long unshaped steps rang before they arrived, as the end of a sentence."""
+    rang = [result_of(x.evaluation, i) for x in parts for i in range(len(x.evaluation.findings))
+            if verdict_on(x.evaluation, i).endswith('ringing')]
+    most = max((x.settled for x in rang if x is not None), default=math.nan)
+    return f', unshaped steps after ringing for up to {1e3 * most:.3g} ms' if rang else ''
+
+
+_MEASURED = (
+    Column('target'), Column('move time', 'ms', '.4g'),
+    Column('settling time', 'ms', '.4g', 'settled'), Column('residual', '%', '%'),
+    Column('verdict'),
+    Column('judged from', 'ms', '.4g'), Column('offset', '%', '+%'),
+    Column('offset std', '%', '%', DEVIATION), Column('vibration', '%', '%'),
+    Column('vibration std', '%', '%', DEVIATION))
+_CAPTION = (
+    'move time: from the first level to planned rest, half a period for an unshaped step; '
+    'settled: from then on it stays within arrival_tolerance of the target; residual: peak to '
+    'peak after the move time; judged from: start of the samples that decide the verdict, for an '
+    'unshaped step once its vibration should have faded; offset: their mean less the target; '
+    'vibration: peak to peak in their first period; ±: standard deviations')
+
+
+def _measured(part: Part, number: int) -> tuple[float | str, ...]:
+    """Return the values of the columns `_MEASURED`; NaN if not measured."""
+    found, result = part.evaluation.findings[number], result_of(part.evaluation, number)
+    return (
+        found.setpoint.target, *((math.nan,) * 3 if result is None else (
+            1e3 * result.arrival, 1e3 * result.settled, 100.0 * result.residual)),
+        verdict_on(part.evaluation, number), 1e3 * judged_from(found),
+        *(found.setpoint.percent(x) for x in (
+            found.offset, found.offset_std, found.vibration, found.vibration_std)))
+
+
+def _apart(first: Part, part: Part, number: int) -> float:
+    """Return the largest distance of two curves around an arrival, in percent of the step."""
+    reference, move = (result_of(x.evaluation, number) for x in (first, part))
+    if part is first or reference is None or move is None:
+        return math.nan
+    (time, off), (other, values) = (
+        (time[np.isfinite(off)], off[np.isfinite(off)]) for time, off in (
+            around(reference, first.evaluation.recorded), around(move, part.evaluation.recorded)))
+    if len(other) < 2 or len(time) < 2:
+        return math.nan
+    inside = (time >= other[0]) & (time <= other[-1])
+    # Each curve is in percent of its own step, relative to its own target.
+    step = abs(reference.step)
+    shift = 100.0 * (move.stretch - reference.stretch) / step
+    away = np.interp(time[inside], other, values) * abs(move.step) / step + shift - off[inside]
+    return float(np.max(np.abs(away), initial=0.0))

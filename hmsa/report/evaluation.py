@@ -1,0 +1,345 @@
+"""
+Evaluate a run: its setpoints, residual vibration, and prediction.
+
+Times are in s from the first level of the run; timestamps stay integer nanoseconds.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+
+from hmsa.errors import HmsaError
+from hmsa.interfaces.topics import PLANNER
+from hmsa.judge.records import Finding, Setpoint, Tolerances
+from hmsa.model.delivery import Delivery
+from hmsa.model.equations import (
+    Array,
+    elastic_force,
+    signed_root,
+    stretch_limits,
+)
+from hmsa.model.moves import Level as PlannedLoad
+from hmsa.model.moves import State
+from hmsa.model.parameters import ActuatorParameters
+from hmsa.model.residual import residual_vibration
+from hmsa.model.simulation import follow, response, sampled
+from hmsa.model.units import NANOSECONDS
+from hmsa.report.curves import Curve, fine, through
+from hmsa.report.outcome import findings_of, tolerances_of
+from hmsa.runs.levels import in_force, Level, without_repeats
+from hmsa.runs.parameters import creep_of
+from hmsa.runs.record import Run, Times
+from hmsa.runs.setpoints import Requested, SAME, setpoints_of, start_of
+
+#: With fewer samples per period, peaks are missed.
+FEW_SAMPLES = 10
+# Fraction of the step; a block that covers less did not move.
+_MOVED = 0.1
+# Maximum natural periods to simulate: more take minutes, and indicate a pause or another clock.
+_MOST_PERIODS = 1e6
+
+
+@dataclass(frozen=True)
+class Move:
+    """One setpoint as it was commanded; timestamps in ns."""
+
+    stretch: float  #: target
+    start: float  #: stretch before
+    begin: int  #: of the first command
+    arrival: int  #: planned rest at the target
+    end: int  #: end of the hold at the target
+    flux_densities: tuple[float, ...]  #: levels in T; the last one holds the target
+    place: int = 0  #: index among all requested setpoints
+
+
+@dataclass(frozen=True)
+class MoveResult:
+    """The result of one setpoint."""
+
+    stretch: float  #: target
+    start: float  #: stretch before
+    #: first and last level and duration of the move, nondimensional as in the paper
+    b_p: float
+    tau_p: float
+    b_1: float
+    begin: float  #: in s of the run
+    arrival: float  #: planned rest at the target, in s from the begin
+    end: float  #: in s of the run
+    error: float  #: largest distance from the target after arrival, as a fraction of the step
+    #: peak-to-peak stretch after arrival as a fraction of the step: recorded, and simulated for
+    #: unshaped steps of the same plant; NaN without samples, and for a block that did not move
+    residual: float
+    residual_unshaped: float
+    #: from the begin until the recorded stretch stays within the tolerance of the target, in s;
+    #: NaN if it does not, or without samples
+    settled: float
+    #: whether the mean after arrival lies at least a tenth of the step from the start
+    moved: bool
+    place: int = 0  #: index among all requested setpoints
+
+    @property
+    def step(self) -> float:
+        """Target minus start."""
+        return self.stretch - self.start
+
+    @property
+    def rests(self) -> float:
+        """Planned rest at the target in s of the run."""
+        return self.begin + self.arrival
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The results of a run."""
+
+    #: timestamp in ns of time 0: the first level of the run, or the first sample without levels
+    zero: int
+    time: Array  #: times of the samples in s, shape (n,)
+    start: float  #: stretch at rest before the first move
+    levels: tuple[Level, ...]  #: commands that took effect and changed the level, by timestamp
+    moves: tuple[Move, ...]  #: setpoints
+    results: tuple[MoveResult, ...]  #: one per move
+    recorded: Curve  #: through the samples
+    #: simulated for unshaped steps; NaN without a move, and for steps too large or too long to
+    #: simulate
+    plain: Curve
+    plan: tuple[Level, ...]  #: planned changes of level that were not replanned, by timestamp
+    #: predicted by the plan, at the samples and between them; NaN before and without a plan
+    planned: Curve
+    findings: tuple[Finding, ...] = ()  #: one per requested setpoint
+
+    def seconds(self, stamp: int) -> float:
+        """Return a timestamp in s of the run."""
+        return (stamp - self.zero) / NANOSECONDS
+
+
+def judged_from(finding: Finding) -> float:
+    """Return the time of the first judged sample in s from the start of the move."""
+    return (finding.setpoint.rests_from - finding.setpoint.begins) / NANOSECONDS
+
+
+def verdicts(evaluations: Sequence[Evaluation], number: int) -> str:
+    """Return the different verdicts on a move in several runs, each after a comma."""
+    places = [(x, x.results[number].place) for x in evaluations if number < len(x.results)]
+    return ''.join(f', {x}' for x in dict.fromkeys(
+        verdict_on(found, i) for found, i in places if i < len(found.findings)))
+
+
+def verdict_on(evaluation: Evaluation, number: int) -> str:
+    """
+    Return the verdict on a setpoint in words.
+
+    An unshaped step is judged once its vibration has faded: the words say that it rang before.
+    """
+    finding, result = evaluation.findings[number], result_of(evaluation, number)
+    setpoint, words = finding.setpoint, str(finding.verdict).replace('_', ' ')
+    approached = setpoint.arrival is None and setpoint.moved is None
+    rang = approached and setpoint.decay < setpoint.frequency and (
+        result is not None and not result.settled <= result.arrival)
+    return f'{words} after ringing' if finding.arrived and rang else words
+
+
+def result_of(evaluation: Evaluation, number: int) -> MoveResult | None:
+    """Return the result of a setpoint; None without an arrival in the recording."""
+    return next((x for x in evaluation.results if x.place == number), None)
+
+
+def evaluate(run: Run, tolerances: Tolerances | None = None) -> Evaluation:
+    """Evaluate a run with the given tolerances, by default those of its planner."""
+    levels = in_force((x,) for x in without_repeats(run.commands)[0])
+    plan = in_force(run.plans)
+    asked = setpoints_of(run)
+    first = _first(run, levels, asked)
+    start = asked[0].setpoint.start if asked else start_of(run, first)
+    found = tuple(find_moves(run, levels, asked))
+    time = (run.time - first) / NANOSECONDS
+    period = run.plant.period
+    plain = _plain(run, time, found, first, start)
+    recorded = through(Curve(time, run.stretch, run.rate), period)
+    tolerances = tolerances or tolerances_of(run)
+    results = [_measure(
+        run, time, recorded, plain, x, first, asked[x.place].setpoint, tolerances) for x in found]
+    stamps = run.time
+    if plan:
+        between = np.rint(fine(time, period) * NANOSECONDS).astype(np.int64) + first
+        stamps = np.unique(np.concatenate([run.time, between, [
+            x.stamp for x in plan if run.time[0] <= x.stamp <= run.time[-1]]]).astype(np.int64))
+    return Evaluation(
+        first, time, start, levels, found, tuple(results), recorded, plain, plan,
+        Curve((stamps - first) / NANOSECONDS, *_predict(run, plan, stamps)),
+        tuple(findings_of(run, tolerances, asked=asked)))
+
+
+def _first(run: Run, levels: Sequence[Level], asked: Sequence[Requested]) -> int:
+    """Return the begin of the first level in ns, skipping the level that an earlier run left."""
+    begins = asked[0].setpoint.begins if asked else int(run.time[0])
+    later = [x for x in levels if x.stamp >= begins]
+    if not later:
+        return levels[0].stamp if levels else int(run.time[0])
+    before = int(np.searchsorted(run.time, later[0].stamp)) - 1
+    held = next((x.flux_density for x in reversed(levels) if x.stamp < begins), float(
+        run.flux_density[before]) if before >= 0 else math.nan)
+    return next((x for x in later if x.flux_density != held), later[0]).stamp
+
+
+def find_moves(run: Run, levels: Sequence[Level], setpoints: Sequence[Requested]) -> list[Move]:
+    """Return the moves whose planned arrival lies within the recording."""
+    last = int(run.time[-1])
+    moves = []
+    for place, asked in enumerate(setpoints):
+        setpoint, arrival = asked.setpoint, asked.arrival
+        end = min(x for x in (asked.due, asked.until, last) if x is not None)
+        inside = [x for x in levels if setpoint.begins <= x.stamp <= (arrival or end)]
+        if asked.missed or setpoint.step <= SAME or not inside:
+            continue
+        if arrival is None:
+            # An unshaped step has no arrival: take half a period, that of a two-step command.
+            arrival = inside[0].stamp + round(math.pi / setpoint.frequency * NANOSECONDS)
+            inside = [x for x in inside if x.stamp <= arrival]
+        if arrival < end:
+            moves.append(Move(
+                setpoint.target, setpoint.start, inside[0].stamp, arrival, end,
+                tuple(x.flux_density for x in inside), place))
+    return moves
+
+
+def _plain(
+        run: Run, time: Array, moves: Sequence[Move], zero: int, start: float) -> Curve:
+    """Simulate unshaped steps, at the samples and between them."""
+    nothing = Curve(time, np.full_like(time, np.nan), np.full_like(time, np.nan))
+    begins = np.array([(x.begin - zero) / NANOSECONDS for x in moves])
+    if not moves or time[-1] - begins[0] > _MOST_PERIODS * run.plant.period:
+        return nothing
+    before = time[time < begins[0]]
+    grid = fine(np.union1d(begins[:1], time[len(before):]), run.plant.period)
+    lower, upper = stretch_limits(run.plant.nondimensional)
+    margin = 1e-6 * (min(upper, 2.0) - lower)
+    start = min(max(start, lower + margin), upper - margin)
+    try:
+        # With the amplifier, coil and elastomer of the run.
+        stretch, rate, _ = response(
+            replace(run.plant, creep=creep_of(run.parameters, run.joint)),
+            _delivery(run, run.plant, 'plant'), begins,
+            np.array([x.flux_densities[-1] for x in moves]), grid, start)
+    except HmsaError:
+        return nothing
+    return Curve(*(np.concatenate(x) for x in (
+        (before, grid), (np.full_like(before, start), stretch), (np.zeros_like(before), rate))))
+
+
+def _delivery(run: Run, actuator: ActuatorParameters, node: str) -> Delivery:
+    """Return slew limit and lag between the levels of a node and the field."""
+    unit = actuator.time_unit
+    return Delivery(
+        slew=run.number(f'{node}.slew_limit') / actuator.flux_density_unit * unit or math.inf,
+        lag=run.number(f'{node}.coil_time_constant') / unit)
+
+
+def _measure(
+        run: Run, time: Array, recorded: Curve, plain: Curve, move: Move, zero: int,
+        setpoint: Setpoint, tolerances: Tolerances) -> MoveResult:
+    """Evaluate one setpoint."""
+    step = move.stretch - move.start
+    begin, arrival, end = (
+        (x - zero) / NANOSECONDS for x in (move.begin, move.arrival, move.end))
+    window = {'arrival': arrival, 'end': end, 'step': step}
+    after = (time >= arrival) & (time <= end)
+    error = residual = unshaped = math.nan
+    moved = True
+    if np.count_nonzero(after) >= 2:
+        error = float(np.max(np.abs(run.stretch[after] - move.stretch)) / abs(step))
+        before = run.stretch[max(int(np.searchsorted(time, begin, side='right')) - 1, 0)]
+        moved = bool((np.mean(run.stretch[after]) - before) / step >= _MOVED)
+        if moved:
+            residual = residual_vibration(time, run.stretch, **window)
+        unshaped = residual_vibration(plain.time, plain.stretch, **window)
+    of_level = run.planner.units.of_level
+    allowed, _ = tolerances.of(setpoint)
+    return MoveResult(
+        stretch=move.stretch, start=move.start,
+        b_p=float(signed_root(of_level(move.flux_densities[0]))),
+        tau_p=(arrival - begin) / run.planner.time_unit,
+        b_1=float(signed_root(of_level(move.flux_densities[-1]))), begin=begin,
+        arrival=arrival - begin, end=end, error=error, residual=residual,
+        residual_unshaped=unshaped,
+        settled=_settled(recorded.between(begin, end), move.stretch, allowed) - begin,
+        moved=moved, place=move.place)
+
+
+def _settled(curve: Curve, target: float, allowed: float) -> float:
+    """Return the time in s from which a curve stays within a distance of the target; else NaN."""
+    off = np.flatnonzero(np.abs(curve.stretch - target) > allowed)
+    place = int(off[-1]) + 1 if len(off) else 0
+    return float(curve.time[place]) if place < len(curve.time) else math.nan
+
+
+def _predict(run: Run, plan: Sequence[Level], stamps: Times) -> tuple[Array, Array]:
+    """Return the stretch and rate that the plan predicts, simulated from point to point."""
+    predicted = np.full((2, len(stamps)), np.nan)
+    actuator: ActuatorParameters = run.planner
+    creep = creep_of(run.parameters, run.joint, PLANNER)
+    material = replace(actuator, creep=creep).nondimensional
+    lower, upper = stretch_limits(material)
+    # A recorded message can contain impossible stretches.
+    plan = [x for x in plan if lower < x.stretch < upper]
+    if not plan:
+        return predicted[0], predicted[1]
+    unit, delivery = actuator.time_unit, _delivery(run, actuator, 'planner')
+    state = State(plan[0].stretch, load=float(elastic_force(plan[0].stretch, material)))
+    for i, point in enumerate(plan):
+        until = plan[i + 1].stamp if i + 1 < len(plan) else max(int(run.time[-1]), point.stamp)
+        if until - point.stamp > _MOST_PERIODS * actuator.period * NANOSECONDS:
+            continue
+        level = PlannedLoad(0.0, actuator.units.of_level(point.flux_density))
+        state = replace(state, stretch=point.stretch, rate=point.rate * unit)
+        part = slice(
+            int(np.searchsorted(stamps, point.stamp)), int(np.searchsorted(
+                stamps, until, side='right' if i + 1 == len(plan) else 'left')))
+        try:
+            if part.start < part.stop:
+                predicted[:, part] = sampled(
+                    (level,), state, (stamps[part] - point.stamp) / NANOSECONDS / unit, material,
+                    delivery)[:2]
+            state = follow(
+                (level,), state, (until - point.stamp) / NANOSECONDS / unit, material, delivery)
+        except HmsaError:
+            # The plan was made with other parameters than the run contains.
+            continue
+    return predicted[0], predicted[1] / unit
+
+
+@dataclass(frozen=True)
+class PlanPoint:
+    """A change of level in the plan and the recorded values there; NaN if not recorded."""
+
+    time: float  #: in s of the run
+    planned: float  #: flux density in T
+    commanded: float  #: command with the same timestamp, in T
+    stretch: float  #: predicted for the first sample at or after the change
+    rate: float  #: predicted likewise, in 1/s
+    recorded_stretch: float  #: of that sample
+    recorded_rate: float
+    deviation: float  #: largest difference of recorded and predicted stretch until the next point
+
+
+def plan_points(run: Run, evaluation: Evaluation) -> list[PlanPoint]:
+    """Compare the plan of a run with the recorded motion, by time."""
+    commanded = {x.stamp: x.flux_density for x in evaluation.levels}
+    planned = evaluation.planned.at(evaluation.time)
+    stretch, rate = planned.stretch, planned.rate
+    # The first sample of each point, then the end.
+    firsts = [int(np.searchsorted(run.time, x.stamp)) for x in evaluation.plan]
+    firsts.append(len(run.time))
+    points = []
+    for point, first, until in zip(evaluation.plan, firsts, firsts[1:], strict=False):
+        values = [math.nan] * 5
+        if first < until:
+            values = [float(x[first]) for x in (stretch, rate, run.stretch, run.rate)]
+            values.append(float(np.max(np.abs(
+                run.stretch[first:until] - stretch[first:until]))))
+        points.append(PlanPoint(
+            evaluation.seconds(point.stamp), point.flux_density,
+            commanded.get(point.stamp, math.nan), *values))
+    return points

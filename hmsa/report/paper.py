@@ -1,0 +1,96 @@
+"""The width, font size and format of a figure."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from hmsa.errors import BadInputError
+
+#: Formats of figures; ``pgf`` is for LaTeX.
+KINDS = ('png', 'pdf', 'svg', 'pgf')
+#: Widths of journal figures in mm: one, one and a half, and two columns.
+WIDTHS = (85.0, 120.0, 183.0)
+_INCH = 25.4
+# Minimum width of a panel in mm, at 8 pt.
+_PANEL = 55.0
+
+
+@dataclass(frozen=True)
+class Paper:
+    """
+    The size of a figure, and whether its data is written to a CSV file.
+
+    Raises
+    ------
+    BadInputError
+        If a number is out of range.
+
+    """
+
+    width: float = WIDTHS[-1]  #: in mm, 40 to 400
+    letters: float = 8.0  #: font size in pt, 4 to 24
+    dpi: float = 600.0  #: of PNG, 50 to 1200
+    data: bool = False  #: whether the plotted data are also written as CSV
+
+    def __post_init__(self) -> None:
+        for name, value, unit, least, most in (
+                ('width', self.width, ' mm', 40.0, 400.0),
+                ('font size', self.letters, ' pt', 4.0, 24.0),
+                ('dpi', self.dpi, '', 50.0, 1200.0)):
+            if not least <= value <= most:
+                raise BadInputError(
+                    f'the {name} of a picture is {value:g}{unit}: expected {least:g} to '
+                    f'{most:g}{unit}')
+
+    @property
+    def inches(self) -> float:
+        """Width in inches."""
+        return self.width / _INCH
+
+    def columns(self, most: int) -> int:
+        """Return how many panels fit side by side, 1 to ``most``."""
+        return max(1, min(most, int(self.width * 8.0 / self.letters // _PANEL)))
+
+    def tables(self, pictures: Sequence[Path]) -> list[Path]:
+        """Return the CSV files with the data of figures; none without ``data``."""
+        return list(dict.fromkeys(x.with_suffix('.csv') for x in pictures if self.data))
+
+
+#: Figures of the documentation.
+SCREEN = Paper(dpi=200.0)
+
+
+def kind_of(path: Path) -> str:
+    """
+    Return the format of a figure by the suffix of its path.
+
+    Raises
+    ------
+    BadInputError
+        If the suffix is not one of `KINDS`.
+
+    """
+    kind = path.suffix.lower().removeprefix('.')
+    if kind not in KINDS:
+        raise BadInputError(
+            f'the format of {path} is unknown: expected a name that ends in '
+            f'{", ".join(f".{x}" for x in KINDS[:-1])} or .{KINDS[-1]}')
+    return kind
+
+
+def kinds_in(text: str) -> tuple[str, ...]:
+    """
+    Return the formats in a comma-separated list.
+
+    Raises
+    ------
+    BadInputError
+        If one is none of `KINDS`.
+
+    """
+    return tuple(dict.fromkeys(kind_of(Path(f'picture.{x.strip()}')) for x in text.split(',')))
+
+
+def named(folder: Path, name: str, kinds: Sequence[str]) -> list[Path]:
+    """Return the paths of a figure in a folder, one for each format."""
+    return [folder / f'{name}.{x}' for x in kinds]

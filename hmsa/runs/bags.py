@@ -1,0 +1,412 @@
+"""
+Reading of runs from a bag.
+
+Topics are found by the end of their name and their type, so that any namespace is possible. The
+bag may be recorded by this package or rosbag2, from a simulated plant or a coil.
+"""
+
+from bisect import bisect_left, bisect_right
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hmsa.bag import limits
+from hmsa.bag.info import BagSummary, summarize
+from hmsa.bag.reader import BagReader, Message
+from hmsa.errors import assume, BadInputError, BagError, MissingWarning
+from hmsa.interfaces.status import whole
+from hmsa.judge.records import Sensor
+from hmsa.model.schedule import obeyed
+from hmsa.model.units import NANOSECONDS
+from hmsa.runs import answers
+from hmsa.runs import topics as roles
+from hmsa.runs.levels import Level
+from hmsa.runs.parameters import actuators, named_joint, recorded
+from hmsa.runs.record import LearntSensor, RecordedRequest, Run, Verdict
+from hmsa.runs.samples import nanoseconds_of, SampleReader
+from hmsa.runs.topics import topics_by_joint
+
+# Time between samples that is a gap in a bag with missing messages, relative to the median.
+_UNUSUAL_STEP = 10
+# Messages between two calls of the progress callback.
+_PROGRESS_MESSAGES = 20_000
+_MOST_NOTES = 20
+# In ns, minimum time between messages of a planner, so that a request fits in between.
+_APART = 2
+_LEVELS = ('ok', 'warning', 'error')
+
+
+def read_runs(
+        path: str | Path, *, parameters: Mapping[str, object] | None = None,
+        joints: Sequence[str] = (), max_chunk_size: int = limits.CHUNK_SIZE,
+        progress: Callable[[str, float], None] = lambda what, share: None) -> list[Run]:
+    """
+    Read a bag: one run for each actuator with joint states.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder of a bag, or an ``.mcap`` file.
+    parameters : mapping of str to object, optional
+        True parameters of the block and its coil, from `read_parameter_file`; default those in
+        the bag.
+    joints : sequence of str
+        Names of the actuators in the joint states; default all that have their own commands, or
+        the one that the nodes name.
+    max_chunk_size : int
+        As for `BagReader`.
+    progress : callable
+        Called with a description of the work and the completed fraction.
+
+    Returns
+    -------
+    list of Run
+        At least one, ordered by namespace and joint. A `MissingWarning` reports messages that are
+        missing from them.
+
+    Raises
+    ------
+    BadInputError
+        If there is no bag, or it has no samples of an actuator.
+
+    """
+    path = Path(path)
+    reader = BagReader(path, max_chunk_size=max_chunk_size)
+    spaces = topics_by_joint(reader)
+    collected = _collect(reader, spaces, progress)
+    summary = summarize(reader)
+    label = path.resolve().stem if path.is_file() else path.resolve().name
+    runs, reasons = [], []
+    for space, by_joint in sorted(spaces.items()):
+        name = label if len(spaces) == 1 else f'{label} {space or "/"}'
+        for joint, topics in sorted(by_joint.items()):
+            if joint and joints and joint not in joints:
+                reasons.append(BadInputError(
+                    f'{path} has no joint {" or ".join(joints)}: expected one of '
+                    f'{", ".join(sorted(by_joint))}'))
+                continue
+            for wanted in ([joint] if joint else joints or ['']):
+                several = len(by_joint) > 1 or len(joints) > 1
+                try:
+                    runs.append(collected[space].finish(
+                        f'{name} {wanted}' if several else name, reader, summary, topics,
+                        parameters or {}, joint, wanted))
+                except BadInputError as error:
+                    reasons.append(error)
+    if not runs:
+        # Skipped messages may be the reason.
+        notes = [x for each in collected.values() for x in each.notes]
+        raise BadInputError('; '.join([str(reasons[0]), *notes[:1]]))
+    if missing := summary.missing({x for run in runs for x in run.topics.values()}):
+        assume('; '.join([f'{path}: {missing}', *filter(None, map(_gap, runs))]), MissingWarning)
+    return runs
+
+
+def _gap(run: Run) -> str:
+    """Return the longest time without samples as a part of a sentence; empty if it is usual."""
+    steps = np.diff(run.time)
+    if not len(steps) or (longest := int(steps.max())) < _UNUSUAL_STEP * np.median(steps):
+        return ''
+    begin = run.time[int(steps.argmax())] - run.time[0]
+    return (f'{run.label} has no samples for {longest / NANOSECONDS:.3g} s from '
+            f'{begin / NANOSECONDS:.3g} s on')
+
+
+def read_run(
+        path: Path, *, joint: str = '',
+        progress: Callable[[str, float], None] = lambda what, share: None) -> Run:
+    """Read the single run of a bag, as `read_runs`; raise `BadInputError` if there are several."""
+    runs = read_runs(path, joints=[joint] if joint else [], progress=progress)
+    if len(runs) > 1:
+        raise BadInputError(
+            f'{path} has the runs {", ".join(x.label for x in runs)}: expected one; ' + (
+                'name its actuator (--joint)' if len({x.joint for x in runs}) == len(runs)
+                else 'record the topics of one namespace in a bag'))
+    return runs[0]
+
+
+def _collect(
+        reader: BagReader, spaces: Mapping[str, Mapping[str, Mapping[str, str]]],
+        progress: Callable[[str, float], None]) -> 'dict[str, _Collected]':
+    """Read all messages of some topics, by namespace."""
+    # The topics of a namespace, and those of each joint in it.
+    found = {topic: (space, role, joint) for space, by_joint in spaces.items()
+             for joint, topics in by_joint.items() for role, topic in topics.items()}
+    decoders: dict[str, Callable[[bytes], Any]] = {}
+    for topic in found:
+        try:
+            decoders[topic] = reader.decoder(topic)
+        except BagError as error:
+            raise BadInputError(f'{reader.path} cannot be evaluated: {error}') from error
+    collected = {space: _Collected() for space in spaces}
+    begin, end = reader.start_time or 0, reader.end_time or 0
+    for i, message in enumerate(reader.messages(list(found))):
+        if i % _PROGRESS_MESSAGES == 0:
+            progress(
+                f'reading {reader.path.name}', (message.log_time - begin) / max(end - begin, 1))
+        space, role, joint = found[message.topic]
+        collected[space].take(role, joint, message, decoders[message.topic])
+    for one in collected.values():
+        one.order()
+    return collected
+
+
+@dataclass(frozen=True)
+class _Point:
+    """A point of a trajectory: time from its start in ns, and values by joint."""
+
+    time: int | None  # None if held until the next setpoint
+    positions: tuple[float, ...]
+    velocities: tuple[float, ...]
+    effort: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Trajectory:
+    """A request or a plan as received, with its timestamp in ns."""
+
+    sent: int
+    joints: tuple[str, ...]
+    stamp: int
+    points: tuple[_Point, ...]
+    name: str  # of the request, if it has one
+    taken: bool = True  # False if the planner is known to have refused it
+
+    @classmethod
+    def of(cls, sent: int, message: Any) -> '_Trajectory':
+        """Return the trajectory in a message."""
+        return cls(sent, tuple(message.joint_names), nanoseconds_of(message.header.stamp), tuple(
+            _Point(nanoseconds_of(x.time_from_start), *(
+                tuple(map(float, y)) for y in (x.positions, x.velocities, x.effort)))
+            for x in message.points), message.header.frame_id)
+
+
+class _Collected:
+    """Data read so far for the actuators of one namespace; dictionaries are by joint."""
+
+    def __init__(self) -> None:
+        self.samples = SampleReader()
+        self.commands: defaultdict[str, list[Level]] = defaultdict(list)
+        self.applied: defaultdict[str, list[Level]] = defaultdict(list)
+        self.forces: defaultdict[str, list[tuple[int, int, float]]] = defaultdict(list)
+        self.refused = Counter[str]()
+        # Of all joints; plans and verdicts are assigned after sorting.
+        self.plans: list[_Trajectory] = []
+        self.requests: list[_Trajectory] = []
+        self.stops: list[int] = []  # recording times of plans without a request
+        self.verdicts: list[Verdict] = []
+        # Plans and verdicts, with the time of publishing by the planner's clock.
+        self.published: list[tuple[int, _Trajectory | Verdict]] = []
+        # With the joint of each.
+        self.sensors: list[tuple[str, LearntSensor]] = []
+        self.notes: list[str] = []
+        self.left_out = 0
+
+    def take(
+            self, role: str, joint: str, message: Message,
+            decode: Callable[[bytes], Any]) -> None:
+        """Add a message, or count and note it if it does not fit its topic."""
+        try:
+            self._take(role, joint, message, decode(message.data))
+        except (AttributeError, TypeError, ValueError, OverflowError, BagError) as error:
+            # The bag contains the definition, which may be anything.
+            reason = str(error) if isinstance(error, BagError) else (
+                f'a message of topic {message.topic} is not as {roles.TYPES[role]} is defined in '
+                f'ROS 2: {error}')
+            self.left_out += 1
+            if len(self.notes) < _MOST_NOTES:
+                self.notes.append(f'{reason}: left out')
+
+    def _take(self, role: str, joint: str, message: Message, content: Any) -> None:
+        sent = message.log_time
+        if role == roles.JOINT_STATES:
+            self.samples.take(sent, content)
+        elif role in (roles.COMMAND, roles.APPLIED):
+            vector = content.magnetic_field
+            if obeyed(vector.x, vector.y, vector.z):
+                stamp = nanoseconds_of(content.header.stamp)
+                kept = self.commands if role == roles.COMMAND else self.applied
+                kept[joint].append(Level(
+                    stamp or (sent if role == roles.COMMAND else 0), float(vector.z), sent))
+            else:
+                self.refused[joint] += 1
+        elif role == roles.FORCE:
+            self.forces[joint].append((
+                sent, nanoseconds_of(content.header.stamp) or sent,
+                float(content.wrench.force.z)))
+        elif role == roles.PLAN:
+            self.published.append((message.publish_time, _Trajectory.of(sent, content)))
+        elif role == roles.TRAJECTORY:
+            self.requests.append(_Trajectory.of(sent, content))
+        elif role == roles.SETPOINT:
+            self.requests.append(_Trajectory(
+                sent, (joint,) if joint else (), 0,
+                (_Point(None, (float(content.data),), (), ()),), ''))
+        elif role == roles.ESTIMATE:
+            self.sensors += (
+                (x.hardware_id, LearntSensor(sent, Sensor.of({y.key: y.value for y in x.values})))
+                for x in content.status)
+        else:
+            level = content.level[0] if isinstance(content.level, bytes) else int(content.level)
+            values = {x.key: x.value for x in content.values}
+            self.published.append((message.publish_time, Verdict(
+                sent, _LEVELS[min(level, 2)], values.get('code', ''), content.message,
+                whole(values.get('plan')), values.get('request', ''))))
+
+    def order(self) -> None:
+        """
+        Sort plans and verdicts into the order in which the planner published them.
+
+        Both are latched: new subscribers receive old ones, perhaps after newer ones. Each counts
+        as received no later than those published after it, and all at different times, although
+        everything between two ticks of a clock is recorded at the same time.
+        """
+        if all(time in (0, x.sent) for time, x in self.published):
+            self._pair()
+        self.published.sort(key=lambda x: x[0])
+        times = [x.sent for _, x in self.published]
+        for i in reversed(range(len(times) - 1)):
+            times[i] = min(times[i], times[i + 1])
+        for i in range(1, len(times)):
+            times[i] = max(times[i], times[i - 1] + _APART)
+        for (_, one), sent in zip(self.published, times, strict=True):
+            kept: list[Any] = self.verdicts if isinstance(one, Verdict) else self.plans
+            kept.append(replace(one, sent=sent))
+        self._answer(times)
+
+    def _pair(self) -> None:
+        """Put plans right before their verdicts if only recording times are known."""
+        verdicts = sorted(
+            (x for _, x in self.published if isinstance(x, Verdict)), key=lambda x: x.sent)
+        before = answers.plans_of(verdicts, sorted(
+            x.sent for _, x in self.published if isinstance(x, _Trajectory)))
+        self.published = [
+            (2 * before[x.sent] - 1 if isinstance(x, _Trajectory) and x.sent in before
+             else 2 * x.sent, x) for _, x in self.published]
+
+    def _answer(self, times: Sequence[int]) -> None:
+        """
+        Determine which requests were accepted, and put each right before its plan and verdict.
+
+        A recorder may receive a request after them, and a latched earlier verdict after it.
+        ``times`` are those of all plans and verdicts, in order.
+        """
+        plans = {x.sent for x in self.plans}
+
+        def announced(verdict: Verdict) -> int:
+            place = bisect_left(times, verdict.sent)
+            return times[place - (place > 0 and times[place - 1] in plans)]
+
+        self.requests.sort(key=lambda x: x.sent)
+        found, others = answers.answered(self.requests, self.verdicts)
+        self.stops = [announced(x) for x in others]
+        unheard = sum(answer is None and not taken for answer, taken in found)
+        if unheard:
+            self.notes.append(
+                f'{unheard} of {len(found)} requests have no answer of a planner, and are not '
+                'judged: was it running, and is its ~/status recorded?')
+        for i, (request, (answer, taken)) in enumerate(zip(self.requests, found, strict=True)):
+            sent = request.sent
+            if answer is not None:
+                begun = announced(answer)
+                place = bisect_left(times, begun)
+                before = times[place - 1] if place else sent - 1
+                sent = min(max(sent, before + 1), begun - 1)
+            self.requests[i] = replace(request, sent=sent, taken=taken)
+
+    def _plans(self, joint: str) -> Iterator[tuple[Level, ...]]:
+        """Yield the plans of a joint, and those without joint names."""
+        for plan in self.plans:
+            place = _place(plan.joints, joint)
+            if place is None:
+                continue
+            levels = [
+                Level(plan.stamp + (x.time or 0), x.effort[place], plan.sent, x.positions[place],
+                      x.velocities[place])
+                for x in plan.points
+                if min(len(x.positions), len(x.velocities), len(x.effort)) > place]
+            if len(plan.joints) > 1:
+                # The plan has a point for each change of any joint, from the present levels on.
+                first = bisect_right(levels, plan.sent, key=lambda x: x.stamp)
+                levels = levels[max(first - 1, 0):]
+                levels = [x for i, x in enumerate(levels) if i == 0
+                          or x.flux_density != levels[i - 1].flux_density]
+            yield tuple(levels)
+
+    def _requests(self, joint: str) -> Iterator[RecordedRequest]:
+        """Yield the requests for a joint, by time."""
+        for asked in sorted(self.requests, key=lambda x: x.sent):
+            place = _place(asked.joints, joint)
+            if place is not None:
+                points = tuple(
+                    (x.positions[place], x.time) for x in asked.points
+                    if len(x.positions) == max(len(asked.joints), 1))
+                moves = len(points) > 0 and any(any(x.velocities) for x in asked.points)
+                path = points[-1][1] if moves else None
+                yield RecordedRequest(
+                    asked.sent, asked.stamp,
+                    points if path is None else ((points[-1][0], None),), path, asked.name,
+                    asked.taken)
+
+    def finish(
+            self, label: str, reader: BagReader, summary: BagSummary, topics: Mapping[str, str],
+            given: Mapping[str, object], key: str, joint: str) -> Run:
+        """Return the run of one joint, with or without the joint's name in the topics."""
+        states = topics[roles.JOINT_STATES]
+        parameters = recorded(reader.custom_data, states[:-len(roles.JOINT_STATES)])
+        planned = [x for plan in self.plans for x in plan.joints]
+        beside = topics.get(roles.COMMAND, '').split('/')[-2:-1]
+        named = joint or next(
+            (x for x in (*planned, named_joint(parameters), *beside) if x in self.samples.names),
+            '')
+        samples, sample_notes, lost_samples = self.samples.columns(
+            f'{reader.path}: {states}', named, required=bool(joint))
+        plant, planner, known, more = actuators(parameters, given, named)
+        refused = self.refused[key]
+        notes = [*self.notes, *summary.problems]
+        if roles.COMMAND not in topics:
+            notes.append(
+                f'The recording has no {roles.COMMAND}: unshaped steps and lateness are unknown, '
+                'and so are setpoints that were not requested.')
+        elif not self.commands[key]:
+            notes.append(
+                f'{topics[roles.COMMAND]} holds no command: there is no setpoint to evaluate.')
+        if refused:
+            notes.append(
+                f'{refused} commands are not finite or not along z: left out, as the plant '
+                'does.')
+        run = Run(
+            label, named, reader.path, **samples, commands=tuple(self.commands[key]),
+            applied=_begun(self.applied[key], int(samples['time'][0])),
+            forces=tuple(self.forces[key]), plans=tuple(self._plans(joint)),
+            requests=tuple(self._requests(joint)), verdicts=tuple(self.verdicts),
+            stops=tuple(self.stops), sensors=tuple(
+                x for of, x in self.sensors
+                if of == joint or len({y for y, _ in self.sensors}) == 1),
+            parameters={**parameters, **given}, plant=plant, planner=planner,
+            parameters_known=known, left_out=self.left_out + refused + lost_samples,
+            notes=(*notes, *sample_notes, *more), topics=topics, summary=summary)
+        if not (lost := run.lost(roles.COMMAND, roles.APPLIED)):
+            return run
+        return replace(run, notes=(
+            *run.notes, f'The recorder lost {" and ".join(lost)}: levels may be missing; record '
+            'on a machine that is less busy.'))
+
+
+def _begun(levels: Sequence[Level], first: int) -> tuple[Level, ...]:
+    """Return the changes that took effect; time 0 means before the first sample."""
+    known = any(0 < x.stamp <= first for x in levels)
+    return tuple(
+        x if x.stamp else replace(x, stamp=min(x.sent, first)) for x in levels
+        if x.stamp or not known)
+
+
+def _place(names: Sequence[str], joint: str) -> int | None:
+    """Return the index of a joint among names; the first if there are no names or no joint."""
+    if joint in names:
+        return list(names).index(joint)
+    return 0 if not joint or not names else None

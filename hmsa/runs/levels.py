@@ -1,0 +1,91 @@
+"""Levels of the field: commanded, superseded, repeated, and applied."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmsa.model.equations import Array
+from hmsa.model.schedule import CommandSchedule, Superseding
+from hmsa.model.units import NANOSECONDS
+
+#: Maximum rounding error of a level by the hardware, relative to the largest.
+ROUNDED = 1e-3
+#: Maximum clock error of a device in reported timestamps, in ns.
+ROUNDED_STAMP = 100_000
+
+
+@dataclass(frozen=True)
+class Level:
+    """A command, or a change of level in a plan."""
+
+    stamp: int  # start time in ns
+    flux_density: float  # in T
+    sent: int  # recording time in ns
+    stretch: float = math.nan  # predicted at the timestamp; NaN for a command
+    rate: float = math.nan  # predicted at the timestamp, in 1/s
+
+
+def in_force(messages: Iterable[Sequence[Level]]) -> tuple[Level, ...]:
+    """Return the remaining levels; each message replaces all at or after its first timestamp."""
+    levels: Superseding[Level] = Superseding()
+    for message in messages:
+        for level in sorted(message, key=lambda x: x.stamp):
+            levels.put(level.stamp, level)
+    return tuple(levels)
+
+
+def held_at(levels: Sequence[Level], stamps: NDArray[np.int64]) -> Array:
+    """Return the level in T at timestamps in ns, for levels by time; NaN before the first."""
+    place = np.searchsorted([x.stamp for x in levels], stamps, side='right')
+    return np.array([math.nan, *(x.flux_density for x in levels)])[place]
+
+
+def without_repeats(commands: Sequence[Level]) -> tuple[tuple[Level, ...], int]:
+    """Return the commands that change the level, and the number of those that do not."""
+    schedule = CommandSchedule(math.nan)
+    kept = tuple(x for x in commands if schedule.insert(x.stamp, x.flux_density))
+    return kept, len(commands) - len(kept)
+
+
+def lateness_of(
+        commands: Sequence[Level], applied: Sequence[Level], last: int) -> tuple[Array, int]:
+    """
+    Return the lateness of each command, and the number of commands that never took effect.
+
+    The lateness is in s, for each command from `without_repeats`: NaN for one that never took
+    effect, empty if changes were not reported. The number counts changes of level that were due
+    before ``last`` (ns), were not replaced, and never took effect.
+    """
+    if not applied:
+        return np.empty(0), 0
+    result = np.full(len(commands), np.nan)
+    unapplied = 0
+    # Commands that were replaced before their time never took effect.
+    standing = in_force((x,) for x in commands)
+    places = {x: i for i, x in enumerate(commands)}
+    same = _same_for(commands)
+    # The level when the first command was due; reported levels may be older.
+    begin = standing[0].stamp if standing else 0
+    before: Level | None = max(
+        (x for x in applied if x.stamp <= begin), key=lambda x: x.stamp,
+        default=min(applied, key=lambda x: x.stamp))
+    for i, command in enumerate(standing):
+        until = next(
+            (x.stamp for x in standing[i + 1:] if same(x, command)), math.inf)
+        when = [x.stamp for x in applied if same(x, command)
+                and command.stamp - ROUNDED_STAMP <= x.stamp < until - ROUNDED_STAMP]
+        if when:
+            result[places[command]] = (min(when) - command.stamp) / NANOSECONDS
+        elif command.stamp < last and not (before and same(before, command)):
+            unapplied += 1
+        before = command
+    return result, unapplied
+
+
+def _same_for(commands: Sequence[Level]) -> Callable[[Level, Level], bool]:
+    """Return a function that tests whether two levels are equal up to rounding by hardware."""
+    rounding = ROUNDED * max((abs(x.flux_density) for x in commands), default=0.0)
+    return lambda one, other: abs(one.flux_density - other.flux_density) <= rounding

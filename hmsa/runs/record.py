@@ -1,0 +1,153 @@
+"""Record of a run: measurements, commands, plans and parameters of one actuator."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+import math
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmsa.errors import BadInputError
+from hmsa.interfaces.parameters import number_of
+from hmsa.judge.records import Sensor
+from hmsa.model.equations import Array
+from hmsa.model.parameters import ActuatorParameters, paper_actuator
+from hmsa.runs.levels import in_force, Level
+from hmsa.runs.parameters import of_joint
+from hmsa.runs.topics import APPLIED
+
+if TYPE_CHECKING:
+    from hmsa.bag.info import BagSummary
+
+Times = NDArray[np.int64]
+
+
+def read_only(values: NDArray[Any]) -> NDArray[Any]:
+    """Return a view of an array that cannot be written to."""
+    view = values.view()
+    view.flags.writeable = False
+    return view
+
+
+@dataclass(frozen=True)
+class RecordedRequest:
+    """A request to the planner."""
+
+    sent: int  # recording time in ns
+    stamp: int  # start of the sequence in ns; 0 for at once
+    # Stretch, and end time in ns from the start; None for a setpoint that is held until the
+    # next.
+    points: tuple[tuple[float, int | None], ...]
+    # End time of a path in ns from the start; its one point is where it ends. None for setpoints.
+    path: int | None = None
+    name: str = ''  # if any
+    taken: bool = True  # False if the planner is known to have refused it
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The planner's verdict on a request."""
+
+    sent: int  # recording time in ns
+    level: str  # ``'ok'``, ``'warning'`` or ``'error'``
+    code: str
+    message: str
+    plan: int = 0  # number of the running request, from 1; 0 if not reported
+    request: str = ''  # name of the request, if any
+
+
+@dataclass(frozen=True)
+class LearntSensor:
+    """The planner's estimate of a sensor from a time on."""
+
+    sent: int  # recording time in ns
+    sensor: Sensor
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Data of one actuator in one run; tuples are in recorded order."""
+
+    label: str  # name for display
+    joint: str  # name in the joint states; empty if unknown
+    path: Path  # the bag or table
+    time: Times  # shape (n,), n of at least 1: timestamps in ns, increasing
+    logged: Times  # shape (n,): recording times of the samples in ns
+    stretch: Array  # shape (n,)
+    rate: Array  # shape (n,): in 1/s, computed from the stretch if not recorded
+    flux_density: Array  # shape (n,): in T, NaN if not recorded
+    commands: tuple[Level, ...] = ()
+    applied: tuple[Level, ...] = ()  # changes of the field that took effect, as reported
+    forces: tuple[tuple[int, int, float], ...] = ()  # recording time, timestamp (ns), newtons
+    plans: tuple[tuple[Level, ...], ...] = ()
+    requests: tuple[RecordedRequest, ...] = ()
+    verdicts: tuple[Verdict, ...] = ()  # each once
+    stops: tuple[int, ...] = ()  # recording times in ns of plans without a recorded request
+    sensors: tuple[LearntSensor, ...] = ()  # by time; the given sensor applies before
+    # Parameters of the nodes, by ``'node.name'``
+    parameters: Mapping[str, object] = field(default_factory=dict)
+    plant: ActuatorParameters = field(default_factory=paper_actuator)  # true parameters
+    # Parameters used by the planner
+    planner: ActuatorParameters = field(default_factory=paper_actuator)
+    parameters_known: bool = False  # if False, those of the example block
+    left_out: int = 0  # messages or rows that could not be used
+    notes: tuple[str, ...] = ()  # information for the reader, one sentence each
+    # Topic names by role (`hmsa.runs.topics`)
+    topics: Mapping[str, str] = field(default_factory=dict)
+    summary: 'BagSummary | None' = None  # None for a table
+    origin: str = 'recorded'  # or simulated
+
+    def __post_init__(self) -> None:
+        """Check the arrays, and protect the record from changes."""
+        for name in ('time', 'logged', 'stretch', 'rate', 'flux_density'):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+        shapes = {x.shape for x in (
+            self.time, self.logged, self.stretch, self.rate, self.flux_density)}
+        if len(shapes) != 1 or not len(self.time) or np.any(np.diff(self.time) <= 0):
+            raise BadInputError(
+                f'the samples of {self.label} have shapes {sorted(shapes)}: expected one shape, '
+                'at least one sample, and increasing times')
+
+    def lost(self, *names: str) -> list[str]:
+        """Return the numbers of messages that the recorder lost, as ``'3 of /name'``."""
+        counts = {} if self.summary is None else {x.name: x.lost for x in self.summary.topics}
+        return [f'{count} of {name}' for x in names
+                if (name := self.topics.get(x)) and (count := counts.get(name))]
+
+    def number(self, name: str) -> float:
+        """Return a number like ``'planner.slew_limit'``; 0 if unknown, negative or not finite."""
+        value = number_of(of_joint(self.parameters, self.joint, name))
+        return value if value is not None and 0.0 <= value < math.inf else 0.0
+
+    @property
+    def reported(self) -> tuple[Level, ...]:
+        """
+        Levels that the plant reported as applied, by time.
+
+        Empty if some reports were lost and there are commands to use instead.
+        """
+        if self.commands and self.lost(APPLIED):
+            return ()
+        return tuple(sorted(self.applied, key=lambda x: x.stamp))
+
+    @property
+    def levels(self) -> tuple[Level, ...]:
+        """
+        Changes of the field, by time.
+
+        These are the levels that the plant reported as applied; without complete reports the
+        commands that were not replaced; else changes of the measured flux density, accurate to one
+        sample.
+        """
+        if reported := self.reported:
+            return reported
+        if self.commands:
+            return in_force((x,) for x in self.commands)
+        known = np.flatnonzero(np.isfinite(self.flux_density))
+        values = self.flux_density[known]
+        places = known[np.append(True, values[1:] != values[:-1])] if len(known) else known
+        return tuple(
+            Level(int(self.time[i]), float(self.flux_density[i]), int(self.logged[i]))
+            for i in places)

@@ -1,0 +1,202 @@
+"""Tables of results: text in a terminal, HTML in a notebook, columns for further use."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+import math
+import shutil
+import sys
+import textwrap
+from typing import Any
+
+from hmsa.errors import BadInputError
+
+#: Heading of the standard deviation of the column before.
+DEVIATION = '±'
+_GAP = '  '
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column: its name, unit (or empty), and number format."""
+
+    name: str
+    unit: str = ''
+    form: str = '.6g'  #: as for `format`; ``'%'``, optionally after a sign, for percent of a step
+    head: str = ''  #: shorter heading that replaces the name
+
+    @property
+    def title(self) -> str:
+        """The name with its unit."""
+        name = self.head or self.name
+        return f'{name} ({self.unit})' if self.unit and name != DEVIATION else name
+
+    def shown(self, value: object) -> str:
+        """Return a value as text, a dash for a missing one."""
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            return '–' if value is None else str(value)
+        if math.isnan(value):
+            return '–'
+        if math.isinf(value):
+            return '∞' if value > 0.0 else '-∞'
+        if self.form.endswith('%'):
+            from hmsa.model.residual import percent  # imports NumPy
+
+            return percent(0.01 * value, self.form[:-1])
+        return f'{value:{self.form}}'
+
+
+@dataclass(frozen=True)
+class Table:
+    """
+    Rows of results.
+
+    Printing aligns the columns, and a notebook shows HTML. ``table['arrival']`` returns a column
+    by its name without the unit, and `to_pandas` returns a DataFrame.
+    """
+
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Any, ...], ...]
+    caption: str = ''
+    notes: tuple[str, ...] = ()  #: one sentence each
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, name: str) -> list[Any]:
+        names = [x.name for x in self.columns]
+        if name not in names:
+            raise BadInputError(
+                f'the table has no column {name!r}: expected one of {", ".join(names)}')
+        return [row[names.index(name)] for row in self.rows]
+
+    def __repr__(self) -> str:
+        return str(self)  # shown at a prompt
+
+    def __str__(self) -> str:
+        texts = list(self._texts())
+        right = [all(not isinstance(row[i], str) for row in self.rows)
+                 for i in range(len(self.columns))]
+        room = _room()
+        heads = [[x.title] for x in self.columns]
+        if _width(_widths(heads, texts)) > room:
+            heads = [_stacked(x.title, y) for x, y in zip(
+                self.columns, _widths([[''] for _ in heads], texts), strict=True)]
+        lines: list[str] = []
+        for block in _blocks(
+                [x.title for x in self.columns], _widths(heads, texts), self._keys(), room):
+            lines += [''] * bool(lines) + _aligned(
+                [heads[i] for i in block], [[row[i] for i in block] for row in texts],
+                [right[i] for i in block])
+        room = max(shutil.get_terminal_size().columns, 60)
+        for text in (self.caption, *(f'note: {x}' for x in self.notes)):
+            lines += textwrap.wrap(text, room, break_long_words=False, break_on_hyphens=False)
+        return '\n'.join(lines)
+
+    def _keys(self) -> int:
+        """Return the number of leading columns that name a row."""
+        named = [all(isinstance(row[i], (str, int)) for row in self.rows)
+                 for i in range(len(self.columns))]
+        return max(1, named.index(False) if False in named else 1)
+
+    def _repr_html_(self) -> str:
+        def row(cells: Sequence[str], tag: str) -> str:
+            return f'<tr>{"".join(f"<{tag}>{escape(x)}</{tag}>" for x in cells)}</tr>'
+
+        caption = f'<caption>{escape(self.caption)}</caption>' if self.caption else ''
+        return (
+            f'<table>{caption}<thead>{row([x.title for x in self.columns], "th")}</thead><tbody>'
+            + ''.join(row(x, 'td') for x in self._texts()) + '</tbody></table>'
+            + ''.join(f'<p>{escape(x)}</p>' for x in self.notes))
+
+    def _texts(self) -> Iterator[list[str]]:
+        for row in self.rows:
+            yield [x.shown(value) for x, value in zip(self.columns, row, strict=True)]
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return each row as a mapping from column names."""
+        return [dict(zip((x.name for x in self.columns), row, strict=True)) for row in self.rows]
+
+    def to_pandas(self) -> Any:
+        """
+        Return a DataFrame whose column names contain the units.
+
+        Raises
+        ------
+        BadInputError
+            If pandas is not installed.
+
+        """
+        return frame({
+            f'{x.name} ({x.unit})' if x.unit else x.name: self[x.name] for x in self.columns})
+
+
+# Characters in a line of a notebook, which has no width of its own.
+_NOTEBOOK = 80
+
+
+def _room() -> float:
+    """
+    Return the characters in a line of the output; infinite for files and pipes.
+
+    A terminal and a notebook break longer lines anywhere.
+    """
+    if sys.stdout.isatty() or 'ipykernel' in sys.modules:
+        return shutil.get_terminal_size((_NOTEBOOK, 24)).columns
+    return math.inf
+
+
+def _stacked(title: str, width: int) -> list[str]:
+    """Return a heading in several lines, as narrow as its words and the cells allow."""
+    most = max([width, *map(len, title.split())])
+    return textwrap.wrap(title, most, break_long_words=False, break_on_hyphens=False) or ['']
+
+
+def _widths(heads: Sequence[Sequence[str]], texts: Sequence[Sequence[str]]) -> list[int]:
+    """Return the width of each column."""
+    return [max(map(len, (*head, *(row[i] for row in texts)))) for i, head in enumerate(heads)]
+
+
+def _width(widths: Sequence[int]) -> int:
+    """Return the length of a line with columns of these widths."""
+    return sum(widths) + len(_GAP) * (len(widths) - 1)
+
+
+def _blocks(
+        titles: Sequence[str], widths: Sequence[int], keys: int, room: float) -> list[list[int]]:
+    """Return the columns of each block that fits into a line; each starts with the keys."""
+    first = list(range(keys))
+    blocks = [first[:]]
+    for i in range(keys, len(widths)):
+        if titles[i] == DEVIATION and len(blocks[-1]) > keys:
+            continue  # with the column before
+        added = [i, i + 1] if titles[i + 1:i + 2] == [DEVIATION] else [i]
+        if len(blocks[-1]) > keys and _width([widths[x] for x in (*blocks[-1], *added)]) > room:
+            blocks.append(first[:])
+        blocks[-1] += added
+    return blocks
+
+
+def _aligned(
+        heads: Sequence[Sequence[str]], texts: Sequence[Sequence[str]],
+        right: Sequence[bool]) -> list[str]:
+    """Return the lines of a table."""
+    widths, tall = _widths(heads, texts), max(map(len, heads))
+    above = zip(*([*[''] * (tall - len(x)), *x] for x in heads), strict=True)
+    lines = [_GAP.join(
+        f'{x:>{n}}' if number else f'{x:<{n}}'
+        for x, n, number in zip(row, widths, right, strict=True)).rstrip()
+        for row in (*above, *texts)]
+    lines.insert(tall, _GAP.join('─' * n for n in widths))
+    return lines
+
+
+def frame(columns: dict[str, Any]) -> Any:
+    """Return columns as a DataFrame; raise `BadInputError` if pandas is not installed."""
+    try:
+        import pandas
+    except ImportError as error:
+        raise BadInputError(
+            'pandas is not installed: install it (pip install pandas), or take the columns as '
+            'arrays') from error
+    return pandas.DataFrame(columns)

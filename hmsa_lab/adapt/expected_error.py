@@ -1,0 +1,180 @@
+"""
+Expected error of a course, and the decision whether to change to another one.
+
+The expected squared error is that of the most probable motion plus the contribution of the
+covariance of state and parameters under this course; it combines vibration and distance from the
+target. A course is corrected only if the expected error of another one is smaller. Early in a
+move, with large uncertainty, a course that tolerates errors is therefore preferred to one that is
+exact for uncertain parameters.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from hmsa.model.equations import Array
+from hmsa.model.laws.coordinate import coordinate_of
+from hmsa.model.units import NANOSECONDS
+from hmsa_lab.adapt.estimator import Estimate
+from hmsa_lab.adapt.motion import follow, Levels, Motion, rest
+
+#: Maximum error after a correction, relative to that of the present course, while more corrections
+#: are possible, and at rest.
+SHARE, AT_REST = 0.9, 0.5
+#: The same relative to a plan with the given parameters.
+CLEARLY = 0.25
+#: Required gain, as a fraction of the step, before samples have shown an arrival.
+MUCH = 0.05
+#: Change, as a fraction of the step, up to which a correction is small.
+LITTLE = 2.5e-3
+# Time in ns of a level before the course, which the field has then reached.
+_LONG = 1000 * NANOSECONDS
+# Time constants of a coil after which its field has settled.
+_LAGS = 10.0
+# Noise, as a fraction of the step, up to which it is small.
+_QUIET = 0.004
+
+
+def caution(count: int, noise: float) -> float:
+    """
+    Return the factor on the duration of a cautious move, by the number of estimated parameters.
+
+    The factor is three for three parameters and five for six; each doubling of the noise of a
+    sample above 0.4 % of the step adds one, up to two.
+    """
+    more = math.log2(max(noise, _QUIET) / _QUIET)
+    return max(3.0, 1.0 + 2.0 * count / 3.0) + min(more, 2.0)
+
+
+@dataclass(frozen=True)
+class Course:
+    """Levels to a target."""
+
+    # Timestamp in ns and level in T, by time; the last level is held.
+    levels: tuple[tuple[int, float], ...]
+    arrival: int  # time in ns of rest at the target
+    target: float  # stretch
+    before: float = math.nan  # level in T before the first one; NaN if that came long before
+    relaxed: float = math.nan  # level in T that holds it after relaxation; NaN: the last level
+
+    @property
+    def holding(self) -> float:
+        """Level in T that is held at the end."""
+        return self.levels[-1][1] if math.isnan(self.relaxed) else self.relaxed
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Expected error of a course."""
+
+    misses: Array  # expected errors of stretch, of rate, and of the target
+    covariance: Array  # of these errors
+
+    @property
+    def size(self) -> float:
+        """Root of the expected squared vibration and distance from the target together."""
+        return math.sqrt(float(self.misses @ self.misses) + float(np.trace(self.covariance)))
+
+    def apart(self, other: 'Outcome') -> float:
+        """Return the distance between the expected errors of two courses."""
+        return float(np.linalg.norm(self.misses - other.misses))
+
+
+class Ahead(NamedTuple):
+    """A section of a path to look ahead."""
+
+    times: Array  # in s from the earliest change of the course, shape (n,)
+    stretch: Array  # desired at these times, shape (n,)
+
+
+#: Outcome of a motion that cannot be simulated.
+_NOWHERE = Outcome(np.full(3, math.inf), np.zeros((3, 3)))
+
+
+def expect(
+        estimate: Estimate, course: Course, slew_limit: float = math.inf,
+        until: int = 0) -> Outcome:
+    """
+    Return the expected error of a course; infinite if the motion cannot be simulated.
+
+    The course may be changed from the time of the estimate on, and contains the level at that
+    time. If it ends before `until`, in ns, the decay of vibration until then counts.
+    """
+    begin = estimate.time
+    # A lagging coil shifts the motion, and has no effect after the field has settled.
+    lag = estimate.values['coil_time_constant'] + 2.0 * estimate.deviations.get(
+        'coil_time_constant', 0.0)
+    end = max(course.arrival, begin, until) + round(_LAGS * lag * NANOSECONDS)
+    levels = course.levels
+    if not math.isnan(course.before):
+        # A first level at the time of the estimate is a step.
+        levels = ((min(begin, levels[0][0]) - _LONG, course.before), *(
+            (x + (x == begin), y) for x, y in levels))
+    motion = _motion(estimate, levels, slew_limit, np.array([(end - begin) / NANOSECONDS]))
+    at = rest(estimate.values, estimate.free, course.holding)
+    if motion is None or at is None:
+        return _NOWHERE
+    stretch, frequency, by = at
+    rows = np.zeros((3, len(estimate.covariance)))
+    rows[0] = motion.by[0]
+    rows[0, :-2] -= by
+    rows[1] = motion.rate_by[0] / frequency
+    rows[2, :-2] = by
+    if estimate.gain >= 0:
+        # The target is defined by the reading of the sensor.
+        rows[2, estimate.gain] = estimate.values['stretch_gain'] * (
+            stretch - coordinate_of(estimate.values['law']).rest)
+    return _outcome(estimate, np.array([
+        motion.stretch[0] - stretch, motion.rate[0] / frequency, stretch - course.target]), rows)
+
+
+def expect_along(
+        estimate: Estimate, levels: Sequence[tuple[int, float]], ahead: Ahead,
+        slew_limit: float = math.inf) -> Outcome:
+    """Return the expected RMS deviation of levels (timestamp in ns, T) from a path."""
+    motion = _motion(estimate, levels, slew_limit, ahead.times)
+    if motion is None:
+        return _NOWHERE
+    root = math.sqrt(len(ahead.times))
+    return _outcome(estimate, (motion.stretch - ahead.stretch) / root, motion.by / root)
+
+
+def _motion(
+        estimate: Estimate, levels: Sequence[tuple[int, float]], slew_limit: float,
+        times: Array) -> Motion | None:
+    """Return the motion at times in s after that of an estimate; None if impossible."""
+    return follow(
+        estimate.values, estimate.free, (estimate.stretch, estimate.rate),
+        Levels(np.array([(x - estimate.time) / NANOSECONDS for x, _ in levels]),
+               np.array([x for _, x in levels]), slew_limit), 0.0, times)
+
+
+def _outcome(estimate: Estimate, misses: Array, rows: Array) -> Outcome:
+    """Return an outcome from the most probable errors and their derivatives."""
+    off = rows @ estimate.off
+    return Outcome(misses + off, rows @ estimate.covariance @ rows.T - np.outer(off, off))
+
+
+def worthwhile(
+        before: Outcome, after: Outcome, least: float = 0.0, *, little: float,
+        share: float = SHARE) -> bool:
+    """
+    Return whether another course has a sufficiently smaller error, and gains at least ``least``.
+
+    Both are compared along the direction in which their errors differ, since common errors do not
+    matter. The error has to decrease to less than ``share`` of the former one; for a change of
+    less than ``little``, in units of stretch, `SHARE` suffices, since it can do little harm.
+    """
+    if not math.isfinite(before.size + after.size):
+        return after.size < before.size
+    apart = before.apart(after)
+    share = SHARE if apart < little else share
+    way = (before.misses - after.misses) / apart if apart else np.zeros(len(before.misses))
+    square = [float((x.misses @ way) ** 2 + way @ x.covariance @ way) for x in (before, after)]
+    beside = [float(np.trace(x.covariance) - way @ x.covariance @ way) for x in (before, after)]
+    one, other = (math.sqrt(max(x + y - min(beside), 0.0)) for x, y in zip(
+        square, beside, strict=True))
+    return other < min(share * one, one - least)

@@ -1,0 +1,285 @@
+"""Feedback: estimates from samples, and models learnt from them."""
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Any
+
+from hmsa.judge.holds import Hold
+from hmsa.judge.records import Sensor
+from hmsa.offload import ANSWER, Awaited, Doing, goes_on, here
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Believed
+from hmsa.planning.timeline import Model
+from hmsa_lab.adapt.corrections import Corrections
+from hmsa_lab.adapt.joint import Joint, RESTING
+from hmsa_lab.adapt.learnt import alike, save
+from hmsa_lab.adapt.words import differences
+from hmsa_ros.runtime.environment import Clock
+from hmsa_ros.runtime.follower import as_held, Follower
+from hmsa_ros.runtime.records import EstimateChanged, Output, Settings, Severity, Verdict
+from hmsa_ros.runtime.slices import Drafts, Work
+
+# Interval in ns at which the estimate is published.
+_REPORT = 200_000_000
+# Minimum delay of the next update, as a multiple of the time that an update or a correction took,
+# for each joint.
+_IDLE = 6
+# Largest factor of that delay after updates have kept commands waiting, and its decay with each
+# update.
+_SELDOM, _OFTENER = 32.0, 0.8
+
+
+class Feedback(Follower):
+    """
+    Estimate from samples, report discrepancies, and plan with the parameters learnt.
+
+    ``joints`` contains all joints, or none if feedback is off.
+    """
+
+    open_loop = False
+
+    def __init__(
+            self, group: PlannerGroup, settings: Settings, outputs: list[Output], clock: Clock,
+            report_ended: Callable[[str], None], doing: Doing = here) -> None:
+        """Begin; ``report_ended`` is called with the reason why feedback of a joint has ended."""
+        super().__init__(group, settings, doing)
+        self._outputs, self._clock, self._report_ended = outputs, clock, report_ended
+        self.joints: dict[str, Joint] = {}
+        self._corrections = Corrections(self, clock)
+        self.corrections = 0  # number of corrected plans
+        self._seldom = 1.0  # factor of the delay between updates
+        self._ended: list[Joint] = []  # joints whose plans are to be reverted
+        for name, planner in group.planners.items():
+            planner.believed = partial(self._believed, name)
+        self._begin({name: x.model for name, x in group.planners.items()})
+
+    @property
+    def on(self) -> bool:
+        """Whether samples are used."""
+        return self._settings.feedback != 'off'
+
+    def do(self, *work: Any) -> Awaited[Any]:
+        """Execute work with `doing` if feedback is on, else in this process."""
+        return self.doing(*work) if self.on else super().do(*work)
+
+    def _believed(self, name: str, time: int) -> Believed | None:
+        joint = self.joints.get(name)
+        return as_held(self._group.planners[name], time) if joint is None else (
+            joint.believed(time))
+
+    def restart(self) -> None:
+        """Discard the estimates: plan with the given parameters, from the predicted state."""
+        for joint in self.joints.values():
+            joint.planner.take_model(joint.given)
+        self._begin({name: x.given for name, x in self.joints.items()})
+
+    def _begin(self, models: Mapping[str, Model]) -> None:
+        """Begin without samples, with models as given."""
+        for joint in self.joints.values():
+            # Without an estimate, corrections that are being drafted have no result.
+            joint.latest = None
+        self.joints = {
+            name: Joint(name, self._group.planners[name], model, self._settings, self._clock())
+            for name, model in models.items()} if self.on else {}
+
+    def change(self, settings: Settings, models: Mapping[str, Model]) -> Mapping[str, Model]:
+        """
+        Adopt new settings and given models; return the models to plan with.
+
+        Estimates are kept as long as the given block and coil do not change.
+        """
+        before, self._settings = self._settings, settings
+        if not (self.on and self.joints
+                and settings.feedback_parameters == before.feedback_parameters
+                and all(models[name].actuator == x.given.actuator
+                        and models[name].others == x.given.others
+                        for name, x in self.joints.items())):
+            self._begin(models)
+            return models
+        for name, joint in self.joints.items():
+            joint.settings, joint.given = settings, models[name]
+            joint.estimator.learning = not settings.feedback_frozen
+        return {name: x.learnt(x.given) if x.adapts else x.given
+                for name, x in self.joints.items()}
+
+    def reset(self) -> str:
+        """Discard the estimates and return a confirmation; refused if feedback is off."""
+        if not self.on:
+            return super().reset()
+        self.restart()
+        return 'the estimates are discarded: plans use the parameters as given'
+
+    def save(self, *, by_joint: bool) -> str:
+        """Write the estimates to the configured file and return a confirmation, or refuse."""
+        if not self.on:
+            return super().save(by_joint=by_joint)
+        return save(
+            self._settings.feedback_file,
+            {name: joint.latest for name, joint in self.joints.items()}, by_joint=by_joint)
+
+    def wants(self, stamp: int) -> bool:
+        """Return whether a sample with a timestamp in ns is needed."""
+        return any(x.wants(stamp) for x in self.joints.values())
+
+    def observed(
+            self, joint: str, stamp: int, stretch: float, flux_density: float, came: int) -> None:
+        """Process a sample of a joint; its timestamp and arrival in ns, its field in T."""
+        if joint in self.joints:
+            self.joints[joint].add(stamp, stretch, flux_density, came)
+
+    def applied(self, joint: str, stamp: int, flux_density: float) -> None:
+        """Record that a level in T has taken effect, before the plan does."""
+        if joint in self.joints:
+            self.joints[joint].applied(stamp, flux_density)
+
+    def cautious(self, drafts: Drafts) -> Drafts:
+        """Return the drafts of a request with more time for moves to be corrected."""
+        return self._corrections.cautious(drafts)
+
+    def due(self, now: int) -> Iterator[Work]:
+        """Yield corrections that may help at a time in ns."""
+        return self._corrections.due(now)
+
+    def take(self, work: Work, drafts: Drafts, now: int) -> Verdict | None:
+        """Adopt a correction made for a time in ns; None if nothing changes."""
+        return self._corrections.take(work, drafts, now)
+
+    def follows(self, name: str) -> bool:
+        """Return whether plans for a joint begin from its estimate."""
+        joint = self.joints.get(name)
+        return joint is not None and joint.adapted() and joint.state(self._clock()) is not None
+
+    def sensor(self, name: str) -> Sensor:
+        """Return the sensor of a joint as estimated; as given where there is no estimate."""
+        return self.joints[name].sensor if name in self.joints else Sensor()
+
+    # -- looks at samples ----------------------------------------------------------------------
+
+    @property
+    def wake(self) -> int | None:
+        """Time in ns of the next update; None for never, 0 for now."""
+        joints = self.joints.values()
+        if any(x.looking or x.choosing or x.auditing for x in joints):
+            return self._clock() + ANSWER
+        if any(x.ready or x.adapts and x.news for x in joints):
+            return 0
+        return min((x.next_look if x.fresh else 0 for x in joints if x.fresh or x.audits),
+                   default=None)
+
+    def give_way(self, now: int) -> None:
+        """Update less often from a time in ns on, since commands have been kept waiting."""
+        self._seldom = min(2.0 * self._seldom, _SELDOM)
+        for joint in self.joints.values():
+            joint.not_before = max(joint.not_before, now + round(self._seldom * RESTING))
+
+    def spent(self, joint: Joint, time: int) -> None:
+        """Delay the next update, since work for a joint has taken a time in ns."""
+        rest = round(_IDLE * len(self.joints) * self._seldom * time)
+        joint.not_before = max(joint.not_before, self._clock() + rest)
+
+    def update(self, now: int) -> bool:
+        """
+        Process the samples of a joint that have arrived by a time in ns, and publish the estimate.
+
+        Return whether this took long.
+        """
+        busy = False
+        # An update under way ends before another begins, first for the joint that waited longest.
+        for joint in sorted(
+                self.joints.values(), key=lambda x: (x.looking is None, x.next_look)):
+            if joint.choosing is not None:
+                if not goes_on(joint.choosing):
+                    joint.choosing, joint.chosen, joint.news = None, True, True
+                    busy = True
+                continue
+            if joint.ready:
+                joint.auditing = joint.auditing or self._audit(joint, joint.audits.pop(0))
+                if goes_on(joint.auditing):
+                    continue
+                joint.auditing, joint.ready = None, joint.ready - 1
+            elif joint.looking is not None:
+                return self._look(joint, joint.looking, now) or busy
+            elif joint.audits and not joint.fresh:
+                joint.ready = len(joint.audits)
+            elif joint.fresh and now >= joint.next_look:
+                joint.looking, joint.spent = joint.update(now, self.doing), 0
+                self._look(joint, joint.looking, now)
+            else:
+                continue
+            # Commands are sent before the next joint is updated.
+            return True
+        return busy
+
+    def _look(self, joint: Joint, looking: Iterator[None], now: int) -> bool:
+        """Continue an update; return whether it has ended, which takes long."""
+        begun = self._clock()
+        if goes_on(looking):
+            joint.spent += self._clock() - begun
+            return False
+        joint.looked()
+        joint.spent += self._clock() - begun
+        self.spent(joint, joint.spent)
+        self._seldom = max(_OFTENER * self._seldom, 1.0)
+        joint.next_update = now + joint.interval
+        if now >= joint.next_report:
+            joint.next_report = now + _REPORT
+            self._report(joint, now)
+        joint.ready = len(joint.audits)
+        return True
+
+    def _report(self, joint: Joint, now: int) -> None:
+        found, mode = joint.latest, self._settings.feedback
+        bad = joint.trust.why or found is not None and mode == 'observe' and differences(
+            found, joint.estimator.prior.values)
+        self._outputs.append(EstimateChanged(
+            now, joint.name, Severity.WARN if bad else Severity.OK, joint.words(now),
+            {'mode': mode, **joint.figures(),
+             'used_by_plans': joint.adapts and joint.acting is not None,
+             'corrections': self.corrections}))
+
+    # -- results -------------------------------------------------------------------------------
+
+    def audit(self, name: str, hold: Hold) -> None:
+        """Audit a setpoint of a joint, once all samples that have arrived are processed."""
+        joint = self.joints.get(name)
+        if joint is not None and joint.adapts and not joint.trust.ended and (
+                hold not in joint.audits):
+            joint.audits.append(hold)
+
+    def _audit(self, joint: Joint, hold: Hold) -> Awaited[None]:
+        """Decide by the samples of a setpoint whether feedback ends."""
+        if joint.lost or joint.trust.ended or joint.trust.why or (
+                joint.estimator.screening.trouble):
+            # With a failing sensor, nothing can be concluded about the move.
+            return
+        plan = joint.planner.plan
+        why = yield from joint.ledger.take(hold, plan, joint.given, joint.moves, joint.sensor)
+        if not why:
+            joint.trust.confirm(plan.levels[-1].model, joint.ledger.left)
+            return
+        joint.trust.end(why)
+        joint.news, joint.fresh = True, True
+        self._ended.append(joint)
+        self._report_ended(joint.words(self._clock()))
+
+    def taken_back(self) -> list[Joint]:
+        """Return joints, once each, whose plans must be reverted to the given parameters."""
+        found, self._ended = self._ended, []
+        return found
+
+    def news(self) -> Iterator[Joint]:
+        """Plan with the best known parameters, and yield joints with new estimates to use."""
+        for joint in self.joints.values():
+            if not joint.adapts or not joint.news or joint.choosing is not None:
+                continue
+            joint.news = False
+            latest = joint.acting
+            if latest is None:
+                joint.used = joint.learnt(joint.given)
+                if not alike(joint.used, joint.planner.model):
+                    joint.planner.take_model(joint.used)
+            elif joint.may_choose(latest):
+                joint.choosing = joint.choose(latest, self.doing)
+            else:
+                joint.chosen = False
+                yield joint

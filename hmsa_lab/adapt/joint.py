@@ -1,0 +1,421 @@
+"""One joint under feedback: its estimate, and how plans use it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, InitVar, replace
+from functools import partial
+import math
+
+from hmsa.errors import HmsaError
+from hmsa.identification.known import Known
+from hmsa.judge.holds import Hold
+from hmsa.judge.records import Sensor
+from hmsa.model.equations import equilibrium_stretch
+from hmsa.model.units import flux_text, NANOSECONDS
+from hmsa.offload import Awaited, Doing
+from hmsa.planning.planner import Believed, Planner
+from hmsa.planning.timeline import Model, Plan
+from hmsa_lab.adapt.choice import clearly_better
+from hmsa_lab.adapt.estimator import Estimate, Estimator, Options
+from hmsa_lab.adapt.learnt import as_of_path, believed, differs, learnt_model, sensor_of
+from hmsa_lab.adapt.ledger import Ledger, Moves
+from hmsa_lab.adapt.motion import held, rest
+from hmsa_lab.adapt.prior import Prior
+from hmsa_lab.adapt.trust import Trust
+from hmsa_lab.adapt.words import sentence
+from hmsa_ros.runtime.follower import as_held
+from hmsa_ros.runtime.records import Settings
+
+# Earlier levels that still affect the samples: the field of a coil with lag depends on them.
+_BEFORE = 8
+# Fraction of the time scale by which a sample may be ahead of the clock, since clocks differ.
+_AHEAD = 0.1
+# Time scales ahead from which the predicted state is that at rest.
+_FAR = 100.0
+# Intervals between updates: at most these ns and this many time scales while a joint moves, and
+# these ns while it rests.
+_UPDATE, _OFTEN, RESTING = 20_000_000, 0.45, 200_000_000
+# Factor of the interval while a joint rings, and the time scales after its last change of level
+# from which it rings, and from which it rests.
+_SELDOM, _RINGING, _QUIET = 4, 3.0, 24.0
+# Samples used per natural period, and the factor by which there are fewer at rest.
+_DENSE, _SPARSE = 40, 10
+# Time scales between two choices of the parameters to plan with.
+_CHOICE = 3.0
+# Time scales after an arrival that show whether it succeeded.
+_LOOK = 3.0
+# Tolerance of the measured field: this fraction of its value or of the unit of load, and this many
+# time scales and coil time constants after a change.
+_OFF, _LEAST, _FOLLOWED = 0.05, 0.01, 3.0
+# Fraction by which the report of an applied level may be rounded.
+_ROUNDED = 0.01
+
+
+@dataclass(eq=False)
+class Joint:
+    """State of one joint under feedback; times in ns."""
+
+    name: str
+    planner: Planner
+    given: Model
+    settings: Settings
+    begun: InitVar[int]
+    estimator: Estimator = field(init=False)
+    trust: Trust = field(init=False)
+    start: float = field(init=False)  # stretch before the setpoint under way
+    ledger: Ledger = field(default_factory=Ledger)
+    moves: Moves = field(default_factory=Moves)  # those of the plan in force
+    latest: Estimate | None = None
+    newest: int = 0  # time of the newest sample
+    next_sample: int = 0  # time from which another sample is useful
+    next_update: int = 0  # time of the next update
+    not_before: int = 0  # earliest time of an update, which limits the CPU time
+    next_report: int = 0  # when to publish the estimate
+    next_choice: int = 0  # when to choose the parameters to plan with
+    used: Model | None = None  # chosen model; None for that of the planner
+    choosing: Iterator[None] | None = None  # the choice under way
+    chosen: bool = False  # whether a choice was made since the latest estimate
+    waits: int = 0  # arrival of a move slowed down to be corrected
+    next_path: int = 0  # when to check a path again
+    planning: int = 0  # how long planning a path took
+    after: float = 0.0  # predicted error of a drafted correction
+    amplitude: float = 0.0  # largest vibration since the last arrival
+    fresh: bool = False  # whether there are unprocessed samples
+    looking: Iterator[None] | None = None  # the update under way
+    spent: int = 0  # time spent on the update
+    audits: list[Hold] = field(default_factory=list)  # setpoints to be audited after an update
+    ready: int = 0  # number of audits to do now
+    auditing: Iterator[None] | None = None  # the audit under way
+    lost: str = ''  # why the field is not as commanded; empty if it is
+    largest: float = math.inf  # level in T at which the amplifier saturated
+    news: bool = False  # whether the latest estimate awaits comparison with the plan
+    # Samples that arrived during an update: timestamp, stretch, and time of arrival.
+    _waiting: list[tuple[int, float, int]] = field(default_factory=list)
+    _setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place under way
+    _sensor: tuple[Estimate, Sensor] | None = None  # estimate, and its sensor
+    _measured: bool = False  # whether the field is measured
+
+    def __post_init__(self, begun: int) -> None:
+        given, settings = self.given, self.settings
+        prior = Prior.nominal(
+            given.actuator, settings.feedback_parameters, suspects=True, others=given.others)
+        self.estimator = Estimator(
+            prior.informed(settings.known.get(self.name, Known())),
+            Options(slew_limit=given.options.slew_limit, learn=not settings.feedback_frozen))
+        self.trust = Trust(begun, at_once=settings.cautious)
+        self.start = given.actuator.rest
+
+    @property
+    def unit(self) -> float:
+        """Given time scale in s."""
+        return float(self.estimator.prior.values['time_unit'])
+
+    @property
+    def adapts(self) -> bool:
+        """Whether plans use the estimate."""
+        return self.settings.adapts
+
+    @property
+    def tolerance(self) -> float:
+        """Predicted error, as a fraction of the step, up to which a move is not slowed down."""
+        return self.settings.feedback_tolerance if self.settings.cautious else math.inf
+
+    @property
+    def acting(self) -> Estimate | None:
+        """The latest estimate if it is to be used: a whole move has shown that it fits."""
+        latest = self.latest
+        return latest if latest is not None and latest.trusted and self.trust.acts else None
+
+    # -- samples -------------------------------------------------------------------------------
+
+    @property
+    def next_look(self) -> int:
+        """Time in ns of the next update; only `not_before` delays it while audits wait."""
+        return max(self.not_before, 0 if self.audits else self.next_update)
+
+    @property
+    def interval(self) -> int:
+        """Time in ns from one update to the next."""
+        if self._still(_QUIET * self.given.units.time):
+            return RESTING
+        return min(_UPDATE, round(_OFTEN * self.unit * NANOSECONDS)) * (
+            _SELDOM if self._still(_RINGING * self.unit) else 1)
+
+    def _still(self, span: float) -> bool:
+        """Return whether no level has changed for a duration in s."""
+        last = self.planner.plan.levels[-1].stamp
+        return self.newest > last + round(span * NANOSECONDS)
+
+    def wants(self, stamp: int) -> bool:
+        """Return whether a timestamp is far enough from the previous sample's."""
+        return not self.newest <= stamp < self.next_sample
+
+    def add(self, stamp: int, stretch: float, flux_density: float, now: int) -> None:
+        """
+        Add stretch and field in T measured at a timestamp, which arrive at a time.
+
+        Samples may arrive in any order.
+        """
+        if not self.wants(stamp):
+            return
+        lost = self.lost = self._off(stamp, flux_density)
+        if lost and self.trust.why != lost and self.trust.doubt(lost, now, at_once=True):
+            # The estimate is discarded, and the update under way ends.
+            self.estimator.restart()
+            self.latest, self.news = None, True
+            self.looked()
+        sample = stamp, math.nan if lost else stretch, now
+        self.fresh = True
+        if not self._is_ahead(stamp, now):
+            self.newest = max(self.newest, min(stamp, now))
+        if self.looking is None:
+            self._take(*sample)
+        else:
+            self._waiting.append(sample)
+        cell = round(self.given.units.time * NANOSECONDS) * 2 // _DENSE
+        rests = self.latest and self._still(_QUIET * self.given.units.time)
+        self.next_sample = self.newest + (cell * _SPARSE if rests else cell)
+
+    def _is_ahead(self, stamp: int, now: int) -> bool:
+        return stamp > now + _AHEAD * self.unit * NANOSECONDS
+
+    def _take(self, stamp: int, stretch: float, now: int) -> None:
+        if self._is_ahead(stamp, now):
+            self.estimator.screening.refuse_ahead((stamp - now) / NANOSECONDS)
+        else:
+            self.estimator.sample(stamp, stretch)
+
+    def applied(self, stamp: int, flux_density: float) -> None:
+        """Record that a level in T has taken effect, before the plan does."""
+        wanted = self.planner.plan.level(stamp).flux_density
+        if abs(flux_density) > self.largest:
+            self.largest = math.inf
+        if wanted and 0.0 < flux_density / wanted < 1.0 - _ROUNDED:
+            self.largest = abs(flux_density)
+
+    def _off(self, stamp: int, field: float) -> str:
+        """Return why the field may differ from the commanded one; empty if it does not."""
+        if math.isnan(field):
+            return (
+                'the field is no longer reported, and may differ from the command'
+                if self._measured else '')
+        self._measured = True
+        plan = self.planner.plan
+        level = plan.level(stamp)
+        wanted, options, units = level.flux_density, level.model.options, level.model.units
+        follows = _FOLLOWED * (units.time + options.coil_time_constant) + (
+            abs(wanted - level.in_force) / options.slew_limit)
+        if not plan.segments or stamp < level.stamp + follows * NANOSECONDS or (
+                abs(field - wanted) <= max(
+                    _OFF * max(abs(field), abs(wanted)), _LEAST * units.load)):
+            return ''
+        return f'the coil has {flux_text(field)} where {flux_text(wanted)} were commanded'
+
+    # -- looks at them -------------------------------------------------------------------------
+
+    def _take_levels(self, until: int) -> None:
+        """Pass the levels of the plan that matter until a time to the estimator."""
+        plan = self.planner.plan
+        first = max(plan.place(self.estimator.since) - _BEFORE, 0)
+        self.estimator.set_levels([
+            (x.stamp, x.flux_density) for x in plan.levels[first:plan.place(until) + 1]])
+
+    def update(self, now: int, doing: Doing) -> Awaited[None]:
+        """Update the estimate with new samples, and predict the state at a time."""
+        plan = self.planner.plan
+        self.fresh = False
+        self._take_levels(max(now, self.newest))
+        before = self.estimator.screening.lost
+        estimator, found = yield from doing(_updated, self.estimator, now)
+        estimator.learning, self.estimator = self.estimator.learning, estimator
+        screening, trust = estimator.screening, self.trust
+        self._note_start(plan, now)
+        trouble = screening.trouble if found is None else found.trouble
+        if screening.lost > before and not trust.acts:
+            # Later samples of the same update have fitted again.
+            trouble = trouble or screening.last_trouble
+        if trust.doubt(trouble, now) if trouble else found is not None and trust.fits(
+                plan, self.unit, self.estimator, now):
+            self.estimator.restart()
+        if found is not None and not trust.why:
+            self._look_at_vibration(plan, found)
+        if found is not None and trust.why:
+            found = replace(found, trusted=False, trouble=trust.why)
+        self.latest, self.news = found, True
+
+    def looked(self) -> None:
+        """End the update under way, and add the samples that arrived during it."""
+        self.looking = None
+        for sample in self._waiting:
+            self._take(*sample)
+        self._waiting.clear()
+
+    def _note_start(self, plan: Plan, now: int) -> None:
+        """Store the position of the joint before the setpoint that is under way at a time."""
+        place, before = plan.under_way(now), self._setpoint
+        self._setpoint = plan.number, place
+        if self._setpoint == before:
+            return
+        if plan.number == before[0] and place > before[1] >= 0:
+            self.start = plan.segments[place - 1].stretch
+        else:
+            self.start = plan.levels[0].stretch if self.latest is None else self.latest.stretch
+
+    def _look_at_vibration(self, plan: Plan, found: Estimate) -> None:
+        """Update the largest amplitude since the last arrival."""
+        place = plan.under_way(found.time)
+        segment = plan.segments[place] if place >= 0 else None
+        if segment is None or segment.arrival is None or found.time < segment.arrival:
+            self.amplitude = 0.0
+            return
+        level = plan.level(found.time)
+        at = held(found.values, found.stretch, level.flux_density)
+        if at is not None:
+            self.amplitude = max(self.amplitude, math.hypot(
+                found.stretch - at[0], found.rate / at[1]))
+
+    # -- initial states of plans ---------------------------------------------------------------
+
+    def predicted(self, time: int) -> Estimate | None:
+        """Return the estimate for a time under the plan in force."""
+        self._take_levels(time)
+        return self.estimator.predict(time)
+
+    def state(self, time: int) -> Estimate | None:
+        """Return the initial state of plans at a time; None if the plan's prediction applies."""
+        latest = self.acting
+        if latest is None or not self.adapts or (
+                time - latest.time > _FAR * latest.values['time_unit'] * NANOSECONDS):
+            return None
+        return self.predicted(time)
+
+    def foreseen(self, time: int) -> Estimate | None:
+        """Return the state for slowing down moves; a cautious joint has one before any sample."""
+        if self.latest is not None or math.isinf(self.tolerance):
+            return self.state(time)
+        return self.predicted(time)
+
+    def adapted(self, model: Model | None = None) -> bool:
+        """Return whether a model, by default that of the plans, uses learnt parameters."""
+        return (model or self.planner.model) != self.given
+
+    def believed(self, time: int) -> Believed | None:
+        """Return the state for `hmsa.planning.planner.Planner` to plan from at a time."""
+        try:
+            found = self.state(time) if self.adapted() else None
+        except HmsaError:
+            return None
+        if found is None:
+            return as_held(self.planner, time)
+        # Effects missing in the model shift its equilibrium: a plan uses the stretches of its
+        # model.
+        level, model = self.planner.plan.levels[-1].flux_density, self.planner.model
+        at = rest(found.values, (), level)
+        if at is None:
+            return None
+        shift = float(equilibrium_stretch(model.load(level), model.material)) - at[0]
+        stretch, rate, behind = believed(found, creeps=bool(model.material.creep))
+        return stretch + shift, rate, behind
+
+    @property
+    def sensor(self) -> Sensor:
+        """The sensor as estimated; as given where there is no estimate."""
+        found = self.acting
+        if found is None:
+            return Sensor()
+        if self._sensor is None or self._sensor[0] is not found:
+            self._sensor = found, sensor_of(found, self.estimator.prior)
+        return self._sensor[1]
+
+    # -- models of plans -----------------------------------------------------------------------
+
+    def learnt(self, model: Model) -> Model:
+        """Return a model updated by the estimate, or by the last confirmed parameters."""
+        if self.acting is not None:
+            return learnt_model(model, self.acting, self.planner.plan.levels[-1].stretch)
+        confirmed = self.trust.confirmed
+        return model if confirmed is None else Model(
+            confirmed.actuator, replace(model.options, **confirmed.others))
+
+    def may_choose(self, latest: Estimate) -> bool:
+        """Return whether an estimate may be used to choose the parameters to plan with."""
+        # A plan with changed parameters begins from an unknown state, so moves are not
+        # interrupted.
+        return not self.chosen and bool(self.planner.plan.segments) and (
+            latest.time < self.waits
+            or latest.time >= self.next_choice and self.shown(latest.time))
+
+    def shown(self, time: int) -> bool:
+        """Return whether samples until a time show how the joint has arrived."""
+        plan = self.planner.plan
+        place = plan.under_way(self.planner.soonest(time))
+        look = round(_LOOK * self.unit * NANOSECONDS)
+        return place >= 0 and time >= (plan.segments[place].arrival or 0) + look
+
+    def choose(self, latest: Estimate, doing: Doing) -> Awaited[None]:
+        """Adopt learnt parameters once clearly better, or while a move waits for them."""
+        used, segments = self.used or self.planner.model, self.planner.plan.segments
+        model, waits = used, latest.time < self.waits
+        if differs(used, latest):
+            learnt = self.learnt(used)
+            if segments[-1].path is not None:
+                learnt = as_of_path(learnt, used, latest)
+            better = partial(clearly_better, given=used == self.given, shown=not waits)
+            if (yield from doing(
+                    better, latest, learnt, used, self.start, segments[-1].stretch)):
+                model = learnt
+        if self.acting is None:
+            return
+        if not waits:
+            self.next_choice = latest.time + round(_CHOICE * self.unit * NANOSECONDS)
+            self.used = model
+        self.planner.take_model(model)
+
+    # -- words ---------------------------------------------------------------------------------
+
+    def words(self, now: int) -> str:
+        """Return the problem at a time, in a sentence without full stop."""
+        trust = self.trust
+        why = trust.why or self.estimator.screening.trouble
+        if trust.ended:
+            return (f'{why}: feedback has ended, open loop with {trust.parameters}; '
+                    '~/reset_estimate restarts it')
+        if why:
+            more = f', with {trust.parameters}' if self.adapts else ''
+            restart = ('; the estimate has restarted and is used after a move that samples fit; '
+                       '~/reset_estimate discards it') if trust.beginnings else ''
+            return f'{why}: open loop until samples fit again{more}{restart}'
+        if self.latest is None:
+            return 'no estimate yet'
+        plan = self.planner.plan
+        place = plan.under_way(now)
+        target = plan.segments[place].stretch if place >= 0 else self.start
+        use = 'plans use it' if trust.acts else 'plans use it after a move that samples fit'
+        return sentence(
+            self.latest, self.estimator.prior.values, plan.level(now).flux_density, target,
+            self.start, self.amplitude, use if self.adapts else '')
+
+    def figures(self) -> dict[str, object]:
+        """Return parameters in SI, with standard deviations and given values, and counters."""
+        prior, screening = self.estimator.prior.values, self.estimator.screening
+        found = self.latest
+        values: dict[str, object] = {'trusted': found is not None and found.trusted}
+        if found is not None:
+            for key in found.free:
+                values |= {
+                    key: f'{found.values[key]:.9g}', f'{key}.std': f'{found.deviations[key]:.3g}',
+                    f'{key}.nominal': f'{prior[key]:.9g}'}
+            values |= {
+                'stretch': f'{found.stretch:.9g}', 'stretch_rate': f'{found.rate:.6g}',
+                'noise': f'{found.noise:.3g}'}
+        return values | {
+            'learning': self.estimator.learning,
+            'rejected': screening.rejected, 'frozen': screening.frozen,
+            'unreadable': screening.unreadable, 'repeated': screening.repeated,
+            'too_late': screening.late, 'ahead_of_clock': screening.ahead,
+            'new_beginnings': self.trust.beginnings, 'ended': self.trust.ended,
+            **self.sensor.to_dict()}
+
+
+def _updated(estimator: Estimator, now: int) -> tuple[Estimator, Estimate | None]:
+    """Return an estimator updated with its samples, and its estimate for a time."""
+    return estimator, estimator.update(now)

@@ -1,0 +1,145 @@
+"""Knowledge of an actuator before the first sample."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+import math
+from typing import Any
+
+import numpy as np
+
+from hmsa.errors import BadInputError
+from hmsa.identification.known import Known
+from hmsa.identification.quantities import (
+    check_free,
+    complete,
+    derivative,
+    QUANTITIES,
+    values_of,
+)
+from hmsa.model.equations import Array
+from hmsa.model.laws.coordinate import Coordinate, coordinate_of
+from hmsa.model.parameters import ActuatorParameters
+from hmsa_ros.runtime.records import TRACKED
+
+#: Default standard deviations: of the logarithm for parameters that are estimated by it, else of
+#: the value, with the force as a load, and latency and lag in time scales. Those of damping and
+#: J_lim are relative.
+DEVIATIONS = {
+    'shear_modulus': 0.15, 'density': 0.1, 'remanence': 0.1, 'time_unit': 0.1,
+    'chain_limit': 0.1, 'damping_coefficient': 0.25, 'stretch_bias': 3e-3,
+    'stretch_gain': 0.02, 'sensor_latency': 0.05, 'coil_time_constant': 0.05,
+    'constant_force': 0.007, 'viscoelastic_ratio': 0.03, 'viscoelastic_time': 1.0}
+# Minimum 1/J_lim and zeta of relative deviations, so that values of 0 have one.
+_LEAST_LIMIT, _LEAST_ZETA = 0.02, 0.1
+# Quantities that are no parameters of the planner.
+_SENSED = ('stretch_bias', 'stretch_gain', 'sensor_latency', 'constant_force')
+_NOT_TRACKED = (
+    'initial_stretch', 'initial_rate', *(x for x in QUANTITIES if x.startswith('viscoelastic_')))
+#: Possible other errors, tracked so that they are not mistaken for errors of these. The gain of
+#: the sensor, here about rest without field, is never estimated: it resembles another remanence
+#: and chain limit.
+SUSPECTS = (
+    'remanence', 'chain_limit', 'coil_time_constant', 'sensor_latency', 'viscoelastic_ratio',
+    'viscoelastic_time', 'constant_force', 'stretch_gain')
+# Tracked parameters that may well have their given values.
+_AS_GIVEN = ('shear_modulus', 'damping_coefficient')
+# Relaxation time of a suspected branch in time scales.
+_RELAXATION = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Values and their uncertainty."""
+
+    # Of all quantities, the hyperelastic model, and the viscoelastic branches.
+    values: dict[str, Any]
+    free: tuple[str, ...]  # tracked quantities
+    covariance: Array  # of the coordinates of these, shape (p, p)
+    # Deviations of the coordinates of a block that was never identified, shape (p,); they limit
+    # the range and the drift of estimates, since a block changes after its identification.
+    spread: Array
+    suspects: tuple[int, ...] = ()  # indices of suspects
+    named: int = 0  # number of named quantities, which come first
+
+    @classmethod
+    def nominal(
+            cls, actuator: ActuatorParameters, free: Sequence[str] = TRACKED, *,
+            suspects: bool = False, others: Mapping[str, float] | None = None,
+            deviations: Mapping[str, float] | None = None) -> 'Prior':
+        """
+        Return the prior of a block that was never identified.
+
+        With suspects, those of `SUSPECTS` are tracked too. ``others`` are values of coil and
+        sensor that differ from the defaults, and ``deviations`` replace some of `DEVIATIONS`,
+        in SI units. Raise `BadInputError` with the name that is unknown or cannot be tracked.
+        """
+        free = check_free(free, actuator.law)
+        wrong = [x for x in free if x in _NOT_TRACKED]
+        if wrong:
+            raise BadInputError(
+                f'{", ".join(wrong)} cannot be tracked: expected some of '
+                + ', '.join(x for x in DEVIATIONS if x not in _NOT_TRACKED))
+        named = len(free)
+        if suspects:
+            free = (*free, *(
+                x for x in SUSPECTS if x not in free
+                and not (x == 'chain_limit' and actuator.law is not None)
+                and not (x.startswith('viscoelastic') and any(actuator.creep.ratios))))
+        values: dict[str, Any] = complete(values_of(actuator, others), free)
+        values['viscoelastic_time'] = _RELAXATION * actuator.time_unit
+        if actuator.creep:
+            values['creep'] = actuator.creep.held
+        if 'chain_limit' in free:
+            values['chain_limit'] = min(values['chain_limit'], 1e9)
+        size, given = [], deviations or {}
+        for name in free:
+            deviation = given.get(name, DEVIATIONS[name])
+            if name == 'constant_force' and name not in given:
+                deviation /= actuator.load_per_newton
+            elif name in ('sensor_latency', 'coil_time_constant') and name not in given:
+                deviation *= actuator.time_unit
+            elif name == 'damping_coefficient':
+                deviation *= max(values[name], _LEAST_ZETA * actuator.damping_unit)
+            elif name == 'chain_limit':
+                deviation *= max(1.0 / values[name], _LEAST_LIMIT)
+            if not 0.0 < deviation < math.inf:
+                raise BadInputError(
+                    f'the deviation of {name} is {deviation:g}: expected a number above 0')
+            size.append(deviation)
+        return cls(
+            values, free, np.diag(np.square(size)), np.array(size), tuple(
+                i for i, x in enumerate(free) if i >= named or x in _AS_GIVEN) if suspects else (),
+            named)
+
+    @property
+    def coordinate(self) -> Coordinate:
+        """Kind of position that samples measure."""
+        return coordinate_of(self.values['law'])
+
+    def informed(self, known: Known) -> 'Prior':
+        """
+        Return the prior of a block that was identified; other quantities keep theirs.
+
+        Parameters of block and coil keep the values of this prior.
+        """
+        values = dict(self.values)
+        for name in _SENSED:
+            value = known.value(name)
+            values[name] = values[name] if value is None else value
+        both = [x for x in self.free if x in known.names and (
+            x not in _SENSED or known.value(x) is not None)]
+        places = [known.names.index(x) for x in both]
+        into = [self.free.index(x) for x in both]
+        scale = np.array([derivative(x, values[x]) for x in both])
+        covariance = self.covariance.copy()
+        covariance[np.ix_(into, into)] = (
+            known.covariance[np.ix_(places, places)] / np.outer(scale, scale))
+        if 'stretch_gain' in both[self.named:] and 'stretch_bias' in both:
+            # The identified gain is about 0, the suspected one about rest.
+            about = np.eye(len(self.free))
+            about[self.free.index('stretch_bias'), self.free.index('stretch_gain')] = (
+                values['stretch_gain'] * self.coordinate.rest)
+            covariance = about @ covariance @ about.T
+        return replace(
+            self, values=values, covariance=covariance,
+            spread=np.maximum(self.spread, np.sqrt(np.diag(covariance))))

@@ -1,0 +1,91 @@
+"""When an estimate is used, and which parameters plans use otherwise."""
+
+from hmsa.model.units import NANOSECONDS
+from hmsa.planning.timeline import Model, Plan
+from hmsa_lab.adapt.estimator import Estimator
+
+# Number of successive updates with samples that do not fit until the estimator restarts.
+_PERSISTENT = 3
+# Time scales of motion, and samples of it, that must fit before an estimate is used.
+_SHOWN, _FEWEST = 6.0, 10
+# Fraction of the samples of a move that may be rejected.
+_REJECTED = 0.1
+# Largest error, as a fraction of the step, that confirms the parameters of a move.
+_CONFIRMS = 0.02
+
+
+class Trust:
+    """
+    Track how well the samples of one joint fit.
+
+    An estimate is used once a whole move has fitted, or ``at_once`` if requested. While samples do
+    not fit, plans use the parameters that a move confirmed last, or the given ones. If the misfit
+    persists, the estimator restarts.
+    """
+
+    def __init__(self, begin: int, *, at_once: bool) -> None:
+        # Model of the last move that arrived, as measured.
+        self.confirmed: Model | None = None
+        self.beginnings = 0  # number of restarts
+        self.acts = at_once
+        self.why = ''  # why samples are not trusted; empty if they are
+        self.ended = False  # whether learnt parameters made moves worse
+        self._begin, self._doubts, self._rejected = begin, 0, 0
+        # Number of estimates that fitted a move and failed later; number of moves still to fit.
+        self._failures, self._moves = 0, 1
+
+    def doubt(self, why: str, now: int, *, at_once: bool = False) -> bool:
+        """Record that samples do not fit at a time in ns; return whether to restart."""
+        if self.ended:
+            return False
+        self.why = why
+        self._doubts += 1
+        if self.acts and self._doubts < _PERSISTENT and not at_once:
+            return False
+        self._failures += self.acts
+        if self._failures > 1:
+            self.confirmed = None
+        self.beginnings += 1
+        self.acts, self._begin, self._doubts = False, now, 0
+        # From the second failure on, each one doubles the number of moves that must fit.
+        self._moves = 2 ** max(self._failures - 1, 0)
+        return True
+
+    def fits(self, plan: Plan, unit: float, estimator: Estimator, now: int) -> bool:
+        """Record that samples fit at a time in ns; return whether to restart as too few did."""
+        # The time scale is in s.
+        self._doubts = 0
+        if self.ended:
+            return False
+        if not self.acts:
+            place = plan.place(self._begin) + 1
+            begin = plan.levels[place].stamp if place < len(plan.levels) else now
+            count, rejected = estimator.count_since(begin), estimator.screening.rejected
+            if begin + round(_SHOWN * unit * NANOSECONDS) <= now and count >= _FEWEST:
+                many = rejected - self._rejected > max(_REJECTED * count, 1)
+                self._begin, self._rejected = now, rejected
+                if many:
+                    return self.doubt('many samples of a move do not fit', now)
+                self._moves -= 1
+                self.acts = self._moves == 0
+        if self.acts or not self.beginnings:
+            self.why = ''
+        return False
+
+    def confirm(self, model: Model, left: float) -> None:
+        """Record the error of a move planned with a model, as a fraction of its step."""
+        if self.acts and left < _CONFIRMS:
+            self.confirmed = model
+
+    def end(self, why: str) -> None:
+        """End feedback, since learnt parameters make moves worse."""
+        if not self.why:
+            # The samples fit, so the parameters that they confirmed are no better.
+            self.confirmed = None
+        self.why, self.ended, self.acts = why, True, False
+
+    @property
+    def parameters(self) -> str:
+        """The parameters that plans use while samples do not fit, in words."""
+        return 'the parameters given' if self.confirmed is None else (
+            'the parameters that samples confirmed last')

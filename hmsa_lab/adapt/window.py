@@ -1,0 +1,341 @@
+"""
+Moving horizon estimation: the most probable motion through the newest samples, by Gauss-Newton.
+
+The unknowns are the coordinates of the free parameters, then stretch and rate at the start of the
+window. Earlier data form a Gaussian prior: when the window moves on, the samples that leave
+it are added to the prior at the present estimate, and the prior is propagated along the motion
+(C. V. Rao, J. B. Rawlings and D. Q. Mayne, IEEE Trans. Autom. Control 48 (2003) 246).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmsa.identification.fit import loss, weights_of
+from hmsa.identification.quantities import complete, QUANTITIES, values_at
+from hmsa.identification.response import sensed
+from hmsa.model.equations import Array
+from hmsa.model.laws.coordinate import coordinate_of
+from hmsa_lab.adapt.motion import follow, Levels, Motion, rest
+from hmsa_lab.adapt.suspects import GAIN, inverse, Look, optimum, Others, Suspects
+
+# Maximum Gauss-Newton iterations, halvings of each step, and small step in standard deviations.
+_PASSES, _HALVINGS, _SMALL = 4, 4, 0.1
+# Growth of the number of samples after which the suspects are examined again.
+_MORE = 1.3
+# Mean negative log probability of a sample above which a fit is poor; the usual value is 0.5.
+_POOR = 1.0
+# Maximum change per step of a coordinate that is a logarithm.
+_STRIDE = 0.3
+
+
+class Trial(NamedTuple):
+    """Simulation of the samples for some coordinates."""
+
+    values: dict[str, Any]  # of all quantities
+    motion: Motion  # at the samples, and last at the requested time
+    residual: Array  # measured minus simulated, shape (n,)
+    by: Array  # derivatives of the reading by the coordinates, shape (n, q)
+    weights: Array  # weight of each sample, 0 to 1
+    cost: float  # negative log probability
+
+    def moved(self, values: dict[str, Any], step: Array) -> 'Trial':
+        """Return the linearised simulation after a small step of the coordinates."""
+        motion = replace(
+            self.motion, stretch=self.motion.stretch + self.motion.by @ step,
+            rate=self.motion.rate + self.motion.rate_by @ step)
+        return self._replace(
+            values=values, motion=motion, residual=self.residual - self.by @ step)
+
+
+class Found(NamedTuple):
+    """The most probable values of the estimated coordinates."""
+
+    z: Array
+    here: Trial
+    matrix: Array  # second derivatives of the cost
+    gradient: Array  # negative first derivatives
+    loose: NDArray[np.bool_]  # which coordinates vary
+
+
+class Doubt(NamedTuple):
+    """Expectation if a constant force and the gain of the sensor may be in error, too."""
+
+    off: Array  # expected minus most probable coordinates, shape (q,)
+    covariance: Array  # about the most probable ones, shape (q, q)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The most probable motion."""
+
+    z: Array  # coordinates, initial stretch and rate, shape (q,)
+    here: Trial  # simulation with these
+    covariance: Array  # about z
+    off: Array  # expected values minus z, shape (q,)
+    # As `off` for plans, where other parameters represent an apparent gain of the sensor.
+    instead: Array
+    doubt: Doubt
+
+    def at_end(self) -> tuple[Array, Array, Array, Doubt]:
+        """Return coordinates and state at the requested time, their covariance and `off`."""
+        motion = self.here.motion
+        change = transport(motion, -1)
+        state = np.append(self.z[:-2], [motion.stretch[-1], motion.rate[-1]])
+        return state, change @ self.covariance @ change.T, change @ self.off, Doubt(
+            change @ self.doubt.off, change @ self.doubt.covariance @ change.T)
+
+
+def transport(motion: Motion, place: int) -> Array:
+    """Return the derivative of coordinates and state at a sample by those at the start."""
+    size = motion.by.shape[1]
+    change = np.eye(size)
+    change[-2], change[-1] = motion.by[place], motion.rate_by[place]
+    return change
+
+
+class Rest(NamedTuple):
+    """An equilibrium, which depends on parameters, and its observation."""
+
+    level: float  # in T
+    mean: Array  # of the parameters, before the observation, shape (p,)
+    covariance: Array
+    shown: float = 0.0  # reading of the sensor
+    weight: float = 0.0  # information in the reading
+
+
+@dataclass(eq=False)
+class Window:
+    """Samples and prior of the horizon; times in s from a common origin."""
+
+    values: dict[str, Any]  # of all quantities; those that are not free stay
+    free: tuple[str, ...]  # estimated quantities
+    mean: Array  # of the prior, shape (q,)
+    covariance: Array  # of the prior, shape (q, q)
+    bounds: Array  # of the coordinates, shape (p, 2)
+    begin: float  # time of the estimated stretch and rate
+    time: Array  # of the samples, not before the begin
+    stretch: Array
+    suspects: Suspects
+    suspected: tuple[int, ...] = ()  # indices of suspects that are estimated
+    weighed: int = 0  # number of samples when these were chosen
+    others: Others = Others(1.0, *(np.zeros(()),) * 3)  # effect of other sets
+    rest: Rest | None = None  # equilibrium at the begin
+    information: Array = field(init=False)  # inverse of the covariance, set by `settle`
+
+    def values_at(self, z: Array) -> dict[str, Any]:
+        """Return the values of all quantities for coordinates."""
+        return complete(values_at(self.values, self.free, z[:-2]), self.free)
+
+    def settle(self, z: Array, off: float) -> None:
+        """
+        Start at equilibrium, if applicable, to within a deviation, linearised at coordinates.
+
+        Far from them a force would shift it differently, which would look like an observation.
+        """
+        if self.rest is not None:
+            self._rest(self.rest, z, off)
+        self.information = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
+
+    def _rest(self, known: Rest, z: Array, off: float) -> None:
+        """Start at an equilibrium."""
+        values = self.values_at(z)
+        at = rest(values, self.free, known.level)
+        if at is None:
+            return
+        tie = np.vstack([np.eye(len(z) - 2), at[2], np.zeros(len(z) - 2)])
+        there = np.append(z[:-2], [at[0], 0.0])
+        self.mean = there + tie @ (known.mean - z[:-2])
+        self.covariance = tie @ known.covariance @ tie.T
+        self.covariance[[-2, -1], [-2, -1]] += np.square([off, off * at[1]])
+        if known.weight > 0.0:
+            state = np.zeros((1, len(z)))
+            state[0, -2] = values['stretch_gain']
+            shown, by_all = sensed(values, self.free, np.array([at[0]]), np.zeros(1), state)
+            by = self._about_rest(values, by_all)[0]
+            pull = self.covariance @ by
+            share = pull / (by @ pull + 1.0 / known.weight)
+            self.mean += share * (known.shown - float(shown[0]) - by @ (self.mean - there))
+            self.covariance -= np.outer(share, pull)
+
+    def rest_on(
+            self, at: Rest, count: int, begin: float, here: Trial, noise: float,
+            drift: Array) -> 'Window':
+        """Return the window, entirely at rest, without the first samples; as `move_on`."""
+        before, weights = at.weight, here.weights[:count]
+        before /= 1.0 + before * float(np.sum(np.square(here.by[:count][-1:]) @ drift))
+        weight = before + float(np.sum(weights)) / noise ** 2
+        shown = before * at.shown + float(weights @ self.stretch[:count]) / noise ** 2
+        return replace(
+            self, begin=begin, time=self.time[count:], stretch=self.stretch[count:], weighed=0,
+            rest=at._replace(
+                covariance=at.covariance + np.diag(drift[:-2]),
+                shown=shown / weight if weight else 0.0, weight=weight))
+
+    def solve(
+            self, z: Array, levels: Levels, noise: float, until: float, here: Trial | None = None
+    ) -> Solution | None:
+        """
+        Estimate the most probable motion from initial coordinates; None if there is none.
+
+        The noise is the standard deviation of a sample. The motion extends to a time that is not
+        before the last sample. The result of `simulate` at the coordinates may be given.
+        """
+        def descend(z: Array, here: Trial | None = None) -> Found | None:
+            return self._descend(z, here, levels, noise, until)
+
+        found = descend(z, here) or descend(self._at_ease(self.mean))
+        if found is None:
+            return None
+        if len(self.time) >= _MORE * self.weighed or self._is_poor(found, noise):
+            found = self._look(found, descend)
+            if self._is_poor(found, noise):
+                # There may be another local optimum.
+                before = self.suspected, self.others
+                self.suspected = tuple(
+                    i for i in self.suspects.places if i != self.suspects.gain)
+                other = descend(self._at_ease(self.mean))
+                other = other and self._look(other, descend)
+                if other and other.here.cost < found.here.cost:
+                    found = other
+                else:
+                    self.suspected, self.others = before
+        sure, off, square, instead = self.others
+        return Solution(
+            found.z, found.here, sure * inverse(found.matrix, found.loose) + square,
+            np.broadcast_to(off, z.shape), np.broadcast_to(instead, z.shape), self._doubt(found))
+
+    def _doubt(self, found: Found) -> Doubt:
+        """Return the expectation if a constant force and a gain may be in error, too."""
+        loose = found.loose | self.suspects.of(('constant_force', GAIN), len(found.loose))
+        covariance = inverse(found.matrix, loose)
+        off = covariance @ found.gradient
+        return Doubt(off, covariance + np.outer(off, off))
+
+    def _is_poor(self, found: Found, noise: float) -> bool:
+        """Return whether the estimated quantities explain the samples poorly."""
+        return loss(found.here.residual, noise, convex=True) > _POOR * len(self.time)
+
+    def _look(
+            self, found: Found, descend: Callable[[Array], Found | None]) -> Found:
+        """Choose the suspects to estimate, and return the most probable coordinates then."""
+        self.weighed, before = len(self.time), self.suspected
+        self.suspected, self.others = Look(
+            self.suspects, found.z, found.matrix, found.gradient,
+            *self._room(found.z)).choose(before)
+        if self.suspected == before:
+            return found
+        return descend(self._at_ease(found.z)) or found
+
+    def _descend(
+            self, z: Array, here: Trial | None, levels: Levels, noise: float, until: float
+    ) -> Found | None:
+        """
+        Search the most probable values of the estimated coordinates.
+
+        The last step, which is small, is not simulated.
+        """
+        here = here or self.simulate(z, levels, noise, until)
+        if here is None:
+            return None
+        for number in range(_PASSES + 1):
+            weighted = here.weights[:, None] * here.by / noise ** 2
+            matrix = self.information + here.by.T @ weighted
+            gradient = weighted.T @ here.residual + self.information @ (self.mean - z)
+            step, loose = self._step(z, matrix, gradient)
+            if float(step @ matrix @ step) < _SMALL ** 2:
+                z = z + step
+                gradient = gradient - matrix @ step
+                here = here.moved(self.values_at(z), step)
+                break
+            there = None
+            for _ in range(_HALVINGS if number < _PASSES else 0):
+                there = self.simulate(self._bounded(z + step), levels, noise, until)
+                if there is not None and there.cost <= here.cost:
+                    break
+                step *= 0.4
+                there = None
+            if there is None:
+                break
+            z, here = self._bounded(z + step), there
+        return Found(z, here, matrix, gradient, loose)
+
+    def _at_ease(self, z: Array) -> Array:
+        """Return coordinates with the given values for those that are not estimated."""
+        return self.suspects.at_ease(z, self.suspected)
+
+    def _room(self, z: Array) -> tuple[Array, Array]:
+        """Return the minimum and maximum step within the bounds."""
+        low, high = np.full(len(z), -math.inf), np.full(len(z), math.inf)
+        low[:-2], high[:-2] = (self.bounds - z[:-2, None]).T
+        return low, high
+
+    def _bounded(self, z: Array) -> Array:
+        kept: Array = z.copy()
+        kept[:-2] = np.clip(z[:-2], self.bounds[:, 0], self.bounds[:, 1])
+        return kept
+
+    def _step(
+            self, z: Array, matrix: Array, gradient: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the bounded step to the optimum, and which coordinates vary."""
+        longest = np.array([
+            _STRIDE if QUANTITIES[x].scale == 'log' else math.inf for x in self.free] + [
+                math.inf] * 2)
+        low, high = self._room(z)
+        return optimum(
+            matrix, gradient, np.zeros(len(z)), self.suspects.sought(len(z), self.suspected),
+            np.maximum(low, -longest), np.minimum(high, longest))
+
+    def simulate(
+            self, z: Array, levels: Levels, noise: float, until: float) -> Trial | None:
+        """Return the simulation of the samples for coordinates."""
+        values, times = self.values_at(z), np.append(self.time, until)
+        motion = follow(
+            values, self.free, (float(z[-2]), float(z[-1])), levels, self.begin,
+            times - values['sensor_latency'])
+        if motion is None:
+            return None
+        n = len(self.stretch)
+        shown, by = sensed(
+            values, self.free, motion.stretch, motion.rate, values['stretch_gain'] * motion.by)
+        residual: Array = self.stretch - shown[:n]
+        apart = z - self.mean
+        cost = loss(residual, noise, convex=True) + 0.5 * float(
+            apart @ self.information @ apart)
+        return Trial(
+            values, motion, residual, self._about_rest(values, by[:n]),
+            weights_of(residual, noise, convex=True), cost)
+
+    def _about_rest(self, values: dict[str, Any], by: Array) -> Array:
+        """Return derivatives of the reading, with a suspected gain about rest."""
+        if self.suspects.gain >= 0:
+            by[:, self.suspects.gain] -= (
+                values['stretch_gain'] * coordinate_of(values['law']).rest)
+        return by
+
+    def move_on(
+            self, count: int, begin: float, z: Array, here: Trial, noise: float,
+            drift: Array) -> 'Window':
+        """
+        Return the window without the first samples, which become part of the prior.
+
+        It begins at the next sample, or at the requested time. The drift is the variance that
+        parameters and state gain in between, shape (q,).
+        """
+        by, weights = here.by[:count], here.weights[:count]
+        matrix = self.information + by.T @ (weights[:, None] * by) / noise ** 2
+        gradient = by.T @ (weights * here.residual[:count]) / noise ** 2
+        gradient = gradient + self.information @ (self.mean - z)
+        covariance = inverse(matrix, np.ones(len(z), dtype=np.bool_))
+        change = transport(here.motion, count)
+        there = np.append(z[:-2], [here.motion.stretch[count], here.motion.rate[count]])
+        there = there + change @ (covariance @ gradient)
+        covariance = change @ covariance @ change.T + np.diag(drift)
+        return Window(
+            self.values, self.free, there,
+            0.5 * (covariance + covariance.T), self.bounds, begin,
+            self.time[count:], self.stretch[count:], self.suspects, self.suspected)

@@ -1,0 +1,184 @@
+"""Coil properties from readings of a field probe: constant, saturation, table and hysteresis."""
+
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+from scipy.optimize import curve_fit
+from scipy.special import stdtrit
+
+from hmsa.errors import BadInputError
+from hmsa.model.equations import Array
+
+# Minimum number of readings for a fit.
+_FEWEST = 4
+# Fraction of the range by which a model may deviate beyond the hysteresis; saturation, in units of
+# the range, from which it is not significant.
+_MISSES, _FAR = 0.005, 20.0
+# Number of levels that demagnetise a core.
+_DECAY = 12
+# Currents closer than this fraction of their range count as equal.
+_SAME = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class CoilCalibration:
+    """
+    A coil as measured with a field probe.
+
+    Attributes
+    ----------
+    tesla_per_ampere, std : float
+        Coil constant at small currents, and its standard deviation.
+    interval : (float, float)
+        95 % interval of the coil constant.
+    saturation : float
+        B_s in T of ``B_s tanh(tesla_per_ampere I / B_s)``; infinite if not significant.
+    offset : float
+        Reading in T without a current.
+    misses : float
+        Largest deviation of a mean reading from the model, as a fraction of the range.
+    hysteresis : float
+        Largest difference of the mean readings at one current between rising and falling current,
+        as a fraction of the range; NaN if no current was approached from both sides.
+    current, flux_density : ndarray, shape (m,)
+        Distinct currents in ascending order, and the mean reading at each minus the offset.
+    model : str
+        Recommended model: ``number``, ``saturation`` or ``table``.
+
+    """
+
+    tesla_per_ampere: float
+    std: float
+    interval: tuple[float, float]
+    saturation: float
+    offset: float
+    misses: float
+    hysteresis: float
+    current: Array
+    flux_density: Array
+    model: str
+
+    def settings(self, table: str) -> dict[str, Any]:
+        """Return a driver's settings ``hardware.coil.*``; ``table`` is the file of a table."""
+        if self.model == 'table':
+            return {'hardware.coil.file': table}
+        return {'hardware.coil.tesla_per_ampere': self.tesla_per_ampere} | (
+            {'hardware.coil.saturation': self.saturation} if self.model == 'saturation' else {})
+
+    def curve(self, current: Array) -> Array:
+        """Return the flux density in T of the model at currents in A, without offset."""
+        return np.interp(current, self.current, self.flux_density) if self.model == 'table' else (
+            _model(current, self.tesla_per_ampere, 0.0, self.saturation))
+
+
+def calibrate_coil(current: Array, flux_density: Array) -> CoilCalibration:
+    """
+    Fit a coil to readings of a field probe.
+
+    Parameters
+    ----------
+    current : ndarray, shape (n,)
+        Current in A (or voltage in V) of the source at each reading, in chronological order.
+    flux_density : ndarray, shape (n,)
+        Reading in T, including any offset of the probe.
+
+    Returns
+    -------
+    CoilCalibration
+        With the simplest model that fits the readings.
+
+    Raises
+    ------
+    BadInputError
+        If there are too few currents, or the readings do not depend on them.
+
+    """
+    if not np.all(np.isfinite(current) & np.isfinite(flux_density)):
+        raise BadInputError('readings are not all finite: expected numbers, in A and T')
+    places = np.unique(np.round(current / max(float(np.ptp(current)), 1e-300) / _SAME))
+    if len(current) < _FEWEST or len(places) < _FEWEST or not (
+            np.min(current) <= 0.0 <= np.max(current)):
+        raise BadInputError(
+            f'{len(current)} readings at {len(places)} currents: expected at least {_FEWEST} '
+            'currents with 0 A within their range')
+    span = float(np.ptp(flux_density))
+    if span == 0.0:
+        raise BadInputError(
+            f'all readings are {flux_density[0]:g} T: they do not follow the current; check the '
+            'probe and its direction')
+    straight = _fit(current, flux_density, saturating=False)
+    bent = _fit(current, flux_density, saturating=True)
+    at, mean, hysteresis = branch_means(current, flux_density)
+    better = len(current) * math.log(
+        max(float(np.sum(straight[2]**2)), 1e-300) / max(float(np.sum(bent[2]**2)), 1e-300))
+    saturates = better > 10.0 and abs(bent[0][2]) < _FAR * span
+    values, deviation, _ = bent if saturates else straight
+    slope, offset = float(values[0]), float(values[1])
+    saturation = abs(float(values[2])) if saturates else math.inf
+    if slope == 0.0 or not deviation < 0.2 * abs(slope):
+        raise BadInputError(
+            f'the readings do not follow the current ({slope:.3g} T/A, standard deviation '
+            f'{deviation:.3g}): expected a field that rises or falls with it; check the '
+            'probe and its direction')
+    misses = float(np.max(np.abs(mean - _model(at, *values)))) / span
+    half = float(stdtrit(len(current) - len(values), 0.975)) * deviation
+    # Both branches of a loop deviate from a middle curve by half of the hysteresis.
+    allowed = _MISSES + 0.5 * (0.0 if math.isnan(hysteresis) else hysteresis)
+    model = 'table' if misses > allowed else 'saturation' if saturates else 'number'
+    return CoilCalibration(
+        slope, deviation, (slope - half, slope + half), saturation, offset, misses, hysteresis,
+        at, mean - float(np.interp(0.0, at, mean)), model)
+
+
+def _model(current: Array, slope: float, offset: float, saturation: float = math.inf) -> Array:
+    found: Array = offset + (
+        slope * current if saturation == math.inf
+        else saturation * np.tanh(slope * current / saturation))
+    return found
+
+
+def _fit(current: Array, flux_density: Array, *, saturating: bool) -> tuple[Array, float, Array]:
+    """Return slope, offset and any B_s; standard deviation of the slope; and residuals."""
+    slope, offset = np.polyfit(current, flux_density, 1)
+    start = [slope, offset, 2.0 * np.max(np.abs(flux_density - offset))][:3 if saturating else 2]
+    values, covariance = curve_fit(
+        _model, current, flux_density, start, method='trf', x_scale='jac', xtol=1e-15, ftol=1e-15,
+        gtol=1e-15)
+    return values, math.sqrt(covariance[0, 0]), _model(current, *values) - flux_density
+
+
+def branch_means(current: Array, flux_density: Array) -> tuple[Array, Array, float]:
+    """Return currents, mean readings at each, and hysteresis as a fraction of the range."""
+    size = float(np.ptp(current))
+    places = np.round(current / size / _SAME).astype(np.int64)
+    before = np.concatenate([[np.nan], current[:-1]])
+    # The first of several readings at one current shows from which side it was approached.
+    side = np.sign(current - before)
+    for i in range(1, len(side)):
+        if places[i] == places[i - 1]:
+            side[i] = side[i - 1]
+    at, mean, apart = [], [], [math.nan]
+    for place in np.unique(places):
+        here = places == place
+        at.append(float(np.mean(current[here])))
+        branches = [flux_density[here & (side == x)] for x in (1.0, -1.0)]
+        if all(len(x) for x in branches):
+            rising, falling = (float(np.mean(x)) for x in branches)
+            apart.append(abs(rising - falling) / float(np.ptp(flux_density)))
+            mean.append(0.5 * (rising + falling))
+        else:
+            mean.append(float(np.mean(flux_density[here])))
+    return np.array(at), np.array(mean), float(np.nanmax(apart)) if len(apart) > 1 else math.nan
+
+
+def loop(largest: float, steps: int) -> list[float]:
+    """Return levels from 0 up to the largest one, down to its negative, and back to 0."""
+    up = np.linspace(0.0, largest, steps + 1)
+    return [float(x) for x in (*up, *up[-2::-1], *-up[1:], *-up[-2::-1])]
+
+
+def decay(largest: float) -> list[float]:
+    """Return levels that demagnetise a core: of alternating sign and decreasing size, then 0."""
+    return [largest * (1.0 - i / _DECAY) * (-1.0)**i for i in range(_DECAY)] + [0.0]

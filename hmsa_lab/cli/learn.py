@@ -1,0 +1,65 @@
+"""
+Correct the levels of a sequence by the errors of its repeats.
+
+Read the runs of one sequence, in their order, and correct its levels by the measured errors, such
+as those by hysteresis or a second mode. The first run has the planned setpoints; each of the
+others executed the levels learnt from those before it. Print the error of each run, and write the
+levels for the next run, for hmsa run --levels.
+
+example: hmsa learn planned/run second/run --out next.yaml
+"""
+
+import argparse
+import math
+from pathlib import Path
+from typing import Any
+
+from hmsa.cli.options import add_command, bags, JSON, show
+from hmsa.cli.progress import progress
+from hmsa.files import check_targets, write_text
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command."""
+    add_command(
+        subparsers, __name__, __doc__,
+        bags('runs'),
+        ('--joint', 'NAME', str, 'joint to learn for, if the bags have several', {'default': ''}),
+        ('--out', 'YAML', Path, 'file for the next levels'),
+        JSON)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Read, learn and print."""
+    check_targets(arguments.out)
+    from hmsa.identification.sequences import learn_from, sequence_text
+    from hmsa.runs.bags import read_run
+    from hmsa.table import Column, Table
+
+    with progress('reading'):
+        found, targets = learn_from([read_run(x, joint=arguments.joint) for x in arguments.runs])
+    if arguments.out is not None:
+        write_text(arguments.out, sequence_text(found, targets, arguments.runs))
+    rows = [(run, target.stretch, left.vibration, left.offset)
+            for run, each in zip(arguments.runs, found.left, strict=True)
+            for left, target in zip(each, targets, strict=True)]
+    best = arguments.runs[found.best]
+    lines: list[object] = [Table(
+        (Column('run'), Column('setpoint'), Column('vibration', '%', '%'),
+         Column('offset', '%', '+%')),
+        tuple((str(x), f'{y:g}', 100.0 * vibration, 100.0 * offset)
+              for x, y, vibration, offset in rows),
+        'vibration: peak to peak in the first period after the move; offset: mean less the '
+        'setpoint; in % of the step')]
+    if math.isfinite(found.frequency):
+        lines.append(f'second mode at {found.frequency:.4g} Hz')
+    if found.best != len(arguments.runs) - 1:
+        lines.append(f'note: {best} left less than later runs: the next levels start from it, '
+                     'with smaller changes')
+    return show(arguments, {
+        'runs': [{'run': x, 'setpoints': [
+            dict(zip(('stretch', 'vibration', 'offset'), y[1:], strict=True))
+            for y in rows if y[0] is x]} for x in arguments.runs],
+        'best': best, 'second_mode': found.frequency,
+        'levels': list(zip(found.level_times, found.levels, strict=True)),
+        'file': arguments.out}, *lines, written=[arguments.out])

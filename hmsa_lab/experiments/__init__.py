@@ -1,0 +1,1 @@
+"""Experiments: tuning an actuator, and calibrating coil, latency and sensor."""

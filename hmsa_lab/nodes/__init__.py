@@ -1,0 +1,1 @@
+"""Nodes and hardware classes that convert topics of other nodes."""

@@ -1,0 +1,327 @@
+"""
+Collect the state of running nodes by polling a few times a second.
+
+Subscriptions have no executor: messages are taken from the middleware at each look, so that a
+thousand samples a second cause no callbacks.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+import math
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from sensor_msgs.msg import JointState
+
+from hmsa.errors import BadInputError, printable
+from hmsa.interfaces import topics
+from hmsa.interfaces.status import real, texts, Verdict, whole
+from hmsa.model.laws.coordinate import COORDINATES
+from hmsa.model.schedule import CommandSchedule
+from hmsa.model.units import NANOSECONDS
+from hmsa_lab.watch.scene import History, Joint, Report, Scene
+from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
+from hmsa_ros.nodes.conversions import from_time
+from hmsa_ros.nodes.endpoints import interface_class
+from hmsa_ros.nodes.presence import Presence
+from hmsa_ros.nodes.visitor import leave, visit
+
+# Number of samples kept since the last look: all of them at 1 kHz.
+_SAMPLES = 200
+_SAMPLE_QOS = topics.Quality(_SAMPLES, reliable=False)
+_REPORT_QOS = topics.Quality(100, reliable=False)
+# Limit on joints times samples read at one look: all of them for up to ten joints at 1 kHz.
+_MOST_READ = 1000
+# Interval of looks at the graph, and time for discovery, in s.
+_GRAPH_SECONDS = 1.0
+_DISCOVERY_SECONDS = 1.5
+# Time in s without samples after which they are reported as missing; window of their rate.
+_QUIET_SECONDS = 2.0
+_RATE_SECONDS = 1.0
+# Time in s after which reports of ended nodes and of unreadable messages are dropped.
+_FORGET_SECONDS = 30.0
+
+
+@dataclass
+class _Source:
+    """A subscription, with a count of its unreadable messages."""
+
+    topic: str
+    kind: type[Any]
+    subscription: RawSubscription
+    unreadable: int = 0
+    complaint: str = ''
+    complained: float = -math.inf
+
+    def read(self, taken: Iterable[Taken]) -> Iterator[Any]:
+        """Yield the readable messages."""
+        for one in taken:
+            try:
+                yield decode(one.data, self.kind)
+            except BadInputError as error:
+                self.unreadable += 1
+                self.complaint = str(error)
+                self.complained = monotonic()
+
+    def new(self) -> Iterator[Any]:
+        """Yield the readable messages that have arrived."""
+        return self.read(self.subscription.take())
+
+
+class Listener:
+    """
+    Monitor the nodes of one namespace; a context manager.
+
+    All joints are shown by default; the charts cover the last ``span`` seconds.
+    """
+
+    def __init__(
+            self, *, namespace: str = '', joints: Sequence[str] = (),
+            span: float = 10.0) -> None:
+        self._wanted = tuple(joints)
+        self._span = span
+        self._node = visit(
+            'watch', namespace, enable_rosout=False, start_parameter_services=False)
+        self._domain = int(self._node.context.get_domain_id())
+        self._sources: list[_Source] = []
+        self._samples = self._subscribe(topics.JOINT_STATES, _SAMPLE_QOS)
+        self._status = self._subscribe(topics.STATUS)
+        self._plan = self._subscribe(topics.PLAN)
+        self._diagnostics = self._subscribe(topics.DIAGNOSTICS, _REPORT_QOS)
+        self._commands: dict[str, tuple[_Source, CommandSchedule]] = {}
+        self._joints: dict[str, Joint] = {}
+        self._heard: dict[tuple[str, str, str], tuple[float, Report]] = {}
+        self._request: Verdict | None = None
+        self._targets: dict[str, float] = {}
+        self._coordinates: dict[str, str] = {}
+        self._planned_joints: tuple[str, ...] = ()
+        self._plan_span: tuple[int, int] | None = None
+        self._begin = self._looked = monotonic()
+        self._graph_at = -math.inf
+        self._senders = {'samples': 0, 'planner': 0}
+        self._presence, self._crowd = Presence(self._node), list[str]()
+        self._stamp: int | None = None
+        self._arrived = -math.inf
+        self._rate = math.nan
+        self._counted: tuple[float, int] | None = None
+
+    def __enter__(self) -> 'Listener':
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for source in self._sources:
+            source.subscription.destroy()
+        self._presence.close()
+        leave(self._node)
+
+    def _subscribe(self, topic: topics.Topic, qos: topics.Quality | None = None) -> _Source:
+        source = _Source(
+            self._node.resolve_topic_name(topics.from_outside(topic.name, topics.PLANNER)),
+            interface_class(topic.type), endpoints.listen(
+                self._node, replace(topic, qos=qos or topic.qos), topics.PLANNER))
+        self._sources.append(source)
+        return source
+
+    def look(self) -> Scene:
+        """Return the present scene, including messages since the last look."""
+        now = monotonic()
+        if now - self._graph_at >= _GRAPH_SECONDS:
+            self._graph_at = now
+            self._look_at_graph()
+        self._take_planner()
+        self._take_samples(now)
+        self._take_commands()
+        self._take_reports(now)
+        for name, joint in self._joints.items():
+            joint.target = self._targets.get(name, math.nan)
+            joint.coordinate = self._coordinates.get(name, joint.coordinate)
+            if math.isfinite(joint.target):
+                joint.targets.hold(self._looked, now, joint.target)
+        self._looked = now
+        shown = [x for x in self._joints.values() if not self._wanted or x.name in self._wanted]
+        return Scene(
+            where=f'domain {self._domain}  {self._node.get_namespace()}', now=now,
+            stamp=math.nan if self._stamp is None else self._stamp / NANOSECONDS,
+            age=now - self._arrived if self._stamp is not None else math.nan,
+            sample_rate=self._rate, joints=shown, request=self._request,
+            progress=self._progress(), waiting=self._waiting(now, len(shown)),
+            reports=self._reports(now))
+
+    # -- messages ------------------------------------------------------------------------------
+
+    def _look_at_graph(self) -> None:
+        node = self._node
+        self._presence.look()
+        self._crowd = [x for x in (
+            self._presence.planners(topics.PLANNER),
+            self._presence.devices(self._planned_joints or tuple(self._joints))) if x]
+        self._senders = {
+            'samples': node.count_publishers(self._samples.topic),
+            'planner': node.count_publishers(self._status.topic)}
+        space = node.get_namespace().rstrip('/')
+        end = f'/{topics.FLUX_DENSITY_COMMAND.name}'
+        for name, _ in node.get_topic_names_and_types():
+            if name.startswith(f'{space}/') and name.endswith(end):
+                joint = name[len(space):-len(end)].strip('/')
+                if '/' not in joint and joint not in self._commands:
+                    self._commands[joint] = self._subscribe(
+                        replace(topics.FLUX_DENSITY_COMMAND, name=name),
+                        _REPORT_QOS), CommandSchedule(math.nan)
+
+    def _take_planner(self) -> None:
+        for message in self._plan.new():
+            self._planned_joints = tuple(printable(x) for x in message.joint_names)
+            start = from_time(message.header.stamp)
+            times = [from_time(x.time_from_start) for x in message.points]
+            self._plan_span = (start, start + max(times)) if times else None
+        for message in self._status.new():
+            values = texts(message)
+            # Keys of a single joint have no joint name; those of several have.
+            self._name_coordinates(message.hardware_id, values)
+            self._targets = {
+                key.rpartition('.')[0] or printable(message.hardware_id): real(value)
+                for key, value in values.items() if key.rpartition('.')[2] == 'stretch'}
+            self._request = Verdict.read(message)
+
+    def _take_samples(self, now: float) -> None:
+        arrived = self._samples.subscription.take()
+        if not arrived:
+            if now - self._arrived > _QUIET_SECONDS:
+                self._rate, self._counted = math.nan, None
+            return
+        # With many joints, not every sample can be read in time.
+        every = max(1, math.ceil(len(arrived) * len(self._joints) / _MOST_READ))
+        taken: dict[tuple[str, ...], list[JointState]] = {}
+        for message in self._samples.read(arrived[::-1][::every][::-1]):
+            taken.setdefault(tuple(printable(x) for x in message.name), []).append(message)
+            self._stamp = from_time(message.header.stamp)
+        if not taken:
+            return
+        self._arrived = now
+        number = arrived[-1].sequence
+        if self._counted is None or number < self._counted[1]:
+            self._counted = now, number
+        elif now - self._counted[0] >= _RATE_SECONDS:
+            self._rate = (number - self._counted[1]) / (now - self._counted[0])
+            self._counted = now, number
+        for names, messages in taken.items():
+            self._put(now, names, messages)
+
+    def _put(self, now: float, names: tuple[str, ...], messages: list[JointState]) -> None:
+        newest = messages[-1]
+        messages = [x for x in messages if len(x.position) == len(names)]
+        if not messages:
+            return
+        stretches = np.array([x.position for x in messages], dtype=np.float64)
+        for i, name in enumerate(names):
+            joint = self._joints.get(name)
+            if joint is None:
+                joint = self._joints[name] = Joint(
+                    name, History(self._span), History(self._span),
+                    fluxes=History(self._span))
+            joint.stretch = float(stretches[-1, i])
+            joint.rate = newest.velocity[i] if i < len(newest.velocity) else math.nan
+            joint.flux_density = newest.effort[i] if i < len(newest.effort) else math.nan
+            finite = stretches[np.isfinite(stretches[:, i]), i]
+            if len(finite):
+                joint.stretches.put(self._looked, now, finite)
+            fluxes = np.array([x.effort[i] for x in messages if i < len(x.effort)])
+            joint.fluxes.put(self._looked, now, fluxes[np.isfinite(fluxes)])
+
+    def _take_commands(self) -> None:
+        for name, (source, schedule) in self._commands.items():
+            for message in source.new():
+                schedule.insert(from_time(message.header.stamp), message.magnetic_field.z)
+            # Without the time of a sample, the newest command applies.
+            value = schedule.apply_until(math.inf if self._stamp is None else self._stamp)
+            joint = self._joints.get(name or self._only_joint())
+            if joint is not None:
+                joint.commanded = value
+
+    def _only_joint(self) -> str:
+        """Return the joint of topics without a joint name."""
+        for names in (self._planned_joints, tuple(self._joints)):
+            if len(names) == 1:
+                return names[0]
+        return ''
+
+    def _take_reports(self, now: float) -> None:
+        for message in self._diagnostics.new():
+            for status in message.status:
+                name = printable(status.name.partition(':')[0].strip().rpartition('/')[2])
+                # Diagnostics of a robot cover many other components.
+                if name not in topics.NODES and status.hardware_id not in self._joints:
+                    continue
+                values = texts(status)
+                self._name_coordinates(status.hardware_id, values)
+                counts = {key: whole(value) for key, value in values.items()
+                          if '.' not in key and value.isdigit()}
+                self._heard[name, status.name, status.hardware_id] = now, Report(
+                    name, status.level[0], printable(status.message), counts)
+        self._heard = {
+            key: (when, report) for key, (when, report) in self._heard.items()
+            if now - when <= _FORGET_SECONDS}
+
+    def _name_coordinates(self, joint: str, values: Mapping[str, str]) -> None:
+        """Record coordinate names from a status, whose keys have no joint name for one joint."""
+        for key, value in values.items():
+            name, _, last = key.rpartition('.')
+            if last == 'coordinate' and value in COORDINATES:
+                self._coordinates[name or printable(joint)] = value
+
+    def _reports(self, now: float) -> list[Report]:
+        """Return the worst report of each node, with all of its counters."""
+        by_node: dict[str, list[tuple[float, Report]]] = {}
+        for (name, _, _), said in sorted(self._heard.items(), key=lambda x: x[0]):
+            by_node.setdefault(name, []).append(said)
+        reports = []
+        for name, heard in by_node.items():
+            worst = max((x for _, x in heard), key=lambda x: x.level)
+            counts: Counter[str] = Counter()
+            for _, report in heard:
+                counts.update(report.counts)
+            reports.append(Report(
+                name, worst.level, worst.message, dict(counts),
+                now - max(when for when, _ in heard)))
+        return reports
+
+    # -- derived values ------------------------------------------------------------------------
+
+    def _progress(self) -> float:
+        if self._plan_span is None or self._stamp is None:
+            return math.nan
+        begin, end = self._plan_span
+        if end <= begin:
+            return float(self._stamp >= end)
+        return min(max((self._stamp - begin) / (end - begin), 0.0), 1.0)
+
+    def _waiting(self, now: float, shown: int) -> list[str]:
+        """Return what is missing, with the possible reason."""
+        if now - self._begin < _DISCOVERY_SECONDS:
+            return self._crowd or ([] if shown or self._request else ['looking around'])
+        where = f'on domain {self._domain}'
+        if self._node.get_namespace() != '/':
+            where += f' in namespace {self._node.get_namespace()}'
+        mend = ('is it running, with the same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE '
+                'as here?')
+        sentences = self._crowd.copy()
+        if not self._senders['samples']:
+            sentences.append(f'no plant or driver that sends joint states seen {where}: {mend}')
+        elif now - self._arrived > _QUIET_SECONDS:
+            quiet = now - max(self._arrived, self._begin)
+            sentences.append(
+                f'nothing on {self._samples.topic} for {quiet:.0f} s: is the plant paused?')
+        elif not shown:
+            sentences.append(
+                f'no joint {" or ".join(self._wanted)} on {self._samples.topic}: it has '
+                + ', '.join(list(self._joints)[:8]))
+        if not self._senders['planner']:
+            sentences.append(f'no planner seen {where}: {mend}')
+        sentences += [
+            f'{x.unreadable} messages on {x.topic} ignored ({x.complaint}): end the program '
+            'that publishes them, or remap its topic'
+            for x in self._sources if now - x.complained < _FORGET_SECONDS]
+        return sentences

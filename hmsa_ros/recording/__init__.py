@@ -1,0 +1,1 @@
+"""Recording messages to a bag, and playing them."""

@@ -1,0 +1,141 @@
+"""What follows the joints by their samples: feedback, or nothing in open loop."""
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Any
+
+from hmsa.errors import BadInputError
+from hmsa.judge.holds import Hold
+from hmsa.judge.records import Sensor
+from hmsa.model.equations import equilibrium_stretch, stretch_limits
+from hmsa.offload import Awaited, Doing, here
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Believed, Planner
+from hmsa.planning.timeline import Model
+from hmsa.plugins import FOLLOWER, registered
+from hmsa_ros.runtime.environment import Clock
+from hmsa_ros.runtime.records import Output, Settings, Verdict
+from hmsa_ros.runtime.slices import Drafts, Work
+
+
+class Follower:
+    """
+    Open loop: samples change nothing, and plans begin from the predicted state.
+
+    Feedback is a subclass, registered as the entry point ``adapt`` of ``hmsa_ros.follower``.
+    """
+
+    open_loop = True
+
+    def __init__(self, group: PlannerGroup, settings: Settings, doing: Doing = here) -> None:
+        self._group, self._settings = group, settings
+        #: Executes long-running work.
+        self.doing = doing
+        for planner in group.planners.values():
+            planner.believed = partial(as_held, planner)
+
+    @property
+    def on(self) -> bool:
+        """Whether samples are used."""
+        return False
+
+    @property
+    def wake(self) -> int | None:
+        """Time in ns of the next `update`; None for never, 0 for now."""
+        return None
+
+    # -- reports -------------------------------------------------------------------------------
+
+    def wants(self, stamp: int) -> bool:
+        """Return whether a sample with a timestamp in ns is needed."""
+        return False
+
+    def observed(
+            self, joint: str, stamp: int, stretch: float, flux_density: float, came: int) -> None:
+        """Process a sample of a joint; its timestamp and arrival in ns, its field in T."""
+
+    def applied(self, joint: str, stamp: int, flux_density: float) -> None:
+        """Record that a level in T has taken effect, before the plan does."""
+
+    def audit(self, joint: str, hold: Hold) -> None:
+        """Audit a setpoint of a joint, once all samples that have arrived are processed."""
+
+    # -- plans ---------------------------------------------------------------------------------
+
+    def update(self, now: int) -> bool:
+        """Process the samples that have arrived by a time in ns; return whether it took long."""
+        return False
+
+    def give_way(self, now: int) -> None:
+        """Update less often from a time in ns on, since commands have been kept waiting."""
+
+    def cautious(self, drafts: Drafts) -> Drafts:
+        """Return the drafts of a request with more time for moves to be corrected."""
+        return drafts
+
+    def due(self, now: int) -> Iterator[Work]:
+        """Yield corrections that may help at a time in ns."""
+        return iter(())
+
+    def take(self, work: Work, drafts: Drafts, now: int) -> Verdict | None:
+        """Adopt a correction made for a time in ns; None if nothing changes."""
+        return None
+
+    def follows(self, joint: str) -> bool:
+        """Return whether plans for a joint begin from its estimate."""
+        return False
+
+    def sensor(self, joint: str) -> Sensor:
+        """Return the sensor of a joint as estimated; as given where there is no estimate."""
+        return Sensor()
+
+    def do(self, *work: Any) -> Awaited[Any]:
+        """Execute work with `doing` if samples are used, else in this process."""
+        return here(*work)
+
+    # -- settings ------------------------------------------------------------------------------
+
+    def restart(self) -> None:
+        """Discard the estimates."""
+
+    def change(self, settings: Settings, models: Mapping[str, Model]) -> Mapping[str, Model]:
+        """Adopt new settings and given models; return the models to plan with."""
+        self._settings = settings
+        return models
+
+    def reset(self) -> str:
+        """Discard the estimates and return a confirmation; raise `BadInputError` if off."""
+        raise BadInputError('feedback is off and nothing is learnt: expected observe or adapt')
+
+    def save(self, *, by_joint: bool) -> str:
+        """Write the estimates to a file and return a confirmation; `BadInputError` if off."""
+        raise BadInputError('feedback is off and nothing is learnt: expected observe or adapt')
+
+
+def feedback(
+        group: PlannerGroup, settings: Settings, outputs: list[Output], clock: Clock,
+        report_ended: Callable[[str], None], doing: Doing) -> Follower:
+    """Return feedback from samples; ``report_ended`` is told why that of a joint has ended."""
+    make: Callable[..., Follower] = registered(FOLLOWER)['adapt'].load()
+    return make(group, settings, outputs, clock, report_ended, doing)
+
+
+def as_held(planner: Planner, time: int) -> Believed | None:
+    """
+    Return the predicted state at a time in ns, in the stretches of the planner's model.
+
+    The last level may be planned with other parameters. With those of the model it holds another
+    stretch, and a move from the planned one would leave vibration. None if both have the same
+    parameters, or if the model cannot be at that stretch.
+    """
+    last, model = planner.plan.levels[-1], planner.model
+    if last.model.actuator == model.actuator and last.model.others == model.others:
+        return None
+    state = planner.state(time)
+    stretch = state.stretch + float(
+        equilibrium_stretch(model.load(last.flux_density), model.material)
+        - equilibrium_stretch(last.load, last.model.material))
+    low, high = stretch_limits(model.material)
+    return None if not low < stretch < high else (
+        stretch, state.rate / model.units.time, tuple(
+            x + model.holding(stretch) - model.holding(state.stretch) for x in state.followed))

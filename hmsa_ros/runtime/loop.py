@@ -1,0 +1,105 @@
+"""
+Run the controller and a device in one loop, in simulated time, as fast as possible.
+
+The controller is `hmsa_ros.runtime.planner.PlannerRuntime`, as in the nodes. The loop passes it
+the time, the applied levels and the samples.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from hmsa.model.equations import Array
+from hmsa.model.units import NANOSECONDS
+from hmsa.planning.group import PlannerGroup
+from hmsa_ros.runtime.environment import Environment
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import Output, Send, Settings
+
+# Time to wait, in ns, while the controller waits for something.
+_PATIENCE = NANOSECONDS // 1000
+
+
+class SimulatedDevice(Protocol):
+    """A device that carries out commands; times in ns, fields in T, joints by number."""
+
+    @property
+    def time(self) -> int:
+        """Time that the device has been advanced to."""
+
+    @property
+    def next_sample(self) -> int:
+        """Time of the next sample."""
+
+    def receive(self, joint: int, stamp: int, level: float) -> None:
+        """Accept a level that applies from a timestamp."""
+
+    def advance(self, time: int) -> None:
+        """Simulate until a time."""
+
+    def changes(self) -> Sequence[tuple[int, int, float]]:
+        """Return the levels that took effect: joint, timestamp and level."""
+
+    def samples(self) -> Sequence[tuple[int, Array, Array, Array]]:
+        """Return the samples: timestamp, and stretch, rate (1/s) and field of each joint."""
+
+
+class Loop:
+    """
+    Run a controller and a device.
+
+    Parameters
+    ----------
+    group : PlannerGroup
+        The planners, in the order of the device's joints.
+    settings : Settings
+        Settings of the controller.
+    device : SimulatedDevice
+        The device to command; its time is that of the loop.
+
+    """
+
+    def __init__(
+            self, group: PlannerGroup, settings: Settings, device: SimulatedDevice) -> None:
+        self.now = device.time  #: in ns
+        self.device = device
+        self.runtime = PlannerRuntime(
+            group, settings, Environment(
+                clock=lambda: self.now, steady=lambda: self.now, one_clock=lambda: True))
+        self.runtime.active = True
+        #: Called with each output of the controller.
+        self.deliver: Callable[[Output], None] = lambda output: None
+        self._names = list(group.planners)
+
+    def run(self, until: int) -> None:
+        """Run until a time in ns."""
+        while self.now < until:
+            self.serve()
+            wakes = [self.runtime.wake, self.runtime.group.next_command()]
+            if wakes[0] is not None and wakes[0] <= self.now:
+                # There is more to do, which may have to wait.
+                self.serve()
+                wakes = [self.now + _PATIENCE, self.runtime.group.next_command()]
+            self.now = min(
+                until, max(self.device.next_sample, self.now + 1),
+                *(x for x in wakes if x is not None and x > self.now))
+            self._follow()
+
+    def serve(self) -> None:
+        """Do the work that is due now."""
+        for output in self.runtime.tick(self.now):
+            if isinstance(output, Send):
+                self.device.receive(
+                    self._names.index(output.joint), output.stamp, output.flux_density)
+            self.deliver(output)
+
+    def _follow(self) -> None:
+        """Advance the device to now, and pass on its changes and samples."""
+        self.device.advance(self.now)
+        self.now = max(self.now, self.device.time)
+        for joint, stamp, level in self.device.changes():
+            self.runtime.applied(self._names[joint], stamp, level)
+        for stamp, *measured in self.device.samples():
+            if self.runtime.looks_at(stamp):
+                for name, *values in zip(
+                        self._names, *(x.tolist() for x in measured), strict=True):
+                    self.runtime.observed(name, stamp, *values)

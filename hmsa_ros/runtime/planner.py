@@ -1,0 +1,596 @@
+"""
+A planner at work: takes requests, receipts and samples, and returns commands and verdicts.
+
+Does not depend on ROS. The caller calls `PlannerRuntime.tick` with the time of its clock, at the
+latest at `PlannerRuntime.wake`, and delivers the returned outputs: a node to topics, a loop
+directly to the coil.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+import math
+import re
+
+from hmsa.model.status import Code, RefusedError
+from hmsa.model.units import NANOSECONDS
+from hmsa.planning import path
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.timeline import Model
+from hmsa_ros.runtime.checks import check_joints, check_ready
+from hmsa_ros.runtime.devices import Devices
+from hmsa_ros.runtime.environment import Environment, Seen
+from hmsa_ros.runtime.follower import feedback, Follower
+from hmsa_ros.runtime.following import Following
+from hmsa_ros.runtime.planning import Planning
+from hmsa_ros.runtime.receipts import Receipts
+from hmsa_ros.runtime.records import (
+    Note,
+    Output,
+    Request,
+    Settings,
+    Severity,
+    Stop,
+    Trajectory,
+    Verdict,
+)
+from hmsa_ros.runtime.reporting import LOOK, Reporting
+from hmsa_ros.runtime.silence import Silence
+from hmsa_ros.runtime.slices import SLICE
+from hmsa_ros.runtime.stops import Stops
+from hmsa_ros.runtime.takeover import Takeover
+from hmsa_ros.runtime.throttle import Throttle
+from hmsa_ros.runtime.watching import Watch
+from hmsa_ros.timekeeping import clock_set_words
+
+# In ns by the steady clock: delay of a service that is a stall of this process; time that the
+# middleware then takes to deliver what has arrived; and time within which a device that is within
+# reach gives a receipt, of which there are five a second.
+_STALL, _SETTLE, _OWED = 200_000_000, 50_000_000, 500_000_000
+# Heartbeats without which a watchdog is not expected to trip.
+_LOST = 2
+# Clock jumps that follow each other within this time are reported once.
+_STORM = NANOSECONDS
+# A name that no other request has: 128 random bits.
+_UNIQUE = re.compile('[0-9a-f]{32}')
+_WAITING = Verdict(
+    Severity.OK, Code.WAITING, 'accepted: starts as soon as the current state is known')
+
+
+class PlannerRuntime:
+    """Plan requests in slices, send commands in time and track their effects."""
+
+    def __init__(
+            self, group: PlannerGroup, settings: Settings, environment: Environment) -> None:
+        self.group = group
+        self.settings = settings
+        self._prepare()
+        self.active = False
+        #: Refuses requests except stops, while several planners or devices are running.
+        self.crowded: RefusedError | None = None
+        self.clock_jumps = 0
+        # Time in ns by which the clock was set ahead since `tick` last processed that.
+        self._stepped = 0
+
+        def clock() -> int:
+            # A clock that is set continues unchanged until that is processed.
+            return environment.clock() - self._stepped
+        around = self.environment = replace(environment, clock=clock)
+        self._clock, self._steady = clock, around.steady
+        self._outputs: list[Output] = []
+        receipts = Receipts(around.steady)
+        self.following = Following(group, receipts, self._note)
+        self.follower = Follower(group, settings)
+        self._follow()
+        self._takeover = Takeover(
+            group.planners, around, receipts, self.following.newest,
+            self._follows, self._note)
+        self._silence = Silence(around)
+        self._watch = Watch(group, around, lambda: self.follower)
+        self.devices = Devices(
+            group.planners, receipts, self.following, self._takeover, around, self._outputs)
+        self._reporting = Reporting(
+            group, self.following, self._watch, around, self._outputs, self._note,
+            lambda: around.unheard() or receipts.words, self._unseen)
+        self._stops = Stops(
+            group, self.devices, self.following.newest, self._watch, around, around.unheard,
+            lambda: self.settings.tolerances)
+        self.planning = Planning(
+            group, self.following, lambda: self.follower, self._reporting,
+            around, lambda: self.devices.send(clock()), self._stops.begin)
+        self._next_beat = 0  # time in ns of the next heartbeat
+        # Time by the steady clock, in ns, by which the caller serves this again; None for any.
+        self._next_service: int | None = None
+        # Time until which reports are read after a stall, and joints that owe a receipt.
+        self._listens_until: tuple[int, int] | None = None
+        self._unheard: set[str] = set()
+        self._last_jump: int | None = None
+        self._set_back = 0
+        self._differ = False  # whether a clock offset was reported
+        self._impossible_due = Throttle()
+
+    def _follow(self) -> None:
+        """Begin feedback from samples, once it is wanted."""
+        if self.settings.feedback != 'off' and self.follower.open_loop:
+            self.follower = feedback(
+                self.group, self.settings, self._outputs, self._clock, self._report_ended,
+                self.follower.doing)
+
+    def _follows(self, joint: str) -> bool:
+        return self.follower.follows(joint)
+
+    def _note(self, words: str) -> None:
+        self._outputs.append(Note(Severity.WARN, words))
+
+    # -- in ------------------------------------------------------------------------------------
+
+    def request(self, request: Request) -> Verdict:
+        """
+        Accept a request, and plan it immediately for the duration of a slice.
+
+        A request that replaces all others from now on is planned before those that wait, which are
+        dropped if it can be carried out. The verdict is ``waiting`` until there is one for this
+        request. A trajectory without points is a stop. A trajectory with a unique name is carried
+        out once, since a client that has just been discovered may have to send it again.
+        """
+        if isinstance(request, Trajectory) and _UNIQUE.fullmatch(request.name) and (
+                self._reporting.answered(request.name)
+                or any(x.name == request.name for x in self.planning.requests)):
+            self._reporting.report()
+            return self._reporting.verdict
+        try:
+            check_ready(self._clock(), active=self.active)
+            check_joints(request, tuple(self.group.planners), self.settings)
+            if isinstance(request, Trajectory) and not request.count:
+                # As for a joint_trajectory_controller; goals are checked before.
+                request = Stop(request.name)
+            if not isinstance(request, Stop):
+                if self.crowded is not None:
+                    raise self.crowded
+                self.devices.check(request.joints)
+        except RefusedError as error:
+            return self.planning.refuse(error, request)
+        if (isinstance(request, Trajectory) and self.settings.trajectory_mode == 'rest'
+                and not request.follows):
+            request = replace(request, path=None)
+        self._process_clock()
+        self._check(request)
+        if not isinstance(request, Stop):
+            self.following.asked(request.joints)
+        work = self.planning.add(request, engaged=self._takeover.engaged)
+        self._engage(begin=True)
+        sure = self._work_on()
+        while sure and work in self.planning and not isinstance(request, Trajectory):
+            # It is short work, and the caller waits for it.
+            sure = self._work_on()
+        if self._set_back:
+            # The clock was set back during planning, so the planned times are invalid.
+            return self.request(request)
+        if isinstance(request, Stop) and self.devices.apart:
+            # What was to stop is dropped already, and no command reaches the device in time.
+            return self.planning.refuse(self.devices.differs(min(self.devices.apart)), request)
+        return _WAITING if work in self.planning else self._reporting.verdict
+
+    def _check(self, request: Request) -> None:
+        """Have joints that are to move now checked; a stop does not wait."""
+        self.devices.since = None
+        if isinstance(request, Stop) or not self._takeover.engaged:
+            return
+        later = isinstance(request, Trajectory) and request.stamp is not None
+        now = self._clock()
+        self._look_at_samples()
+        self._takeover.check(
+            x for x in request.joints if not (later and self.group.planners[x].moves(now)))
+
+    def _look_at_samples(self) -> None:
+        for joint, seen in self.environment.glance():
+            self._takeover.observe(joint, seen)
+            self._silence.record(joint, seen.stamp)
+
+    def _unseen(self) -> str:
+        self._look_at_samples()
+        return self._silence.words
+
+    def received(
+            self, joint: str, time: int, command: int, *, cut_off: bool,
+            locked: bool = False) -> None:
+        """
+        Process a receipt: by its time in ns, a device has received the command of a timestamp.
+
+        A device that was cut off rejects commands until that is acknowledged, and ``command`` is
+        the time of the cut-off; one that is locked by an interlock rejects all.
+        """
+        self.following.seen(time)
+        self._unheard.discard(joint)
+        self._drop(self.devices.received(joint, time, None if cut_off else command))
+        self._check_clock(joint)
+        self.cut_off(joint, in_force=cut_off or locked, locked=locked,
+                     time=command if cut_off else 0)
+
+    def cut_off(
+            self, joint: str, *, in_force: bool, locked: bool = False, time: int = 0) -> None:
+        """
+        Record whether a joint's device is cut off, or locked, and rejects commands.
+
+        ``time`` in ns names the cut-off.
+        """
+        if locked and joint not in self.devices.open:
+            self.planning.refuse_all(self.devices.interlock(joint))
+            self.planning.clear()
+        self._drop(self.devices.cut_off(
+            joint, self.settings, in_force=in_force, locked=locked, time=time))
+        if in_force and self.active and self._takeover.engaged:
+            # Before the first request there are no heartbeats: released, the device would be cut
+            # off again.
+            self.devices.acknowledge(joint)
+
+    def _check_clock(self, joint: str) -> None:
+        """Drop the plan of a joint whose device has another time."""
+        before = joint in self.devices.apart
+        verdict = self.devices.check_clock(joint, self.settings)
+        now = joint in self.devices.apart
+        if before is not now or verdict is not None:
+            # Samples from before and after do not belong to one motion.
+            self.follower.restart()
+            self._silence.restart()
+        if now and not before:
+            self.planning.refuse_all(self.devices.differs(joint))
+        self._drop(verdict)
+
+    def _drop(self, verdict: Verdict | None) -> None:
+        """Report that a plan was dropped, if there is a verdict."""
+        if verdict is not None:
+            self._reporting.show()
+            self._reporting.go_on(verdict, log=True)
+
+    def applied(self, joint: str, stamp: int, flux_density: float) -> None:
+        """Record that a joint's level in T was in force from a timestamp in ns on."""
+        if math.isnan(flux_density):
+            # The applied level is unknown.
+            return
+        if not self.group.planners[joint].follows(flux_density):
+            if self._impossible_due():
+                self._note(
+                    f'joint {joint}: a report that {flux_density:g} T took effect is ignored, '
+                    'since no motion can be predicted from there; see what publishes it')
+            return
+        now = self._clock()
+        if self._stepped:
+            # The timestamp is of the clock after it was set.
+            self._process_clock()
+            now = self._clock()
+        if joint in self.devices.apart or not self.devices.receipts.is_past(joint, stamp, now):
+            # The clock of the device was set, and the time is unknown.
+            self.following.newest[joint] = 0, flux_density
+            return
+        self.follower.applied(joint, stamp, flux_density)
+        if self._takeover.engaged:
+            self.following.applied(joint, stamp, flux_density, self.settings, now)
+        else:
+            self.following.newest[joint] = stamp, flux_density
+
+    def observed(
+            self, joint: str, stamp: int, stretch: float, rate: float,
+            flux_density: float, *, came: int | None = None) -> None:
+        """
+        Process a sample: timestamp in ns, stretch, rate in 1/s and flux density in T.
+
+        If the sample waited to be read, `came` is the time in ns of its arrival.
+        """
+        came = self._clock() if came is None else came - self._stepped
+        if self._takeover.waiting or not self._takeover.engaged:
+            self._takeover.observe(joint, Seen(
+                stamp, stretch, rate, flux_density,
+                None if self.environment.one_clock() else came - stamp))
+        if joint in self.devices.apart:
+            return
+        self._watch.add(joint, stamp, stretch)
+        self.follower.observed(joint, stamp, stretch, flux_density, came)
+
+    def clock_set(self, by: int) -> None:
+        """Record that the clock was set ahead by some ns; plans continue."""
+        self.clock_jumps += 1
+        self._stepped += by
+
+    def clock_set_back(self, back: int) -> None:
+        """
+        Record that simulated time restarted, some ns back: the actual state is read again.
+
+        The clock may detect this when it is read during planning, so the plans are dropped
+        afterwards.
+        """
+        self.clock_jumps += 1
+        self._set_back = max(self._set_back, back)
+
+    def _process_clock(self) -> None:
+        """Process a clock that was set, and report it."""
+        back, self._set_back = self._set_back, 0
+        by, self._stepped = self._stepped, 0
+        if not (back or by):
+            return
+        requests = [] if back else self.planning.requests
+        self.planning.clear()
+        self.following.restart(levels=not back)
+        self.follower.restart()
+        self.devices.receipts.clock_set()
+        self._silence.restart()
+        if back:
+            self.group.restart()
+            self._watch.restart()
+            self._takeover.drop()
+            self._stops.drop()
+            self._takeover.engaged = False
+        else:
+            # All plans continue as if the clock had not been set.
+            self.group.clock_set(by)
+            self._watch.clock_set(by)
+            self._takeover.clock_set(by)
+            self._next_beat += by
+            for request in requests:
+                # It was being planned for times that are now invalid.
+                self.planning.add(request, engaged=self._takeover.engaged)
+            self._reporting.show()
+        last, self._last_jump = self._last_jump, self._steady()
+        if last is not None and self._last_jump - last < _STORM:
+            return
+        self._reporting.go_on(Verdict(
+            Severity.WARN, Code.CLOCK_JUMPED,
+            f'the clock jumped back by {back / NANOSECONDS:.3f} s: the plan is dropped, and the '
+            'actuator is assumed where it began, at initial_stretch, unless joint_states shows '
+            'otherwise' if back else
+            clock_set_words(by, 'planned levels apply')), log=True)
+
+    def deactivate(self) -> None:
+        """Come to rest, sending all commands for that now, and accept no more requests."""
+        self._process_clock()
+        self.active = False
+        # Samples from before the joints come to rest do not show their later position.
+        self._takeover.drop()
+        self.planning.clear()
+        now = self._clock()
+        if self._takeover.engaged and now:
+            work = self.planning.add(Stop(), engaged=True)
+            while not self.planning.advance(work):
+                pass
+            self.planning.clear()
+            self.devices.send(now, everything=True)
+            self._watch.restart()
+            self._reporting.give(Verdict(
+                Severity.OK, Code.INACTIVE, 'deactivated: coming to rest, if its commands arrive'))
+        self._stops.drop()
+        self._takeover.engaged = False
+
+    def change(
+            self, settings: Settings, models: Mapping[str, Model], *,
+            simultaneous: bool) -> None:
+        """Adopt new settings now, and new models by joint from the next request on."""
+        if settings.heartbeat_period != self.settings.heartbeat_period:
+            self._next_beat = self._clock() + settings.heartbeat_period
+        self.settings = settings
+        self._prepare()
+        self._follow()
+        for name, model in self.follower.change(settings, models).items():
+            self.group.planners[name].take_model(model)
+        self.group.simultaneous = simultaneous
+
+    def _prepare(self) -> None:
+        if self.settings.trajectory_mode == 'path':
+            path.prepare()
+
+    # -- out -----------------------------------------------------------------------------------
+
+    @property
+    def wants_samples(self) -> bool:
+        """Whether samples are needed now or soon."""
+        return self._takeover.waiting or self.active and (
+            self._watch.open or self.follower.on)
+
+    def looks_at(self, stamp: int) -> bool:
+        """Return whether a sample with a timestamp in ns is needed; most are not."""
+        self.following.seen(stamp)
+        return (self._takeover.waiting or self._watch.wants(stamp)
+                or self.follower.wants(stamp))
+
+    @property
+    def wake(self) -> int | None:
+        """Time in ns of the next work; None for never, 0 for now."""
+        if (self._set_back or self._stepped or self.planning or self._takeover.waiting
+                or self._outputs or self._listens_until is not None):
+            return 0
+        if not self._takeover.engaged:
+            return None
+        now = self._clock()
+        times = [
+            None if self.devices.all_silent else self.group.next_command(),
+            self._reporting.next_change, self._reporting.preview_again, self._watch.wake(now),
+            self.follower.wake]
+        if self.settings.heartbeat_period:
+            times.append(self._next_beat)
+        if self.following.astray or self.following.verdicts:
+            times.append(0)
+        if self.following.advises:
+            times.append(now + LOOK)
+        if self.devices.receipts or self._stops.open:
+            times.append(now + LOOK)
+        return min((x for x in times if x is not None), default=None)
+
+    def send(self, now: int) -> list[Output]:
+        """Return the commands due at a time in ns: the urgent part of `tick`."""
+        self._process_clock()
+        if not self._listens():
+            self._send(now)
+        return self._taken()
+
+    def serve_by(self, steady: int | None) -> None:
+        """Record that the caller serves this again by a steady time in ns; None for any time."""
+        self._listens()
+        self._next_service = steady
+
+    def _listens(self) -> bool:
+        """
+        Return whether reports must be read before anything is sent or planned.
+
+        After a stall of this process, such as a suspended computer, the coil may be off, and
+        reports that say so wait to be read.
+        """
+        # A stall in the middle of a service is found at its end.
+        steady, due = self._steady(), self._next_service
+        stall = 0 if due is None else steady - due
+        if stall > _STALL:
+            self._next_service = None
+        if stall > _STALL and self._takeover.engaged and (
+                stall > _LOST * (self.settings.heartbeat_period or math.inf) or self._overdue):
+            self._unheard = self.devices.receipts.joints
+            self._listens_until = steady + _SETTLE, steady + _OWED
+            self._note(
+                f'the planner stood still for {stall / NANOSECONDS:.3f} s: it reads what plant '
+                'or driver report before it sends anything')
+        if self._listens_until is not None:
+            least, most = self._listens_until
+            if steady >= (most if self._unheard else least):
+                self._listens_until = None
+        return self._listens_until is not None
+
+    def tick(self, now: int) -> list[Output]:
+        """Do the work due at a time in ns, for a few ms at most; return the outputs."""
+        self._process_clock()
+        if self._listens():
+            return self._taken()
+        self._engage()
+        estimated = self._send(now) and self.follower.update(now)
+        if not estimated:
+            self._work_on()
+        if self._reporting.preview_again is not None and now >= self._reporting.preview_again:
+            self._reporting.show()
+        self._reporting.report_progress(now)
+        self.following.advise()
+        if self.active and (
+                self._watch.open or self._reporting.unheard or self._reporting.unseen
+                or self.devices.receipts or self._reporting.next_change is not None):
+            self._reporting.look_for_listeners()
+            if not estimated:
+                self._judge(now)
+        if (verdict := self._stops.look(now)) is not None:
+            self._reporting.give(verdict, log=verdict.severity > Severity.OK)
+        self._process_clock()
+        return self._taken()
+
+    def _send(self, now: int) -> bool:
+        """Send the commands that are due; return whether commands are sent at all."""
+        if not (self._takeover.engaged and self.active):
+            return False
+        self.devices.look()
+        if self.settings.replan_late:
+            self.following.drop_missed(now, self.settings.lateness_tolerance)
+        if self.following.astray:
+            # Replan before more of a plan is sent that no longer applies.
+            self._work_on()
+        late = self.following.lateness.count
+        self.devices.send(now)
+        if self.following.lateness.count > late:
+            self.follower.give_way(now)
+        if self.settings.heartbeat_period and now >= self._next_beat:
+            # Heartbeats, and a check which devices report.
+            self._next_beat = now + self.settings.heartbeat_period
+            if self.settings.replan_late:
+                self.following.look_for_unheard(now)
+            self._drop(self.devices.look_for_newcomers())
+            self.devices.beat(now)
+        return True
+
+    def _taken(self) -> list[Output]:
+        outputs = self._outputs.copy()
+        self._outputs.clear()
+        return outputs
+
+    def _engage(self, *, begin: bool = False) -> None:
+        """Start from the actual state of the joints, as soon as it is known."""
+        engaged = self._takeover.engaged
+        if begin:
+            self._takeover.begin(self.settings)
+        if self._takeover.waiting:
+            self._look_at_samples()
+        try:
+            self._takeover.go_on(self.settings)
+        except RefusedError as error:
+            self._takeover.drop()
+            self.planning.refuse_all(error)
+            return
+        if self._takeover.engaged and not engaged:
+            self._next_beat = self._clock() + self.settings.heartbeat_period
+
+    @property
+    def _overdue(self) -> bool:
+        """Whether a level that has not been sent should be in force by now."""
+        now = self._clock()
+        return any(x.next_stamp is not None and x.next_stamp < now
+                   for x in self.group.planners.values())
+
+    def _work_on(self) -> bool:
+        """Plan waiting work if the state of the joints is known; return whether it is."""
+        if self._listens() or not self._takeover.engaged or not self._sure():
+            return False
+        self.planning.work_on()
+        return True
+
+    def _sure(self) -> bool:
+        """Return whether the joints are where predicted, or measured, as far as that matters."""
+        requests = self.planning.requests
+        if not requests and not self.following.astray:
+            return True
+        if requests and isinstance(requests[0], Stop):
+            # It does not wait.
+            return True
+        try:
+            if self.devices.must_wait(self.settings):
+                return False
+            self._look_at_samples()
+            return self._takeover.look(self.settings, keep=not requests)
+        except RefusedError as error:
+            self.planning.refuse_all(error)
+            return not requests
+
+    def _judge(self, now: int) -> None:
+        """Judge arrivals from samples."""
+        if not self._watch.open:
+            return
+        end, observable = self._steady() + SLICE, self.environment.observable()
+        while self._steady() < end:
+            finding = self._watch.judge(
+                now, self.settings.tolerances, end, observable=observable)
+            if finding is not None or not self._watch.open:
+                # A rest beside the predicted one is no failure of a stop.
+                self._reporting.found(finding, judged=self._stops.judges)
+            if finding is None:
+                break
+
+    def _report_ended(self, words: str) -> None:
+        """Report why feedback of a joint has ended."""
+        self._reporting.go_on(Verdict(Severity.WARN, Code.FEEDBACK_ENDED, words), log=True)
+
+    def report(self) -> tuple[Severity, str, dict[str, object]]:
+        """Return the state of the commands: severity, message and counters."""
+        late, severity, message = self.following.lateness, Severity.OK, 'commands sent in time'
+        receipts, clocks = self.devices.receipts, self.devices.clocks
+        if late.count:
+            severity = Severity.WARN if late.harms or self.following.clocks else Severity.OK
+            message = f'{late.count} commands late: {self.following.advice}'
+        elif clocks:
+            severity, message = Severity.WARN, clocks
+        if self.active:
+            self._reporting.look_for_listeners()
+        if self._reporting.unseen:
+            severity, message = Severity.WARN, self._reporting.unseen
+        if receipts.words:
+            severity, message = Severity.ERROR, receipts.words
+        if clocks and not self._differ:
+            self._note(clocks)
+        self._differ = bool(clocks)
+        offset = receipts.offset
+        values: dict[str, object] = {} if offset is None else {
+            'clock_offset_ms': f'{offset.ahead / 1e6:.3f}',
+            'clock_offset_error_ms': f'{offset.error / 1e6:.3f}'}
+        return severity, message, {
+            'sent': self.devices.sent, 'late': late.count, 'replanned': self.following.replanned,
+            'heartbeats': self.devices.heartbeats,
+            'largest_lateness_ms': f'{late.largest / 1e6:.3f}',
+            'refused': self.planning.refused, 'clock_jumps': self.clock_jumps, **values}

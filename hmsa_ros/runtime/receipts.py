@@ -1,0 +1,259 @@
+"""Receipts of plant or driver: acknowledged commands, and the time of the device's clock."""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from hmsa.model.units import NANOSECONDS
+from hmsa_ros.runtime.device_clock import DeviceClock, Offset
+from hmsa_ros.runtime.lateness import Disturbance
+
+# Receipts arrive five times a second: longest gap between them, in ns by the steady clock.
+_PATIENCE = 800_000_000
+# A longer pause between two looks is a stall of this process, which could not receive any.
+_PAUSE = 300_000_000
+# A receipt that is older than the silence that it ends was delayed in transit, unless further
+# ones follow at the pace of the device's clock for a time in ns: delayed ones arrive at once.
+_STALE, _PACED = 300_000_000, 350_000_000
+# Largest difference in ns between that pace and the steady clock.
+_UNEVEN = 100_000_000
+# Number of looks, five a second, without a publisher until no receipts are expected.
+_MISSING = 25
+# Number of disturbances that are stored until they are asked for.
+_REMEMBERED = 16
+
+
+@dataclass
+class _Joint:
+    """State of the device of a joint; times in ns by the steady clock, unless noted."""
+
+    arrived: int  # arrival of the newest receipt
+    time: int = 0  # its time by the clock of the device
+    command: int = 0  # timestamp that it acknowledged; 0 for none
+    unanswered: int | None = None  # time since which no command is acknowledged
+    acknowledged: int = 0  # newest timestamp sent that was acknowledged; 0 for none
+    silent: bool = False
+    missing: int = 0  # consecutive looks without a publisher of receipts
+    clock: DeviceClock = field(default_factory=DeviceClock)
+    step: int = 0  # ns by which its clock was set ahead since `Receipts.take_step`
+    # During a silence: time of a receipt that seemed delayed, and of its arrival.
+    delayed: tuple[int, int] | None = None
+
+    def is_delayed(self, time: int, steady: int) -> bool:
+        """Return whether a receipt was sent before the silence during which it arrives."""
+        if time - self.time >= steady - self.arrived - _STALE:
+            return False
+        # It was delayed, or the clock of the device was set back.
+        if self.delayed is not None:
+            before, came = self.delayed
+            if abs((time - before) - (steady - came)) <= _UNEVEN:
+                return steady - came < _PACED
+        self.delayed = time, steady
+        return True
+
+
+class Receipts:
+    """
+    Track receipts, which are optional: only their absence after the first one is an alarm.
+
+    ``silent`` contains the joints whose device has stopped sending receipts.
+    """
+
+    def __init__(self, steady: Callable[[], int]) -> None:
+        self._steady = steady
+        self._joints: dict[str, _Joint] = {}
+        self._looked = steady()
+        self._disturbances: deque[Disturbance] = deque(maxlen=_REMEMBERED)
+        self.silent: set[str] = set()
+
+    def __bool__(self) -> bool:
+        return bool(self._joints)
+
+    def sent(self, joint: str, stamp: int, now: int) -> None:
+        """Record that a command was sent; timestamp and time in ns of the planner's clock."""
+        known = self._joints.get(joint)
+        if known is None:
+            return
+        if known.unanswered is None:
+            known.unanswered = self._steady()
+        known.clock.sent(stamp, now)
+
+    def received(
+            self, joint: str, time: int, command: int | None, now: int, *,
+            comparable: bool) -> bool:
+        """
+        Process a receipt with the device's time; return whether the device restarted.
+
+        ``command`` is the timestamp of the newest command that the device has received, 0 for
+        none; None if the receipt contains none, as during a cut-off. ``now`` is the time of the
+        planner's clock. The two times are ``comparable`` if each side has its own clock: a shared
+        clock may be slowed down or paused. A device has restarted if it reports no command after
+        it reported one.
+        """
+        steady = self._steady()
+        known = self._joints.get(joint)
+        if known is None:
+            known = self._joints[joint] = _Joint(steady)
+        if known.silent and comparable and known.is_delayed(time, steady):
+            return False
+        if steady - known.arrived > _STALE:
+            self._disturbed(known.arrived, _outage(joint, steady - known.arrived))
+        restarted = known.command != 0 and command == 0
+        if command is not None:
+            known.command = command
+        if restarted:
+            # Commands that were sent to the previous device are lost.
+            known.clock.lost()
+            known.unanswered = None
+            known.acknowledged = 0
+        known.arrived, known.time, known.missing, known.delayed = steady, time, 0, None
+        if command is not None and known.clock.awaits(command):
+            known.unanswered, known.acknowledged = None, command
+        if comparable:
+            known.step += known.clock.received(time, command, now, steady)
+        return restarted
+
+    def knows(self, joint: str) -> bool:
+        """Return whether there was a receipt of a joint."""
+        return joint in self._joints
+
+    def _disturbed(self, begin: int, words: str) -> None:
+        self._disturbances.append(Disturbance(begin, self._steady(), words))
+
+    def take_disturbances(self) -> list[Disturbance]:
+        """Return the disturbances since the last call, and those that last."""
+        for name, known in self._joints.items():
+            if (silence := self._steady() - known.arrived) > _STALE:
+                self._disturbed(known.arrived, _outage(name, silence))
+        found = list(self._disturbances)
+        self._disturbances.clear()
+        return found
+
+    def void(self, joint: str) -> None:
+        """Expect no acknowledgement of the commands sent so far, since they are rejected."""
+        known = self._joints.get(joint)
+        if known is not None:
+            known.clock.lost()
+            known.unanswered = None
+
+    @property
+    def joints(self) -> set[str]:
+        """Joints whose device gives receipts."""
+        return {*self._joints}
+
+    def since(self, joint: str, time: int) -> bool:
+        """Return whether a joint's newest receipt is no older than a time of its device."""
+        known = self._joints.get(joint)
+        return known is None or known.silent or known.time >= time
+
+    def carried_out(self, joint: str, stamp: int) -> bool | None:
+        """
+        Return whether a joint's device has acknowledged a command and reached its timestamp in ns.
+
+        A newer command acknowledges it too. None if the device sends no receipts.
+        """
+        known = self._joints.get(joint)
+        return None if known is None else (
+            not known.silent and known.acknowledged >= stamp and known.time >= stamp)
+
+    def forget(self, joint: str) -> None:
+        """
+        Expect no more receipts of a joint, since its current subscriber publishes none.
+
+        Only repeated calls take effect, because discovery finds one topic after the other.
+        """
+        known = self._joints.get(joint)
+        if known is None:
+            return
+        known.missing += 1
+        if known.missing >= _MISSING:
+            del self._joints[joint]
+            self.silent.discard(joint)
+
+    def clock_set(self) -> None:
+        """Record that the planner's clock was set."""
+        self._disturbed(self._steady() - _STALE, 'the clock of the planner was set')
+        for known in self._joints.values():
+            known.clock.set(self._steady())
+            known.acknowledged = 0
+
+    def take_step(self, joint: str) -> int:
+        """Return by how many ns a device's clock was set ahead since the last call."""
+        known = self._joints.get(joint)
+        if known is None:
+            return 0
+        step, known.step = known.step, 0
+        return step
+
+    def look(self) -> list[str]:
+        """Return the joints whose device has fallen silent, or is received again."""
+        steady = self._steady()
+        absent, self._looked = steady - self._looked, steady
+        changed: list[str] = []
+        if absent > _PAUSE:
+            self._disturbed(
+                steady - absent, f'the planner stood still for {absent / NANOSECONDS:.3f} s')
+        for name, known in self._joints.items():
+            if absent > _PAUSE:
+                known.arrived = min(known.arrived + absent, steady)
+                known.unanswered = None
+            silent = steady - known.arrived > _PATIENCE
+            if silent is not known.silent:
+                changed.append(name)
+                known.silent = silent
+        self.silent = {x for x, known in self._joints.items() if known.silent}
+        return changed
+
+    def lost(self, joint: str, patience: int = _PATIENCE) -> bool:
+        """Return whether a command has been unacknowledged for longer than ``patience`` in ns."""
+        known = self._joints.get(joint)
+        return known is not None and known.unanswered is not None and (
+            self._steady() - known.unanswered > patience)
+
+    @property
+    def steady(self) -> int:
+        """The steady time in ns."""
+        return self._steady()
+
+    @property
+    def words(self) -> str:
+        """Why commands do not arrive; empty if they do or if there are no receipts."""
+        for name, known in self._joints.items():
+            if known.silent:
+                return (
+                    f'no receipt of joint {name} from the plant or driver for more than '
+                    f'{_PATIENCE / NANOSECONDS:g} s: it has ended, or its host cannot be '
+                    'reached, or has another address now (then restart it); no command is sent '
+                    'until receipts arrive')
+            if self.lost(name):
+                return (
+                    f'commands of joint {name} do not arrive: the plant or driver sends receipts, '
+                    f'but has received no command for more than {_PATIENCE / NANOSECONDS:g} s')
+        return ''
+
+    def lag(self, joint: str) -> int | None:
+        """Return the smallest age in ns of a joint's receipts at arrival; None for no receipt."""
+        known = self._joints.get(joint)
+        return None if known is None else known.clock.lag
+
+    def is_past(self, joint: str, time: int, now: int) -> bool:
+        """Return whether a time of a device can have passed by one of the planner's clock."""
+        known = self._joints.get(joint)
+        return known is None or known.clock.is_past(time, now)
+
+    def offset_of(self, joint: str) -> Offset | None:
+        """Return the clock offset of a joint's device; None if unknown."""
+        known = self._joints.get(joint)
+        return None if known is None else known.clock.offset
+
+    @property
+    def offset(self) -> Offset | None:
+        """Largest clock offset among the devices; None if unknown."""
+        found = (x.clock.offset for x in self._joints.values())
+        return max((x for x in found if x is not None), key=lambda x: abs(x.ahead), default=None)
+
+
+def _outage(joint: str, silence: int) -> str:
+    """Return a clause that receipts of a joint were missing for some ns."""
+    return (f'no receipt of joint {joint} arrived for {silence / NANOSECONDS:.3f} s, as in an '
+            'outage or a stall')

@@ -1,0 +1,200 @@
+"""Inputs and outputs of a planner runtime."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any, TYPE_CHECKING
+
+from hmsa.errors import BadInputError
+from hmsa.judge.records import Finding, GoalTolerances, Tolerances
+from hmsa.model.status import Code
+from hmsa.model.units import NANOSECONDS
+from hmsa.planning.group import Progress
+
+if TYPE_CHECKING:
+    from hmsa.identification.known import Known
+
+#: How velocities in a trajectory are treated: refused, as it rests at each point, or as a path.
+TRAJECTORY_MODES = ('rest', 'path')
+#: What to do after a coil was cut off: wait for a request, or continue with a shaped move.
+AFTER_CUT_OFF = ('wait', 'resume')
+#: Open loop; estimates from samples; corrected plans, too; slower moves where errors are likely.
+FEEDBACK_MODES = ('off', 'observe', 'adapt', 'cautious')
+#: Parameters that feedback estimates by default.
+TRACKED = ('shear_modulus', 'damping_coefficient', 'stretch_bias')
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of a planner runtime; times in ns."""
+
+    # Interval at which the level in force is sent again; 0 for never.
+    heartbeat_period: int = NANOSECONDS // 5
+    replan_late: bool = True  # replan the rest of a sequence after a deviation
+    lateness_tolerance: int = 5000  # largest lateness without a new plan
+    takeover_timeout: int = NANOSECONDS // 2  # initial wait for plant and sample; 0: no wait
+    takeover_max_age: int = NANOSECONDS // 2  # maximum age of such a sample
+    after_cut_off: str = 'wait'  # one of `AFTER_CUT_OFF`
+    max_points: int = 100_000  # maximum number of setpoints in a request, summed over joints
+    trajectory_mode: str = 'rest'  # one of `TRAJECTORY_MODES`
+    allow_partial_joints: bool = False  # whether a trajectory may omit joints
+    tolerances: Tolerances = field(default_factory=Tolerances)
+    feedback: str = 'off'  # one of `FEEDBACK_MODES`
+    feedback_parameters: tuple[str, ...] = TRACKED  # estimated in addition to the state
+    feedback_cautious: bool = False  # whether ``adapt`` is ``cautious``
+    feedback_tolerance: float = 5e-3  # large predicted error, as a fraction of the step
+    feedback_trim: float = 0.0  # limit in T for trimming against a force; 0: off
+    feedback_frozen: bool = False  # estimate only the state, keep the parameters
+    feedback_file: str = ''  # file for learnt parameters; empty: none
+    # By joint, prior uncertainty of the parameters.
+    known: Mapping[str, 'Known'] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ('heartbeat_period', 'lateness_tolerance', 'takeover_timeout',
+                     'takeover_max_age', 'max_points'):
+            if getattr(self, name) < 0:
+                raise BadInputError(f'{name} is {getattr(self, name)}: expected at least 0')
+
+    @property
+    def adapts(self) -> bool:
+        """Whether plans use the estimate."""
+        return self.feedback in ('adapt', 'cautious')
+
+    @property
+    def cautious(self) -> bool:
+        """Whether moves with a large predicted error are slowed down."""
+        return self.feedback == 'cautious' or self.adapts and self.feedback_cautious
+
+
+# -- in -----------------------------------------------------------------------------------------
+
+@dataclass(frozen=True)
+class Trajectory:
+    """
+    A request to go through setpoints.
+
+    Each point contains the stretch of each joint and the end of the setpoint in ns from the start.
+    If ``raw``, it contains the flux density in T of each joint and the time from which it applies.
+    Points are read in pieces, and again for each replanning; iterating them may raise
+    `RefusedError`. Points of a ``path`` contain stretch, rate (1/s) and acceleration (1/s^2, or
+    NaN) of each joint. The path is followed if the settings or ``follows`` request it. Without
+    points, it is a stop.
+    """
+
+    joints: tuple[str, ...]
+    points: Iterable[tuple[Sequence[Any], int]]
+    count: int  # number of points
+    stamp: int | None = None  # start in ns; None for now
+    name: str = ''  # repeated in the verdict
+    raw: bool = False
+    path: Iterable[tuple[Sequence[Any], int]] | None = None
+    follows: bool = False
+    # Goal tolerances by joint, where they differ from the settings.
+    goals: Mapping[str, GoalTolerances] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Target:
+    """A request to go to a stretch now and to hold it."""
+
+    joint: str
+    stretch: float
+    name: str = ''
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints that it moves."""
+        return (self.joint,)
+
+
+@dataclass(frozen=True)
+class Stop:
+    """A request to drop the remaining setpoints and to come to rest."""
+
+    name: str = ''
+
+
+Request = Trajectory | Target | Stop
+
+
+# -- out ----------------------------------------------------------------------------------------
+
+class Severity(IntEnum):
+    """Severity, as in diagnostics."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Result of a request; an error if it is not carried out."""
+
+    severity: Severity
+    code: Code
+    message: str  # one sentence
+    request: str = ''  # name of the request
+    figures: Mapping[str, float] = field(default_factory=dict)  # values behind the message
+
+
+@dataclass(frozen=True)
+class Send:
+    """A command to send now: from a timestamp in ns on, a flux density in T for a joint's coil."""
+
+    joint: str
+    stamp: int
+    flux_density: float
+
+
+@dataclass(frozen=True)
+class PlanChanged:
+    """A preview of the plan, with a sample at each change of level of any joint."""
+
+    stamps: tuple[int, ...]  # in ns, increasing; only the start of a long plan
+    # By joint, for each timestamp: stretch, rate in 1/s, and flux density in T from then on.
+    samples: Mapping[str, Sequence[tuple[float, float, float]]]
+
+
+@dataclass(frozen=True)
+class StatusChanged:
+    """A new verdict or a change in the progress."""
+
+    verdict: Verdict
+    progress: Progress
+    each: Mapping[str, Progress]
+    plan: int  # accepted requests so far
+    late: int  # late commands
+    replanned: int  # number of replannings
+    findings: Mapping[str, Finding] = field(default_factory=dict)  # newest, by joint
+    worst: Finding | None = None  # worst finding of the last request
+    watching: bool = False  # whether started setpoints are still to be judged
+    unheard: str = ''  # why commands are not carried out; empty if they are
+    unseen: str = ''  # joint whose samples have stopped; empty for none
+    measuring: bool = False  # whether there are recent samples
+    # Name of each joint's position coordinate.
+    coordinates: Mapping[str, str] = field(default_factory=dict)
+    # Newest verdicts on recent requests by name, each with the number of plans then.
+    answers: Mapping[str, tuple[Verdict, int]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Note:
+    """A message for the log."""
+
+    severity: Severity
+    message: str
+
+
+@dataclass(frozen=True)
+class EstimateChanged:
+    """An estimate of a joint from samples."""
+
+    time: int  # in ns
+    joint: str
+    severity: Severity  # WARN if parameters differ from the given ones or samples are not trusted
+    message: str
+    values: Mapping[str, object]  # in SI, with standard deviations, given values and counters
+
+
+Output = Send | PlanChanged | StatusChanged | Note | EstimateChanged

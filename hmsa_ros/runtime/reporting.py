@@ -1,0 +1,156 @@
+"""Reports of a runtime: verdicts, progress and previews, in chronological order."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+
+from hmsa.judge.records import Finding, VERDICTS
+from hmsa.model.status import Code
+from hmsa.model.units import NANOSECONDS
+from hmsa.planning.group import PlannerGroup, Progress
+from hmsa.planning.timeline import PlannedSegment
+from hmsa_ros.runtime.environment import Environment
+from hmsa_ros.runtime.following import Following
+from hmsa_ros.runtime.records import (
+    Output,
+    PlanChanged,
+    Request,
+    Severity,
+    StatusChanged,
+    Trajectory,
+    Verdict,
+)
+from hmsa_ros.runtime.watching import Watch
+
+# Changes of level in one preview, and the delay in ns until a preview shows a correction: a
+# preview takes time to make, and corrections of several joints arrive together.
+_PREVIEW, _SOON = 500, 50_000_000
+#: Interval in ns at which subscribers are looked up.
+LOOK = 200_000_000
+# Number of requests whose verdicts are repeated, and time in ns by the steady clock: many requests
+# at once replace each other's status before their senders have read it.
+_ANSWERS, _REPEATED = 64, 30 * NANOSECONDS
+
+
+class Reporting:
+    """Verdicts, progress, previews and notes that wait to be published."""
+
+    def __init__(
+            self, group: PlannerGroup, following: Following, watch: Watch,
+            environment: Environment, outputs: list[Output], note: Callable[[str], None],
+            *looks: Callable[[], str]) -> None:
+        """Begin without a verdict; ``looks`` return the values of `unheard` and `unseen`."""
+        self._group, self._following, self._watch = group, following, watch
+        self._around, self._looks = environment, looks
+        self.outputs, self.note = outputs, note
+        self._look_again = 0
+        self.unheard = ''  # why commands are not carried out; empty if they are
+        self.unseen = ''  # joint whose samples have stopped; empty for none
+        self.verdict = Verdict(Severity.OK, Code.NONE, 'no request yet')
+        # By name of request: the newest verdict, the number of plans then, and the steady time.
+        self._answers: dict[str, tuple[Verdict, int, int]] = {}
+        self.preview_again: int | None = None  # time in ns of the next part of a long plan
+        self._reported: tuple[Progress, Mapping[str, Progress], bool] | None = None
+        # The plans that progress was computed from, valid until `next_change`.
+        self._segments: list[tuple[PlannedSegment, ...]] = []
+        self.next_change: int | None = None  # time in ns at which progress changes next
+        self.report()
+
+    def give(self, verdict: Verdict, *, log: bool = False) -> None:
+        """Set the verdict; a correction does not replace a warning."""
+        if verdict.code is not Code.CORRECTED or not self._warned:
+            self.verdict = verdict
+            if verdict.request:
+                self._answers.pop(verdict.request, None)
+                self._answers[verdict.request] = (
+                    verdict, self._group.number, self._around.steady())
+        if log:
+            self.note(verdict.message)
+        self.report()
+
+    def answered(self, name: str) -> bool:
+        """Return whether there is a verdict on a recent request of a name."""
+        return name in self._answers
+
+    def go_on(self, verdict: Verdict, *, log: bool = False) -> None:
+        """Set a verdict on the same request as the previous one."""
+        self.give(replace(verdict, request=self.verdict.request), log=log)
+
+    @property
+    def _warned(self) -> bool:
+        """Whether the verdict is a warning that does not concern the measured result."""
+        return self.verdict.severity > Severity.OK and self.verdict.code not in VERDICTS
+
+    def report(self) -> None:
+        """Report verdict and progress."""
+        self._reported = self._state()
+        progress, each, watching = self._reported
+        old = self._around.steady() - _REPEATED
+        self._answers = {
+            name: x for name, x in [*self._answers.items()][-_ANSWERS:] if x[-1] >= old}
+        self.outputs.append(StatusChanged(
+            self.verdict, progress, each, self._group.number, self._following.lateness.count,
+            self._following.replanned, self._watch.findings, self._watch.worst, watching,
+            self.unheard, self.unseen, self._watch.measuring,
+            {name: x.model.units.coordinate for name, x in self._group.planners.items()},
+            {name: x[:2] for name, x in self._answers.items()}))
+
+    def report_progress(self, now: int) -> None:
+        """Report the progress if it has changed by a time in ns."""
+        planners = self._group.planners.values()
+        # Progress is unchanged if no plan was replaced and no part of a plan has begun or ended.
+        same = (self.next_change is None or now < self.next_change) and all(
+            x.plan.segments is known for x, known in zip(planners, self._segments, strict=True))
+        if not same and self._state() != self._reported:
+            self.report()
+
+    def _state(self) -> tuple[Progress, Mapping[str, Progress], bool]:
+        now = self._around.clock()
+        self._watch.follow(now)
+        self._segments = [x.plan.segments for x in self._group.planners.values()]
+        self.next_change = self._group.next_change(now)
+        return *self._group.progress(now), self._watch.open
+
+    def take_goals(self, request: Request) -> None:
+        """Apply the goal tolerances of a request whose plan has just been adopted."""
+        self._watch.goals = request.goals if isinstance(request, Trajectory) else {}
+
+    def show(self) -> None:
+        """Preview the plan; of a long plan only the beginning, and the rest in time."""
+        stamps, samples = self._group.preview(self._around.clock(), _PREVIEW)
+        self.preview_again = stamps[_PREVIEW // 2] if len(stamps) == _PREVIEW else None
+        self.outputs.append(PlanChanged(tuple(stamps), samples))
+
+    def found(self, finding: Finding | None, *, judged: bool = False) -> None:
+        """Report a finding; the worst one of the request is the verdict, unless it is judged."""
+        worst = self._watch.worst
+        if judged or worst is None or self.verdict.severity is Severity.ERROR or (
+                not worst.failed and (self._warned or not self._watch.finished)):
+            self.report()
+            return
+        fine = worst.arrived or worst.verdict is Code.UNOBSERVED and not self._watch.measuring
+        self.go_on(
+            Verdict(Severity.OK if fine else Severity.WARN, worst.verdict, worst.message),
+            log=worst.failed and worst is finding)
+
+    def corrected(self, names: Iterable[str], now: int) -> None:
+        """Record that plans were corrected at a time in ns, and preview them soon."""
+        for name in names:
+            self._watch.corrected(name)
+        soon = now + _SOON
+        self.preview_again = soon if self.preview_again is None else min(self.preview_again, soon)
+
+    def look_for_listeners(self) -> None:
+        """Warn if commands are not carried out or samples have stopped, and report recovery."""
+        now = self._around.steady()
+        if now < self._look_again:
+            return
+        self._look_again = now + LOOK
+        before = self.unheard, self.unseen
+        self.unheard, self.unseen = (look() for look in self._looks)
+        for one, other, well in zip(
+                before, (self.unheard, self.unseen),
+                ('commands are carried out now', 'samples come again'), strict=True):
+            if one != other:
+                self.note(other or well)
+        if before != (self.unheard, self.unseen):
+            self.report()

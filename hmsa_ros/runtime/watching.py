@@ -1,0 +1,340 @@
+"""The setpoints of a request as requested, and the findings from samples of each."""
+
+from bisect import bisect_left
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from hmsa.judge.holds import AHEAD, Hold
+from hmsa.judge.records import (
+    Finding,
+    GoalTolerances,
+    missed,
+    Setpoint,
+    Tolerances,
+    worst,
+)
+from hmsa.model.equations import stretch_limits
+from hmsa.model.law import critical_zeta
+from hmsa.offload import Awaited, Doing
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.timeline import Plan, PlannedSegment
+from hmsa_ros.runtime.environment import Environment
+from hmsa_ros.runtime.follower import Follower
+
+# Largest age of the newest sample for further samples to be expected, by the steady clock.
+_RECENT = 10_000_000_000
+_LEFT_OUT = 'commands came late, and there was no time left for it'
+_UNDONE = 'its commands were not sent in time, or took no effect'
+_STOPPED = 'the joint came to rest instead'
+
+
+@dataclass
+class _Joint:
+    """The setpoints of a joint as requested, and their findings."""
+
+    name: str  # empty if there is only one
+    doing: Doing  # executes the judging
+    asked: Plan  # plan as accepted
+    plan: Plan  # plan now
+    request: int  # number of the request in the group
+    goal: GoalTolerances | None = None  # tolerances at the last setpoint
+    following: int = 0  # number, from 0, of the next setpoint to watch
+    left: Sequence[int] = field(init=False)  # numbers of setpoints that are still planned
+    holds: list[Hold] = field(default_factory=list)  # the last one stays after it is over
+    news: list[Finding] = field(default_factory=list)  # findings that need no samples
+    corrected: bool = False  # whether the next plan is a correction from samples
+    needed: bool = False  # whether the plan was replanned after a deviation
+    newest: Finding | None = None
+    closed: Finding | None = None  # worst finding of the setpoints that are over
+
+    def __post_init__(self) -> None:
+        self.left = range(self.count)
+
+    @property
+    def count(self) -> int:
+        """Number of setpoints requested."""
+        return len(self.asked.segments) - self.asked.kept
+
+    @property
+    def begins(self) -> int | None:
+        """Time in ns at which the next setpoint to watch begins; None if there is none."""
+        if self.following >= self.count:
+            return None
+        return self.asked.segments[self.asked.kept + self.following].since
+
+    @property
+    def open(self) -> bool:
+        """Whether setpoints that have started are still to be judged."""
+        return bool(self.news) or any(not x.over or x.unreported for x in self.holds)
+
+    @property
+    def worst(self) -> Finding | None:
+        return worst(x for x in (self.closed, *(y.found for y in self.holds)) if x is not None)
+
+    def close(self, found: Finding | None) -> None:
+        """Record the finding of a setpoint that is over."""
+        self.closed = worst(x for x in (self.closed, found) if x is not None)
+
+    def segment(self, number: int) -> PlannedSegment | None:
+        """Return a setpoint as planned now; None if it was left out."""
+        place = bisect_left(self.left, number)
+        if place == len(self.left) or self.left[place] != number:
+            return None
+        # All plans end with the last setpoint.
+        back = len(self.left) - place
+        return self.plan.segments[-back] if back <= len(self.plan.segments) else None
+
+    def leave_out(self, plan: Plan, now: int) -> Sequence[int]:
+        """Adopt a new plan, and return the numbers of the setpoints that it leaves out."""
+        before, after = self.plan.segments, plan.segments
+        # Finished setpoints stay as they are.
+        place = max(self.plan.under_way(now), 0)
+        while place < min(len(before), len(after)) and before[place] is after[place]:
+            place += 1
+        self.plan = plan
+        at = max(place + len(self.left) - len(before), 0)
+        gone = self.left[at:at + max(len(before) - len(after), 0)]
+        if gone:
+            self.left = [*self.left[:at], *self.left[at + len(gone):]]
+        return gone
+
+    def undone(self) -> set[int]:
+        """Return the numbers of the setpoints that have started and were not carried out."""
+        return {x for x in range(self.following)
+                if (one := self.segment(x)) is not None and not one.carried_out}
+
+    def stop(self, plan: Plan) -> None:
+        """Record that a joint came to rest instead of completing a request."""
+        self.plan = plan
+        for hold in self.holds:
+            hold.miss(_STOPPED)
+        self._miss((x for x in self.left if x >= self.following), _STOPPED)
+        self.following = self.count
+
+    def change(self, plan: Plan, now: int) -> None:
+        """Adopt a new plan; the setpoints that it leaves out are missed."""
+        self.needed |= not self.corrected
+        self.corrected = False
+        begun = {x.setpoint.number - 1: x for x in self.holds}
+        undone = self.undone()
+        gone = self.leave_out(plan, now)
+        for number in begun.keys() & gone:
+            begun[number].miss(_LEFT_OUT)
+        self._miss((x for x in gone if x not in begun and x >= self.following), _LEFT_OUT)
+        for hold in self.holds:
+            self._keep_up(hold)
+        self._miss(sorted(self.undone() - undone - begun.keys()), _UNDONE)
+
+    def _miss(self, numbers: Iterable[int], reason: str) -> None:
+        """Record as missed setpoints that have no samples."""
+        self.news += [missed(self._setpoint(x), reason) for x in numbers]
+
+    def open_next(self) -> None:
+        """Watch the next setpoint."""
+        number, self.following = self.following, self.following + 1
+        if number not in self.left:
+            return
+        for hold in self.holds:
+            if hold.over:
+                self.close(hold.found)
+        self.holds = [x for x in self.holds if not x.over or x.unreported]
+        self.holds.append(self._hold(number))
+
+    def restart_holds(self) -> None:
+        """Restart gathering samples of unfinished setpoints, since all times have changed."""
+        self.holds = [
+            x if x.over else self._hold(x.setpoint.number - 1) for x in self.holds]
+
+    def _hold(self, number: int) -> Hold:
+        """Return a new hold for a setpoint."""
+        setpoint = self._setpoint(number)
+        hold = Hold(setpoint, self.goal if setpoint.held else None, self.doing)
+        self._keep_up(hold)
+        return hold
+
+    def _keep_up(self, hold: Hold) -> None:
+        """Have a setpoint judged from its arrival in the plan in force."""
+        segment = self.segment(hold.setpoint.number - 1)
+        if segment is None:
+            hold.miss(_LEFT_OUT)
+        elif not segment.carried_out:
+            hold.miss(_UNDONE)
+        elif segment.arrival is not None:
+            hold.move(segment.arrival, corrected=not self.needed)
+        elif hold.setpoint.arrival is not None:
+            hold.miss('its time ended before the move to it')
+
+    def _setpoint(self, number: int) -> Setpoint:
+        """Return a setpoint as requested."""
+        asked, place, last = self.asked, self.asked.kept + number, number + 1 == self.count
+        segment = asked.segments[place]
+        level = asked.level(segment.begin if segment.arrival is None else segment.arrival)
+        model = level.model
+        omega = model.frequency(segment.stretch) / model.units.time
+        ratio = model.material.zeta / critical_zeta(segment.stretch, model.material.packed)
+        return Setpoint(
+            segment.stretch, asked.segments[place - 1].stretch if number
+            else asked.level(segment.begin).stretch,
+            segment.since, segment.arrival, segment.until if last
+            else asked.segments[place + 1].since, omega, ratio * omega, self.name, number + 1,
+            self.count, possible=stretch_limits(model.material), held=last)
+
+
+class Watch:
+    """Gather samples of each setpoint as requested, and judge them."""
+
+    def __init__(
+            self, group: PlannerGroup, environment: Environment,
+            follower: Callable[[], Follower]) -> None:
+        self._group, self._around, self._follower = group, environment, follower
+        #: Goal tolerances of the newest request, by joint.
+        self.goals: Mapping[str, GoalTolerances] = {}
+        self._joints: dict[str, _Joint] = {}
+        # Cached, since reading a clock for each sample of each joint would dominate the time.
+        self._now = 0
+        self._heard: int | None = None
+        # Begin of the next setpoint in ns: its samples may arrive before the next tick.
+        self._opens: int | None = None
+        self.restart()
+
+    def restart(self) -> None:
+        """Discard all findings; present plans are not judged."""
+        self._opens = None
+        for name, planner in self._group.planners.items():
+            plan = planner.plan
+            self._begin(name, replace(plan, kept=len(plan.segments)), plan)
+
+    def _begin(self, name: str, asked: Plan, plan: Plan) -> None:
+        """Watch the requested setpoints of a joint."""
+        self._joints[name] = _Joint(
+            name if len(self._group.planners) > 1 else '', self._do, asked, plan,
+            self._group.number, self.goals.get(name))
+
+    def _do(self, *work: Any) -> Awaited[Any]:
+        """Execute judging where feedback executes its work."""
+        return self._follower().do(*work)
+
+    def clock_set(self, by: int) -> None:
+        """Shift all times by the ns that the clock was set ahead."""
+        for name, joint in self._joints.items():
+            joint.asked = joint.asked.shifted(by)
+            joint.plan = self._group.planners[name].plan
+            joint.restart_holds()
+        if self._opens is not None:
+            self._opens += by
+
+    def _asked(self) -> list[_Joint]:
+        """Return the joints of the newest request."""
+        newest = max(x.request for x in self._joints.values())
+        return [x for x in self._joints.values() if x.request == newest]
+
+    @property
+    def open(self) -> bool:
+        """Whether started setpoints are still to be judged."""
+        return any(x.open for x in self._joints.values())
+
+    @property
+    def finished(self) -> bool:
+        """Whether all setpoints have been judged."""
+        return not self.open and all(x.following >= x.count for x in self._asked())
+
+    @property
+    def measuring(self) -> bool:
+        """Whether there are recent samples."""
+        return self._heard is not None and self._around.steady() - self._heard < _RECENT
+
+    @property
+    def findings(self) -> dict[str, Finding]:
+        """The newest finding of each joint that has one."""
+        return {
+            name: x.newest for name, x in self._joints.items() if x.newest is not None}
+
+    @property
+    def worst(self) -> Finding | None:
+        """The worst finding of the newest request."""
+        return worst(x.worst for x in self._asked() if x.worst is not None)
+
+    def wake(self, now: int) -> int | None:
+        """Return the time in ns at which to judge next; None for never, 0 for now."""
+        times = [0 for x in self._joints.values() if x.news]
+        times += [
+            y.wake(now)
+            for x in self._joints.values() for y in x.holds if not y.over or y.unreported]
+        return min(times, default=None)
+
+    # -- setpoints -----------------------------------------------------------------------------
+
+    def corrected(self, name: str) -> None:
+        """Record that the next plan of a joint is a correction, not a replanning in need."""
+        self._joints[name].corrected = True
+
+    def follow(self, now: int) -> None:
+        """Watch the setpoints that have started by a time in ns, as requested."""
+        for name, planner in self._group.planners.items():
+            joint, plan = self._joints[name], planner.plan
+            if plan.number == joint.plan.number:
+                if plan.segments is not joint.plan.segments:
+                    joint.change(plan, now)
+            elif self._group.number == joint.request:
+                joint.stop(plan)
+            else:
+                self._begin(name, plan, plan)
+        self._open_until(now)
+
+    def _open_until(self, time: int) -> None:
+        """Watch the setpoints that start by a time in ns."""
+        for joint in self._joints.values():
+            while joint.begins is not None and joint.begins <= time:
+                joint.open_next()
+        self._opens = min(
+            (x.begins for x in self._joints.values() if x.begins is not None), default=None)
+
+    # -- samples -------------------------------------------------------------------------------
+
+    def wants(self, stamp: int) -> bool:
+        """Return whether a sample with a timestamp in ns is needed for any joint."""
+        steady, wanted = self._around.steady(), False
+        self._heard = steady
+        if self._opens is not None and stamp >= self._opens:
+            self._open_until(min(stamp, self._around.clock() + AHEAD))
+        for joint in self._joints.values():
+            for hold in joint.holds:
+                wanted |= hold.needs(stamp, steady)
+        return wanted
+
+    def add(self, name: str, stamp: int, stretch: float) -> None:
+        """Add a stretch measured at a timestamp in ns; samples may arrive in any order."""
+        if name not in self._joints:
+            return
+        if stamp > self._now:
+            self._now = self._around.clock()
+        for hold in self._joints[name].holds:
+            hold.add(stamp, stretch, self._now)
+
+    def judge(
+            self, now: int, tolerances: Tolerances, until: int, *,
+            observable: bool) -> Finding | None:
+        """
+        Judge one setpoint that is due at a time in ns; return its finding if it is new.
+
+        No judging begins after the steady time ``until`` in ns.
+        """
+        self._now = now
+        for name, joint in self._joints.items():
+            if joint.news:
+                joint.newest = joint.news.pop(0)
+                joint.close(joint.newest)
+                return joint.newest
+            for hold in joint.holds:
+                if (steady := self._around.steady()) >= until:
+                    return None
+                found = hold.judge(
+                    now, steady, tolerances, self._follower().sensor(name), observable=observable)
+                if hold.news:
+                    hold.news = False
+                    self._follower().audit(name, hold)
+                if found is not None:
+                    joint.newest = found
+                    return found
+        return None
