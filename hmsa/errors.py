@@ -59,7 +59,7 @@ class MissingWarning(UserWarning):
     """
     Messages that are missing from a recording, which is used without them.
 
-    ``warnings.simplefilter('ignore', hmsa_ros.MissingWarning)`` accepts all of them.
+    ``warnings.simplefilter('ignore', hmsa.MissingWarning)`` accepts all of them.
     """
 
 

@@ -25,7 +25,6 @@ from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs.verify import verify
-import hmsa_ros
 from hmsa_ros.nodes.conversions import from_time, to_command
 
 SAME = 1e-9
@@ -215,7 +214,7 @@ def test_every_reader_says_what_is_missing_from_a_damaged_bag(tmp_path, capsys):
     path.write_bytes(data)
     said = re.compile(
         r'/a: (\d+) of 201 messages cannot be read; a has no samples for (0\.\d+) s from')
-    with pytest.warns(hmsa_ros.MissingWarning) as found:
+    with pytest.warns(hmsa.MissingWarning) as found:
         motion = hmsa.read(folder)
     count, gap = said.search(str(found[0].message)).groups()
     assert len(motion.times) == 200 - int(count)

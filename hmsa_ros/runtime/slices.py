@@ -12,12 +12,15 @@ from hmsa.planning.planner import Planner
 from hmsa.planning.timeline import Draft
 from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.records import Request, Stop, Target, Trajectory
-from hmsa_ros.runtime.worker import Job
+from hmsa_ros.runtime.worker import Inline, Job
 
+_INLINE = Inline()
 #: Drafts by joint.
 Drafts = Mapping[str, Draft]
 #: Duration in ns that the loop waits for drafts before it serves commands and requests.
 SLICE = 4_000_000
+# Setpoints up to which drafts are made in the loop, in less than a slice (bench_preemption).
+_FEW = 10
 # Number of trajectory points that are read between two checks.
 _READ = 100
 # Factor by which planning may take longer next time than estimated or measured.
@@ -49,6 +52,7 @@ class Work:
     #: Returns what to draft for a time in ns; None if nothing is to be changed.
     prepare: Callable[[int], Drafting | None]
     request: Request | None = None  # None for a replanning
+    brief: bool = True  # whether the drafts take less than a slice
     size: int = 1  # approximate number of checks
     #: Reads the request, before anything else.
     read: Callable[[Check], None] | None = None
@@ -87,15 +91,16 @@ class Work:
         meanwhile. None if there are no drafts yet. Raise `HmsaError` if there will be none.
         """
         planners = [group.planners[x] for x in self.joints]
+        worker = _INLINE if self.brief else around.worker
         if self._job is None and self.read is not None:
-            self._job = around.worker.submit(self.read)
+            self._job = worker.submit(self.read)
         elif self._job is None:
             self._began, self._revisions = around.clock(), tuple(x.revision for x in planners)
             drafting = self.prepare(self._began + self._later)
             if drafting is None:
                 return {}, self._began + self._later
             draft, self._complete = drafting
-            self._job = around.worker.submit(self._drafted(
+            self._job = worker.submit(self._drafted(
                 draft, planners[0].options.lead_time, around))
         if not self._job.done(wait / NANOSECONDS):
             return None
@@ -122,7 +127,7 @@ class Work:
             self, draft: Callable[[Check], Drafts], lead: int,
             around: Environment) -> Callable[[Check], Drafts]:
         """Return drafting that ends as soon as it is clear that it takes too long."""
-        if around.one_clock():
+        if self.brief or around.one_clock():
             # The time of the loop does not run with that of the worker.
             return draft
         size, later, steady = self.size, self._later, around.steady
@@ -182,7 +187,8 @@ def _of_trajectory(
 
     # The work of a path is not proportional to its number of points.
     size = 1 if path else request.count * len(request.joints)
-    return Work(frozenset(request.joints), prepare, request, size, read)
+    return Work(
+        frozenset(request.joints), prepare, request, not path and size <= _FEW, size, read)
 
 
 class Replanning(NamedTuple):
@@ -210,4 +216,6 @@ def replanning(
             adopted = anew.adopt(drafts[name])
             return {} if adopted is None else {name: adopted}
         return Drafting(draft, complete)
-    return Work(frozenset([name]), prepare, corrects=corrects)
+    segments = planner.plan.segments
+    brief = len(segments) <= _FEW and all(x.path is None for x in segments)
+    return Work(frozenset([name]), prepare, brief=brief, corrects=corrects)
