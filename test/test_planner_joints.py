@@ -275,6 +275,8 @@ def test_first_request_waits_for_the_state_in_force(rig, ros):
     # Somebody publishes samples: the planner asks for one, and this request waits its turn.
     ros.spin_until(lambda: samples.get_subscription_count() > 1, 'the subscription')
     setpoints.publish(Float64(data=1.25))
+    # One that came after the samples would be planned first.
+    planner.spin(lambda: len(planner.runtime.planning.requests) == 2, 'both requests')
     old = driver.sample()
     old.header.stamp = to_time(START - 600 * MS)
     for message in (old, driver.sample('knee')):
