@@ -25,7 +25,13 @@ from benchmarks.sheet import Sheet
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa_ros.runtime.loop import Loop
-from hmsa_ros.runtime.records import EstimateChanged, Output, Settings, StatusChanged, Target
+from hmsa_ros.runtime.records import (
+    EstimateChanged,
+    Output,
+    Settings,
+    StatusChanged,
+    StretchRequest,
+)
 
 #: Benches, and the seed of the first; earlier seeds are for development.
 RUNS, SEED = 400, 90_000
@@ -78,7 +84,7 @@ def run(bench: Bench, way: str) -> list[Left]:
     for target in bench.targets:
         sent.clear()
         begin = loop.now
-        loop.runtime.request(Target('a', target))
+        loop.runtime.request(StretchRequest('a', target))
         loop.serve()
         arrival = loop.runtime.group.planners['a'].plan.segments[-1].arrival or begin
         loop.run(max(begin + 2 * lead, arrival) + round(_HOLD * unit))

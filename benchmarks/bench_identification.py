@@ -9,8 +9,8 @@ import numpy as np
 from benchmarks.fits import Fitted, with_casadi, with_scipy
 from benchmarks.sheet import Sheet
 from hmsa.identification.identify import identify
+from hmsa.identification.measurement import Measurement
 from hmsa.identification.quantities import DEFAULT_FREE, derivative, values_of
-from hmsa.identification.recording import Recording
 from hmsa.identification.response import respond
 from hmsa.model.equations import Array, elastic_force
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
@@ -102,7 +102,7 @@ def _cell(
     """Identify runs of one kind; ``place`` seeds their noise."""
     times = np.arange(int(DURATION * rate)) / rate
     values = values_of(BLOCK)
-    blank = Recording(times, np.linspace(1.0, 1.5, len(times)), *levels)
+    blank = Measurement(times, np.linspace(1.0, 1.5, len(times)), *levels)
     exact = respond(blank, values, DEFAULT_FREE, rtol=1e-12)
     scale = np.array([abs(derivative(x, values[x])) for x in DEFAULT_FREE])
     bound = scale * noise * np.sqrt(np.diag(np.linalg.inv(exact.jacobian.T @ exact.jacobian)))
@@ -115,7 +115,7 @@ def _cell(
         begin = process_time()
         # The gain is exact and given: an unknown gain widens intervals.
         found = identify(
-            Recording(times, stretch, *levels), actuator=start, known={'stretch_gain': 1.0})
+            Measurement(times, stretch, *levels), actuator=start, known={'stretch_gain': 1.0})
         durations.append(process_time() - begin)
         if found.verdict != 'identified':
             failed += 1
@@ -173,11 +173,11 @@ def robustness(*, quick: bool = False, runs: int = ROBUST_RUNS) -> Sheet:
     runs = QUICK_RUNS if quick else runs
     levels = levels_of(False, 15)
     times = np.arange(int(1000 * DURATION)) * 1e-3
-    blank = Recording(times, np.linspace(1.0, 1.5, len(times)), *levels)
+    blank = Measurement(times, np.linspace(1.0, 1.5, len(times)), *levels)
     values = values_of(BLOCK)
     true = np.array([values[x] for x in DEFAULT_FREE])
     exact = respond(blank, values, (), rtol=1e-10).stretch
-    plain = [identify(Recording(times, _spoilt(
+    plain = [identify(Measurement(times, _spoilt(
         '', exact, np.random.default_rng(seed)), *levels)).parameters for seed in range(runs)]
     rows, figures = [], {}
     for kind in ('nothing but white noise', _FAR, _LOST, _JUMPS, _CORRELATED, _PIXELS, *_ERRORS):
@@ -189,7 +189,7 @@ def robustness(*, quick: bool = False, runs: int = ROBUST_RUNS) -> Sheet:
             clean = respond(at, values, (), rtol=1e-10).stretch
             spoilt = _spoilt(kind, clean, np.random.default_rng(seed))
             start = _off(random, 10.0) if kind == _FAR else _off(random)
-            found = identify(Recording(times, spoilt, *levels), actuator=start)
+            found = identify(Measurement(times, spoilt, *levels), actuator=start)
             verdicts.append(found.verdict)
             if found.verdict == 'not_identifiable':
                 continue
@@ -231,10 +231,10 @@ def speed(*, quick: bool = False) -> Sheet:
     times = np.arange(2000) * 1e-3
     rows, figures, shooting = [], {}, ''
     for free, known in ((DEFAULT_FREE, {}), (nine, others)):
-        blank = Recording(times, np.linspace(1.0, 1.5, len(times)), *levels)
+        blank = Measurement(times, np.linspace(1.0, 1.5, len(times)), *levels)
         values = values_of(BLOCK, known)
         clean = respond(blank, values, (), rtol=1e-12).stretch
-        recording = Recording(
+        recording = Measurement(
             times, clean + 1e-3 * np.random.default_rng(0).standard_normal(len(times)), *levels)
         start = values | {x: 1.1 * values[x] for x in free}
 

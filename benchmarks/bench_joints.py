@@ -16,7 +16,7 @@ from benchmarks.sheet import Sheet
 from hmsa.errors import HmsaError
 from hmsa.interfaces import topics
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.capture import Capture, Taken
 from hmsa_ros.nodes.cdr import stamp_of
 from hmsa_ros.nodes.conversions import to_trajectory
@@ -48,10 +48,10 @@ class _Watch:
         self.refusal = ''
         # Timestamped on arrival and not decoded, so that later work here does not count.
         self._capture = Capture(self._take)
-        self._capture.add(None, endpoints.listen(rig.node, replace(
+        self._capture.add(None, ros_entities.listen(rig.node, replace(
             topics.JOINT_STATES, name=f'{space}/{topics.JOINT_STATES.name}')))
         self._capture.start()
-        endpoints.subscribe(rig.node, topics.STATUS, self._judge, f'{space}/{topics.PLANNER}')
+        ros_entities.subscribe(rig.node, topics.STATUS, self._judge, f'{space}/{topics.PLANNER}')
 
     def close(self) -> None:
         """End the receiving thread."""
@@ -87,7 +87,7 @@ def _run(
         rig.spin_until(
             lambda: all(x.behind for x in watches), 'samples of all plants', _PATIENCE)
         trajectories = [
-            endpoints.publisher(
+            ros_entities.publisher(
                 rig.node, topics.JOINT_TRAJECTORY, f'/pair_{k}/{topics.PLANNER}')
             for k in range(spaces)]
         rig.spin_until(

@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.sheet import Sheet
 from hmsa.judge.judging import judge
-from hmsa.judge.records import Setpoint, Tolerances
+from hmsa.judge.records import RequestedSetpoint, Tolerances
 
 #: Runs of each kind.
 RUNS = 200
@@ -54,7 +54,7 @@ class Trial:
 
     seed: int
     kind: str
-    setpoint: Setpoint
+    setpoint: RequestedSetpoint
     time: np.ndarray  # (n,): timestamps, with those of the move and of the setpoint before
     stretch: np.ndarray  # (n,)
     within: bool | None  # None where either answer is acceptable
@@ -176,7 +176,7 @@ def draw(seed: int, kind: str) -> Trial:
     if push and limit < vibration < _BEYOND * limit + _PEAKS * noise:
         # Too close to the tolerance to distinguish from noise.
         within = None
-    setpoint = Setpoint(
+    setpoint = RequestedSetpoint(
         target, start, _ARRIVAL - round(1e9 * move), _ARRIVAL, _ARRIVAL + round(1e9 * hold),
         model, decay, possible=(0.1, 3.0))
     return Trial(

@@ -25,9 +25,9 @@ import numpy as np
 from benchmarks.laboratory import Bench, Iron, Plant
 from benchmarks.sheet import Sheet
 from hmsa.identification.files import read_belief
-from hmsa.identification.learning import learn, Target
-from hmsa.identification.learning import Trial as Repeat
-from hmsa.identification.recording import Recording
+from hmsa.identification.learning import learn, TargetWindow
+from hmsa.identification.learning import SequenceRepeat as Repeat
+from hmsa.identification.measurement import Measurement
 from hmsa.interfaces.actuator import planned_from
 from hmsa.interfaces.topics import PLANNER
 from hmsa.model.equations import natural_frequency
@@ -278,7 +278,7 @@ def _last(moves: Sequence[Left]) -> float:
     return max(x.size for x in moves[2:])
 
 
-class Trial:
+class SequenceRepeat:
     """A laboratory, its driver and a planner in one loop."""
 
     def __init__(self, driver: Driver, planner: Planner) -> None:
@@ -310,7 +310,7 @@ class Trial:
         # Replanned segments start later than the first level.
         first = self._first()
         self.targets = [
-            Target(x, hold * i, hold * (i + 1), 1e-9 * (y.arrival - first))
+            TargetWindow(x, hold * i, hold * (i + 1), 1e-9 * (y.arrival - first))
             for i, (x, y) in enumerate(zip(targets, segments, strict=True))]
         return self._left([x.arrival or 0.0 for x in self.targets], [
             self.verdicts.get(i + 1, 'unobserved') for i in range(len(targets))])
@@ -357,13 +357,13 @@ class Trial:
                 list(zip(found.levels.tolist(), found.level_times.tolist(), strict=True)),
                 raw=True)
 
-    def recorded(self, begin: int) -> Recording:
+    def recorded(self, begin: int) -> Measurement:
         """Return the recording since ``begin``."""
         samples, changes = self.driver.samples_seen, self.driver.changes_seen
         first = max((i for i, x in enumerate(changes) if x[0] <= begin), default=0)
         time, stretch = np.array([(x - begin, y) for x, y in samples if x >= begin]).T
         since, levels = np.array([(x - begin, y) for x, y in changes[first:]]).T
-        return Recording(1e-9 * time, stretch, np.maximum(1e-9 * since, 0.0), levels)
+        return Measurement(1e-9 * time, stretch, np.maximum(1e-9 * since, 0.0), levels)
 
 
 def calibrated(lab: Laboratory) -> CoilModel:
@@ -397,10 +397,10 @@ def run(lab: Laboratory) -> Outcome:
         Path(), tuple(((x,), hold) for x in lab.bench.targets), Path(), entries,
         accept=True)
     belief = read_belief(None, entries)
-    trial = Trial(Driver(Board(lab), sheet), planner_of(belief.actuator))
+    trial = SequenceRepeat(Driver(Board(lab), sheet), planner_of(belief.actuator))
     before = trial.moves(hold)
     if lab.hysteresis:
-        trial = Trial(Driver(Board(lab), calibrated(lab)), planner_of(belief.actuator))
+        trial = SequenceRepeat(Driver(Board(lab), calibrated(lab)), planner_of(belief.actuator))
     trial.request([(1.0, hold)], raw=False)
     begin = trial.request(
         [(y, x) for x, y in excitation(tuning, belief, 1e9 / _PERIOD)], raw=True)
@@ -410,7 +410,7 @@ def run(lab: Laboratory) -> Outcome:
         return Outcome(lab, found.verdict, found.reason, '', before, [], [])
     _, settings = chosen(tuning, belief, found)
     actuator = planned_from(settings)
-    trial = Trial(trial.driver, planner_of(
+    trial = SequenceRepeat(trial.driver, planner_of(
         actuator, shaper=settings['shaper'],
         coil_time_constant=settings.get('coil_time_constant', 0.0)))
     after = trial.moves(hold)

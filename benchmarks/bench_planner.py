@@ -30,7 +30,7 @@ from hmsa.model.creep import Creep
 from hmsa.model.delivery import Delivery
 from hmsa.model.moves import State
 from hmsa.model.parameters import NondimensionalParameters
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.shapers.two_step import two_step as shaper
 from hmsa.planning.two_step import (
     available_cores,
@@ -103,7 +103,7 @@ def _shaped(reference: Reference, setting: str, lag: float, creep: Creep) -> Con
     """Time the shaper; a lag of the coil adds an unknown, a branch adds a state."""
     material = replace(MATERIAL, creep=creep)
     requests = [
-        Request(State(start), target, material, delivery=Delivery(lag=lag))
+        MoveRequest(State(start), target, material, delivery=Delivery(lag=lag))
         for start, target in MOVES]
 
     def loads() -> list[float]:

@@ -79,7 +79,7 @@ def round_trip(count: int) -> Row:
     from std_msgs.msg import Float64
 
     from hmsa.interfaces import topics
-    from hmsa_ros.nodes import endpoints
+    from hmsa_ros.nodes import ros_entities
 
     planner = subprocess.Popen([sys.executable, '-m', 'hmsa_ros', 'planner'])
     rclpy.init(args=[])
@@ -89,8 +89,8 @@ def round_trip(count: int) -> Row:
         executor.add_node(node)
         received: list[float] = []
         command = topics.FLUX_DENSITY_COMMAND
-        endpoints.subscribe(node, command, lambda _: received.append(perf_counter()))
-        publisher = endpoints.publisher(node, topics.SETPOINT, topics.PLANNER)
+        ros_entities.subscribe(node, command, lambda _: received.append(perf_counter()))
+        publisher = ros_entities.publisher(node, topics.SETPOINT, topics.PLANNER)
         deadline = monotonic() + 30.0
         while publisher.get_subscription_count() == 0 or not node.count_publishers(command.name):
             executor.spin_once(timeout_sec=0.05)

@@ -437,7 +437,7 @@ class Soak:
         """Send garbage; in calm cycles only where it cannot reach the plant or checked topics."""
         from benchmarks.faults import garbage
         from hmsa.interfaces import topics
-        from hmsa_ros.nodes.endpoints import interface_class
+        from hmsa_ros.nodes.ros_entities import interface_class
 
         inputs = [
             x for x in self._topics
@@ -464,7 +464,7 @@ class Soak:
         from std_srvs.srv import SetBool
 
         from benchmarks.faults.inputs import wild_request
-        from hmsa_ros.nodes.endpoints import interface_class
+        from hmsa_ros.nodes.ros_entities import interface_class
 
         choice = self._dice.random()
         if choice < 0.4:

@@ -2,7 +2,7 @@
 Recordings of actuators that deviate from the model, integrated by SciPy alone.
 
 Many actuators of one kind are integrated at once, in units of their own time scale L sqrt(rho/G)
-and modulus. Of the package, only the block's parameters and the `Recording` class are used.
+and modulus. Of the package, only the block's parameters and the `Measurement` class are used.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from scipy.constants import mu_0
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
-from hmsa.identification.recording import Recording
+from hmsa.identification.measurement import Measurement
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
 
 Array = NDArray[np.float64]
@@ -170,7 +170,7 @@ class Sensor:
 
 def measured(place: int, given: Plants, seen: Callable[[int, Array], Array], switches: Array,
              levels: Array, end: float, sensor: Sensor, seed: int, at: Array | None = None
-             ) -> Recording:
+             ) -> Measurement:
     """Return the recording of one plant in SI; evenly sampled unless times are given."""
     random = np.random.default_rng((seed, place))
     block = given.block(place)
@@ -189,7 +189,7 @@ def measured(place: int, given: Plants, seen: Callable[[int, Array], Array], swi
         step = 2.0 * sensor.noise
         stretch = np.round(stretch / step) * step
     per_load = block.shear_modulus * mu_0 / block.remanence
-    return Recording(at * unit, stretch, switches * unit, levels[place] * per_load)
+    return Measurement(at * unit, stretch, switches * unit, levels[place] * per_load)
 
 
 def away(block: ActuatorParameters, random: np.random.Generator, most: float = 0.3

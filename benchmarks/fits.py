@@ -8,8 +8,8 @@ import numpy as np
 from scipy.constants import mu_0
 from scipy.optimize import least_squares
 
+from hmsa.identification.measurement import Measurement
 from hmsa.identification.quantities import from_coordinate, to_coordinate
-from hmsa.identification.recording import Recording
 from hmsa.identification.response import respond
 from hmsa.model.equations import Array
 
@@ -26,7 +26,7 @@ class Fitted:
 
 
 def with_scipy(
-        recording: Recording, start: Mapping[str, float], free: Sequence[str], *,
+        recording: Measurement, start: Mapping[str, float], free: Sequence[str], *,
         derivatives: bool) -> Fitted:
     """Fit with SciPy's least squares and this package's simulation, from start values."""
     def respond_at(x: Array, names: Sequence[str] = ()):
@@ -50,7 +50,7 @@ def with_scipy(
 
 
 def with_casadi(
-        recording: Recording, start: Mapping[str, float], free: Sequence[str]
+        recording: Measurement, start: Mapping[str, float], free: Sequence[str]
 ) -> Callable[[], Fitted] | None:
     """
     Set up a fit by CasADi and IPOPT: multiple shooting with the Gauss-Newton Hessian.

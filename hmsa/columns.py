@@ -46,7 +46,7 @@ _SEPARATOR_LINE = re.compile(r'\s*"?sep=(.)"?\s*', re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class CsvColumns:
     """Columns of a CSV file by name."""
 
     columns: dict[str, Array]  # in SI; NaN for a missing value
@@ -102,7 +102,7 @@ def _decoded(content: bytes) -> str:
 
 def read_table(
         path: Path, wanted: tuple[str, ...], *, kind: str = 'a CSV',
-        rest_length: float | None = None, notes: list[str] | None = None) -> Table:
+        rest_length: float | None = None, notes: list[str] | None = None) -> CsvColumns:
     """
     Read the wanted columns of a CSV file, in SI.
 
@@ -181,7 +181,7 @@ def read_table(
             notes.append(text)
         elif not stated:
             assume(text)
-    return Table(columns, np.array([x[0] for x in rows[1 + bool(below):]]))
+    return CsvColumns(columns, np.array([x[0] for x in rows[1 + bool(below):]]))
 
 
 def _rows(text: str) -> tuple[list[tuple[int, str]], str | None]:

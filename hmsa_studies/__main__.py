@@ -16,8 +16,8 @@ from hmsa.model.moves import State
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.residual import percent
 from hmsa.planning.shapers import SHAPERS
-from hmsa.planning.shapers.pace import Pace
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
+from hmsa.planning.shapers.smooth_limits import SmoothLimits
 from hmsa.report.paper import SCREEN
 from hmsa_studies.damped import damped_study, DampedStudy, LIMITS
 from hmsa_studies.pictures import draw_damped, draw_front, draw_robustness, draw_sampled
@@ -59,7 +59,8 @@ def smooth_table() -> Table:
     """Return header and rows with the residual vibration of smooth moves of several durations."""
     rows: Table = [('smooth, at least', *(f'{x:g} periods' for x in PACES))]
     for start, target in MOVES:
-        moves = [SHAPERS['smooth'](Request(State(start), target, MATERIAL, pace=Pace(x)))
+        moves = [
+            SHAPERS['smooth'](MoveRequest(State(start), target, MATERIAL, pace=SmoothLimits(x)))
                  for x in PACES]
         name = f'{start:g} to {target:g}'
         rows.append((f'arrival, {name}', *(f'{x.duration:.3f}' for x in moves)))

@@ -38,7 +38,7 @@ class Spread:
 
 
 @dataclass(frozen=True, eq=False)
-class Belief:
+class NormalColumns:
     """Columns with a joint normal distribution, with means (p,) and covariance (p, p)."""
 
     names: tuple[str, ...]
@@ -46,7 +46,7 @@ class Belief:
     covariance: Array
 
 
-NOTHING = Belief((), np.zeros(0), np.zeros((0, 0)))
+NOTHING = NormalColumns((), np.zeros(0), np.zeros((0, 0)))
 
 
 def _too_many(column: str, points: int) -> BadInputError:
@@ -160,7 +160,8 @@ def _case(cells: Sequence[str], names: Sequence[str], where: str) -> list[float]
 
 
 def draw(
-        spreads: Mapping[str, Spread], belief: Belief, count: int, seed: int) -> dict[str, Array]:
+        spreads: Mapping[str, Spread], belief: NormalColumns, count: int, seed: int
+) -> dict[str, Array]:
     """Draw samples by column, the same on every machine, or raise `BadInputError`."""
     from scipy.special import ndtri
     from scipy.stats import qmc
@@ -191,7 +192,7 @@ def draw(
     return found
 
 
-def _factor(belief: Belief) -> list[list[float]]:
+def _factor(belief: NormalColumns) -> list[list[float]]:
     """Return the lower triangular Cholesky factor of the covariance."""
     rows: list[list[float]] = []
     for i, given in enumerate(belief.covariance.tolist()):

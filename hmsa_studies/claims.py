@@ -22,7 +22,7 @@ from hmsa.model.residual import residual_vibration
 from hmsa.model.simulation import simulate
 from hmsa.planning.two_step import CODES, Groups, plan_two_step, plan_two_step_batch
 from hmsa_studies import paper_data
-from hmsa_studies.paper_data import Run
+from hmsa_studies.paper_data import PaperResponse
 
 _PAPER = NondimensionalParameters(zeta=0.2, j_lim=5.0)
 #: J_lim that is practically infinite: the neo-Hookean solid.
@@ -185,14 +185,15 @@ def _cycles() -> Iterator[str]:
 
 
 def _unshaped(
-        targets: Sequence[float], material: NondimensionalParameters, span: float) -> Run:
+        targets: Sequence[float], material: NondimensionalParameters,
+        span: float) -> PaperResponse:
     """Return the response to unshaped steps with durations so long that each starts from rest."""
     run, = paper_data.respond(
         '', targets, material, commands=('unshaped',), span=span, samples=30_001)
     return run
 
 
-def _unsettled(run: Run, span: float) -> list[tuple[float, float]]:
+def _unsettled(run: PaperResponse, span: float) -> list[tuple[float, float]]:
     """Return for each setpoint its start and the time after which the response stays close."""
     parts = []
     for i, (start, target) in enumerate(zip((1.0, *run.targets), run.targets, strict=False)):
@@ -238,12 +239,12 @@ def _moves(stretches: Array, zetas: Sequence[float]) -> tuple[Array, Array, Arra
     return start[moves], target[moves], zeta[moves]
 
 
-def _shaped(targets: Sequence[float], material: NondimensionalParameters) -> Run:
+def _shaped(targets: Sequence[float], material: NondimensionalParameters) -> PaperResponse:
     run, = paper_data.respond('', targets, material, commands=('shaped',))
     return run
 
 
-def _resample(run: Run, time: Floats) -> Array:
+def _resample(run: PaperResponse, time: Floats) -> Array:
     stretch, _ = simulate(run.switches, run.loads, time, run.material)
     return stretch
 

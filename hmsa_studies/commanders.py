@@ -11,7 +11,7 @@ from hmsa_lab.adapt.expected_error import caution
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.runtime.loop import Loop
-from hmsa_ros.runtime.records import Settings, Target
+from hmsa_ros.runtime.records import Settings, StretchRequest
 from hmsa_studies.linear import Controller, Predictive, Quadratic
 from hmsa_studies.scenario import Scenario, Strategy
 
@@ -105,7 +105,7 @@ class _Running(Commander):
 
     def move(self, target: float) -> int:
         self.target = target
-        self._loop.runtime.request(Target(_JOINT, target))
+        self._loop.runtime.request(StretchRequest(_JOINT, target))
         return self.planner.plan.segments[-1].arrival or self.now
 
     def run(self, until: int) -> None:

@@ -15,7 +15,7 @@ from hmsa.model.moves import Limits, Move, State
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.planning.shapers.linear import step
 from hmsa.planning.shapers.minimum_time import minimum_time
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 from hmsa_studies.residual import Actual, ringing
 
 #: Deviation from the target, as a fraction of the step, at which a motion counts as settled.
@@ -69,13 +69,13 @@ def damped_study(start: float, target: float, zetas: Floats) -> DampedStudy:
     """Compare the unshaped step with the minimum-time command over values of zeta above 0."""
     materials = [NondimensionalParameters(float(zeta)) for zeta in zetas]
     plain = np.array([
-        settling_time(step(Request(State(start), target, x)), start, target, x)
+        settling_time(step(MoveRequest(State(start), target, x)), start, target, x)
         for x in materials])
     arrival = np.empty((len(LIMITS), len(materials)))
     settled = np.empty_like(arrival)
     for row in range(len(LIMITS)):
         for column, material in enumerate(materials):
-            move = minimum_time(Request(
+            move = minimum_time(MoveRequest(
                 State(start), target, material, limits_of(target, material, row)))
             arrival[row, column] = move.duration
             settled[row, column] = settling_time(move, start, target, material)

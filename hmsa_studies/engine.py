@@ -31,7 +31,7 @@ PATIENCE = 10.0
 
 
 @dataclass
-class Outcome:
+class ChunkCounts:
     """Numbers of chunks of its shard that a call of `compute` kept and computed."""
 
     kept: int = 0
@@ -51,7 +51,7 @@ def parse_shard(text: str) -> tuple[int, int]:
 def compute(
         study: Study, folder: Path, executor: Executor | Start = here, *,
         shard: tuple[int, int] = (0, 1), resume: bool = False, say: Say = print,
-        advance: Callable[[int], object] | None = None) -> Outcome:
+        advance: Callable[[int], object] | None = None) -> ChunkCounts:
     """
     Compute the chunks of a study.
 
@@ -91,7 +91,7 @@ def compute(
     mine = list(range(chunks.count))[shard[0]::shard[1]]
     found = chunks.found() if resume else {}
     todo = [x for x in mine if not (x in found and chunks.sound(found[x]))]
-    outcome = Outcome(len(mine) - len(todo))
+    outcome = ChunkCounts(len(mine) - len(todo))
     start = (lambda: given(executor)) if isinstance(executor, Executor) else executor
     scratch = chunks.folder / f'.run-{uuid.uuid4().hex}'
     try:
@@ -135,7 +135,7 @@ def _work(scratch: str, index: int) -> None:
 
 def _compute(
         study: Study, chunks: Chunks, waiting: deque[int], start: Start, scratch: Path,
-        outcome: Outcome, say: Say, advance: Callable[[int], object]) -> None:
+        outcome: ChunkCounts, say: Say, advance: Callable[[int], object]) -> None:
     """Compute the waiting chunks; after a loss of workers, restart with the lost ones."""
     losses = 0
     while waiting:
@@ -161,7 +161,7 @@ def _compute(
 
 def _feed(
         chunks: Chunks, waiting: deque[int], running: dict[Future[None], int],
-        executor: Executor, ahead: int, scratch: Path, outcome: Outcome,
+        executor: Executor, ahead: int, scratch: Path, outcome: ChunkCounts,
         advance: Callable[[int], object]) -> None:
     """Keep an executor busy until no task is waiting or running."""
     while waiting or running:

@@ -26,7 +26,7 @@ CYCLES, _TRIALS = 3, 4
 
 
 @dataclass(frozen=True)
-class Left:
+class ExpectedResidual:
     """Residual if the present course were completed, relative to the step."""
 
     #: Of a controller that sets a level after each sample, measured in the next cycle.
@@ -34,15 +34,15 @@ class Left:
     offset: float  #: rest minus target
     motion: float = 0.0  #: peak to peak in the next cycle, in which the loop stays closed
 
-    def watched(self, seen: Sequence[float], *, steadily: bool) -> 'Left':
+    def watched(self, seen: Sequence[float], *, steadily: bool) -> 'ExpectedResidual':
         """Return it with the motion of the next cycle, relative to the step."""
         motion = max(seen) - min(seen)
         if steadily:
-            return Left(motion, sum(seen) / len(seen), motion)
+            return ExpectedResidual(motion, sum(seen) / len(seen), motion)
         return replace(self, motion=motion)
 
 
-def settle(plant: ActuatorSimulation, end: int, target: float, before: float) -> Left:
+def settle(plant: ActuatorSimulation, end: int, target: float, before: float) -> ExpectedResidual:
     """Return the residual in four time scales from an arrival in ns on, and at rest."""
     unit = plant.actuator.time_unit * NANOSECONDS
     seen = []
@@ -50,12 +50,12 @@ def settle(plant: ActuatorSimulation, end: int, target: float, before: float) ->
         plant.advance(end + round(4.0 * unit * i / _LOOK))
         seen.append(plant.stretch)
     plant.advance(end + round(_SETTLED * unit))
-    return Left(
+    return ExpectedResidual(
         (max(seen) - min(seen)) / abs(target - before),
         (plant.stretch - target) / (target - before))
 
 
-def _moves(commanding: Commander, targets: Sequence[float]) -> Iterator[Left]:
+def _moves(commanding: Commander, targets: Sequence[float]) -> Iterator[ExpectedResidual]:
     """Yield the residuals after the first move, after each cycle, and after the next moves."""
     scenario = commanding.scenario
     cycle = round(CYCLE * scenario.block.time_unit * NANOSECONDS)
@@ -78,7 +78,7 @@ def _moves(commanding: Commander, targets: Sequence[float]) -> Iterator[Left]:
 
 def trial(
         scenario: Scenario, strategy: Strategy, error: float, seed: int,
-        targets: Sequence[float] = ()) -> list[Left]:
+        targets: Sequence[float] = ()) -> list[ExpectedResidual]:
     """
     Run one sequence of moves.
 
@@ -110,7 +110,7 @@ def trial(
 
 def _learned(
         scenario: Scenario, strategy: Strategy, error: float, seed: int,
-        target: float) -> Iterator[Left]:
+        target: float) -> Iterator[ExpectedResidual]:
     """Yield the residuals of trials of the first move, each from rest with a zeroed sensor."""
     random, block = np.random.default_rng(seed), scenario.block
     plan = planner_of(scenario, strategy).setpoint(target, 0)

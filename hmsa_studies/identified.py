@@ -6,13 +6,13 @@ import numpy as np
 
 from hmsa.errors import BadInputError
 from hmsa.identification.files import Belief as Known
-from hmsa_studies.axes import Belief
+from hmsa_studies.axes import NormalColumns
 
 # Identified names that differ from those of the block's parameters.
 _OTHERS = {'coil_time_constant': 'coil_time_constant', 'time_unit': 'actuator.density'}
 
 
-def belief_of(found: Known, path: Path) -> Belief:
+def belief_of(found: Known, path: Path) -> NormalColumns:
     """Return the uncertainty of the block in a file; raise `BadInputError` if there is none."""
     numbers, known = found.actuator.numbers, found.known
     means, names, places = [], [], []
@@ -39,5 +39,5 @@ def belief_of(found: Known, path: Path) -> Belief:
             f'{path} has no covariance of the block: expected a file that hmsa identify --out '
             'wrote')
     covariance = slopes @ known.covariance @ slopes.T
-    return Belief(
+    return NormalColumns(
         tuple(names), np.array(means, dtype=np.float64), covariance[np.ix_(places, places)])

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr
 
-from hmsa_studies.feedback import CYCLE, CYCLES, Left, trial
+from hmsa_studies.feedback import CYCLE, CYCLES, ExpectedResidual, trial
 from hmsa_studies.scenario import CHAINED, Scenario, SCENARIOS, STRATEGIES, Strategy, TARGETS
 from hmsa_studies.tasks import Tasks
 
@@ -31,15 +31,15 @@ class Row:
     error: float  #: relative error of G
     #: Root mean square over both signs and all seeds: after the first move, one cycle later, two
     #: cycles later, and after the next move; of learning, after each of four trials.
-    left: 'tuple[Left, ...]'
+    left: 'tuple[ExpectedResidual, ...]'
     worst: tuple[float, ...]  #: largest vibration of all
     no_worse: bool | None = None  #: whether no run exceeds `allowed`; None for open loop
 
 
-def rms(trials: Iterable[Sequence[Left]]) -> list[Left]:
+def rms(trials: Iterable[Sequence[ExpectedResidual]]) -> list[ExpectedResidual]:
     """Return the root mean square over trials, for each time."""
     rows = np.array([[(x.vibration, x.offset, x.motion) for x in row] for row in trials])
-    return [Left(*x) for x in np.sqrt(np.mean(np.square(rows), axis=0)).tolist()]
+    return [ExpectedResidual(*x) for x in np.sqrt(np.mean(np.square(rows), axis=0)).tolist()]
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Matrix:
             'scenario': 'string', 'strategy': 'string', 'error': 'double', 'seed': 'int64',
             **dict.fromkeys(_LEFT, 'doubles')}, (4, 100))
 
-    def rows(self, left: Iterator[list[Left]]) -> Iterator[Row]:
+    def rows(self, left: Iterator[list[ExpectedResidual]]) -> Iterator[Row]:
         """Yield the rows of results given in the order of the tasks."""
         limits: dict[tuple[str, tuple[float, ...]], list[list[float]]] = {}
         for scenario, errors, strategy, tasks in self._trials():
@@ -95,9 +95,9 @@ def _row(scenario: Scenario, strategy: Strategy, error: float, seed: int) -> dic
         **{name: [getattr(x, name) for x in left] for name in _LEFT}}
 
 
-def left_of(row: Mapping[str, Any]) -> list[Left]:
+def left_of(row: Mapping[str, Any]) -> list[ExpectedResidual]:
     """Return the result of `trial` from the row of a table."""
-    return [Left(*x) for x in zip(*(row[name] for name in _LEFT), strict=True)]
+    return [ExpectedResidual(*x) for x in zip(*(row[name] for name in _LEFT), strict=True)]
 
 
 def allowed(scenario: Scenario, error: float) -> list[float]:

@@ -14,7 +14,7 @@ from hmsa.model.equations import signed_root, stretch_limits
 from hmsa.report import looks, style
 from hmsa.report.paper import named, Paper
 from hmsa_studies import paper_data
-from hmsa_studies.paper_data import Data, Run, Sweep
+from hmsa_studies.paper_data import Data, PaperResponse, PaperSweep
 
 TAU = style.axis('time', r'\tau')
 STRETCH = style.axis('stretch', r'\lambda')
@@ -24,10 +24,10 @@ TAU_P = style.axis('time of first level', r'\tau_p')
 #: Critical damping as quoted in the paper, for 1 -> 1.1.
 PAPER_CRITICAL = 2.14
 _COMMANDS = (('unshaped', style.UNSHAPED), ('shaped', style.SHAPED))
-_ALONE = looks.Look(looks.INDIGO, 1.2, (6.0, 1.5, 1.0, 1.5)).line()
+_ALONE = looks.LineStyle(looks.INDIGO, 1.2, (6.0, 1.5, 1.0, 1.5)).line()
 _CASES = (
-    looks.Look(looks.BLUE, 1.0), looks.Look(looks.ORANGE, 1.5, (5.0, 1.5), order=3),
-    looks.Look(looks.BLACK, 1.2, (1.0, 1.2), order=4))
+    looks.LineStyle(looks.BLUE, 1.0), looks.LineStyle(looks.ORANGE, 1.5, (5.0, 1.5), order=3),
+    looks.LineStyle(looks.BLACK, 1.2, (1.0, 1.2), order=4))
 # Width in inches below which panels are stacked.
 _NARROW = 4.0
 
@@ -84,11 +84,11 @@ def _pair(figure: Figure) -> Any:
     return figure.subplots(2, 1) if _stacked(figure) else figure.subplots(1, 2)
 
 
-def _find(runs: Sequence[Run], command: str) -> Run:
+def _find(runs: Sequence[PaperResponse], command: str) -> PaperResponse:
     return next(x for x in runs if x.command == command)
 
 
-def _plot_command(axes: Axes, run: Run, **look: Any) -> None:
+def _plot_command(axes: Axes, run: PaperResponse, **look: Any) -> None:
     """Draw the level b, from 0 before the start to the end of the run."""
     end = float(run.time[-1])
     b = signed_root(run.loads)
@@ -97,7 +97,7 @@ def _plot_command(axes: Axes, run: Run, **look: Any) -> None:
         np.concatenate(([0.0], np.repeat(b, 2))), drawstyle='default', **look)
 
 
-def _plot_targets(axes: Axes, run: Run) -> None:
+def _plot_targets(axes: Axes, run: PaperResponse) -> None:
     """Mark each target during its setpoint."""
     for i, target in enumerate(run.targets):
         axes.plot(
@@ -105,14 +105,14 @@ def _plot_targets(axes: Axes, run: Run) -> None:
             label='target' if i == 0 else None, **style.TARGET)
 
 
-def _plot_responses(axes: Axes, runs: Sequence[Run]) -> None:
+def _plot_responses(axes: Axes, runs: Sequence[PaperResponse]) -> None:
     for command, look in _COMMANDS:
         run = _find(runs, command)
         axes.plot(run.time, run.stretch, label=command, **look)
     axes.set_xlim(0.0, float(run.time[-1]))
 
 
-def _plot_phase(axes: Axes, runs: Sequence[Run]) -> None:
+def _plot_phase(axes: Axes, runs: Sequence[PaperResponse]) -> None:
     for command, look in _COMMANDS:
         run = _find(runs, command)
         axes.plot(run.stretch, run.rate, label=command, **look)
@@ -120,7 +120,7 @@ def _plot_phase(axes: Axes, runs: Sequence[Run]) -> None:
         run.targets, np.zeros(len(run.targets)), label='equilibrium', **style.EQUILIBRIUM)
 
 
-def _draw_multi_step(figure: Figure, runs: tuple[Run, ...]) -> None:
+def _draw_multi_step(figure: Figure, runs: tuple[PaperResponse, ...]) -> None:
     run, = runs
     left, right = _pair(figure)
     _plot_command(left, run, **style.UNSHAPED | {'linestyle': '-', 'linewidth': 1.4})
@@ -143,7 +143,7 @@ def _draw_multi_step(figure: Figure, runs: tuple[Run, ...]) -> None:
     style.finish(right, TAU, STRETCH, 'b')
 
 
-def _draw_single_move(figure: Figure, runs: tuple[Run, ...]) -> None:
+def _draw_single_move(figure: Figure, runs: tuple[PaperResponse, ...]) -> None:
     shaped, plain, alone = (_find(runs, x) for x in ('shaped', 'unshaped', 'b_p alone'))
     tau_p = float(shaped.switches[1])
     b_p, b_1 = (float(x) for x in signed_root(shaped.loads))
@@ -185,7 +185,7 @@ def _draw_single_move(figure: Figure, runs: tuple[Run, ...]) -> None:
     style.legend_below(figure, right)
 
 
-def _draw_shaped_multi_step(figure: Figure, runs: tuple[Run, ...]) -> None:
+def _draw_shaped_multi_step(figure: Figure, runs: tuple[PaperResponse, ...]) -> None:
     left, right = _pair(figure)
     shaped = _find(runs, 'shaped')
     _plot_command(left, _find(runs, 'unshaped'), **style.UNSHAPED)
@@ -205,7 +205,7 @@ def _draw_shaped_multi_step(figure: Figure, runs: tuple[Run, ...]) -> None:
     style.legend_below(figure, right)
 
 
-def _draw_sequences(figure: Figure, runs: tuple[Run, ...]) -> None:
+def _draw_sequences(figure: Figure, runs: tuple[PaperResponse, ...]) -> None:
     """Draw Figs. 5 and 6: two sequences over time, the first one in the phase plane."""
     rows = [['first'], ['second'], ['phase']]
     if not _stacked(figure):
@@ -228,7 +228,7 @@ def _draw_sequences(figure: Figure, runs: tuple[Run, ...]) -> None:
     style.legend_below(figure, panels['first'], axes)
 
 
-def _draw_damping_cases(figure: Figure, runs: tuple[Run, ...]) -> None:
+def _draw_damping_cases(figure: Figure, runs: tuple[PaperResponse, ...]) -> None:
     grid = figure.subplots(4, 1, sharex=True).reshape(2, 2).T if _stacked(figure) else (
         figure.subplots(2, 2, sharex=True, sharey='col'))
     half = len(runs) // 2
@@ -250,7 +250,7 @@ def _draw_damping_cases(figure: Figure, runs: tuple[Run, ...]) -> None:
     style.legend_below(figure, grid[0, 0])
 
 
-def _draw_damping_sweep(figure: Figure, sweep: Sweep) -> None:
+def _draw_damping_sweep(figure: Figure, sweep: PaperSweep) -> None:
     left, right = _pair(figure)
     for axes in (left, right):
         axes.plot(sweep.zeta, sweep.tau_p, label=r'$\tau_p$, $1\to1.1$', **style.SHAPED)
@@ -273,7 +273,7 @@ def _draw_damping_sweep(figure: Figure, sweep: Sweep) -> None:
     style.legend_below(figure, left)
 
 
-def _draw_chain_limit_cases(figure: Figure, runs: tuple[Run, ...]) -> None:
+def _draw_chain_limit_cases(figure: Figure, runs: tuple[PaperResponse, ...]) -> None:
     pairs = [runs[i:i + 2] for i in range(0, len(runs), 2)]
     grid = figure.subplots(2 * len(pairs), 1).reshape(-1, 2) if _stacked(figure) else (
         figure.subplots(len(pairs), 2, sharex='col', width_ratios=[1.6, 1.0]))
@@ -299,7 +299,7 @@ def _draw_chain_limit_cases(figure: Figure, runs: tuple[Run, ...]) -> None:
     style.legend_below(figure, grid[0, 0])
 
 
-def _draw_chain_limit_sweep(figure: Figure, sweep: Sweep) -> None:
+def _draw_chain_limit_sweep(figure: Figure, sweep: PaperSweep) -> None:
     left, right = _pair(figure)
     marks = np.searchsorted(sweep.j_lim, paper_data.J_LIMS)
     extension = style.axis('chain extensibility', r'J_{\mathrm{lim}}')

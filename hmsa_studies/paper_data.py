@@ -52,7 +52,7 @@ _FASTER = 5
 
 
 @dataclass(frozen=True)
-class Run:
+class PaperResponse:
     """A response of the actuator."""
 
     name: str  #: distinguishes it in its figure, for instance ``zeta 0.02``
@@ -78,7 +78,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Sweep:
+class PaperSweep:
     """The first move of a sequence over a parameter, zeta or j_lim."""
 
     start: float
@@ -92,13 +92,13 @@ class Sweep:
     critical: float  #: linearised critical zeta at the target; NaN if zeta does not vary
 
 
-Data = tuple[Run, ...] | Sweep
+Data = tuple[PaperResponse, ...] | PaperSweep
 
 
 def respond(
         name: str, targets: Sequence[float], material: NondimensionalParameters, *,
         commands: Sequence[str] = _BOTH, span: float = SPAN,
-        samples: int = SAMPLES, faster: int = 1) -> tuple[Run, ...]:
+        samples: int = SAMPLES, faster: int = 1) -> tuple[PaperResponse, ...]:
     """Compute the response to targets of a given duration, from rest; one run per command."""
     # With at least 2 evenly spaced samples, denser by a factor in the last setpoint.
     setpoints = [Setpoint(x, span) for x in targets]
@@ -114,7 +114,7 @@ def respond(
         even = np.concatenate((fine[::faster], fine[fine > end - span]))
         time = np.union1d(even, switches)
         stretch, rate = simulate(switches, loads, time, material)
-        runs.append(Run(
+        runs.append(PaperResponse(
             name, command, material, tuple(targets), switches, loads, time, stretch, rate))
     return tuple(runs)
 
@@ -127,7 +127,7 @@ def _levels(segments: Sequence[Segment]) -> tuple[Array, Array]:
 
 def _respond_all(
         sequences: Sequence[Sequence[float]], commands: Sequence[str],
-        samples: int = SAMPLES) -> tuple[Run, ...]:
+        samples: int = SAMPLES) -> tuple[PaperResponse, ...]:
     """Compute the responses of the paper's block to sequences, with a number of samples each."""
     return tuple(
         run for targets in sequences for run in respond(
@@ -146,7 +146,7 @@ expansion = partial(_respond_all, (EXPANSION, SECOND_EXPANSION), _BOTH)
 contraction = partial(_respond_all, (CONTRACTION, SECOND_CONTRACTION), _BOTH)
 
 
-def damping_cases(samples: int = SAMPLES) -> tuple[Run, ...]:
+def damping_cases(samples: int = SAMPLES) -> tuple[PaperResponse, ...]:
     """Compute Fig. 7: three values of zeta in expansion, then contraction, shaped and unshaped."""
     return tuple(
         run for targets in (EXPANSION, DEEP_CONTRACTION) for zeta in ZETAS
@@ -155,7 +155,7 @@ def damping_cases(samples: int = SAMPLES) -> tuple[Run, ...]:
             NondimensionalParameters(zeta=zeta, j_lim=5.0), samples=samples))
 
 
-def damping_sweep(points: int = SWEEP_POINTS) -> Sweep:
+def damping_sweep(points: int = SWEEP_POINTS) -> PaperSweep:
     """Compute Fig. 8: tau_p over zeta for 1 -> 1.1, while b_p differs from b_1 numerically."""
     start, target = 1.0, EXPANSION[0]
     critical = float(critical_zeta(target, _PAPER))
@@ -175,9 +175,9 @@ def near_limit(j_lim: float) -> tuple[float, ...]:
     return (1.2, 1.4, NEAR_LIMIT * stretch_limits(j_lim)[1])
 
 
-def chain_limit_cases(samples: int = SAMPLES) -> tuple[Run, ...]:
+def chain_limit_cases(samples: int = SAMPLES) -> tuple[PaperResponse, ...]:
     """Compute Fig. 9: three values of J_lim, the last setpoint near the limiting stretch."""
-    runs: list[Run] = []
+    runs: list[PaperResponse] = []
     for j_lim in J_LIMS:
         runs += respond(
             f'J_lim {j_lim:g}', near_limit(j_lim),
@@ -185,16 +185,16 @@ def chain_limit_cases(samples: int = SAMPLES) -> tuple[Run, ...]:
     return tuple(runs)
 
 
-def chain_limit_sweep(points: int = SWEEP_POINTS) -> Sweep:
+def chain_limit_sweep(points: int = SWEEP_POINTS) -> PaperSweep:
     """Compute Fig. 10: tau_p and b_p over J_lim for 1 -> 1.2, including those of Fig. 9."""
     j_lim = np.union1d(np.linspace(*J_LIM_RANGE, points), J_LIMS)
     return _sweep(1.0, 1.2, np.full(j_lim.size, _PAPER.zeta), j_lim, float('nan'))
 
 
-def _sweep(start: float, target: float, zeta: Array, j_lim: Array, critical: float) -> Sweep:
+def _sweep(start: float, target: float, zeta: Array, j_lim: Array, critical: float) -> PaperSweep:
     plans = plan_two_step_batch(start, target, Groups(zeta=zeta, j_lim=j_lim, c1=_PAPER.c1))
     status = tuple(str(CODES[x]) for x in plans.status.tolist())
-    return Sweep(
+    return PaperSweep(
         start, target, zeta, j_lim, status, plans.tau_p, plans.beta_p, plans.beta_1, critical)
 
 
@@ -211,7 +211,7 @@ def write_csv(path: Path, data: Data) -> None:
     """Write a figure's data in full precision, by rows; loads apply from their time on."""
     with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
         writer = csv.writer(file, lineterminator='\n')
-        if isinstance(data, Sweep):
+        if isinstance(data, PaperSweep):
             writer.writerow(_SWEEP_COLUMNS)
             writer.writerows(_rows(
                 data.zeta, data.j_lim, data.tau_p, signed_root(data.beta_p),

@@ -14,9 +14,9 @@ from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.residual import percent, RESOLVED
 from hmsa.planning.shapers.linear import step
 from hmsa.planning.shapers.minimum_time import minimum_time
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 from hmsa.report import looks, style
-from hmsa.report.looks import Look
+from hmsa.report.looks import LineStyle
 from hmsa.report.paper import Paper
 from hmsa_studies.damped import DampedStudy, LIMITS, limits_of, SETTLED
 from hmsa_studies.residual import Actual
@@ -88,11 +88,11 @@ def _nominal(case: Case) -> str:
     return rf'nominal $\zeta$ = {material.zeta:.4g}, {whose}, $c_1$ = {material.c1:.4g}'
 
 
-def _looks(candidates: Sequence[Candidate]) -> list[tuple[Look, int]]:
+def _looks(candidates: Sequence[Candidate]) -> list[tuple[LineStyle, int]]:
     """Return the look of each candidate, and the index of its order."""
     orders = list(dict.fromkeys(x.order for x in candidates if x.shaper in ORDERED))
     return [
-        (looks.SHAPERS.get(x.shaper, Look(looks.BLACK)),
+        (looks.SHAPERS.get(x.shaper, LineStyle(looks.BLACK)),
          orders.index(x.order) if x.shaper in ORDERED else 0) for x in candidates]
 
 
@@ -130,7 +130,7 @@ def draw_front(
             'open: $G$ alone; number: order', most=6)
 
 
-def _draw_point(figure: style.Picture, panel: Axes, result: Result, look: Look) -> None:
+def _draw_point(figure: style.Picture, panel: Axes, result: Result, look: LineStyle) -> None:
     """Draw one result: all errors together above, the modulus alone below, and the order."""
     both = [100.0 * max(x.residual, _FLOOR) for x in (result.worst, result.alone['G'])]
     panel.plot([result.arrival] * 2, both, color=look.colour, linewidth=0.7, zorder=2)
@@ -158,7 +158,7 @@ def _label(result: Result) -> str:
 
 
 def _bars(
-        axes: Axes, case: Case, results: Sequence[Result], curves: Sequence[Look],
+        axes: Axes, case: Case, results: Sequence[Result], curves: Sequence[LineStyle],
         letter: str) -> None:
     """Draw the worst residuals in the box of all errors."""
     worst = np.array([x.worst.residual for x in results])
@@ -282,9 +282,9 @@ def draw_damped(
             rf'time $\tau$ to within {100.0 * SETTLED:g} % of the step', 'a')
 
         moves: list[tuple[Move, dict[str, Any]]] = [
-            (step(Request(State(study.start), study.target, material)), style.UNSHAPED)]
+            (step(MoveRequest(State(study.start), study.target, material)), style.UNSHAPED)]
         moves += [
-            (minimum_time(Request(
+            (minimum_time(MoveRequest(
                 State(study.start), study.target, material,
                 limits_of(study.target, material, row))),
              look)

@@ -16,7 +16,7 @@ from hmsa.model.moves import Move, State
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.setpoint import Setpoint
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.two_step import CODES, Groups, plan_two_step_batch
 from hmsa_studies.residual import Actual, arrival_of
 from hmsa_studies.settings import Setting
@@ -158,7 +158,7 @@ def _planned(setting: Setting, start: float, target: float, shaper: str) -> _Pla
     try:
         move = plan_sequence(
             [Setpoint(target, math.inf)],
-            Request.of(
+            MoveRequest.of(
                 material, State(start), limits=setting.limits, delivery=setting.delivery,
                 units=setting.units, errors=setting.errors),
             shaper)[0].move

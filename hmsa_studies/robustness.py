@@ -25,7 +25,7 @@ from hmsa.model.simulation import check_stretch
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.shapers import get_shaper, SHAPERS
 from hmsa.planning.shapers.creeping import held
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 from hmsa_studies.residual import Actual, arrival_of, Errors
 from hmsa_studies.tasks import Tasks
 
@@ -170,7 +170,7 @@ def candidates(
 def study(case: Case, candidate: Candidate) -> Result:
     """Plan a move with the nominal parameters and carry it out with errors."""
     try:
-        request = Request(
+        request = MoveRequest(
             State(case.start), case.target, case.material, case.limits, case.delivery,
             candidate.order, errors=(case.box, case.box, case.box))
         move = held(request, get_shaper(candidate.shaper)(request), math.inf)

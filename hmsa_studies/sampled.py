@@ -16,7 +16,7 @@ from hmsa.model.equations import Array, Floats
 from hmsa.model.moves import Level, Move, State
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.status import Code, RefusedError
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.shapers.two_step import two_step
 from hmsa_studies.residual import Actual
 
@@ -42,7 +42,7 @@ class SampledStudy:
 
 def ideal_move(start: float, target: float, material: NondimensionalParameters) -> Move:
     """Return the two-step command for ideal hardware; raise `HmsaError` if there is none."""
-    move = two_step(Request(State(start), target, material))
+    move = two_step(MoveRequest(State(start), target, material))
     if move.code is not Code.TWO_STEP:
         raise HmsaError(
             f'there is no two-step command from {material.coordinate.name} {start:g} to '
@@ -66,7 +66,7 @@ def solved_move(
         period: float) -> Move | None:
     """Return the command solved for on a grid, None if there is none."""
     try:
-        return two_step(Request(State(start), target, material, delivery=Delivery(period)))
+        return two_step(MoveRequest(State(start), target, material, delivery=Delivery(period)))
     except RefusedError:
         return None
 

@@ -46,7 +46,7 @@ def _ranges(specs: tuple[ParameterSpec, ...]) -> dict[str, Range]:
 
 @dataclass(frozen=True)
 class Setting:
-    """A block and its delivery, as in `hmsa.planning.timeline.Model`."""
+    """A block and its delivery, as in `hmsa.planning.timeline.JointModel`."""
 
     material: NondimensionalParameters
     limits: Limits = field(default_factory=Limits)

@@ -11,7 +11,7 @@ from hmsa.errors import BadInputError
 from hmsa.files import replacing, require_arrow
 
 
-class Block(Protocol):
+class TableBlock(Protocol):
     """Some rows: a pyarrow table, or an object with ``arrow()``."""
 
     def to_pydict(self) -> Mapping[str, list[Any]]:
@@ -27,7 +27,7 @@ def repeating(table: Any) -> list[str]:
 
 @contextmanager
 def open_writer(
-        path: Path | None, columns: Sequence[str]) -> Iterator[Callable[[Block], None]]:
+        path: Path | None, columns: Sequence[str]) -> Iterator[Callable[[TableBlock], None]]:
     """Yield a function that writes blocks to a file or stdout, or raise `BadInputError`."""
     if path is None:
         yield _csv_writer(sys.stdout, columns)
@@ -49,14 +49,14 @@ def open_writer(
             yield _parquet_writer(beside, stack)
 
 
-def _csv_writer(file: TextIO, columns: Sequence[str]) -> Callable[[Block], None]:
+def _csv_writer(file: TextIO, columns: Sequence[str]) -> Callable[[TableBlock], None]:
     """Return a function that writes blocks as CSV in full double precision, after a header."""
     writer = csv.writer(file, lineterminator='\n')
     writer.writerow(columns)
     return lambda block: writer.writerows(zip(*block.to_pydict().values(), strict=True))
 
 
-def _parquet_writer(path: Path, stack: ExitStack) -> Callable[[Block], None]:
+def _parquet_writer(path: Path, stack: ExitStack) -> Callable[[TableBlock], None]:
     """Return a function that writes blocks as Parquet row groups; the stack writes the footer."""
     arrow, parquet = require_arrow()
     writer: Any = None

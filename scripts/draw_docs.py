@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 
 from hmsa.model.delivery import ramps
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
@@ -44,7 +44,7 @@ from hmsa.report import looks, style  # noqa: E402
 from hmsa.report.arrivals import Part  # noqa: E402
 from hmsa.report.paper import SCREEN  # noqa: E402
 from hmsa.report.picture import draw  # noqa: E402
-from hmsa.runs.levels import Level  # noqa: E402
+from hmsa.runs.levels import RecordedLevel  # noqa: E402
 from hmsa.runs.record import RecordedRequest, Run  # noqa: E402
 from hmsa_ros.clients.adapting import second_act  # noqa: E402
 from hmsa_ros.clients.demo import SEQUENCE  # noqa: E402
@@ -137,7 +137,7 @@ def deliveries(path: Path) -> None:
         for i, (title, delivery) in enumerate(cases):
             segment, = plan_sequence(
                 [Setpoint(1.4, 20 * period)],
-                Request.of(MATERIAL, State(1.0, 0.0, 0.0), delivery=delivery))
+                MoveRequest.of(MATERIAL, State(1.0, 0.0, 0.0), delivery=delivery))
             levels = segment.move.levels
             rest = replace(levels[0], time=float(time[0]), load=holding)
             switches, loads, slopes = np.array(ramps(
@@ -213,7 +213,7 @@ def creep(path: Path) -> None:
     with style.picture(path, 4.2, SCREEN) as figure:
         rows = figure.subplots(3, 1, sharex=True, height_ratios=[1.0, 1.2, 0.9])
         for material, name, look in curves:
-            segments = plan_sequence(setpoints, Request.of(material, delivery=grid))
+            segments = plan_sequence(setpoints, MoveRequest.of(material, delivery=grid))
             levels = [(x.begin + y.time, y.load) for x in segments for y in x.move.levels]
             switches, loads = np.array([x for x in levels if x[0] < time[-1]]).T
             stretch, _ = simulate(switches, loads, time, creeping)
@@ -277,7 +277,7 @@ def simulated(*setpoints: tuple[float, float], rate: float) -> Run:
     points = [(x, end) for (x, _), end in zip(setpoints, ends, strict=True)]
     plan = Planner(block, Options(lead_time=lead)).request(points, None, start)
     levels = tuple(
-        Level(x.stamp, x.flux_density, start, x.stretch, x.rate) for x in plan.levels
+        RecordedLevel(x.stamp, x.flux_density, start, x.stretch, x.rate) for x in plan.levels
         if x.stamp >= start)
     plant = ActuatorSimulation(block, time=start)
     for level in levels:
@@ -289,7 +289,8 @@ def simulated(*setpoints: tuple[float, float], rate: float) -> Run:
     time, *motion = (np.array(x) for x in zip(*samples, strict=True))
     return Run(
         'run', 'actuator', Path('run'), time, time, *motion,
-        commands=tuple(Level(x.stamp, x.flux_density, x.sent) for x in levels), plans=(levels,),
+        commands=tuple(RecordedLevel(x.stamp, x.flux_density, x.sent) for x in levels),
+        plans=(levels,),
         requests=(RecordedRequest(start, 0, tuple(points)),), plant=block, planner=block,
         parameters_known=True)
 

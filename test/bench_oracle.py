@@ -13,8 +13,8 @@ from hmsa.model.parameters import ActuatorParameters, paper_actuator
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.planner import PlannerRuntime
-from hmsa_ros.runtime.records import EstimateChanged, Send, Settings, StatusChanged, Target
+from hmsa_ros.runtime.records import EstimateChanged, Send, Settings, StatusChanged, StretchRequest
+from hmsa_ros.runtime.runtime import Runtime
 
 MS = 1_000_000
 START = 1000 * MS
@@ -101,7 +101,7 @@ class Bench:
         self.effort: Callable = lambda: math.nan  # field in T reported by the device
         self.wire = []
         self.estimates, self.sent, self.codes = [], [], []
-        self.runtime = PlannerRuntime(
+        self.runtime = Runtime(
             PlannerGroup({'a': Planner(nominal, Options(
                 flux_density_min=-limit, flux_density_max=limit, lead_time=lead))}),
             Settings(**{'takeover_timeout': 0, 'heartbeat_period': 0, 'feedback': 'adapt',
@@ -152,7 +152,7 @@ class Bench:
         """Move to a target; return vibration and steady-state error in % of the step."""
         planner, before = self.planner, self.now
         start = planner.plan.segments[-1].stretch if planner.plan.segments else 1.0
-        self.runtime.request(Target('a', target))
+        self.runtime.request(StretchRequest('a', target))
         segment = planner.plan.segments[-1]
         seen = self.pass_time(hold)
         arrival = max(segment.arrival or 0, before)

@@ -150,10 +150,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def bound(kind: Any, qos: Any = 1000) -> tuple[Any, Any]:
     """Return message class and profile, from rclpy objects or `hmsa.interfaces` names."""
-    from hmsa_ros.nodes import endpoints
-    from hmsa_ros.nodes.endpoints import interface_class
+    from hmsa_ros.nodes import ros_entities
+    from hmsa_ros.nodes.ros_entities import interface_class
     return (interface_class(kind) if isinstance(kind, str) else kind,
-            endpoints.profile(qos) if isinstance(qos, endpoints.Quality) else qos)
+            ros_entities.profile(qos) if isinstance(qos, ros_entities.Quality) else qos)
 
 
 def wait_until(

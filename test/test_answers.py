@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import pytest
 
 from hmsa.runs.answers import answered, plans_of
-from hmsa.runs.record import Verdict
+from hmsa.runs.record import RecordedVerdict
 
 MS = 1_000_000
 
@@ -17,7 +17,7 @@ class Asked:
 
 
 def said(time, plan, code='accepted', level='ok', name=''):
-    return Verdict(round(time * MS), level, code, code, plan, name)
+    return RecordedVerdict(round(time * MS), level, code, code, plan, name)
 
 
 NONE = said(0, 0, 'none')
@@ -56,7 +56,7 @@ def test_which_requests_were_taken(requests, verdicts, taken, others, named):
         renamed, name = [], ''
         for x in verdicts:
             name = '' if x.sent in [y * MS for y in others] else names.get(x.sent, name)
-            renamed.append(Verdict(x.sent, x.level, x.code, x.message, x.plan, name))
+            renamed.append(RecordedVerdict(x.sent, x.level, x.code, x.message, x.plan, name))
         verdicts = renamed
     found, unasked = answered(asked, verdicts)
     assert [x for _, x in found] == taken

@@ -22,7 +22,7 @@ from hmsa.bag import limits, metadata, qos
 from hmsa.bag.definitions import message_definition, type_hash
 from hmsa.bag.info import summarize, to_json, to_text
 from hmsa.bag.reader import BagReader, read_messages
-from hmsa.bag.records import Block, MAGIC, PREFIX
+from hmsa.bag.records import MAGIC, MessageBlock, PREFIX
 from hmsa.bag.recover import recover
 from hmsa.bag.writer import BagWriter, Topic
 from hmsa.cli import main
@@ -211,7 +211,7 @@ def test_no_records_in_any_order_make_the_reader_fail(tmp_path, data):
         opcode, piece = original[i]
         if opcode == Opcode.CHUNK and data.draw(strategies.booleans()):
             # Compressed anew, so that what is wrong in it is found by nothing but reading.
-            stored = Block.of_chunk(0, -PREFIX.size, piece, len(piece))
+            stored = MessageBlock.of_chunk(0, -PREFIX.size, piece, len(piece))
             inner = bytearray(piece[stored.offset:])
             for _ in range(data.draw(strategies.integers(0, 3))):
                 inner[data.draw(strategies.integers(0, len(inner) - 1))] = data.draw(

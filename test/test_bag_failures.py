@@ -21,7 +21,7 @@ from hmsa.bag.recover import recover
 from hmsa.bag.writer import BagWriter, Topic
 from hmsa.errors import BadInputError, BagError
 from hmsa_ros.recording.reception import judge, WARN
-from hmsa_ros.recording.recording import Limits, lost_by_topic, Recording
+from hmsa_ros.recording.writer_thread import lost_by_topic, RecordingLimits, WriterThread
 
 TOPIC = Topic('/a', 'std_msgs/msg/UInt8', 'uint8 data\n')
 PAYLOAD = bytes((0, 1, 0, 0, 7))
@@ -46,8 +46,8 @@ def file_limit() -> Iterator[None]:
 
 def test_when_a_file_may_not_grow_the_next_takes_over(tmp_path):
     reports = []
-    recording = Recording(
-        BagWriter(tmp_path / 'bag', chunk_size=20_000), Limits(flush_period=0.05),
+    recording = WriterThread(
+        BagWriter(tmp_path / 'bag', chunk_size=20_000), RecordingLimits(flush_period=0.05),
         lambda sentence, failure: reports.append((failure, sentence)))
     recording.add_topic(TOPIC)
     with file_limit():
@@ -83,8 +83,8 @@ def test_a_write_that_fails_takes_room_for_the_end_again(tmp_path, monkeypatch):
 
 def test_a_removed_folder_costs_what_was_in_it_and_that_is_counted(tmp_path, wait_until):
     reports = []
-    recording = Recording(
-        BagWriter(tmp_path / 'bag'), Limits(flush_period=0.02),
+    recording = WriterThread(
+        BagWriter(tmp_path / 'bag'), RecordingLimits(flush_period=0.02),
         lambda sentence, failure: reports.append((failure, sentence)))
     recording.add_topic(TOPIC)
     recording.put([message(i) for i in range(10)], 50)
@@ -105,7 +105,7 @@ def test_a_removed_folder_costs_what_was_in_it_and_that_is_counted(tmp_path, wai
 @pytest.mark.parametrize('damage', ['removed', 'shortened'])
 def test_at_the_end_what_can_be_read_is_counted(tmp_path, damage, when):
     writer = BagWriter(tmp_path / 'bag', chunk_size=1000)
-    recording = Recording(writer, Limits(flush_period=0.02))
+    recording = WriterThread(writer, RecordingLimits(flush_period=0.02))
     recording.add_topic(TOPIC)
 
     def record(first):
@@ -150,7 +150,7 @@ def test_at_the_end_what_can_be_read_is_counted(tmp_path, damage, when):
 
 
 def test_what_does_not_fit_into_memory_is_counted_by_topic(tmp_path):
-    recording = Recording(BagWriter(tmp_path / 'bag'), Limits(cache_size=10_000))
+    recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits(cache_size=10_000))
     recording.add_topic(TOPIC)
     recording.put([message(i) for i in range(1000)], 5000)
     recording.put([message(i) for i in range(10)], 50)
@@ -160,7 +160,7 @@ def test_what_does_not_fit_into_memory_is_counted_by_topic(tmp_path):
 
 
 def test_a_writer_that_cannot_write_at_the_end_says_so(tmp_path):
-    recording = Recording(BagWriter(tmp_path / 'bag'), Limits(flush_period=60.0))
+    recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits(flush_period=60.0))
     recording.add_topic(TOPIC)
     recording.put([message(i) for i in range(10)], 50)
     shutil.rmtree(tmp_path / 'bag')
@@ -171,7 +171,7 @@ def test_a_writer_that_cannot_write_at_the_end_says_so(tmp_path):
 
 
 def test_after_the_end_nothing_more_is_done(tmp_path):
-    recording = Recording(BagWriter(tmp_path / 'bag'), Limits())
+    recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits())
     recording.close()
     with pytest.raises(BagError, match='the recording has ended'):
         recording.split()
@@ -185,11 +185,11 @@ def test_after_the_end_nothing_more_is_done(tmp_path):
 ])
 def test_limits_out_of_range_are_refused(options, match):
     with pytest.raises(BadInputError, match=match):
-        Limits(**options)
+        RecordingLimits(**options)
 
 
 def test_files_are_split_by_time_span(tmp_path):
-    recording = Recording(BagWriter(tmp_path / 'bag'), Limits(max_duration_ns=100))
+    recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits(max_duration_ns=100))
     recording.add_topic(TOPIC)
     recording.put([message(i) for i in range(1000)], 5000)
     recording.close()
@@ -199,7 +199,7 @@ def test_files_are_split_by_time_span(tmp_path):
 
 
 def test_a_snapshot_reaches_back_as_far_as_asked_for(tmp_path):
-    recording = Recording(BagWriter(tmp_path / 'bag'), Limits(snapshot_ns=100))
+    recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits(snapshot_ns=100))
     recording.add_topic(TOPIC)
     for i in range(500):
         recording.put([message(i)], 5)
@@ -210,8 +210,8 @@ def test_a_snapshot_reaches_back_as_far_as_asked_for(tmp_path):
 
 
 def test_messages_that_a_snapshot_has_no_room_for_are_counted(tmp_path):
-    recording = Recording(
-        BagWriter(tmp_path / 'bag'), Limits(snapshot_ns=10**9, cache_size=3000))
+    recording = WriterThread(
+        BagWriter(tmp_path / 'bag'), RecordingLimits(snapshot_ns=10**9, cache_size=3000))
     recording.add_topic(TOPIC)
     recording.put([message(0)], 5)
     recording.put([message(i) for i in range(1, 101)], 500)
@@ -259,8 +259,8 @@ def test_a_killed_writer_loses_nothing_it_has_flushed(tmp_path):
 
 def test_files_that_are_full_at_once_do_not_hold_up_the_writing(tmp_path):
     definition = 'uint8 data\n' * 2000
-    recording = Recording(
-        BagWriter(tmp_path / 'bag'), Limits(flush_period=0.05, max_size=1024))
+    recording = WriterThread(
+        BagWriter(tmp_path / 'bag'), RecordingLimits(flush_period=0.05, max_size=1024))
     recording.add_topic(Topic('/a', 'std_msgs/msg/UInt8', definition))
     recording.put([message(i) for i in range(20_000)], 100_000)
     status = recording.close()
@@ -272,7 +272,7 @@ def test_files_that_are_full_at_once_do_not_hold_up_the_writing(tmp_path):
 
 
 def test_what_is_declared_is_no_part_of_the_size_of_a_file(tmp_path):
-    recording = Recording(BagWriter(tmp_path / 'bag'), Limits(max_size=1024))
+    recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits(max_size=1024))
     recording.add_topic(Topic('/a', 'std_msgs/msg/UInt8', 'uint8 data\n' * 2000))
     recording.put([message(i) for i in range(100)], 500)
     recording.close()
@@ -281,7 +281,7 @@ def test_what_is_declared_is_no_part_of_the_size_of_a_file(tmp_path):
 
 
 def test_time_that_jumps_to_and_fro_does_not_make_a_file_each_time(tmp_path):
-    recording = Recording(BagWriter(tmp_path / 'bag'), Limits())
+    recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits())
     recording.add_topic(TOPIC)
     for i in range(500):
         recording.put([message(i)], 5)
@@ -293,8 +293,8 @@ def test_time_that_jumps_to_and_fro_does_not_make_a_file_each_time(tmp_path):
 
 @pytest.mark.slow
 def test_an_end_that_takes_too_long_is_cut_off_and_counted(tmp_path, monkeypatch):
-    monkeypatch.setattr('hmsa_ros.recording.recording.END_SECONDS', 0.0)
-    recording = Recording(BagWriter(tmp_path / 'bag'), Limits())
+    monkeypatch.setattr('hmsa_ros.recording.writer_thread.END_SECONDS', 0.0)
+    recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits())
     recording.add_topic(TOPIC)
     for i in range(200_000):
         recording.put([message(i)], 5)
@@ -326,7 +326,7 @@ def test_a_split_that_fails_loses_no_message(tmp_path, monkeypatch):
         return BagWriter.split(writer)
 
     monkeypatch.setattr(writer, 'split', split)
-    recording = Recording(writer, Limits(max_size=1024))
+    recording = WriterThread(writer, RecordingLimits(max_size=1024))
     recording.add_topic(TOPIC)
     recording.put([message(i) for i in range(100)], 500)
     recording.close()

@@ -293,7 +293,7 @@ def test_requests_of_a_foreign_definition_are_passed_over(tmp_path, capsys):
 
 
 def test_a_type_name_imports_nothing_but_interfaces():
-    from hmsa_ros.nodes.endpoints import interface_class
+    from hmsa_ros.nodes.ros_entities import interface_class
     assert interface_class(FLOAT).__name__ == 'Float64'
     for name in ('antigravity/msg/A', 'os/path/join', 'this/msg/A', '../x/msg/A', 'std_msgs',
                  'std_msgs/os/A', 'std_msgs/msg/', 'std_msgs/msg/../A', '\0/msg/A'):

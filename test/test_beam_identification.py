@@ -24,8 +24,8 @@ from hmsa.errors import BadInputError
 from hmsa.identification.excitation import Bounds, Designer, excite
 from hmsa.identification.files import read_belief
 from hmsa.identification.identify import identify
+from hmsa.identification.measurement import Measurement, UncheckedMeasurement
 from hmsa.identification.quantities import derivative, values_of
-from hmsa.identification.recording import Course, Recording
 from hmsa.identification.response import respond
 from hmsa.model import equations
 from hmsa.model.laws.coordinate import DEFLECTION
@@ -65,7 +65,8 @@ def test_derivatives_are_those_of_the_equation_of_the_angle(name, change):
     ends = [sampled(TIMES[short], LEVEL_TIMES[:2], LEVELS[:2], **{change: middle + x})
             for x in (-size, size)]
     values = values_of(BEAM)
-    found = respond(Course(TIMES[short], LEVEL_TIMES[:2], LEVELS[:2]), values, [name])
+    found = respond(
+        UncheckedMeasurement(TIMES[short], LEVEL_TIMES[:2], LEVELS[:2]), values, [name])
     scale = 1.0 if change == 'force' else TRUE[name]
     wanted = (ends[1] - ends[0]) / (2.0 * size) / scale * derivative(name, values[name])
     assert found.jacobian[:, 0] == pytest.approx(
@@ -73,7 +74,7 @@ def test_derivatives_are_those_of_the_equation_of_the_angle(name, change):
 
 
 def of_beam(times, deflection, level_times=LEVEL_TIMES, levels=LEVELS):
-    return Recording(times, deflection, level_times, levels, coordinate=DEFLECTION)
+    return Measurement(times, deflection, level_times, levels, coordinate=DEFLECTION)
 
 
 def test_modulus_damping_remanence_and_bias_are_found_within_their_deviations():
@@ -143,7 +144,7 @@ def test_command_shows_the_modulus_of_young_and_writes_what_the_nodes_take(tmp_p
 
 
 def test_a_recording_of_a_stretch_is_none_of_a_beam():
-    recording = Recording(TIMES, 1.0 + seen(), LEVEL_TIMES, LEVELS)
+    recording = Measurement(TIMES, 1.0 + seen(), LEVEL_TIMES, LEVELS)
     with pytest.raises(BadInputError, match='has stretches: expected deflections'):
         identify(recording, actuator=BEAM)
 

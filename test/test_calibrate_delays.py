@@ -12,7 +12,7 @@ import pytest
 from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.identification.delays import delays, field_delays
-from hmsa.identification.recording import Recording
+from hmsa.identification.measurement import Measurement
 from hmsa.model.parameters import paper_actuator
 from hmsa.runs.parameters import entries_of
 from hmsa_lab.bench.assembly import SensorScale
@@ -74,7 +74,7 @@ def test_a_field_that_rises_between_two_readings_has_honest_intervals(lag):
 def test_transport_lag_and_latency_are_told_apart_on_random_benches(seed):
     truth, nominal, samples, readings, (begins, levels) = recorded(seed)
     found = delays(
-        Recording(*samples, np.append(0.5, begins), np.append(0.0, levels)),
+        Measurement(*samples, np.append(0.5, begins), np.append(0.0, levels)),
         np.append(math.nan, begins), field_delays(*readings, begins, levels), nominal)
     assert found.motion.verdict == 'identified'
     assert found.transport.value == pytest.approx(truth['transport'], abs=5e-5)
@@ -91,7 +91,7 @@ def test_transport_lag_and_latency_are_told_apart_on_random_benches(seed):
 
 def test_without_a_probe_what_cannot_be_told_apart_is_said():
     truth, nominal, samples, _, (begins, levels) = recorded(0)
-    recording = Recording(*samples, np.append(0.5, begins), np.append(0.0, levels))
+    recording = Measurement(*samples, np.append(0.5, begins), np.append(0.0, levels))
     found = delays(recording, np.append(math.nan, begins), None, nominal, lag=truth['lag'])
     assert found.setting.value == pytest.approx(truth['latency'] + truth['transport'], abs=5e-5)
     assert 'includes transport that the device does not report' in found.notes[0]

@@ -7,7 +7,7 @@ import pytest
 
 from hmsa.cli import main
 from hmsa_lab.bench import conformance
-from hmsa_lab.bench.bench import Seen
+from hmsa_lab.bench.bench import PhaseResults
 from hmsa_ros.device.protocol import Sample
 
 # One class for all: a block at a level, whose state survives its process, in a file.
@@ -114,7 +114,7 @@ def test_without_a_sensor_it_says_what_it_could_not_try(lab, capsys):
 
 def phase(stretch):
     """Return a phase whose samples have these stretches."""
-    return Seen([], [Sample(i, np.array([x]), np.array([0.0]), np.array([0.0]))
+    return PhaseResults([], [Sample(i, np.array([x]), np.array([0.0]), np.array([0.0]))
                      for i, x in enumerate(stretch)], [])
 
 
@@ -122,7 +122,7 @@ def phase(stretch):
 def test_noise_does_not_decide_whether_a_coil_is_off(noise):
     dice = np.random.default_rng(1)
     for _ in range(300):
-        trial = conformance.Trial('', '', {}, level=1e-3, rate=200.0)
+        trial = conformance.ConformanceTrial('', '', {}, level=1e-3, rate=200.0)
         trial._check_response(*(
             phase(1.0 + x + noise * dice.standard_normal(120)) for x in (0.0, 1e-3, -1e-3)))
         assert all(x.passed for x in trial._checks)
@@ -134,7 +134,7 @@ def test_noise_does_not_decide_whether_a_coil_is_off(noise):
 def test_a_sensor_that_a_level_moves_by_a_few_steps_is_not_said_to_repeat(step, tried):
     dice = np.random.default_rng(1)
     moving = 1.0 + np.repeat([5e-4, 1e-3] * 15, 6) + 1e-5 * dice.standard_normal(180)
-    trial = conformance.Trial('', '', {}, level=1e-3, rate=200.0)
+    trial = conformance.ConformanceTrial('', '', {}, level=1e-3, rate=200.0)
     seen = phase(step * np.round(moving / step))
     trial._check_samples([seen], seen)
     assert ('samples_new' in {x.name for x in trial._checks if x.passed}) is tried

@@ -161,7 +161,7 @@ def test_send_is_patient_in_simulated_time_that_is_slower_than_the_wall(start, r
 @pytest.mark.ros
 def test_send_trusts_a_driver_that_publishes_samples_alone(start, ros):
     from hmsa.interfaces import topics
-    from hmsa_ros.nodes import endpoints
+    from hmsa_ros.nodes import ros_entities
 
     ros.collect(
         topics.FLUX_DENSITY_COMMAND.type, 'flux_density_command',
@@ -171,7 +171,7 @@ def test_send_trusts_a_driver_that_publishes_samples_alone(start, ros):
     send = start.hmsa('send', '1.1:0.1', '--wait')
     assert send.wait(30.0) == 1, send.output
     assert 'no node reports applied levels' in send.stderr
-    endpoints.publisher(ros.node, topics.JOINT_STATES)
+    ros_entities.publisher(ros.node, topics.JOINT_STATES)
     send = start.hmsa('send', '1.2:0.1', '--wait')
     assert send.wait(30.0) == 0, send.output
     assert 'done: at_rest, predicted, not measured' in send.stdout

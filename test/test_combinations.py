@@ -20,7 +20,7 @@ from hmsa.model.parameters import NondimensionalParameters
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import SHAPERS
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 
 STRETCHES = np.linspace(0.7, 1.8, 23)
 CONSTANTS = {
@@ -64,7 +64,7 @@ def test_no_combination_is_refused_and_exact_ones_end_at_rest(law):
         delivery = Delivery(
             period=period * unit, slew=slew * held / unit, lag=lag * unit)
         move = plan_sequence(
-            [Setpoint(target, math.inf)], Request.of(
+            [Setpoint(target, math.inf)], MoveRequest.of(
                 replace(material, creep=replace(
                     creep, times=tuple(x * unit for x in creep.times))),
                 delivery=delivery, limits=Limits(-20.0 * held, 20.0 * held)),

@@ -11,8 +11,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from hmsa.errors import BadInputError
-from hmsa.interfaces.status import Verdict, whole
-from hmsa.judge.records import Finding, missed, Setpoint, unobserved
+from hmsa.interfaces.status import StatusVerdict, whole
+from hmsa.judge.records import Finding, missed, RequestedSetpoint, unobserved
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.group import PlannerGroup, Progress
@@ -231,7 +231,7 @@ def test_diagnostics_have_their_statuses_and_stamp(stamp, count):
     assert message.status == statuses
 
 
-SETPOINT = Setpoint(1.4, 1.2, 0, SECOND, 2 * SECOND, 500.0, number=2, count=3)
+SETPOINT = RequestedSetpoint(1.4, 1.2, 0, SECOND, 2 * SECOND, 500.0, number=2, count=3)
 ARRIVED = Finding(Code.ARRIVED, 'rests', SETPOINT, 100, 1e-3, 1e-5, 2e-3, 1e-5, 80.0, 1e-4)
 
 
@@ -253,7 +253,7 @@ def test_only_what_arrived_or_nobody_measures_is_no_failure(
         records.Verdict(records.Severity(severity), code, 'a sentence', 'x'), progress,
         {'a': progress}, 1, 0, 0, {} if finding is None else {'a': finding}, finding,
         measuring=measuring)))
-    read = Verdict.read(status)
+    read = StatusVerdict.read(status)
     assert read.failure.startswith(failure)
     assert bool(read.failure) == bool(failure)
     values = {x.key: x.value for x in status.values}

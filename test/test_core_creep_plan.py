@@ -18,7 +18,7 @@ from hmsa.planning.planner import Options, Planner
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import get_shaper
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.two_step import plan_two_step
 
 MS = 1_000_000
@@ -65,7 +65,7 @@ def test_a_creeping_block_rests_after_a_move_and_after_the_next_one_right_away(
         material, shaper, delivery, wanted):
     segments = plan_sequence(
         [Setpoint(1.4, 24 * 0.27), Setpoint(1.1, 100 * 0.27), Setpoint(0.9, math.inf)],
-        Request.of(material, delivery=delivery), shaper=shaper)
+        MoveRequest.of(material, delivery=delivery), shaper=shaper)
     assert segments[1].start.followed != ()
     for share, said in left(segments, material.creep, delivery=delivery):
         assert share <= said
@@ -76,7 +76,7 @@ def test_a_creeping_block_rests_after_a_move_and_after_the_next_one_right_away(
 @pytest.mark.parametrize('delivery', [
     Delivery(lag=0.12), Delivery(slew=2.0), Delivery(slew=1.0, lag=0.3)], ids=str)
 def test_stretch_rate_and_field_arrive_as_branches_need_them(delivery):
-    move = get_shaper('two_step')(Request(State(1.0), 1.4, THREE, delivery=delivery))
+    move = get_shaper('two_step')(MoveRequest(State(1.0), 1.4, THREE, delivery=delivery))
     end = ended([(x.time, x.load) for x in move.levels], THREE.creep, move.duration, delivery)
     needed = elastic(1.4)[0] + end[3:].sum()
     assert (*end[:2], end[2] - needed) == pytest.approx((1.4, 0.0, 0.0), abs=1e-9)
@@ -117,7 +117,7 @@ def test_a_planner_follows_creep_over_requests_and_a_stop():
 
 def test_once_relaxed_the_next_plan_is_one_from_rest():
     here = plan_sequence([Setpoint(1.4, 4000.0), Setpoint(1.1, math.inf)], ONE)[1]
-    fresh, = plan_sequence([Setpoint(1.1, math.inf)], Request.of(ONE, State(1.4)))
+    fresh, = plan_sequence([Setpoint(1.1, math.inf)], MoveRequest.of(ONE, State(1.4)))
     assert here.move.levels[0].load == pytest.approx(fresh.move.levels[0].load, rel=1e-9)
     assert here.move.duration == pytest.approx(fresh.move.duration, rel=1e-9)
 
@@ -136,14 +136,14 @@ def test_levels_that_follow_creep_keep_inside_the_coil():
     assert highest > segment.move.levels[-1].load
     with pytest.raises(RefusedError, match='stretch 1.4 needs a flux density of'):
         plan_sequence(
-            [Setpoint(1.4, math.inf)], Request.of(ONE, limits=Limits(-1.0, 0.999 * highest)))
+            [Setpoint(1.4, math.inf)], MoveRequest.of(ONE, limits=Limits(-1.0, 0.999 * highest)))
 
 
 @pytest.mark.parametrize('delivery', [
     IDEAL, Delivery(slew=2.0), Delivery(lag=0.2), Delivery(slew=2.0, lag=0.1),
     replace(SAMPLED, slew=2.0)], ids=str)
 def test_the_fastest_move_of_a_creeping_block_ends_at_rest_within_the_limits(delivery):
-    request = Request(State(1.0), 1.4, THREE, Limits(-3.0, 3.0), delivery)
+    request = MoveRequest(State(1.0), 1.4, THREE, Limits(-3.0, 3.0), delivery)
     move, slower = (get_shaper(x)(request) for x in ('minimum_time', 'two_step'))
     assert move.duration <= slower.duration
     assert all(-3.0 <= x.load <= 3.0 for x in move.levels)
@@ -158,7 +158,8 @@ def test_of_a_creeping_block_in_error_minimax_leaves_less_than_the_chain(deliver
     worst = []
     for shaper in ('robust', 'minimax'):
         move = plan_sequence(
-            [Setpoint(1.4, math.inf)], Request.of(THREE, delivery=delivery), shaper=shaper)[0].move
+            [Setpoint(1.4, math.inf)], MoveRequest.of(THREE, delivery=delivery),
+            shaper=shaper)[0].move
         assert str(move.code) == shaper
         left = []
         for error in (-0.1, 0.1):
@@ -183,7 +184,7 @@ def test_of_a_creeping_block_in_error_minimax_leaves_less_than_the_chain(deliver
 @pytest.mark.parametrize('name', ['zv', 'zvd', 'ei', 'minimax'])
 def test_what_rings_on_after_a_move_is_predicted_at_the_levels_that_follow_creep(name, delivery):
     move = plan_sequence(
-        [Setpoint(1.2, math.inf)], Request.of(THREE, delivery=delivery), shaper=name)[0].move
+        [Setpoint(1.2, math.inf)], MoveRequest.of(THREE, delivery=delivery), shaper=name)[0].move
     levels = [(x.time, x.load) for x in move.levels]
     place = len(levels) - len(move.tail)
     for number in (place, place + 3, place + 9):
@@ -219,7 +220,7 @@ def test_one_plan_from_two_ends_says_what_creep_is_not_planned_for():
 @pytest.mark.parametrize('lag', [0.0, 0.1, 0.5])
 def test_one_search_finds_two_levels_and_another_ends_where_they_do(
         lag, creep, start, monkeypatch):
-    request = Request(start, 1.25, replace(ONE, creep=creep), delivery=Delivery(lag=lag))
+    request = MoveRequest(start, 1.25, replace(ONE, creep=creep), delivery=Delivery(lag=lag))
     with monkeypatch.context() as alone:
         alone.setattr('hmsa.motion.solve', None)
         move = get_shaper('two_step')(request)

@@ -18,7 +18,7 @@ from hmsa.planning.planner import Options, Planner
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import get_shaper
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 
 PAPER = NondimensionalParameters()
 LIMITS = Limits(-2.5, 2.5)
@@ -65,7 +65,7 @@ def test_stretch_rate_and_field_arrive_together_from_any_state_within_the_limits
             State(start, 0.0, held),
             State(start, random.uniform(-0.4, 0.4), held + random.uniform(-0.4, 0.4), held),
             State(start, 0.0, held + random.uniform(-0.3, 0.3), held))[number % 3]
-        request = Request(
+        request = MoveRequest(
             state, target, PAPER, LIMITS,
             Delivery(lag=10.0 ** random.uniform(-3.0, -0.3), **hardware))
         move = get_shaper(shaper)(request)
@@ -81,10 +81,11 @@ def test_stretch_rate_and_field_arrive_together_from_any_state_within_the_limits
 
 @pytest.mark.parametrize('slew', [math.inf, 1.5])
 def test_with_less_and_less_lag_the_plan_becomes_the_one_without(slew):
-    plain = get_shaper('two_step')(Request(State(1.0), 1.3, PAPER, delivery=Delivery(slew=slew)))
+    plain = get_shaper('two_step')(
+        MoveRequest(State(1.0), 1.3, PAPER, delivery=Delivery(slew=slew)))
     for lag in (1e-2, 1e-4, 1e-6):
         move = get_shaper('two_step')(
-            Request(State(1.0), 1.3, PAPER, delivery=Delivery(slew=slew, lag=lag)))
+            MoveRequest(State(1.0), 1.3, PAPER, delivery=Delivery(slew=slew, lag=lag)))
         assert len(move.levels) == 3
         assert move.levels[0].load == pytest.approx(plain.levels[0].load, abs=10.0 * lag)
         assert move.duration == pytest.approx(plain.duration, abs=3.0 * lag)
@@ -94,8 +95,9 @@ def test_a_field_that_has_not_settled_is_no_rest():
     held = float(elastic_force(1.2, PAPER))
     shaper = get_shaper('two_step')
     delivery = Delivery(lag=0.1)
-    assert shaper(Request(State(1.2, 0.0, held), 1.2, PAPER, delivery=delivery)).code is Code.HOLD
-    request = Request(State(1.2, 0.0, held + 0.1), 1.2, PAPER, LIMITS, delivery)
+    assert shaper(
+        MoveRequest(State(1.2, 0.0, held), 1.2, PAPER, delivery=delivery)).code is Code.HOLD
+    request = MoveRequest(State(1.2, 0.0, held + 0.1), 1.2, PAPER, LIMITS, delivery)
     stretch, rate, field = end_of(shaper(request), request)
     assert (stretch, rate, field) == pytest.approx((1.2, 0.0, held), abs=1e-10)
 
@@ -103,7 +105,7 @@ def test_a_field_that_has_not_settled_is_no_rest():
 def test_limits_that_leave_no_room_to_settle_the_field_are_named():
     held = float(elastic_force(1.3, PAPER))
     with pytest.raises(RefusedError, match='coil time constant.*flux density limits') as refusal:
-        get_shaper('two_step')(Request(
+        get_shaper('two_step')(MoveRequest(
             State(1.0), 1.3, PAPER, Limits(-1.0, held), Delivery(lag=0.1)))
     assert refusal.value.code is Code.FLUX_LIMIT
 
@@ -112,9 +114,9 @@ def test_limits_that_leave_no_room_to_settle_the_field_are_named():
 def test_predicted_motion_under_a_lag_is_that_of_the_independent_integration(slew):
     delivery = Delivery(slew=slew, lag=0.2)
     segments = plan_sequence(
-        [Setpoint(1.2, 0.7), Setpoint(0.9, math.inf)], Request.of(PAPER, delivery=delivery),
+        [Setpoint(1.2, 0.7), Setpoint(0.9, math.inf)], MoveRequest.of(PAPER, delivery=delivery),
         short_spell='continue')
-    request = Request(segments[1].start, 0.9, PAPER, delivery=delivery)
+    request = MoveRequest(segments[1].start, 0.9, PAPER, delivery=delivery)
     assert segments[1].start.load != segments[1].start.amplifier
     assert np.max(np.abs(np.subtract(
         end_of(segments[1].move, request), (0.9, 0.0, elastic_force(0.9, PAPER))))) < 1e-9

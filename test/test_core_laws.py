@@ -14,7 +14,7 @@ from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.identification.files import read_belief
 from hmsa.identification.identify import identify
-from hmsa.identification.recording import Recording
+from hmsa.identification.measurement import Measurement
 from hmsa.interfaces.actuator import actuator_from, parameters_of
 from hmsa.interfaces.parameters import BLOCK
 from hmsa.model.actuators import check_stretch, unheld
@@ -34,7 +34,7 @@ from hmsa.model.status import Code, RefusedError
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import get_shaper
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.two_step import Groups, plan_two_step, plan_two_step_batch
 from hmsa.runs.parameters import read_parameter_file, recorded
 
@@ -219,7 +219,7 @@ def test_what_cannot_be_held_is_refused_where_the_force_falls(name):
 
 def test_a_move_that_collapses_where_the_force_falls_is_refused_and_others_are_found():
     group = block('mooney_rivlin', {'law.c10': 5e3, 'law.c01': -300.0}).nondimensional
-    request = Request(State(1.0, -0.5), 0.3, group, delivery=Delivery(slew=2.0))
+    request = MoveRequest(State(1.0, -0.5), 0.3, group, delivery=Delivery(slew=2.0))
     fast, slow = (get_shaper(x)(request) for x in ('minimum_time', 'two_step'))
     assert (fast.code, fast.levels) == (Code.TWO_STEP, slow.levels)
     with pytest.raises(RefusedError, match='overshoots .* such as two_step'):
@@ -309,4 +309,4 @@ def test_identification_scales_a_law_and_keeps_the_ratios_of_its_constants(tmp_p
     assert parameters_of(found)['law.mu'] == pytest.approx([6e3, -1500.0, 10.0], rel=2e-3)
     with pytest.raises(BadInputError, match='chain_limit is free: expected none for law ogden'):
         identify(
-            Recording(times, noisy, begins, levels), free=('chain_limit',), actuator=true)
+            Measurement(times, noisy, begins, levels), free=('chain_limit',), actuator=true)

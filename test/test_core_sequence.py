@@ -18,7 +18,7 @@ from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import Units
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.setpoint import Setpoint
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.two_step import plan_two_step
 
 PAPER = NondimensionalParameters()
@@ -173,14 +173,16 @@ REFUSALS = {
                lambda: plan_sequence(setpoints((1.2, 10), (1.7, 10)), group(0.2, 1.0))),
     'holding load': (
         Code.FLUX_LIMIT, 'stretch 1.4 needs a flux density of 0.9648: expected -0.5 to 0.5',
-        lambda: plan_sequence(setpoints((1.4, 10)), Request.of(PAPER, limits=Limits(-0.5, 0.5)))),
+        lambda: plan_sequence(
+            setpoints((1.4, 10)), MoveRequest.of(PAPER, limits=Limits(-0.5, 0.5)))),
     'contraction': (
         Code.FLUX_LIMIT, 'stretch 0.8 needs a flux density of -0.7845: expected -0.5 to 0.5',
-        lambda: plan_sequence(setpoints((0.8, 10)), Request.of(PAPER, limits=Limits(-0.5, 0.5)))),
+        lambda: plan_sequence(
+            setpoints((0.8, 10)), MoveRequest.of(PAPER, limits=Limits(-0.5, 0.5)))),
     'intermediate load': (
         Code.FLUX_LIMIT, r'stretch 1.35 needs a flux density of 0.9\d*: expected -1 to 0.9',
         lambda: plan_sequence(
-            setpoints((1.35, 10)), Request.of(PAPER, State(1.45), limits=Limits(-1.0, 0.9)))),
+            setpoints((1.35, 10)), MoveRequest.of(PAPER, State(1.45), limits=Limits(-1.0, 0.9)))),
     'duration': (Code.SPELL_TOO_SHORT, 'its setpoint lasts 0.5',
                  lambda: plan_sequence(setpoints((1.1, 0.5)), PAPER)),
 }
@@ -209,16 +211,18 @@ def test_reasons_are_worded_in_the_units_given():
     units = Units(4.36e-3, 0.1257, ' s', ' T')
     with pytest.raises(RefusedError, match=r'of 0.1213 T: expected -0.1257 T to 0.06285 T'):
         plan_sequence(
-            setpoints((1.4, 10)), Request.of(PAPER, limits=Limits(-1.0, 0.5), units=units))
+            setpoints((1.4, 10)), MoveRequest.of(PAPER, limits=Limits(-1.0, 0.5), units=units))
     with pytest.raises(RefusedError, match=r'takes 0.005737 s, its setpoint lasts 0.00218 s'):
-        plan_sequence(setpoints((1.1, 0.5)), Request.of(PAPER, units=units))
+        plan_sequence(setpoints((1.1, 0.5)), MoveRequest.of(PAPER, units=units))
 
 
 @pytest.mark.parametrize(('arguments', 'reason'), [
     ({'shaper': 'tow_step'}, "shaper 'tow_step' is unknown: expected one of two_step"),
     ({'short_spell': 'ignore'}, "short_spell is 'ignore': expected one of refuse, continue"),
-    ({'frame': Request.of(PAPER, State(2.7))}, 'start stretch is 2.7: expected a stretch between'),
-    ({'frame': Request.of(PAPER, State(0.0))}, 'start stretch is 0: expected a stretch between')])
+    ({'frame': MoveRequest.of(PAPER, State(2.7))},
+     'start stretch is 2.7: expected a stretch between'),
+    ({'frame': MoveRequest.of(PAPER, State(0.0))},
+     'start stretch is 0: expected a stretch between')])
 def test_arguments_out_of_range_are_bad_input(arguments, reason):
     with pytest.raises(BadInputError, match=reason):
         plan_sequence(setpoints((1.1, 10)), **{'frame': PAPER, **arguments})
@@ -284,7 +288,7 @@ def test_the_step_is_the_papers_unshaped_input():
 def test_rounded_commands_are_followed_as_they_are(resolution):
     segments = plan_sequence(
         setpoints((1.1, 5), (1.2, 5), (1.4, 5)),
-        Request.of(PAPER, delivery=Delivery(resolution=resolution)))
+        MoveRequest.of(PAPER, delivery=Delivery(resolution=resolution)))
     for segment in segments:
         for level in segment.move.levels:
             count = level.time / resolution
@@ -332,7 +336,7 @@ def test_corners_of_every_argument_end_in_a_plan_or_a_refusal(rate, limits):
                 with contextlib.suppress(RefusedError):
                     segments = plan_sequence(
                         setpoints((target, span), (1.2, 10.0)),
-                        Request.of(PAPER, State(start, rate), limits=limits),
+                        MoveRequest.of(PAPER, State(start, rate), limits=limits),
                         short_spell='continue')
                     assert all(
                         limits.minimum <= load <= limits.maximum

@@ -30,7 +30,7 @@ from hmsa.planning.planner import Options, Planner
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import get_shaper, SHAPERS
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 
 PAPER = NondimensionalParameters()
 WIDE = Limits(-20.0, 20.0)
@@ -44,7 +44,7 @@ ROUNDED = 2.0 * 20.0 * np.finfo(float).eps
 MILLISECOND = 1_000_000
 
 
-def end_state(move: Move, request: Request) -> tuple[float, float, float]:
+def end_state(move: Move, request: MoveRequest) -> tuple[float, float, float]:
     """Integrate a move with SciPy; return its end, and the largest stretch times frequency."""
     pieces, last = ramps(move.levels, request.load, move.duration, request.delivery.slew)
     switches, loads, slopes = np.array(pieces).T
@@ -66,7 +66,7 @@ def end_state(move: Move, request: Request) -> tuple[float, float, float]:
     return float(state[0]), float(state[1]), largest
 
 
-def distance_from_rest(move: Move, request: Request) -> float:
+def distance_from_rest(move: Move, request: MoveRequest) -> float:
     """Return the deviation from rest at the target after a move, as a fraction of the move."""
     stretch, rate, largest = end_state(move, request)
     frequency = float(natural_frequency(request.target, request.material))
@@ -82,7 +82,7 @@ def distance_from_rest(move: Move, request: Request) -> float:
     Delivery(), Delivery(period=0.01), Delivery(period=0.13), Delivery(period=0.3),
     Delivery(slew=200.0), Delivery(period=0.1, slew=400.0)], ids=str)
 def test_every_exact_shaper_comes_to_rest_at_the_target(name, start, target, delivery):
-    request = Request(State(start), target, PAPER, WIDE, delivery)
+    request = MoveRequest(State(start), target, PAPER, WIDE, delivery)
     move = get_shaper(name)(request)
     assert move.code is not Code.STEP
     assert distance_from_rest(move, request) < AT_REST
@@ -90,7 +90,7 @@ def test_every_exact_shaper_comes_to_rest_at_the_target(name, start, target, del
 
 @pytest.mark.parametrize('slew', [5.0, 1.0, 0.3, 0.1, 0.05])
 def test_a_slow_amplifier_is_planned_through_its_ramps(slew):
-    request = Request(State(1.0), 1.1, PAPER, WIDE, Delivery(slew=slew))
+    request = MoveRequest(State(1.0), 1.1, PAPER, WIDE, Delivery(slew=slew))
     for name in ('two_step', 'robust'):
         move = get_shaper(name)(request)
         assert distance_from_rest(move, request) < AT_REST
@@ -100,9 +100,9 @@ def test_a_slow_amplifier_is_planned_through_its_ramps(slew):
 @pytest.mark.parametrize(('start', 'target'), [
     (State(1.0), 1.1), (State(1.0), 0.9), (State(1.1, 2e-14), 1.3)])
 def test_a_slow_amplifier_costs_its_ramp_and_half_a_period_at_most(start, target):
-    ideal = get_shaper('two_step')(Request(start, target, PAPER, WIDE)).duration
+    ideal = get_shaper('two_step')(MoveRequest(start, target, PAPER, WIDE)).duration
     for slew in np.geomspace(0.05, 50.0, 40).tolist():
-        request = Request(start, target, PAPER, WIDE, Delivery(slew=slew))
+        request = MoveRequest(start, target, PAPER, WIDE, Delivery(slew=slew))
         move, fast = (get_shaper(x)(request) for x in ('two_step', 'minimum_time'))
         ramp = abs(move.levels[-1].load - request.load) / slew
         assert fast.duration <= move.duration < ramp + ideal
@@ -122,16 +122,16 @@ def test_a_slow_amplifier_costs_its_ramp_and_half_a_period_at_most(start, target
     (State(1.6848, 0.1070, 1.1937), 1.4412, 0.3469),
     (State(1.0068, -0.4092, 0.2448), 0.9611, 0.3469)])
 def test_moves_through_slow_ramps_are_found(state, target, slew):
-    request = Request(state, target, PAPER, Limits(-4.0, 4.0), Delivery(slew=slew))
+    request = MoveRequest(state, target, PAPER, Limits(-4.0, 4.0), Delivery(slew=slew))
     assert distance_from_rest(get_shaper('two_step')(request), request) < AT_REST
 
 
 @pytest.mark.parametrize('share', [0.01, 0.1, 0.2, 0.27, 1.0 / 3.0])
 def test_a_plan_on_the_grid_is_exact_for_any_period_up_to_a_third_of_the_move(share):
     for start, target in ((1.0, 1.1), (1.2, 1.4), (1.0, 0.6)):
-        ideal = get_shaper('two_step')(Request(State(start), target, PAPER))
+        ideal = get_shaper('two_step')(MoveRequest(State(start), target, PAPER))
         period = share * ideal.duration
-        request = Request(State(start), target, PAPER, WIDE, Delivery(period=period))
+        request = MoveRequest(State(start), target, PAPER, WIDE, Delivery(period=period))
         move = get_shaper('two_step')(request)
         for level in move.levels:
             assert level.time / period == pytest.approx(round(level.time / period), abs=1e-9)
@@ -141,7 +141,7 @@ def test_a_plan_on_the_grid_is_exact_for_any_period_up_to_a_third_of_the_move(sh
 
 @pytest.mark.parametrize('order', [1, 2, 3, 4])
 def test_a_chain_has_one_level_more_than_its_order_and_takes_about_as_many_half_periods(order):
-    request = Request(State(1.0), 1.4, PAPER, WIDE, order=order)
+    request = MoveRequest(State(1.0), 1.4, PAPER, WIDE, order=order)
     move = get_shaper('robust')(request)
     single = get_shaper('two_step')(request)
     assert len(move.levels) == order + 1
@@ -156,14 +156,14 @@ def test_chains_of_a_small_undamped_move_have_binomial_levels():
     full = float(elastic_force(1.0 + step, material.j_lim))
     for order, shares in ((2, [1, 3, 4]), (3, [1, 4, 7, 8])):
         move = get_shaper('robust')(
-            Request(State(1.0), 1.0 + step, material, WIDE, order=order))
+            MoveRequest(State(1.0), 1.0 + step, material, WIDE, order=order))
         assert [x.load / full for x in move.levels] == pytest.approx(
             [x / shares[-1] for x in shares], abs=1e-2)
 
 
 def test_minimum_time_is_faster_than_two_step_and_keeps_the_limits():
     limits = Limits(-0.5, 1.2 * float(elastic_force(1.4, 5.0)))
-    request = Request(State(1.0), 1.4, PAPER, limits)
+    request = MoveRequest(State(1.0), 1.4, PAPER, limits)
     move = get_shaper('minimum_time')(request)
     assert move.duration < get_shaper('two_step')(request).duration
     for level in move.levels:
@@ -174,14 +174,14 @@ def test_minimum_time_is_faster_than_two_step_and_keeps_the_limits():
 def test_minimum_time_arrives_above_critical_damping_where_two_step_does_not(zeta):
     material = NondimensionalParameters(zeta=zeta)
     assert zeta > critical_zeta(1.1, material)
-    request = Request(State(1.0), 1.1, material, WIDE)
+    request = MoveRequest(State(1.0), 1.1, material, WIDE)
     assert get_shaper('two_step')(request).code is Code.TOO_DAMPED
     move = get_shaper('minimum_time')(request)
     assert math.isfinite(move.duration)
     assert distance_from_rest(move, request) < AT_REST
 
 
-def plan_or_reason(name: str, request: Request) -> tuple[Move, RefusedError | None]:
+def plan_or_reason(name: str, request: MoveRequest) -> tuple[Move, RefusedError | None]:
     """Return a shaper's move, or an empty one with the refusal."""
     try:
         return get_shaper(name)(request), None
@@ -204,7 +204,7 @@ def test_from_any_state_a_plan_is_at_rest_at_the_target_or_carries_a_reason(
     lower, upper = stretch_limits(j_lim)
     start, target = (lower + (upper - lower) * x for x in place)
     loads = [float(elastic_force(x, j_lim)) for x in (start, target)]
-    request = Request(
+    request = MoveRequest(
         State(start, rate), target, material, Limits(min(loads) - room, max(loads) + room))
     move, refusal = plan_or_reason('two_step', request)
     if refusal is not None:
@@ -222,23 +222,23 @@ def test_from_any_state_a_plan_is_at_rest_at_the_target_or_carries_a_reason(
 def test_too_little_room_for_the_grid_or_the_ramps_is_refused_with_what_is_needed():
     tight = Limits(-0.011, 0.805)
     moving = State(0.9998, 0.3189)
-    assert get_shaper('two_step')(Request(moving, 1.32375, PAPER, tight)).code is Code.TWO_STEP
+    assert get_shaper('two_step')(MoveRequest(moving, 1.32375, PAPER, tight)).code is Code.TWO_STEP
     with pytest.raises(RefusedError, match='or a command period of 0.4'):
-        get_shaper('two_step')(Request(moving, 1.32375, PAPER, tight, Delivery(period=4.0)))
-    slow = Request(State(1.0), 0.6, PAPER, WIDE, Delivery(slew=0.02))
+        get_shaper('two_step')(MoveRequest(moving, 1.32375, PAPER, tight, Delivery(period=4.0)))
+    slow = MoveRequest(State(1.0), 0.6, PAPER, WIDE, Delivery(slew=0.02))
     assert distance_from_rest(get_shaper('two_step')(slow), slow) < AT_REST
     with pytest.raises(RefusedError, match='expected no slew limit'):
         get_shaper('two_step')(replace(slow, delivery=Delivery(slew=1e-4)))
     with pytest.raises(RefusedError, match='needs a flux density of'):
-        get_shaper('zvd')(Request(State(1.0), 1.4, PAPER, Limits(-0.1, 0.5)))
-    holding = get_shaper('step')(Request(State(1.0), 1.1, PAPER)).levels[-1].load
+        get_shaper('zvd')(MoveRequest(State(1.0), 1.4, PAPER, Limits(-0.1, 0.5)))
+    holding = get_shaper('step')(MoveRequest(State(1.0), 1.1, PAPER)).levels[-1].load
     assert get_shaper('minimum_time')(
-        Request(State(1.0), 1.1, PAPER, Limits(-1.0, holding))).code is Code.TWO_STEP
+        MoveRequest(State(1.0), 1.1, PAPER, Limits(-1.0, holding))).code is Code.TWO_STEP
     with pytest.raises(RefusedError, match='room on both sides'):
-        get_shaper('minimum_time')(Request(State(1.0, 2.0), 1.1, PAPER, Limits(-1.0, holding)))
+        get_shaper('minimum_time')(MoveRequest(State(1.0, 2.0), 1.1, PAPER, Limits(-1.0, holding)))
 
 
-def drawn(random: np.random.Generator) -> Request:
+def drawn(random: np.random.Generator) -> MoveRequest:
     """Return a random move, with limits of which some are tight."""
     start, target = random.uniform(0.7, 1.8, 2)
     material = NondimensionalParameters(zeta=float(random.choice([0.05, 0.2, 1.0, 2.5])))
@@ -248,7 +248,7 @@ def drawn(random: np.random.Generator) -> Request:
     half = np.pi / float(natural_frequency(target, material))
     period, slew, lag = random.integers(0, 2, 3)
     rate = random.normal() * 0.3 * (target - start) * random.integers(0, 2)
-    return Request(
+    return MoveRequest(
         State(start, rate, float(elastic_force(start, material))), target, material,
         Limits(loads[0] - room[0], loads[1] + room[1]),
         Delivery(
@@ -270,7 +270,7 @@ def test_minimum_time_finds_what_two_step_finds_and_is_never_slower():
             assert fast.reason or fast.code in (Code.MINIMUM_TIME, Code.HOLD)
 
 
-def eased(request: Request, advice: str) -> Request:
+def eased(request: MoveRequest, advice: str) -> MoveRequest:
     """Return a request with the limits that a refusal advises."""
     limits, delivery = request.limits, request.delivery
     for part in advice.split(' and '):
@@ -317,7 +317,7 @@ def test_a_refusal_costs_no_more_than_its_searches_and_one_for_advice(monkeypatc
 
     monkeypatch.setattr(motion, 'solve', counted)
     creep = Creep((0.1, 0.2, 0.1), (0.2, 4.0, 100.0))
-    request = Request(
+    request = MoveRequest(
         State(0.8861966254382365, -0.00023701158342467364, 0.5361491154517042),
         0.8861926210099953, replace(PAPER, creep=creep), Limits(-0.0928, 6.558),
         Delivery(slew=0.0002451145879390747), order=4)
@@ -330,7 +330,7 @@ def test_a_refusal_costs_no_more_than_its_searches_and_one_for_advice(monkeypatc
 def test_every_shaper_refuses_targets_out_of_range(name):
     for target in (0.1, 3.0, math.nan):
         with pytest.raises(RefusedError, match='between the limits') as refusal:
-            get_shaper(name)(Request(State(1.0), target, PAPER))
+            get_shaper(name)(MoveRequest(State(1.0), target, PAPER))
         assert refusal.value.code is Code.OUT_OF_RANGE
 
 
@@ -338,7 +338,7 @@ def test_an_unknown_shaper_is_refused_with_the_known_ones():
     with pytest.raises(BadInputError, match='expected one of two_step, robust'):
         get_shaper('nothing')
     with pytest.raises(BadInputError, match='order is 0'):
-        get_shaper('robust')(Request(State(1.0), 1.1, PAPER, order=0))
+        get_shaper('robust')(MoveRequest(State(1.0), 1.1, PAPER, order=0))
     with pytest.raises(BadInputError, match='command period is -1'):
         Delivery(period=-1.0)
     with pytest.raises(BadInputError, match='slew limit is 0'):
@@ -347,7 +347,7 @@ def test_an_unknown_shaper_is_refused_with_the_known_ones():
 
 def test_linear_shapers_leave_vibration_and_the_exact_ones_do_not():
     for name, least, most in (('zv', 1e-2, 0.3), ('zvd', 3e-3, 0.3), ('ei', 3e-3, 0.3)):
-        request = Request(State(1.0), 1.4, PAPER)
+        request = MoveRequest(State(1.0), 1.4, PAPER)
         move = get_shaper(name)(request)
         assert move.code is Code.LINEAR
         assert least < distance_from_rest(move, request) < most
@@ -356,7 +356,7 @@ def test_linear_shapers_leave_vibration_and_the_exact_ones_do_not():
 def test_full_on_off_and_on_again_leaves_nothing_of_a_small_move_in_a_third_of_a_period():
     for zeta, creep in (
             (0.0, Creep()), (0.2, Creep()), (1.0, Creep()), (0.2, Creep((0.2,), (1.0,)))):
-        request = Request(
+        request = MoveRequest(
             State(1.0), 1.0001, NondimensionalParameters(zeta=zeta, creep=creep), Limits())
         move, slower, step = (get_shaper(x)(request) for x in ('umzv', 'zv', 'step'))
         assert move.duration < 0.95 * slower.duration
@@ -366,21 +366,21 @@ def test_full_on_off_and_on_again_leaves_nothing_of_a_small_move_in_a_third_of_a
             move, Move(step.code, step.levels, move.duration))] if not creep else [0.0, 1.0]
         assert left[0] < 2e-3 * left[1]
     undamped = NondimensionalParameters(zeta=0.0)
-    small = get_shaper('umzv')(Request(State(1.0), 1.0 + 1e-7, undamped))
+    small = get_shaper('umzv')(MoveRequest(State(1.0), 1.0 + 1e-7, undamped))
     third = 2.0 * math.pi / 3.0 / float(natural_frequency(1.0, undamped))
     assert small.duration == pytest.approx(third, rel=1e-5)
 
 
 def test_a_sequence_begins_each_move_where_the_last_one_really_ended():
     # The first spell is too short: the second move starts from a moving state.
-    first = get_shaper('two_step')(Request(State(1.0), 1.3, PAPER))
+    first = get_shaper('two_step')(MoveRequest(State(1.0), 1.3, PAPER))
     setpoints = [Setpoint(1.3, 0.5 * first.duration), Setpoint(1.1, 10.0)]
     with pytest.raises(RefusedError, match='its setpoint lasts'):
         plan_sequence(setpoints, PAPER)
-    segments = plan_sequence(setpoints, Request.of(PAPER, limits=WIDE), short_spell='continue')
+    segments = plan_sequence(setpoints, MoveRequest.of(PAPER, limits=WIDE), short_spell='continue')
     assert segments[0].move.code is Code.SPELL_TOO_SHORT
     assert abs(segments[1].start.rate) > 0.01
-    request = Request(segments[1].start, 1.1, PAPER, WIDE)
+    request = MoveRequest(segments[1].start, 1.1, PAPER, WIDE)
     assert distance_from_rest(segments[1].move, request) < AT_REST
 
 
@@ -429,7 +429,7 @@ def test_through_ramps_every_moving_start_finds_rest_within_the_limits():
         state = State(
             start, random.normal(0.0, 0.3),
             float(np.clip(held, limits.minimum, limits.maximum)))
-        request = Request(state, target, model.nondimensional, limits, Delivery(slew=slew))
+        request = MoveRequest(state, target, model.nondimensional, limits, Delivery(slew=slew))
         move = get_shaper('two_step')(request)
         assert all(limits.minimum <= x.load <= limits.maximum for x in move.levels)
         end = follow(

@@ -7,12 +7,12 @@ from hmsa.model.moves import State
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import simulate
 from hmsa.planning.stopping import brake
-from hmsa.planning.timeline import Model, Options
+from hmsa.planning.timeline import JointModel, Options
 
 
 @pytest.mark.parametrize('excursion', [1e-4, 1e-3, 1e-2, 0.3])
 def test_a_brake_leaves_nothing_of_the_motion(excursion):
-    model = Model(paper_actuator(), Options(flux_density_min=-0.5, flux_density_max=0.5))
+    model = JointModel(paper_actuator(), Options(flux_density_min=-0.5, flux_density_max=0.5))
     random = np.random.default_rng(4)
     for _ in range(20):
         angle = random.uniform(0.2, 2.9) * random.choice([-1.0, 1.0])

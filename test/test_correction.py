@@ -12,15 +12,15 @@ from scipy.optimize import brentq
 
 from hmsa.identification.known import Known
 from hmsa.planning.group import PlannerGroup
-from hmsa.planning.planner import Options as PlannerOptions
+from hmsa.planning.planner import EstimatorOptions as PlannerOptions
 from hmsa.planning.planner import Planner
 from hmsa_lab.adapt.corrections import course_of
-from hmsa_lab.adapt.estimator import Estimator, Options
-from hmsa_lab.adapt.expected_error import Course, expect
+from hmsa_lab.adapt.estimator import Estimator, EstimatorOptions
+from hmsa_lab.adapt.expected_error import CandidateLevels, expect
 from hmsa_lab.adapt.motion import follow, Levels
 from hmsa_lab.adapt.prior import Prior
 from hmsa_ros.runtime.loop import Loop
-from hmsa_ros.runtime.records import Settings, Target
+from hmsa_ros.runtime.records import Settings, StretchRequest
 from hmsa_studies.feedback import trial
 from hmsa_studies.linear import Linearised
 from hmsa_studies.scenario import scenario_of, SCENARIOS, STRATEGIES, Strategy
@@ -105,7 +105,7 @@ def closed_loop(factor, noise=1e-3, seed=0, **settings):
                  feedback_cautious=True, feedback_tolerance=1e-3, **settings),
         Bench(block, noise, seed))
     loop.run(BEGIN)
-    loop.runtime.request(Target('a', TARGET))
+    loop.runtime.request(StretchRequest('a', TARGET))
     loop.run(90 * MS)
     return block
 
@@ -139,12 +139,12 @@ def test_a_block_that_is_known_exactly_is_left_alone():
 
 def test_what_a_course_is_expected_to_leave_is_what_errors_drawn_from_the_covariance_leave():
     prior = Prior.nominal(oracle.BLOCK, ('shear_modulus',), deviations={'shear_modulus': 0.01})
-    estimator = Estimator(prior, Options(noise=1e-3))
+    estimator = Estimator(prior, EstimatorOptions(noise=1e-3))
     estimator.set_levels([(0, 0.0)])
     estimator.sample(0, 1.0)
     estimate = estimator.update(MS)
     plan = Planner(oracle.BLOCK, PlannerOptions(lead_time=0)).setpoint(TARGET, MS)
-    course = Course(
+    course = CandidateLevels(
         tuple((x.stamp, x.flux_density) for x in plan.levels if x.stamp >= MS),
         plan.segments[-1].arrival, TARGET)
     expected = expect(estimate, course).size
@@ -173,7 +173,7 @@ def test_the_field_of_a_coil_that_lags_remembers_the_levels_before_a_correction(
         np.array([0.0, *(1e-9 * x.stamp for x in levels if x.stamp > 0)]),
         np.array([0.0, *(x.flux_density for x in levels if x.stamp > 0)])), 0.0,
         np.array([1e-9 * begin]))
-    estimator = Estimator(prior, Options(noise=1e-3))
+    estimator = Estimator(prior, EstimatorOptions(noise=1e-3))
     estimator.sample(0, 1.0)
     estimate = replace(
         estimator.update(0), time=begin, stretch=motion.stretch[0], rate=motion.rate[0])
@@ -212,11 +212,11 @@ def test_open_loop_in_the_study_leaves_what_the_study_of_shapers_says():
     from hmsa.model.moves import State
     from hmsa.model.parameters import NondimensionalParameters
     from hmsa.planning.shapers import get_shaper
-    from hmsa.planning.shapers.request import Request
+    from hmsa.planning.shapers.request import MoveRequest
     from hmsa_studies.residual import Actual, Errors
 
     material = NondimensionalParameters()
-    move = get_shaper('two_step')(Request(State(1.0), 1.4, material))
+    move = get_shaper('two_step')(MoveRequest(State(1.0), 1.4, material))
     found = trial(SCENARIOS[0], Strategy('', 'two_step'), 0.2, 0)[0]
     assert found.vibration == pytest.approx(
         Actual.off(material, Errors(0.2)).residual(move, 1.0, 1.4, move.duration), rel=2e-3)

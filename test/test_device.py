@@ -16,7 +16,7 @@ from hmsa.model.sampling import enough_samples, too_few_samples
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa_ros.device.health import judge_commands
 from hmsa_ros.device.protocol import Kind, Sample
-from hmsa_ros.device.sensor import Sensor, SensorErrors, Transport
+from hmsa_ros.device.sensor import Delay, Sensor, SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.device.watchdog import Fallback, GuardedJoint
 
@@ -275,7 +275,7 @@ def test_bias_and_gain_are_those_of_the_sensor_alone():
     (lambda: Fallback(-1.0), 'timeout is -1 s'),
     (lambda: Fallback(safe_flux='full'), "'full': expected one of hold, zero, ramp"),
     (lambda: Fallback(ramp_rate=0.0), 'ramp rate is 0 T/s'),
-    (lambda: Transport(-1), 'delay is -1 ns')])
+    (lambda: Delay(-1), 'delay is -1 ns')])
 def test_settings_out_of_range_are_refused(make, sentence):
     with pytest.raises(BadInputError, match=sentence):
         make()
@@ -312,7 +312,7 @@ def test_the_watchdog_waits_for_a_first_command_and_leaves_pauses_out():
 @given(st.lists(st.integers(0, 5), max_size=30), st.integers(0, 7))
 @settings(deadline=None)
 def test_what_is_sent_arrives_once_in_order_and_its_delay_later(waits, delay):
-    transport = Transport(delay)
+    transport = Delay(delay)
     now, sent, came = 0, [], []
     for wait in waits:
         now += wait

@@ -10,7 +10,7 @@ from test_runtime_planner import HOLD, LEAD, MS, START, trajectory
 
 from hmsa_ros.runtime.device_clock import DeviceClock
 from hmsa_ros.runtime.receipts import Receipts
-from hmsa_ros.runtime.records import Severity, Stop, Target
+from hmsa_ros.runtime.records import Severity, Stop, StretchRequest
 
 SECOND = 1000 * MS
 
@@ -95,7 +95,7 @@ def test_a_device_whose_clock_is_set_halts_the_plan_and_is_found_again(when, by)
     # What the watchdog does is all that happens.
     assert all(level == 0.0 for _, level in rig.levels[changes:])
     assert not any(x.flux_density for _, x in rig.sent[sent:])
-    again = rig.runtime.request(Target('a', 1.3))
+    again = rig.runtime.request(StretchRequest('a', 1.3))
     assert (again.code == 'clocks_differ') is static
     if static:
         found = re.search(
@@ -106,7 +106,7 @@ def test_a_device_whose_clock_is_set_halts_the_plan_and_is_found_again(when, by)
     rig.settle()
     rig.set_device(-by)
     rig.run(rig.now + 1200 * MS)
-    rig.runtime.request(Target('a', 1.25))
+    rig.runtime.request(StretchRequest('a', 1.25))
     rig.run(rig.now + SECOND)
     assert rig.status.verdict.severity is Severity.OK
     assert rig.residual(1.25) < 1e-6
@@ -119,7 +119,7 @@ def test_a_small_delay_of_a_device_at_rest_stops_nothing():
     rig.set_device(-300 * MS)
     rig.run(rig.now + 2 * SECOND)
     assert rig.status.verdict.severity is Severity.OK
-    rig.runtime.request(Target('a', 1.1))
+    rig.runtime.request(StretchRequest('a', 1.1))
     rig.run(rig.now + SECOND)
     assert rig.residual(1.1) < 1e-6
 
@@ -128,7 +128,7 @@ def test_a_small_delay_of_a_device_at_rest_stops_nothing():
     (500, 1500), (1000, 1500), (2500, 10_000), (5000, 1500)])
 def test_receipts_are_accepted_after_an_outage_in_which_the_clock_was_set_back(back, outage):
     rig = Apart()
-    rig.runtime.request(Target('a', 1.2))
+    rig.runtime.request(StretchRequest('a', 1.2))
     rig.run(START + SECOND)
     rig.linked = False
     rig.run(rig.now + outage * MS // 2)
@@ -139,7 +139,7 @@ def test_receipts_are_accepted_after_an_outage_in_which_the_clock_was_set_back(b
     assert 'no receipt' not in rig.status.unheard
     rig.set_device(back * MS)
     rig.run(rig.now + 1200 * MS)
-    rig.runtime.request(Target('a', 1.3))
+    rig.runtime.request(StretchRequest('a', 1.3))
     rig.run(rig.now + SECOND)
     assert rig.status.verdict.severity is Severity.OK
     assert rig.residual(1.3) < 1e-6
@@ -268,7 +268,7 @@ def test_lateness_of_a_slow_link_is_a_reason_to_raise_lead_time_after_an_outage_
 
 def test_the_level_of_a_coil_is_known_after_the_clock_of_the_planner_was_set():
     rig = Bench()
-    rig.runtime.request(Target('a', 1.2))
+    rig.runtime.request(StretchRequest('a', 1.2))
     rig.run(START + SECOND)
     rig.cut_off()
     rig.come_back()
@@ -278,7 +278,7 @@ def test_the_level_of_a_coil_is_known_after_the_clock_of_the_planner_was_set():
     rig.runtime.clock_set(MS)
     rig.run(rig.now + 300 * MS)
     rig.hears = True
-    rig.runtime.request(Target('a', 1.3))
+    rig.runtime.request(StretchRequest('a', 1.3))
     rig.run(rig.now + SECOND)
     assert rig.refused == []
     assert rig.residual(1.3) < 1e-6

@@ -9,12 +9,12 @@ import pytest
 from hmsa.errors import BadInputError
 from hmsa.identification.files import read_belief
 from hmsa.model.creep import Creep
-from hmsa.planning.planner import Options as PlannerOptions
-from hmsa_lab.adapt.estimator import Estimator, Options
+from hmsa.planning.planner import EstimatorOptions as PlannerOptions
+from hmsa_lab.adapt.estimator import Estimator, EstimatorOptions
+from hmsa_lab.adapt.hypotheses import Evidence, Hypotheses
+from hmsa_lab.adapt.messages import confounded, sentence
 from hmsa_lab.adapt.motion import follow, Levels
 from hmsa_lab.adapt.prior import Prior
-from hmsa_lab.adapt.suspects import Look, Suspects
-from hmsa_lab.adapt.words import confounded, sentence
 
 # Rest without field, a push, rest near 1.4, and back to rest near 1.1; in s and T.
 TIMES = np.array([0.0, 0.03, 0.036, 0.09])
@@ -85,7 +85,7 @@ def test_branches_that_are_given_are_followed_over_many_windows(coil, tau):
     state = oracle.simulate(
         np.append(SAMPLED, [end - 1e-5, end, end + 1e-5]), TIMES, LEVELS, block, extras)[-3:]
     estimator, found = run(
-        measured(block, extras, noise=1e-5), prior=prior, options=Options(window=40))
+        measured(block, extras, noise=1e-5), prior=prior, options=EstimatorOptions(window=40))
     assert estimator._window.begin + estimator._origin > 0
     assert found.trusted
     assert found.values['shear_modulus'] == pytest.approx(9e3, rel=1e-3)
@@ -93,7 +93,7 @@ def test_branches_that_are_given_are_followed_over_many_windows(coil, tau):
     assert found.actuator.creep == given.creep
     # Without them it does not fit.
     _, lost = run(measured(block, extras, noise=1e-5), ('shear_modulus', 'damping_coefficient'),
-                  Options(window=40))
+                  EstimatorOptions(window=40))
     assert abs(lost.values['shear_modulus'] - 9e3) > 20.0
 
 
@@ -182,7 +182,7 @@ def test_trust_returns_with_the_sensor():
 
 def test_parameters_stay_where_they_are_if_they_are_not_to_be_learnt():
     block = replace(oracle.BLOCK, shear_modulus=1.02e4)
-    _, found = run(measured(block), options=Options(learn=False, gate=100.0))
+    _, found = run(measured(block), options=EstimatorOptions(learn=False, gate=100.0))
     assert found.values['shear_modulus'] == pytest.approx(1e4, rel=1e-4)
 
 
@@ -216,7 +216,7 @@ def test_a_covariance_that_is_none_is_refused(tmp_path, value, word):
 def test_parameters_that_are_frozen_stay_with_their_deviations_and_are_learnt_again_later():
     block = replace(oracle.BLOCK, shear_modulus=1.1e4)
     samples = measured(block)
-    estimator = Estimator(Prior.nominal(oracle.BLOCK), Options(noise=NOISE))
+    estimator = Estimator(Prior.nominal(oracle.BLOCK), EstimatorOptions(noise=NOISE))
     for time, level in zip(TIMES, LEVELS, strict=True):
         estimator.set_levels([(ns(time), level)])
     found = {}
@@ -235,7 +235,7 @@ def test_parameters_that_are_frozen_stay_with_their_deviations_and_are_learnt_ag
 
 
 def test_samples_that_nobody_asks_for_do_not_pile_up():
-    estimator = Estimator(Prior.nominal(oracle.BLOCK), Options(window=20))
+    estimator = Estimator(Prior.nominal(oracle.BLOCK), EstimatorOptions(window=20))
     for i in range(1000):
         assert estimator.sample(i * 1_000_000, 1.0)
     assert estimator.screening.late == 980
@@ -246,7 +246,7 @@ def test_what_cannot_be_tracked_is_refused():
     with pytest.raises(BadInputError, match='initial_rate cannot be tracked'):
         Prior.nominal(oracle.BLOCK, ('initial_rate',))
     with pytest.raises(BadInputError, match='window is 3'):
-        Options(window=3)
+        EstimatorOptions(window=3)
 
 
 def test_a_bias_and_a_constant_force_are_said_to_be_confounded_until_two_targets_were_held():
@@ -302,8 +302,8 @@ def test_a_gain_of_the_sensor_is_no_chain_limit():
 
 def test_a_gain_that_explains_samples_as_well_as_a_force_is_as_likely_but_not_sought():
     # Three tenths of the prior's deviation, known to a tenth, of either.
-    look = Look(
-        Suspects(('constant_force', 'stretch_gain'), (0, 1), 0, np.zeros(2), np.ones(2)),
+    look = Evidence(
+        Hypotheses(('constant_force', 'stretch_gain'), (0, 1), 0, np.zeros(2), np.ones(2)),
         np.zeros(2), np.array([[101.0, 100.0], [100.0, 101.0]]), np.full(2, 40.0),
         np.full(2, -np.inf), np.full(2, np.inf))
     sought, others = look.choose(())

@@ -7,7 +7,7 @@ from bench_oracle import Bench, MS, paper, Plant
 import numpy as np
 import pytest
 
-from hmsa_lab.adapt import estimator, joint, window
+from hmsa_lab.adapt import adaptive_joint, estimator, window
 from hmsa_lab.adapt.motion import follow
 
 MOVES = (1.4, 1.1, 1.4, 1.1, 1.4)
@@ -128,7 +128,7 @@ def test_moves_that_get_worse_end_feedback_and_what_it_did_is_taken_back(monkeyp
             ('clearly_better', lambda *_, **__: True), ('differs', lambda *_: True),
             ('learnt_model', lambda model, *_: replace(model, actuator=replace(
                 model.actuator, shear_modulus=1.1e4)))):
-        monkeypatch.setattr(joint, name, other)
+        monkeypatch.setattr(adaptive_joint, name, other)
     it = bench(False, 1e-3)
     left = np.sum(np.abs(moves(it)), axis=1)
     assert 1 <= np.count_nonzero(left > 0.5) <= 2

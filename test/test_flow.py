@@ -13,7 +13,7 @@ from test_estimation import LEVELS, measured, run, SAMPLED, TIMES
 from hmsa import motion
 from hmsa.errors import BadInputError
 from hmsa.identification.identify import identify
-from hmsa.identification.recording import Recording
+from hmsa.identification.measurement import Measurement
 from hmsa.interfaces.actuator import creep_from
 from hmsa.model.creep import Creep
 from hmsa.model.delivery import Delivery, IDEAL
@@ -23,8 +23,8 @@ from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.simulation import ActuatorSimulation, follow, sampled, with_followed
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.setpoint import Setpoint
-from hmsa.planning.shapers.request import Request
-from hmsa_lab.adapt.estimator import Options
+from hmsa.planning.shapers.request import MoveRequest
+from hmsa_lab.adapt.estimator import EstimatorOptions
 from hmsa_lab.adapt.prior import Prior
 
 MS = 1_000_000
@@ -88,7 +88,7 @@ def test_a_block_whose_branches_flow_rests_after_a_move_and_after_the_next_one(
         material, shaper, delivery, wanted):
     segments = plan_sequence(
         [Setpoint(1.4, 24 * 0.27), Setpoint(1.1, math.inf)],
-        Request.of(material, delivery=delivery), shaper=shaper)
+        MoveRequest.of(material, delivery=delivery), shaper=shaper)
     move = segments[0].move
     levels = move.levels[:len(move.levels) - len(move.tail)]
     end = ended([(x.time, x.load) for x in levels], material.creep, move.duration, delivery)
@@ -131,7 +131,7 @@ def test_the_exponent_is_found_blind():
     times = np.arange(0.0, 1.27, 1e-3)
     stretch = oracle.simulate(times, level_times, levels, extras=extras)
     found = identify(
-        Recording(times, stretch + 3e-4 * np.random.default_rng(3).standard_normal(len(times)),
+        Measurement(times, stretch + 3e-4 * np.random.default_rng(3).standard_normal(len(times)),
                   level_times, levels),
         free=['shear_modulus', 'damping_coefficient', 'stretch_bias', *list(true)[:3]],
         actuator=replace(oracle.BLOCK, shear_modulus=1.1e4),
@@ -150,7 +150,7 @@ def test_feedback_follows_what_such_a_branch_holds():
     end = SAMPLED[-1] + 2e-3
     state = oracle.simulate(np.append(SAMPLED, end), TIMES, LEVELS, block, extras)[-1]
     _, found = run(
-        measured(block, extras, noise=1e-5), prior=prior, options=Options(window=40))
+        measured(block, extras, noise=1e-5), prior=prior, options=EstimatorOptions(window=40))
     assert found.trusted
     assert found.values['shear_modulus'] == pytest.approx(9e3, rel=1e-3)
     assert found.stretch == pytest.approx(state, abs=5e-5)

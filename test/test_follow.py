@@ -8,7 +8,7 @@ from rclpy.duration import Duration
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from hmsa.interfaces import topics
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 from hmsa_ros.runtime.goals import ErrorCode
@@ -37,7 +37,7 @@ def test_without_its_messages_there_is_no_action_and_one_line_says_so(start, ros
 @pytest.mark.skipif(not INSTALLED, reason='control_msgs is not installed')
 def test_a_client_has_goals_carried_out_canceled_preempted_and_rejected(serve, ros):
     serve(PlannerNode, PlantNode, '-p', 'lead_time:=1.0')
-    action = endpoints.interface_class(topics.FOLLOW.type)
+    action = ros_entities.interface_class(topics.FOLLOW.type)
     client = ActionClient(ros.node, action, '/planner/follow_joint_trajectory')
     ros.spin_until(client.server_is_ready, 'the action')
     states = ros.collect(topics.FOLLOW.state.type, '/planner/controller_state', 10)

@@ -13,8 +13,15 @@ from hmsa.planning.planner import Options, Planner
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.goals import ErrorCode, Goals
-from hmsa_ros.runtime.planner import PlannerRuntime
-from hmsa_ros.runtime.records import Send, Settings, StatusChanged, Stop, Target, Trajectory
+from hmsa_ros.runtime.records import (
+    Send,
+    Settings,
+    StatusChanged,
+    Stop,
+    StretchRequest,
+    Trajectory,
+)
+from hmsa_ros.runtime.runtime import Runtime
 
 MS = 1_000_000
 START = 1000 * MS
@@ -31,7 +38,7 @@ class Bench:
         self.device = SimulatedDevice(
             [SimulatedJoint(Setup(real, real.rest)) for _ in joints], period=MS, time=START)
         options = Options(flux_density_min=-0.5, flux_density_max=0.5)
-        self.runtime = PlannerRuntime(
+        self.runtime = Runtime(
             PlannerGroup({x: Planner(block, options) for x in joints}),
             Settings(takeover_timeout=0), Environment(
                 clock=lambda: self.now, steady=lambda: self.now,
@@ -239,7 +246,7 @@ def test_a_new_goal_preempts_without_a_jump_and_a_refused_one_does_not():
     assert np.ptp(bench.truth[-500:]) < 1e-6
 
 
-@pytest.mark.parametrize('request_', [Target('a', 1.1), Stop()])
+@pytest.mark.parametrize('request_', [StretchRequest('a', 1.1), Stop()])
 def test_any_other_request_takes_its_place(request_):
     bench = Bench()
     bench.add(dense(duration=300))

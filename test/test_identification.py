@@ -10,13 +10,13 @@ from benchmarks.bench_identification import levels_of
 from hmsa.errors import BadInputError
 from hmsa.identification.identify import identify
 from hmsa.identification.intervals import profile
+from hmsa.identification.measurement import Measurement
 from hmsa.identification.quantities import (
     DEFAULT_FREE,
     from_coordinate,
     to_coordinate,
     values_of,
 )
-from hmsa.identification.recording import Recording
 from hmsa.identification.response import respond
 from hmsa.planning.two_step import plan_two_step
 
@@ -46,15 +46,15 @@ def values_with(extras: Extras):
 
 
 def recorded(targets=SEQUENCE, *, noise=1e-3, seed=0, times=TIMES, extras=None, repeats=9,
-             span=SPAN) -> Recording:
+             span=SPAN) -> Measurement:
     """Return a noisy recording of unshaped steps."""
     level_times, levels = steps(targets, span, repeats)
     stretch = simulate(times, level_times, levels, extras=extras)
     noisy = stretch + noise * np.random.default_rng(seed).standard_normal(len(times))
-    return Recording(times, noisy, level_times, levels)
+    return Measurement(times, noisy, level_times, levels)
 
 
-def shaped(repeats: int, noise: float = 1e-3) -> Recording:
+def shaped(repeats: int, noise: float = 1e-3) -> Measurement:
     """Return a recording of two-step moves."""
     now, start, level_times, levels = 0.02, 1.0, [0.0], [0.0]
     for target in SEQUENCE * repeats:
@@ -65,14 +65,14 @@ def shaped(repeats: int, noise: float = 1e-3) -> Recording:
     level_times, levels = np.array(level_times), np.array(levels)
     stretch = simulate(TIMES, level_times, levels)
     noisy = stretch + noise * np.random.default_rng(1).standard_normal(len(TIMES))
-    return Recording(TIMES, noisy, level_times, levels)
+    return Measurement(TIMES, noisy, level_times, levels)
 
 
 @pytest.mark.parametrize('slew', [np.inf, 20.0])
 def test_derivatives_are_those_of_finite_differences_for_every_parameter(slew):
     free = (*NINE, 'density', 'stretch_gain', 'sensor_latency')
     times = np.sort(np.random.default_rng(0).uniform(0.0, 0.25, 300))
-    recording = Recording(
+    recording = Measurement(
         times, 1.0 + 0.1 * np.sin(70.0 * times), *steps(SEQUENCE, SPAN), slew_limit=slew)
     values = values_with(EXTRAS) | {'sensor_latency': 3e-4}
     for at_rest in (True, False):
@@ -104,7 +104,7 @@ def test_derivatives_ring_on_after_a_shaped_move_however_rare_the_samples_are():
 
 def test_derivative_by_a_lag_of_nothing_is_the_limit_of_lags():
     times = np.arange(300) * 1e-3
-    recording = Recording(times, 1.0 + 0.1 * np.sin(70.0 * times), *steps(SEQUENCE, SPAN))
+    recording = Measurement(times, 1.0 + 0.1 * np.sin(70.0 * times), *steps(SEQUENCE, SPAN))
     values = values_of(BLOCK)
     none = respond(recording, values, ('coil_time_constant',), rtol=1e-12)
     little = respond(recording, values | {'coil_time_constant': 1e-7}, (), rtol=1e-12)
@@ -115,7 +115,7 @@ def test_derivative_by_a_lag_of_nothing_is_the_limit_of_lags():
 def test_response_is_that_of_an_independent_solver():
     level_times, levels = steps(SEQUENCE, SPAN, 2)
     times = np.sort(np.random.default_rng(0).uniform(0.0, 0.3, 500))
-    recording = Recording(times, 1.0 + 0.1 * np.sin(70.0 * times), level_times, levels)
+    recording = Measurement(times, 1.0 + 0.1 * np.sin(70.0 * times), level_times, levels)
     found = respond(recording, values_with(EXTRAS), (), rtol=1e-10)
     assert found.stretch == pytest.approx(
         simulate(times, level_times, levels, extras=EXTRAS), abs=5e-7)
@@ -127,7 +127,7 @@ def test_response_is_that_of_an_independent_solver():
     ((1.4, 1.8, .8, 1.0), 12, (.004, .017, .015, .006), 2.8e-5)])
 def test_bounds_of_plain_steps_are_those_of_the_literature(targets, repeats, bounds, bias):
     times = np.arange(2000) * 1e-3
-    recording = Recording(
+    recording = Measurement(
         times, 1.0 + 0.1 * np.sin(70.0 * times), *steps(targets, SPAN, repeats, begin=0.0))
     values = values_of(BLOCK)
     jacobian = respond(recording, values, DEFAULT_FREE).jacobian
@@ -193,7 +193,7 @@ def test_shaped_moves_alone_are_identified_with_a_warning():
 
 def test_search_among_slow_samples_of_shaped_moves_does_not_end_far_off():
     times = np.arange(400) / 200.0
-    recording = Recording(times, 1.0 + 0.1 * np.sin(70.0 * times), *levels_of(True, 15))
+    recording = Measurement(times, 1.0 + 0.1 * np.sin(70.0 * times), *levels_of(True, 15))
     clean = respond(recording, values_of(BLOCK), (), rtol=1e-10).stretch
     noise = 1e-4 * np.random.default_rng(1002).standard_normal(len(times))
     # Here differences from one sample to the next are as large as what a wrong fit leaves.
@@ -219,7 +219,7 @@ def test_begin_in_motion_frees_the_initial_state():
     late = slice(35, None)
     level_times = whole.level_times[1:].copy()
     level_times[0] = whole.time[35]
-    found = identify(Recording(
+    found = identify(Measurement(
         whole.time[late], whole.stretch[late], level_times, whole.levels[1:]))
     assert found.verdict == 'identified', found.reason
     assert not found.recording.at_rest
@@ -281,16 +281,16 @@ def test_what_the_model_leaves_out_rejects_it_by_name(extras, words):
     assert 'autocorrelation' in found.reason
 
 
-def _drifting(recording: Recording) -> Recording:
+def _drifting(recording: Measurement) -> Measurement:
     return replace(recording, stretch=recording.stretch + 0.005 * recording.time)
 
 
-def _ringing_twice(recording: Recording) -> Recording:
+def _ringing_twice(recording: Measurement) -> Measurement:
     return replace(recording, stretch=recording.stretch + 0.003 * np.sin(
         2.0 * np.pi * 311.0 * recording.time))
 
 
-def _jittering(recording: Recording) -> Recording:
+def _jittering(recording: Measurement) -> Measurement:
     late = 1e-4 * np.random.default_rng(5).standard_normal(len(TIMES))
     true = simulate(np.sort(np.clip(TIMES + late, 0.0, TIMES[-1])), *steps(SEQUENCE, SPAN, 9))
     return replace(recording, stretch=true)
@@ -338,7 +338,7 @@ def test_samples_at_rest_alone_show_no_frequency_but_what_rest_determines():
     levels = np.array([level_of(x) for x in targets])
     times = np.sort(np.append(*(np.arange(8) + random.uniform(0.5, 0.95, 8) for _ in range(2))))
     for noise in (1e-4, 1e-3, 5e-3):
-        recording = Recording(
+        recording = Measurement(
             times, np.repeat(targets, 2) + noise * random.standard_normal(16), np.arange(8.0),
             levels)
         found = identify(recording)
@@ -359,7 +359,8 @@ def test_noisy_samples_of_one_step_are_no_higher_frequency_that_fits_them_by_cha
     levels = np.array([0.0, level_of(1.3, block)])
     noise = 0.03 * np.random.default_rng(3).standard_normal(61)
     found = identify(
-        Recording(times, simulate(times, level_times, levels, block) + noise, level_times, levels),
+        Measurement(
+            times, simulate(times, level_times, levels, block) + noise, level_times, levels),
         free=('shear_modulus', 'damping_coefficient', 'remanence', 'stretch_bias'))
     x = found.parameters['shear_modulus']
     assert found.verdict == 'not_identifiable' or x.low < block.shear_modulus < x.high
@@ -385,7 +386,7 @@ def test_latency_that_samples_do_not_show_is_named_with_what_it_moves_until_it_i
     level_times, levels = steps((1.3,), SPAN, 1)
     stretch = simulate(times, level_times, levels) + 2e-3 * np.random.default_rng(
         3).standard_normal(60)
-    recording = Recording(times, stretch, level_times, levels)
+    recording = Measurement(times, stretch, level_times, levels)
     free = tuple(x for x in DEFAULT_FREE if x != 'chain_limit')
     note, = (x for x in identify(recording, free=free).warnings if 'sensor latency below' in x)
     seconds = float(note.split('below ')[1].split(' s ')[0])
@@ -431,7 +432,7 @@ def test_what_a_model_lacks_costs_a_share_of_a_usual_step_not_of_the_smallest():
     since = time - switches[np.searchsorted(switches, time, 'right') - 1]
     seen = simulate(time, switches, levels) + 4e-3 * np.sin(900.0 * since) * np.exp(-50.0 * since)
     noise = np.random.default_rng(0).normal(0.0, 1e-3, len(time))
-    found = identify(Recording(time, seen + noise, switches, levels))
+    found = identify(Measurement(time, seen + noise, switches, levels))
     assert found.verdict == 'model_rejected'
     assert 0.01 < found.cost < 0.03
 
@@ -444,7 +445,7 @@ def test_block_without_limit_of_its_chains_is_identified():
     stretch += 1e-3 * np.random.default_rng(2).standard_normal(len(times))
     free = tuple(x for x in DEFAULT_FREE if x != 'chain_limit')
     found = identify(
-        Recording(times, stretch, level_times, levels), free=free, actuator=replace(
+        Measurement(times, stretch, level_times, levels), free=free, actuator=replace(
             block, shear_modulus=1.3 * block.shear_modulus, remanence=0.08))
     assert found.verdict == 'identified', found.reason
     assert found.parameters['chain_limit'].value == np.inf
@@ -483,7 +484,7 @@ def test_intervals_of_one_step_of_sixty_points_with_wrong_stamps_cover_the_truth
         stamps = times + period * (jitter * random.standard_normal(60) + offset)
         order = np.argsort(stamps)
         found = identify(
-            Recording(stamps[order], stretch[order], level_times, levels), actuator=start)
+            Measurement(stamps[order], stretch[order], level_times, levels), actuator=start)
         warned += any('timestamp errors of' in x for x in found.warnings)
         if found.verdict == 'identified':
             inside += [x.low <= getattr(BLOCK, name) <= x.high

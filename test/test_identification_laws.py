@@ -12,8 +12,8 @@ from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.identification.identify import identify
 from hmsa.identification.known import Known
+from hmsa.identification.measurement import Measurement
 from hmsa.identification.quantities import check_free
-from hmsa.identification.recording import Recording
 from hmsa.interfaces.actuator import actuator_from, parameters_of
 
 NOISE = 1e-3
@@ -33,13 +33,13 @@ def block_of(law: str, constants: dict):
 
 
 def recorded(extras: Extras, *, noise=NOISE, seed=0, levels=(0.05, -0.03, 0.07, 0.02, 0.0),
-             repeats=4, span=0.06, rate=1e3) -> Recording:
+             repeats=4, span=0.06, rate=1e3) -> Measurement:
     """Return a recording of unshaped steps, large enough to distinguish laws."""
     fields = np.append(0.0, np.tile(levels, repeats))
     begins = np.append(0.0, 0.02 + span * np.arange(len(fields) - 1))
     times = np.arange(0.0, begins[-1] + span, 1.0 / rate)
     stretch = simulate(times, begins, fields, extras=extras)
-    return Recording(
+    return Measurement(
         times, stretch + noise * np.random.default_rng(seed).standard_normal(len(times)), begins,
         fields)
 

@@ -17,7 +17,7 @@ from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.interlock import Interlock
 from hmsa_ros.device.protocol import Kind
 from hmsa_ros.device.watchdog import Fallback
-from hmsa_ros.runtime.records import Stop, Target
+from hmsa_ros.runtime.records import Stop, StretchRequest
 
 SECOND = 1000 * MS
 A, B, C = b'a', b'b', b'c'
@@ -205,7 +205,7 @@ def test_a_planner_drops_its_plan_refuses_and_waits_to_be_asked(reaction, monkey
     assert rig.status.verdict.code == 'interlock'
     assert rig.status.progress.state == 'idle'
     sent = len(rig.sent)
-    verdict = rig.runtime.request(Target('a', 1.3))
+    verdict = rig.runtime.request(StretchRequest('a', 1.3))
     assert verdict.code == 'interlock'
     assert 'close it (~/interlock of the driver), then send a new request' in verdict.message
     assert rig.runtime.request(Stop()).code != 'interlock'
@@ -214,14 +214,14 @@ def test_a_planner_drops_its_plan_refuses_and_waits_to_be_asked(reaction, monkey
     rig.run(rig.now + 3000 * MS)
     assert not rig.cut
     assert max(abs(x.flux_density) for _, x in rig.sent[sent:]) < 1e-9
-    assert rig.runtime.request(Target('a', 1.3)).code == 'accepted'
+    assert rig.runtime.request(StretchRequest('a', 1.3)).code == 'accepted'
     rig.run(rig.now + 500 * MS)
     assert rig.residual(1.3) < 1e-6
 
 
 def test_a_request_that_waits_is_refused_when_the_interlock_opens():
     rig = Rig(settings=replace(BEATING, takeover_timeout=5000 * MS))
-    assert rig.runtime.request(Target('a', 1.3)).code == 'waiting'
+    assert rig.runtime.request(StretchRequest('a', 1.3)).code == 'waiting'
     rig.runtime.received('a', rig.now, 0, cut_off=False, locked=True)
     rig.run(rig.now + 6000 * MS)
     assert rig.status.verdict.code == 'interlock'

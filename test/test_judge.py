@@ -6,7 +6,7 @@ from scipy.special import stdtrit
 
 from hmsa.judge.fit import student_quantile
 from hmsa.judge.judging import judge
-from hmsa.judge.records import missed, Sensor, Setpoint, Tolerances, worst
+from hmsa.judge.records import missed, RequestedSetpoint, SensorModel, Tolerances, worst
 
 MS = 1_000_000
 OMEGA, DECAY = 540.0, 54.0
@@ -23,7 +23,7 @@ def held(offset=0.0, vibration=0.0, decay=DECAY, noise=0.0, rate=1000, seconds=0
 
 
 def setpoint(**changes):
-    return Setpoint(**{
+    return RequestedSetpoint(**{
         'target': 1.4, 'start': 1.2, 'begins': -20 * MS, 'arrival': 0, 'end': 500 * MS,
         'frequency': OMEGA, 'decay': DECAY, **changes})
 
@@ -106,14 +106,15 @@ def test_a_plan_made_anew_is_judged_where_the_first_one_is_not_kept_to():
 
 def test_what_is_known_of_the_sensor_counts():
     time, stretch = held(offset=5.0)
-    biased = Sensor(bias=0.05 * STEP, bias_std=1e-4)
+    biased = SensorModel(bias=0.05 * STEP, bias_std=1e-4)
     assert judge(time, stretch, setpoint(), sensor=biased).arrived
     assert judge(time, stretch, setpoint()).verdict == 'off_target'
-    unsure = Sensor(bias=0.05 * STEP, bias_std=2e-3)
+    unsure = SensorModel(bias=0.05 * STEP, bias_std=2e-3)
     assert judge(time, stretch, setpoint(), sensor=unsure).verdict == 'undecided'
     time, stretch = held()
-    assert judge(time, 1.1 * stretch, setpoint(), sensor=Sensor(gain=1.1)).arrived
-    assert judge(time + 30 * MS, stretch, setpoint(end=None), sensor=Sensor(latency=0.03)).arrived
+    assert judge(time, 1.1 * stretch, setpoint(), sensor=SensorModel(gain=1.1)).arrived
+    assert judge(
+        time + 30 * MS, stretch, setpoint(end=None), sensor=SensorModel(latency=0.03)).arrived
 
 
 @pytest.mark.parametrize(('samples', 'words'), [

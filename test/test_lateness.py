@@ -12,9 +12,9 @@ from hmsa.model.parameters import paper_actuator
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.planner import PlannerRuntime
 from hmsa_ros.runtime.records import Note, Send, Settings, Severity, StatusChanged, Trajectory
-from hmsa_ros.runtime.weighing import worthwhile
+from hmsa_ros.runtime.runtime import Runtime
+from hmsa_ros.runtime.weighing import better_than_keeping
 
 MS = 1_000_000
 START = 1000 * MS
@@ -38,7 +38,7 @@ class Bench:
         self.now, self.lead, self.write = START, lead, write
         self.group = PlannerGroup({'a': Planner(self.block, Options(
             shaper, flux_density_min=-LIMIT, flux_density_max=LIMIT, lead_time=lead))})
-        self.runtime = PlannerRuntime(
+        self.runtime = Runtime(
             self.group, settings, Environment(clock=lambda: self.now, steady=lambda: 0))
         self.runtime.active = True
         self.ahead, self.applied, self.outputs, self.sent = [], [(0, 0.0)], [], []
@@ -175,8 +175,8 @@ def _policies(kind, seed, monkeypatch, case=None):
     for policy in ('nothing', 'decide', 'always'):
         with monkeypatch.context() as patch:
             if policy == 'always':
-                patch.setattr('hmsa_ros.runtime.following.expected', lambda *_: np.ones(1))
-                patch.setattr('hmsa_ros.runtime.following.worthwhile', lambda *_, **__: True)
+                patch.setattr('hmsa_ros.runtime.deviations.expected', lambda *_: np.ones(1))
+                patch.setattr('hmsa_ros.runtime.deviations.worthwhile', lambda *_, **__: True)
                 patch.setattr('hmsa_ros.runtime.lateness.Lateness.expected', 0)
                 patch.setattr('hmsa_ros.runtime.lateness.Lateness.unsure', False)
             left[policy] = sequence(
@@ -218,7 +218,7 @@ def test_deciding_is_as_good_as_doing_nothing_and_as_always_replanning(monkeypat
     (0.9, False, True), (1.1, False, False), (1.1, True, True), (2.1, True, False)])
 def test_a_new_plan_that_would_miss_by_a_step_is_left(after, unsure, taken):
     before, after = np.full(4, 5.0), np.full(4, after)
-    assert worthwhile(before, after, news=True, unsure=unsure) is taken
+    assert better_than_keeping(before, after, news=True, unsure=unsure) is taken
 
 
 # -- lateness by its cost -----------------------------------------------------------------------

@@ -11,13 +11,13 @@ import pytest
 from hmsa import Actuator
 from hmsa.cli import main
 from hmsa.errors import BadInputError
-from hmsa.identification.learning import learn, Target, Trial
+from hmsa.identification.learning import learn, SequenceRepeat, TargetWindow
 from hmsa.identification.sequences import levels_in
 from hmsa.model.parameters import paper_actuator
 
 NOMINAL = slow(paper_actuator())
 SETPOINTS = ((1.15, 1.2), (1.3, 1.2), (1.05, 1.2))
-TARGETS = [Target(x, 1.2 * i, 1.2 * (i + 1)) for i, (x, _) in enumerate(SETPOINTS)]
+TARGETS = [TargetWindow(x, 1.2 * i, 1.2 * (i + 1)) for i, (x, _) in enumerate(SETPOINTS)]
 TIME = np.arange(0.0, 3.6, 1e-3)
 NOISE = 3e-4
 
@@ -60,7 +60,8 @@ class Bench:
 
     def trial(self, true, levels):
         times, values = np.array(levels).T
-        return Trial(TIME, true + NOISE * self.random.standard_normal(len(TIME)), times, values)
+        return SequenceRepeat(
+            TIME, true + NOISE * self.random.standard_normal(len(TIME)), times, values)
 
 
 def judged(true, levels):
@@ -153,9 +154,10 @@ def test_levels_that_follow_creep_are_kept_and_corrected_with_their_move():
 
 @pytest.mark.parametrize(('change', 'what'), [
     (lambda x, t: ([], t), '0 repeats'), (lambda x, t: ([x], []), '0 setpoints'),
-    (lambda x, t: ([x], [Target(1.15, 0.0, 1.2), Target(1.15, 1.2, 2.4)]), 'repeats the one'),
-    (lambda x, t: ([x], [Target(1.15, 0.0, 0.1)]), 'at least a period'),
-    (lambda x, t: ([x], [Target(1.15, 9.0, 12.0)]), 'no level belongs'),
+    (lambda x, t: ([x], [TargetWindow(1.15, 0.0, 1.2), TargetWindow(1.15, 1.2, 2.4)]),
+     'repeats the one'),
+    (lambda x, t: ([x], [TargetWindow(1.15, 0.0, 0.1)]), 'at least a period'),
+    (lambda x, t: ([x], [TargetWindow(1.15, 9.0, 12.0)]), 'no level belongs'),
     (lambda x, t: ([replace(x, time=x.time[:100], stretch=x.stretch[:100])], t), 'samples show')])
 def test_what_cannot_be_learnt_from_is_refused(change, what):
     levels = planned()
@@ -168,7 +170,7 @@ def test_what_cannot_be_learnt_from_is_refused(change, what):
     ([], []), ([0.0, 0.0], [1.0, 1.0]), ([0.0, 1.0], [1.0, math.nan]), ([0.0], [1.0, 1.0])])
 def test_samples_that_are_none_are_refused(time, stretch):
     with pytest.raises(BadInputError, match='samples of a repeat'):
-        Trial(np.array(time), np.array(stretch), np.zeros(1), np.zeros(1))
+        SequenceRepeat(np.array(time), np.array(stretch), np.zeros(1), np.zeros(1))
 
 
 @pytest.mark.parametrize('text', [

@@ -14,7 +14,16 @@ from hmsa.interfaces import parameters as declared
 from hmsa.interfaces import topics
 from hmsa.interfaces.actuator import actuator_from
 from hmsa.model.parameters import paper_actuator
-from hmsa_ros.nodes.markers import BLOCK, Block, FIELD, LABEL, MAGNETISATION, Scene, State, TARGET
+from hmsa_ros.nodes.markers import (
+    BLOCK,
+    FIELD,
+    LABEL,
+    MAGNETISATION,
+    MarkerBlock,
+    MarkerLayout,
+    MarkerState,
+    TARGET,
+)
 
 ACTUATOR = paper_actuator()
 STRETCHES = strategies.floats(0.3, 3.0)
@@ -22,9 +31,10 @@ STRETCHES = strategies.floats(0.3, 3.0)
 ROUNDING = 1e-12
 
 
-def scene(*joints: str, **options: object) -> Scene:
+def scene(*joints: str, **options: object) -> MarkerLayout:
     """Return a scene of blocks as in the paper."""
-    return Scene(tuple(Block.of(joint, ACTUATOR) for joint in joints), 'coil', **options)
+    return MarkerLayout(
+        tuple(MarkerBlock.of(joint, ACTUATOR) for joint in joints), 'coil', **options)
 
 
 def of(markers: MarkerArray, number: int, joint: str = 'actuator') -> Marker:
@@ -43,7 +53,7 @@ def length(marker: Marker) -> float:
 
 @given(STRETCHES, strategies.floats(1e-3, 1e3))
 def test_block_keeps_its_volume_and_is_the_stretch_times_as_thick(stretch, scale):
-    block = of(scene('actuator', scale=scale).states(0, [State(stretch, 0.0)]), BLOCK)
+    block = of(scene('actuator', scale=scale).states(0, [MarkerState(stretch, 0.0)]), BLOCK)
     rest = (2 * ACTUATOR.half_length) ** 2 * 2 * ACTUATOR.half_thickness
     assert block.scale.x * block.scale.y * block.scale.z == pytest.approx(
         rest * scale ** 3, rel=ROUNDING)
@@ -53,14 +63,14 @@ def test_block_keeps_its_volume_and_is_the_stretch_times_as_thick(stretch, scale
 
 
 def test_block_is_true_to_size_unless_told_otherwise():
-    block = of(scene('actuator').states(0, [State(1.0, 0.0)]), BLOCK)
+    block = of(scene('actuator').states(0, [MarkerState(1.0, 0.0)]), BLOCK)
     assert block.type == Marker.CUBE
     assert (block.scale.x, block.scale.y, block.scale.z) == (0.02, 0.02, 0.02)
 
 
 @pytest.mark.parametrize('flux_density', [0.12, -0.12])
 def test_field_points_where_its_sign_says_and_magnetisation_always_up(flux_density):
-    markers = scene('actuator').states(0, [State(1.1, flux_density)])
+    markers = scene('actuator').states(0, [MarkerState(1.1, flux_density)])
     field, magnetisation = of(markers, FIELD), of(markers, MAGNETISATION)
     assert math.copysign(1.0, length(field)) == math.copysign(1.0, flux_density)
     assert length(magnetisation) > 0.0
@@ -68,14 +78,14 @@ def test_field_points_where_its_sign_says_and_magnetisation_always_up(flux_densi
 
 def test_field_and_magnetisation_are_drawn_to_one_scale():
     stretch, flux_density = 1.3, -0.25
-    markers = scene('actuator').states(0, [State(stretch, flux_density)])
+    markers = scene('actuator').states(0, [MarkerState(stretch, flux_density)])
     # The remanence moves with the material: Br times the stretch.
     assert length(of(markers, FIELD)) / flux_density == pytest.approx(
         length(of(markers, MAGNETISATION)) / (ACTUATOR.remanence * stretch), rel=ROUNDING)
 
 
 def test_field_stands_beside_the_block_and_magnetisation_inside_it():
-    markers = scene('actuator').states(0, [State(0.6, -0.2)])
+    markers = scene('actuator').states(0, [MarkerState(0.6, -0.2)])
     side = of(markers, BLOCK).scale.x
     assert of(markers, FIELD).points[0].x > side / 2
     assert of(markers, MAGNETISATION).points[0].x == 0.0
@@ -83,19 +93,19 @@ def test_field_stands_beside_the_block_and_magnetisation_inside_it():
 
 
 def test_without_a_field_its_arrow_is_deleted_not_drawn_without_a_direction():
-    markers = scene('actuator').states(0, [State(1.0, 0.0)])
+    markers = scene('actuator').states(0, [MarkerState(1.0, 0.0)])
     assert of(markers, FIELD).action == Marker.DELETE
     assert of(markers, MAGNETISATION).action == Marker.ADD
 
 
 def test_head_of_a_short_arrow_is_no_longer_than_half_of_it():
-    field = of(scene('actuator').states(0, [State(1.0, 1e-5)]), FIELD)
+    field = of(scene('actuator').states(0, [MarkerState(1.0, 1e-5)]), FIELD)
     assert 0.0 < field.scale.z <= length(field) / 2 * (1 + ROUNDING)
 
 
 def test_target_has_the_size_of_the_block_that_reaches_it():
     targets = scene('actuator').targets(0, [1.4])
-    block = of(scene('actuator').states(0, [State(1.4, 0.1)]), BLOCK)
+    block = of(scene('actuator').states(0, [MarkerState(1.4, 0.1)]), BLOCK)
     assert of(targets, TARGET).scale == block.scale
     assert of(targets, TARGET).pose == block.pose
     assert of(targets, TARGET).color.a < block.color.a
@@ -106,7 +116,7 @@ def test_no_target_deletes_the_one_before():
 
 
 def test_label_names_the_joint_and_its_stretch():
-    label = of(scene('left').states(0, [State(1.1, 0.0)]), LABEL, 'left')
+    label = of(scene('left').states(0, [MarkerState(1.1, 0.0)]), LABEL, 'left')
     assert label.type == Marker.TEXT_VIEW_FACING
     assert label.text == 'left 1.1000'
 
@@ -115,7 +125,7 @@ def test_joints_stand_side_by_side_without_touching_about_the_origin():
     joints = [f'joint_{i}' for i in range(20)]
     places = scene(*joints).places()
     assert len(set(places)) == len(joints)
-    widest = Block.of('x', ACTUATOR).size(0.5)[0]
+    widest = MarkerBlock.of('x', ACTUATOR).size(0.5)[0]
     for row in range(0, 20, 8):
         for (x, y), (next_x, next_y) in pairwise(places[row:row + 8]):
             assert y == next_y
@@ -126,8 +136,8 @@ def test_joints_stand_side_by_side_without_touching_about_the_origin():
 
 def test_each_joint_has_a_namespace_and_identifiers_that_stay():
     two = scene('left', 'right', scale=10.0)
-    first = two.states(1, [State(1.0, 0.1), State(1.1, 0.2)])
-    second = two.states(2, [State(1.2, 0.0), State(0.9, -0.2)])
+    first = two.states(1, [MarkerState(1.0, 0.1), MarkerState(1.1, 0.2)])
+    second = two.states(2, [MarkerState(1.2, 0.0), MarkerState(0.9, -0.2)])
     keys = [(x.ns, x.id) for x in first.markers]
     assert keys == [(x.ns, x.id) for x in second.markers]
     assert len(set(keys)) == len(keys) == 8
@@ -137,7 +147,7 @@ def test_each_joint_has_a_namespace_and_identifiers_that_stay():
 
 def test_markers_are_stamped_in_the_frame_and_live_as_long_as_told():
     for marker in scene('actuator', lifetime=1.5).states(
-            2_500_000_000, [State(1.0, 0.1)]).markers:
+            2_500_000_000, [MarkerState(1.0, 0.1)]).markers:
         assert marker.header.frame_id == 'coil'
         assert (marker.header.stamp.sec, marker.header.stamp.nanosec) == (2, 500_000_000)
         assert (marker.lifetime.sec, marker.lifetime.nanosec) == (1, 500_000_000)
@@ -146,7 +156,7 @@ def test_markers_are_stamped_in_the_frame_and_live_as_long_as_told():
 
 def test_block_without_a_name_is_refused():
     with pytest.raises(BadInputError, match='joint is empty'):
-        Block('', 0.01, 0.01, 0.1)
+        MarkerBlock('', 0.01, 0.01, 0.1)
 
 
 def collected(ros, node):
@@ -219,7 +229,8 @@ def test_a_bent_beam_is_closed_keeps_its_volume_and_ends_where_its_tip_is(deflec
     beam = actuator_from({x.name: x.default for x in declared.BLOCK} | {
         'law.name': 'beam', 'law.youngs_modulus': 1e6, 'law.width': 0.005,
         'actuator.half_length': 0.0125, 'actuator.half_thickness': 0.0005})
-    markers = Scene((Block.of('actuator', beam),), 'coil').states(0, [State(deflection, 0.001)])
+    markers = MarkerLayout((MarkerBlock.of('actuator', beam),), 'coil').states(
+        0, [MarkerState(deflection, 0.001)])
     body = of(markers, BLOCK)
     assert body.type == Marker.TRIANGLE_LIST
     points = np.array([(p.x, p.y, p.z) for p in body.points])
@@ -236,4 +247,5 @@ def test_a_bent_beam_is_closed_keeps_its_volume_and_ends_where_its_tip_is(deflec
     begin, end = arrow.points
     assert math.hypot(end.x - begin.x, end.z - begin.z) == pytest.approx(0.0125)
     assert length(of(markers, FIELD)) > 0.0
-    assert of(Scene((Block.of('actuator', beam),), 'coil').targets(0, [0.1]), TARGET).points
+    assert of(
+        MarkerLayout((MarkerBlock.of('actuator', beam),), 'coil').targets(0, [0.1]), TARGET).points

@@ -28,8 +28,8 @@ from hmsa.planning.shapers.minimax import (
     least_largest,
     left,
 )
-from hmsa.planning.shapers.request import Request
-from hmsa.planning.timeline import Model, Options
+from hmsa.planning.shapers.request import MoveRequest
+from hmsa.planning.timeline import JointModel, Options
 
 PAPER = NondimensionalParameters()
 WIDE = Limits(-20.0, 20.0)
@@ -79,7 +79,7 @@ def vibration(move, start, target, errors, delivery=IDEAL):
 
 @pytest.mark.parametrize(('start', 'target'), [(1.0, 1.1), (1.0, 1.4), (1.0, 0.7)])
 def test_at_most_half_of_the_chain_is_left_at_the_worst_in_the_same_time(start, target):
-    request = Request(State(start), target, PAPER)
+    request = MoveRequest(State(start), target, PAPER)
     chain, move = (get_shaper(x)(request) for x in ('robust', 'minimax'))
     assert move.code is Code.MINIMAX
     assert move.duration == move.levels[-1].time == chain.duration
@@ -97,7 +97,7 @@ def test_at_most_half_of_the_chain_is_left_at_the_worst_in_the_same_time(start, 
 def test_an_ellipsoid_of_errors_costs_less_than_the_box_around_it(delivery):
     # G and Br are known only together, as an identification leaves them.
     region = Ellipsoid(((0.14, 0.0, 0.0, 0.13), (0.02, 0.0, 0.0, -0.02), (0.0, 0.1, 0.0, 0.0)))
-    moves = [get_shaper('minimax')(Request(State(1.0), 1.4, PAPER, WIDE, delivery, errors=x))
+    moves = [get_shaper('minimax')(MoveRequest(State(1.0), 1.4, PAPER, WIDE, delivery, errors=x))
              for x in (region, (0.142, 0.1, 0.0))]
     assert [x.code for x in moves] == [Code.MINIMAX] * 2
     shares = np.random.default_rng(3).normal(size=(12, 3))
@@ -108,7 +108,7 @@ def test_an_ellipsoid_of_errors_costs_less_than_the_box_around_it(delivery):
 
 
 def test_what_it_measures_is_the_peak_to_peak_of_an_integration():
-    request = Request(State(1.0), 1.3, PAPER)
+    request = MoveRequest(State(1.0), 1.3, PAPER)
     move = get_shaper('minimax')(request)
     cases = _cases(request, move.levels[-1].load)
     found = left(request, cases, move.levels, move.duration)
@@ -126,7 +126,7 @@ def test_what_it_measures_is_the_peak_to_peak_of_an_integration():
     (2, Delivery(slew=1.0), 0.995), *(pytest.param(2, *x, marks=pytest.mark.slow) for x in (
         (IDEAL, 0.995), (Delivery(slew=3.0), 0.995), (Delivery(slew=0.3), 0.99)))], ids=str)
 def test_no_other_optimiser_finds_much_better_levels(order, delivery, share):
-    request = Request(State(1.0), 1.4, PAPER, WIDE, delivery, order=order)
+    request = MoveRequest(State(1.0), 1.4, PAPER, WIDE, delivery, order=order)
     chain, move = (get_shaper(x)(request) for x in ('robust', 'minimax'))
     cases = _cases(request, chain.levels[-1].load)
     # A push that settles the field follows from the others.
@@ -171,7 +171,7 @@ def test_the_least_longest_vector_is_that_of_linear_programming():
     (Delivery(lag=0.2), 0.3), (Delivery(lag=0.4), 0.2), (Delivery(slew=2.0, lag=0.2), 0.3),
     (Delivery(period=0.05, slew=10.0, lag=0.1), 0.4)], ids=str)
 def test_slow_ramps_and_a_lagging_field_leave_less_than_the_chain_too(delivery, share):
-    request = Request(State(1.0), 1.4, PAPER, WIDE, delivery)
+    request = MoveRequest(State(1.0), 1.4, PAPER, WIDE, delivery)
     chain, move = (get_shaper(x)(request) for x in ('robust', 'minimax'))
     assert (move.code, move.duration) == (Code.MINIMAX, chain.duration)
     worst = [max(vibration(x, 1.0, 1.4, Errors(g, 0.0, j), delivery)
@@ -186,7 +186,7 @@ def test_slow_ramps_and_a_lagging_field_leave_less_than_the_chain_too(delivery, 
 @pytest.mark.parametrize(
     'state', [State(1.0), State(1.2, -0.5), State(1.4, -0.5)], ids=['rest', 'moving', 'through'])
 def test_it_is_never_worse_than_the_chain_on_any_hardware(delivery, state):
-    request = Request(state, 1.4, PAPER, WIDE, delivery)
+    request = MoveRequest(state, 1.4, PAPER, WIDE, delivery)
     chain, move = (get_shaper(x)(request) for x in ('robust', 'minimax'))
     cases = _cases(request, chain.levels[-1].load)
     worst = [largest(left(request, cases, x.levels, x.duration)) for x in (chain, move)]
@@ -202,32 +202,32 @@ def test_it_is_never_worse_than_the_chain_on_any_hardware(delivery, state):
 
 
 def test_a_move_is_designed_once_and_anew_for_other_errors():
-    request = Request(State(1.0), 1.234, PAPER)
+    request = MoveRequest(State(1.0), 1.234, PAPER)
     first = get_shaper('minimax')(request)
     assert get_shaper('minimax')(request) is first
     assert get_shaper('minimax')(
-        Request(State(1.0 + 1e-12, 1e-9), 1.234, PAPER)) is first
-    other = get_shaper('minimax')(Request(State(1.0), 1.234, PAPER, errors=(0.02, 0.0, 0.0)))
+        MoveRequest(State(1.0 + 1e-12, 1e-9), 1.234, PAPER)) is first
+    other = get_shaper('minimax')(MoveRequest(State(1.0), 1.234, PAPER, errors=(0.02, 0.0, 0.0)))
     assert other.levels != first.levels
     assert vibration(other, 1.0, 1.234, Errors()) < 0.1 * vibration(first, 1.0, 1.234, Errors())
 
 
 def test_where_there_is_no_chain_it_answers_what_the_chain_does():
-    assert get_shaper('minimax')(Request(State(1.1), 1.1, PAPER)).code is Code.HOLD
-    exact = get_shaper('minimax')(Request(State(1.0), 1.1, PAPER, errors=(0.0, 0.0, 0.0)))
+    assert get_shaper('minimax')(MoveRequest(State(1.1), 1.1, PAPER)).code is Code.HOLD
+    exact = get_shaper('minimax')(MoveRequest(State(1.0), 1.1, PAPER, errors=(0.0, 0.0, 0.0)))
     assert exact.code is Code.ROBUST
     assert 'no levels leave less' in exact.reason
     damped = NondimensionalParameters(zeta=4.0)
-    assert get_shaper('minimax')(Request(State(1.0), 1.1, damped)).code is Code.TOO_DAMPED
+    assert get_shaper('minimax')(MoveRequest(State(1.0), 1.1, damped)).code is Code.TOO_DAMPED
 
 
 @pytest.mark.parametrize(
     'errors', [(0.1, 0.1), (0.1, 0.1, 1.0), (math.nan, 0.1, 0.1), (-0.1, 0.0, 0.0)])
 def test_errors_that_no_command_can_be_planned_for_are_refused(errors):
     with pytest.raises(BadInputError, match='expected three shares of 0 to 0.9'):
-        get_shaper('minimax')(Request(State(1.0), 1.1, PAPER, errors=errors))
+        get_shaper('minimax')(MoveRequest(State(1.0), 1.1, PAPER, errors=errors))
     with pytest.raises(BadInputError, match='expected three shares of 0 to 0.9'):
-        Model(paper_actuator(), Options(errors=errors))
+        JointModel(paper_actuator(), Options(errors=errors))
 
 
 def test_hmsa_plan_takes_errors_from_the_command_line_or_from_an_identification(

@@ -10,18 +10,17 @@ import random
 import numpy as np
 import pytest
 
-from hmsa.judge.records import Sensor
+from hmsa.judge.records import SensorModel
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa.report.outcome import findings_of
-from hmsa.runs.levels import Level
-from hmsa.runs.record import LearntSensor, RecordedRequest, Run, Verdict
+from hmsa.runs.levels import RecordedLevel
+from hmsa.runs.record import LearntSensor, RecordedRequest, RecordedVerdict, Run
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.planner import PlannerRuntime
 from hmsa_ros.runtime.records import (
     EstimateChanged,
     PlanChanged,
@@ -30,6 +29,7 @@ from hmsa_ros.runtime.records import (
     StatusChanged,
     Trajectory,
 )
+from hmsa_ros.runtime.runtime import Runtime
 
 MS = 1_000_000
 START = 1000 * MS
@@ -58,7 +58,7 @@ class Drawn:
                 stretch_noise=draw.choice([0.0, 1e-4, 1e-3, 3e-3])))],
             period=1000 * MS // rate, time=START, seed=seed)
         self.now = START
-        self.runtime = PlannerRuntime(
+        self.runtime = Runtime(
             PlannerGroup({'a': Planner(block, Options(
                 flux_density_min=-0.5, flux_density_max=0.5, lead_time=50 * MS))}),
             Settings(takeover_timeout=0, feedback=more.choice(['off', 'off', 'adapt'])),
@@ -95,20 +95,20 @@ class Drawn:
             stalled = self.stall_from <= self.now < self.stall_from + self.stall
             for x in [] if stalled else self.runtime.tick(self.now):
                 if isinstance(x, Send):
-                    commands.append(Level(x.stamp, x.flux_density, self.now))
+                    commands.append(RecordedLevel(x.stamp, x.flux_density, self.now))
                     late = self.late_from <= self.now < self.late_from + self.late_for
                     under_way.append((self.now + self.late * late, x))
                 elif isinstance(x, PlanChanged):
                     plans.append(tuple(
-                        Level(stamp, level, self.now, stretch, speed) for stamp, (
+                        RecordedLevel(stamp, level, self.now, stretch, speed) for stamp, (
                             stretch, speed, level) in zip(
                                 x.stamps, x.samples['a'], strict=True)))
                 elif isinstance(x, EstimateChanged):
-                    sensors.append(LearntSensor(self.now, Sensor.of(
+                    sensors.append(LearntSensor(self.now, SensorModel.of(
                         {key: str(value) for key, value in x.values.items()})))
                 elif isinstance(x, StatusChanged):
                     watching = x.watching
-                    verdicts.append(Verdict(
+                    verdicts.append(RecordedVerdict(
                         self.now, LEVELS[x.verdict.severity], x.verdict.code, x.verdict.message,
                         x.plan))
                     # Of several in one tick the newest is told, and the worst of all.
@@ -182,7 +182,7 @@ def test_a_recorder_whose_clock_lags_shows_the_same_setpoints(behind):
     for seed in range(4):
         _, run = carried_out(seed)
         # Plans begin with the level in force, as of the time of the planner.
-        first = Level(START + behind * MS, 0.0, START, 1.0, 0.0)
+        first = RecordedLevel(START + behind * MS, 0.0, START, 1.0, 0.0)
         shown = replace(run, plans=((first, *run.plans[0]), *run.plans[1:]))
         assert [x.setpoint for x in findings_of(shown)] == [
             x.setpoint for x in findings_of(run)], seed

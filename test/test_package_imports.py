@@ -121,7 +121,7 @@ for name in {modules(place)!r}:
 
 
 def test_nodes_do_not_import_without_ros_so_the_blocking_works():
-    result = run(BLOCKED.format(blocked=ROS) + 'import hmsa_ros.nodes.endpoints')
+    result = run(BLOCKED.format(blocked=ROS) + 'import hmsa_ros.nodes.ros_entities')
     assert result.returncode == 1
     assert 'ModuleNotFoundError: blocked: ' in result.stderr
 

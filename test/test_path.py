@@ -19,8 +19,8 @@ from hmsa.model.status import Code, RefusedError
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.planner import PlannerRuntime
 from hmsa_ros.runtime.records import Settings, Severity, Trajectory
+from hmsa_ros.runtime.runtime import Runtime
 
 SECOND = 1_000_000_000
 # The paper's block: units of time (s) and load (T), damping, shape and chain limit.
@@ -240,7 +240,7 @@ def test_a_planner_follows_velocities_only_in_mode_path():
     for mode, severity in (('rest', Severity.ERROR), ('path', Severity.OK)):
         group = PlannerGroup({'a': Planner(paper_actuator(), Options(
             flux_density_min=-0.5, flux_density_max=0.5))})
-        runtime = PlannerRuntime(
+        runtime = Runtime(
             group, Settings(trajectory_mode=mode, takeover_timeout=0), Environment(
                 clock=lambda: SECOND, steady=lambda: 0))
         runtime.active = True
@@ -260,7 +260,7 @@ def test_a_path_begins_soon_though_planning_takes_time():
     points = dense(duration=0.3, count=301)
     group = PlannerGroup({'a': Planner(paper_actuator(), Options(
         flux_density_min=-0.5, flux_density_max=0.5, lead_time=5_000_000))})
-    runtime = PlannerRuntime(
+    runtime = Runtime(
         group, Settings(trajectory_mode='path', takeover_timeout=0), Environment(
             clock=clock, steady=lambda: 0))
     runtime.active = True

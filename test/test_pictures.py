@@ -20,8 +20,8 @@ from hmsa.model.residual import percent
 from hmsa.report import style
 from hmsa.report.bands import draw_bands
 from hmsa.report.charts import commanded
-from hmsa.report.curves import Curve, decimate, through
-from hmsa.report.looks import case, CASES, Look, SHAPERS
+from hmsa.report.curves import decimate, through, TimeCurve
+from hmsa.report.looks import case, CASES, LineStyle, SHAPERS
 from hmsa.report.paper import KINDS, named, Paper
 from hmsa.report.picture import draw
 from hmsa_studies.sweep_pictures import label_of, worded
@@ -61,7 +61,7 @@ def cielab(colour: str, vision: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize('vision', VISIONS)
 @pytest.mark.parametrize('looks', [tuple(SHAPERS.values()), CASES], ids=['shapers', 'cases'])
 def test_shapers_differ_in_colour_dash_and_marker_for_every_vision(
-        looks: tuple[Look, ...], vision: str) -> None:
+        looks: tuple[LineStyle, ...], vision: str) -> None:
     for part in ('colour', 'dash', 'marker'):
         assert len({getattr(x, part) for x in looks}) == len(looks)
     seen = [cielab(x.colour, VISIONS[vision]) for x in looks]
@@ -130,7 +130,7 @@ def oscillation(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def test_between_six_samples_a_period_the_curve_is_the_motion_and_no_polygon() -> None:
     time = np.arange(0.0, 0.05, PERIOD / 6.0)
-    curve = through(Curve(time, *oscillation(time)), PERIOD)
+    curve = through(TimeCurve(time, *oscillation(time)), PERIOD)
     truth, rate = oscillation(curve.time)
     error = np.max(np.abs(curve.stretch - truth))
     polygon = np.max(np.abs(np.interp(curve.time, time, oscillation(time)[0]) - truth))
@@ -138,7 +138,7 @@ def test_between_six_samples_a_period_the_curve_is_the_motion_and_no_polygon() -
     assert np.max(np.abs(curve.rate - rate)) < 0.05 * np.max(np.abs(rate))
     # All samples are on it, and nothing is drawn where samples are missing.
     assert set(time) <= set(curve.time)
-    gapped = through(Curve(*(
+    gapped = through(TimeCurve(*(
         np.delete(x, [8, 9, 10, 11]) for x in (time, *oscillation(time)))), PERIOD)
     inside = (gapped.time > time[7]) & (gapped.time < time[12])
     assert np.isnan(gapped.stretch[inside]).all()

@@ -23,7 +23,7 @@ from hmsa.model.equations import natural_frequency
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa.planning.planner import Options, Planner
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import (
     from_command,
     from_time,
@@ -33,7 +33,7 @@ from hmsa_ros.nodes.conversions import (
     to_trajectory,
 )
 from hmsa_ros.nodes.planner import PlannerNode
-from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.runtime import Runtime
 from hmsa_ros.timekeeping import StepWatch
 
 pytestmark = pytest.mark.ros
@@ -60,10 +60,10 @@ class Driver:
         self.received = 0
         self.hold_back = False
         self.held: list[Any] = []
-        endpoints.subscribe(
+        ros_entities.subscribe(
             ros.node, topics.of_joint(topics.FLUX_DENSITY_COMMAND, joint, joints),
             self.on_command)
-        self.applied = endpoints.publisher(
+        self.applied = ros_entities.publisher(
             ros.node, topics.of_joint(topics.FLUX_DENSITY_APPLIED, joint, joints))
 
     def on_command(self, message: Any) -> None:
@@ -135,9 +135,9 @@ class Rig:
         self.at(START)
 
     @property
-    def runtime(self) -> PlannerRuntime:
+    def runtime(self) -> Runtime:
         """The runtime of the node."""
-        runtime: PlannerRuntime = self.planner._runtime
+        runtime: Runtime = self.planner._runtime
         return runtime
 
     @property
@@ -266,7 +266,7 @@ def test_some_joints_only_by_parameter_and_one_by_its_own_setpoint(rig):
 
 def test_first_request_waits_for_the_state_in_force(rig, ros):
     planner = rig('-p', 'takeover_timeout:=60.0')
-    samples = endpoints.publisher(ros.node, topics.JOINT_STATES)
+    samples = ros_entities.publisher(ros.node, topics.JOINT_STATES)
     ros.spin_until(lambda: planner.planner.count_publishers('joint_states'), 'the publisher')
     driver = planner.driver
     driver.plant.set_state(1.15, 3.0, 0.06)
@@ -306,8 +306,8 @@ def test_planner_that_is_killed_is_followed_by_one_that_takes_over(ros, start, m
     arguments = ('planner', '--ros-args', *QUIET)
     clock = ros.node.create_publisher(
         Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
-    samples = endpoints.publisher(ros.node, topics.JOINT_STATES)
-    setpoints = endpoints.publisher(ros.node, topics.SETPOINT, topics.PLANNER)
+    samples = ros_entities.publisher(ros.node, topics.JOINT_STATES)
+    setpoints = ros_entities.publisher(ros.node, topics.SETPOINT, topics.PLANNER)
     statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
     driver = Driver(ros)
     now = START

@@ -22,7 +22,7 @@ from hmsa.identification.files import errors_from
 from hmsa.interfaces import topics
 from hmsa.model.parameters import paper_actuator
 from hmsa.planning.planner import Options, Planner
-from hmsa.planning.shapers.pace import Pace
+from hmsa.planning.shapers.smooth_limits import SmoothLimits
 from hmsa.planning.timeline import PlannedLevel
 from hmsa_ros.nodes.capture import Taken
 from hmsa_ros.nodes.conversions import from_command, from_time, to_time, to_trajectory
@@ -219,7 +219,7 @@ def test_lead_time_of_the_parameter_is_kept(bench):
     (('-p', 'shaper:=minimax', '-p', 'minimax_errors:=[0.05, 0.1, 0.0]'),
      {'shaper': 'minimax', 'errors': (0.05, 0.1, 0.0)}),
     (('-p', 'shaper:=smooth', '-p', 'smooth_periods:=0.5', '-p', 'stretch_rate_max:=40.0'),
-     {'shaper': 'smooth', 'pace': Pace(0.5, 40.0)}),
+     {'shaper': 'smooth', 'pace': SmoothLimits(0.5, 40.0)}),
     (('-p', 'flux_density_max:=0.2', '-p', 'shaper:=minimum_time'),
      {'flux_density_max': 0.2, 'shaper': 'minimum_time'}),
 ])

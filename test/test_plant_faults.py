@@ -16,10 +16,10 @@ from std_srvs.srv import SetBool
 from hmsa.interfaces import topics
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import ActuatorSimulation
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import from_time, to_clock, to_command, to_time
-from hmsa_ros.nodes.endpoints import interface_class
 from hmsa_ros.nodes.plant import PlantNode
+from hmsa_ros.nodes.ros_entities import interface_class
 
 pytestmark = pytest.mark.ros
 
@@ -236,7 +236,7 @@ def test_a_disturbing_force_acts_from_its_stamp_on(stand):
 def test_another_clock_beside_the_authority_is_told(stand):
     plant = stand('-p', 'real_time_factor:=2.0')
     assert plant.report('time', clock_publishers=1).level == DiagnosticStatus.OK
-    other = endpoints.publisher(plant.ros.node, topics.CLOCK_TOPIC)
+    other = ros_entities.publisher(plant.ros.node, topics.CLOCK_TOPIC)
     other.publish(to_clock(START))
     status = plant.report('time', clock_publishers=2)
     assert status.level == DiagnosticStatus.WARN

@@ -24,7 +24,7 @@ from hmsa.bag.writer import BagWriter, Topic
 from hmsa.cli import main
 from hmsa.interfaces import topics
 from hmsa_ros.clients.launching import REPLAY
-from hmsa_ros.recording.transport import Transport
+from hmsa_ros.recording.playback_clock import PlaybackClock
 
 pytestmark = pytest.mark.ros
 FLOAT = 'std_msgs/msg/Float64'
@@ -180,7 +180,7 @@ def test_pause_next_resume_and_stop(ros, play, tmp_path):
 
 
 def test_a_step_that_was_not_possible_is_not_made_later():
-    transport = Transport(7, 1.0)
+    transport = PlaybackClock(7, 1.0)
     assert not transport.step(0.01)
     assert transport.wait(8, message=True, timeout=0.01) == 7
 

@@ -8,13 +8,13 @@ from sensor_msgs.msg import JointState
 
 from hmsa.cli import main
 from hmsa.interfaces import topics
-from hmsa.interfaces.status import Verdict
+from hmsa.interfaces.status import StatusVerdict
 from hmsa_lab.watch.listener import Listener
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import to_trajectory
+from hmsa_ros.nodes.duplicate_nodes import Active
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
-from hmsa_ros.nodes.presence import Active
 
 pytestmark = pytest.mark.ros
 
@@ -28,20 +28,20 @@ class Asking:
     def __init__(self, ros):
         self.verdicts, self.reports = [], {}
         self._ros = ros
-        endpoints.subscribe(
-            ros.node, topics.STATUS, lambda x: self.verdicts.append(Verdict.read(x)),
+        ros_entities.subscribe(
+            ros.node, topics.STATUS, lambda x: self.verdicts.append(StatusVerdict.read(x)),
             topics.PLANNER)
-        endpoints.subscribe(ros.node, topics.DIAGNOSTICS, self._on_diagnostics)
-        self._setpoint = endpoints.publisher(ros.node, topics.SETPOINT, topics.PLANNER)
+        ros_entities.subscribe(ros.node, topics.DIAGNOSTICS, self._on_diagnostics)
+        self._setpoint = ros_entities.publisher(ros.node, topics.SETPOINT, topics.PLANNER)
         ros.spin_until(self._setpoint.get_subscription_count, 'the planner')
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         self.reports |= {x.name.partition(': commands')[0]: x for x in message.status}
 
-    def until(self, *, refused: bool) -> Verdict:
+    def until(self, *, refused: bool) -> StatusVerdict:
         """Repeat the request until it is refused for several planners, or accepted."""
         del self.verdicts[:]
-        setpoint = endpoints.interface_class(topics.SETPOINT.type)(data=1.1)
+        setpoint = ros_entities.interface_class(topics.SETPOINT.type)(data=1.1)
         again = self._ros.node.create_timer(0.05, lambda: self._setpoint.publish(setpoint))
         self._ros.spin_until(
             lambda: self.verdicts and self.verdicts[-1].code.startswith('several_') == refused,
@@ -53,7 +53,7 @@ class Asking:
 def test_second_plant_of_a_joint_is_refused_until_it_is_gone(ros, serve, start):
     serve(PlannerNode, PlantNode)
     asking = Asking(ros)
-    other = endpoints.publisher(ros.node, topics.JOINT_STATES)
+    other = ros_entities.publisher(ros.node, topics.JOINT_STATES)
     other.publish(JointState(name=['elbow'], position=[1.0]))
     asking.until(refused=False)
     second = start.hmsa('plant')
@@ -133,7 +133,7 @@ def test_a_request_that_no_planner_took_is_named_by_those_who_read_the_bag(
     start.hmsa('planner', '--ros-args', '-p', 'autostart:=false')
     start.hmsa('plant', '--ros-args', '-p', 'publish_rate:=1000.0', '-p', 'stretch_noise:=1e-4')
     recorder = start.hmsa('recorder', '--ros-args', '-p', f'storage.uri:={folder}')
-    asked = endpoints.publisher(ros.node, topics.JOINT_TRAJECTORY, topics.PLANNER)
+    asked = ros_entities.publisher(ros.node, topics.JOINT_TRAJECTORY, topics.PLANNER)
     # It subscribes twice: to record a request, and to name it in the summary.
     ros.spin_until(lambda: asked.get_subscription_count() > 1, 'the recorder')
     asked.publish(to_trajectory([(1.1, 500_000_000)], 'actuator', frame='mine'))
@@ -154,7 +154,7 @@ def test_samples_that_cease_are_a_state_of_their_own(ros, serve):
     serve(PlannerNode)
     asking = Asking(ros)
     statuses = ros.collect(topics.STATUS.type, '/planner/status')
-    samples = endpoints.publisher(ros.node, topics.JOINT_STATES)
+    samples = ros_entities.publisher(ros.node, topics.JOINT_STATES)
 
     def report() -> tuple[int, bool, bool]:
         """Return the severity in diagnostics, and whether these and the status name samples."""

@@ -42,7 +42,7 @@ from hmsa.report.outcome import level_results
 from hmsa.report.page import page
 from hmsa.report.picture import draw
 from hmsa.runs.bags import read_run, read_runs
-from hmsa.runs.levels import in_force, Level, without_repeats
+from hmsa.runs.levels import in_force, RecordedLevel, without_repeats
 from hmsa.runs.topics import (
     APPLIED,
     COMMAND,
@@ -507,11 +507,11 @@ def test_the_plan_predicts_a_plant_that_is_as_planned(tmp_path, slew, lag):
 
 
 def test_a_later_command_supersedes_those_stamped_at_or_after_it():
-    first = [Level(10, 1.0, 0), Level(20, 2.0, 0), Level(30, 3.0, 0)]
+    first = [RecordedLevel(10, 1.0, 0), RecordedLevel(20, 2.0, 0), RecordedLevel(30, 3.0, 0)]
     assert [(x.stamp, x.flux_density) for x in in_force(
-        [*([x] for x in first), [Level(20, 4.0, 5)]])] == [(10, 1.0), (20, 4.0)]
-    assert [x.stamp for x in in_force([first, [Level(25, 4.0, 5), Level(40, 5.0, 5)]])] == [
-        10, 20, 25, 40]
+        [*([x] for x in first), [RecordedLevel(20, 4.0, 5)]])] == [(10, 1.0), (20, 4.0)]
+    assert [x.stamp for x in in_force([
+        first, [RecordedLevel(25, 4.0, 5), RecordedLevel(40, 5.0, 5)]])] == [10, 20, 25, 40]
 
 
 def test_timing_tells_lead_lateness_delay_and_gaps(tmp_path):
@@ -588,8 +588,8 @@ def test_commands_that_are_repeated_change_nothing_but_their_number(tmp_path, ba
 
 
 def test_what_replaces_later_levels_is_no_repeat():
-    first = [Level(10, 1.0, 0), Level(20, 2.0, 0)]
-    same, other = Level(15, 1.0, 5), Level(12, 1.0, 6)
+    first = [RecordedLevel(10, 1.0, 0), RecordedLevel(20, 2.0, 0)]
+    same, other = RecordedLevel(15, 1.0, 5), RecordedLevel(12, 1.0, 6)
     assert without_repeats([*first, same]) == ((*first, same), 0)
     assert [x.stamp for x in in_force((x,) for x in without_repeats([*first, same])[0])] == [
         10, 15]

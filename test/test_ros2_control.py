@@ -16,7 +16,7 @@ from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.runtime.loop import Loop
-from hmsa_ros.runtime.records import Settings, Target
+from hmsa_ros.runtime.records import Settings, StretchRequest
 
 FOLDER = Path(__file__).resolve().parent.parent / 'examples' / 'ros2_control'
 MS = 1_000_000
@@ -76,7 +76,7 @@ def test_a_stream_of_positions_is_followed_late_and_ends_at_rest():
         found = []
         for ms, stretch in enumerate(path):
             if ms <= 1000 and ms % 10 == 0:
-                loop.runtime.request(Target('actuator', stretch))
+                loop.runtime.request(StretchRequest('actuator', stretch))
             found.append(device.stretch[0])
             loop.run(START + (ms + 1) * MS)
         found = np.array(found)

@@ -21,7 +21,7 @@ from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs import bags
-from hmsa.runs.levels import lateness_of, Level
+from hmsa.runs.levels import lateness_of, RecordedLevel
 from hmsa.runs.parameters import actuators, read_parameter_file, recorded, values_of
 from hmsa.runs.record import Run
 from hmsa.runs.tables import levels_of, samples_of, write_table
@@ -35,7 +35,7 @@ STEP = 1_000_000
 def moved(*, applied=True, commands=((10, 0.01),), creep=None, told=None):
     """Return a run of 100 samples whose commands, (sample, T), were obeyed or not."""
     simulation = ActuatorSimulation(paper_actuator(), time=BEGIN, creep=creep)
-    levels = [Level(BEGIN + at * STEP, flux, BEGIN) for at, flux in commands]
+    levels = [RecordedLevel(BEGIN + at * STEP, flux, BEGIN) for at, flux in commands]
     rows = []
     for level in levels if applied else ():
         simulation.command(level.stamp, level.flux_density)
@@ -44,7 +44,7 @@ def moved(*, applied=True, commands=((10, 0.01),), creep=None, told=None):
         rows.append((simulation.stretch, simulation.rate, simulation.flux_density))
     time = BEGIN + STEP * np.arange(100)
     stretch, rate, field = np.array(rows).T
-    in_force = [Level(BEGIN, 0.0, BEGIN), *(levels if applied else ())]
+    in_force = [RecordedLevel(BEGIN, 0.0, BEGIN), *(levels if applied else ())]
     return Run(
         'run', 'actuator', Path('run'), time, time, stretch, rate, field,
         commands=tuple(levels), applied=tuple(in_force), parameters_known=True,
@@ -126,20 +126,21 @@ def test_the_file_of_a_beam_for_the_recording_of_a_block_and_the_reverse_are_ref
 
 
 def test_a_level_that_was_in_force_already_is_no_command_without_effect():
-    earlier = Level(BEGIN - 2 * STEP, 0.02, BEGIN), Level(BEGIN - STEP, 0.01, BEGIN)
-    commands = Level(BEGIN, 0.01, BEGIN), Level(BEGIN + STEP, 0.03, BEGIN)
+    earlier = RecordedLevel(BEGIN - 2 * STEP, 0.02, BEGIN), RecordedLevel(
+        BEGIN - STEP, 0.01, BEGIN)
+    commands = RecordedLevel(BEGIN, 0.01, BEGIN), RecordedLevel(BEGIN + STEP, 0.03, BEGIN)
     lateness, unapplied = lateness_of(
-        commands, (*earlier, Level(BEGIN + STEP, 0.03, BEGIN)), BEGIN + 9 * STEP)
+        commands, (*earlier, RecordedLevel(BEGIN + STEP, 0.03, BEGIN)), BEGIN + 9 * STEP)
     assert unapplied == 0
     assert lateness[1] == 0.0
 
 
 def test_levels_that_a_board_rounds_took_effect():
     asked = np.array([0.0201004, 0.0345398, 0.0648543, 0.0291936, 0.0])
-    commands = [Level(BEGIN + i * STEP, x, BEGIN) for i, x in enumerate(asked.tolist())]
+    commands = [RecordedLevel(BEGIN + i * STEP, x, BEGIN) for i, x in enumerate(asked.tolist())]
     # It counts in us, and sets multiples of 5 uT.
     off = [445, -237, 1854, -435, 493]
-    applied = [Level(x.stamp + late, round(x.flux_density / 5e-6) * 5e-6, BEGIN)
+    applied = [RecordedLevel(x.stamp + late, round(x.flux_density / 5e-6) * 5e-6, BEGIN)
                for x, late in zip(commands, off, strict=True)]
     lateness, unapplied = lateness_of(commands, applied, BEGIN + 9 * STEP)
     assert unapplied == 0

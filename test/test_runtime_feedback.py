@@ -15,7 +15,7 @@ from hmsa.identification.known import Known
 from hmsa.model.creep import Creep
 from hmsa.model.parameters import paper_actuator
 from hmsa.planning.planner import Options
-from hmsa.planning.timeline import Model
+from hmsa.planning.timeline import JointModel
 from hmsa_lab.adapt.estimator import Estimator
 from hmsa_ros.runtime.records import (
     EstimateChanged,
@@ -23,7 +23,7 @@ from hmsa_ros.runtime.records import (
     Settings,
     Severity,
     StatusChanged,
-    Target,
+    StretchRequest,
 )
 from hmsa_studies.scenario import SCENARIOS
 
@@ -102,7 +102,7 @@ def test_adapting_knows_the_creep_of_the_block(factor):
 
 def moved(loop, target):
     """Move to a target; return the setpoint as planned first, and the true stretch."""
-    loop.runtime.request(Target('a', target))
+    loop.runtime.request(StretchRequest('a', target))
     return loop.runtime.group.planners['a'].plan.segments[-1], loop.run((target, 500 * MS))
 
 
@@ -156,7 +156,7 @@ def test_a_cautious_move_takes_longer_the_more_is_estimated_and_the_more_noise_t
             (SCENARIOS[2].free, 1.1, 3.0 + math.log2(2.5))):
         loop = Loop(1.0, 1e-3, 200, 10 * MS, block, 2 * MS, feedback='adapt',
                     feedback_cautious=True, feedback_parameters=free)
-        loop.runtime.request(Target('a', target))
+        loop.runtime.request(StretchRequest('a', target))
         loop.runtime.tick(loop.now)
         first = loop.runtime.group.planners['a'].plan.segments[-1]
         tau = 58.8 if target > 1.2 else 57.4
@@ -184,7 +184,8 @@ def test_only_a_cautious_first_request_waits_for_what_it_may_leave(
     predict, calls = Estimator.predict, []
     monkeypatch.setattr(
         Estimator, 'predict', lambda *x: calls.append(x) or predict(*x))
-    Loop(1.0, 1e-3, feedback=mode, feedback_cautious=cautious).runtime.request(Target('a', 1.2))
+    Loop(1.0, 1e-3, feedback=mode, feedback_cautious=cautious).runtime.request(
+        StretchRequest('a', 1.2))
     assert bool(calls) is predicted
 
 
@@ -271,7 +272,7 @@ def test_what_was_learnt_is_saved_and_the_next_run_begins_with_it(tmp_path):
     again = Loop(1.2, 1e-3, feedback='adapt', known={'a': belief.known})
     again.runtime.change(
         Settings(feedback='adapt', takeover_timeout=0, known={'a': belief.known}),
-        {'a': Model(belief.actuator, again.runtime.group.planners['a'].options)},
+        {'a': JointModel(belief.actuator, again.runtime.group.planners['a'].options)},
         simultaneous=False)
     truth = again.run((1.4, 300 * MS))
     # The first move is right, and its uncertainty is no more than what is left of the first run.
@@ -287,7 +288,7 @@ def test_what_was_learnt_can_be_frozen_and_forgotten():
     planner = loop.runtime.group.planners['a']
     loop.run((1.4, 300 * MS))
     frozen = Settings(feedback='adapt', takeover_timeout=0, feedback_frozen=True)
-    loop.runtime.change(frozen, {'a': Model(paper_actuator(), planner.options)},
+    loop.runtime.change(frozen, {'a': JointModel(paper_actuator(), planner.options)},
                         simultaneous=False)
     # They stay from the next update on.
     loop.run((1.4, 100 * MS))
@@ -312,7 +313,7 @@ def test_what_was_learnt_outlives_other_options_but_not_another_block():
     loop.run((1.4, 300 * MS))
     planner = loop.runtime.group.planners['a']
     assert planner.model.actuator.shear_modulus == pytest.approx(1.2e4, rel=5e-3)
-    given = Model(paper_actuator(), Options(shaper='robust'))
+    given = JointModel(paper_actuator(), Options(shaper='robust'))
     settings = Settings(feedback='adapt', takeover_timeout=0)
     loop.runtime.change(settings, {'a': given}, simultaneous=False)
     assert planner.model.options.shaper == 'robust'

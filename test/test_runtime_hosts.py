@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 from test_runtime_planner import HOLD, LEAD, MS, PATIENT, QUIET, Rig, SEQUENCE, START, trajectory
 
-from hmsa_ros.runtime.environment import Seen
-from hmsa_ros.runtime.records import Severity, Stop, Target
+from hmsa_ros.runtime.environment import ObservedSample
+from hmsa_ros.runtime.records import Severity, Stop, StretchRequest
 
 BEATING = replace(QUIET, heartbeat_period=200 * MS)
 
@@ -32,7 +32,7 @@ class Bench(Rig):
     def glance(self):
         if self.samples:
             stretch = 1.0 if self.lost else self.plant.stretch
-            yield 'a', Seen(
+            yield 'a', ObservedSample(
                 self.now + self.ahead, stretch, 0.0 if self.lost else self.plant.rate,
                 self.plant.flux_density, -self.ahead)
 
@@ -102,10 +102,10 @@ def test_a_device_that_is_not_heard_any_more_is_sent_nothing_and_named():
     assert (rig.status.unheard, rig.runtime.report()[0]) == ('', Severity.OK)
     assert len(rig.sent) > sent
     assert rig.residual(1.2) < 1e-6
-    rig.runtime.request(Target('a', 1.3))
+    rig.runtime.request(StretchRequest('a', 1.3))
     rig.linked = False
     rig.run(START + 6000 * MS)
-    assert rig.runtime.request(Target('a', 1.1)).code == 'waiting'
+    assert rig.runtime.request(StretchRequest('a', 1.1)).code == 'waiting'
     rig.run(START + 17_000 * MS)
     assert rig.status.verdict.code == 'unheard'
     assert 'for 10 s, and no receipts either: start the plant' in rig.status.verdict.message
@@ -113,7 +113,7 @@ def test_a_device_that_is_not_heard_any_more_is_sent_nothing_and_named():
 
 def test_a_device_that_comes_late_is_not_put_on_a_level_in_one_step():
     rig = Rig(settings=BEATING)
-    rig.runtime.environment.glance = lambda: [('a', Seen(
+    rig.runtime.environment.glance = lambda: [('a', ObservedSample(
         rig.now, rig.plant.stretch, rig.plant.rate, rig.plant.flux_density, 0))]
     rig.found = False
     rig.runtime.request(trajectory((1.1, HOLD)))
@@ -220,7 +220,7 @@ def test_after_a_cut_off_the_planner_waits_and_then_starts_from_where_the_actuat
     # It waits to be asked, and gives signs of life with the level in force.
     assert {x.flux_density for t, x in rig.sent if t > rig.now - 800 * MS} == {0.0}
     assert rig.residual(1.0) < 1e-6
-    assert rig.runtime.request(Target('a', 1.4)).code == 'accepted'
+    assert rig.runtime.request(StretchRequest('a', 1.4)).code == 'accepted'
     rig.run(rig.now + 500 * MS)
     assert rig.residual(1.4) < 1e-6
 
@@ -232,7 +232,7 @@ def test_a_planner_that_is_asked_for_nothing_leaves_a_device_cut_off():
     # Its watchdog would have been silenced for a moment only, again and again.
     rig.run(START + 3000 * MS)
     assert (rig.cut, rig.sent) == (True, [])
-    rig.runtime.request(Target('a', 1.2))
+    rig.runtime.request(StretchRequest('a', 1.2))
     rig.run(START + 4000 * MS)
     assert rig.refused == []
     assert rig.residual(1.2) < 1e-6
@@ -244,7 +244,7 @@ def test_a_request_before_the_first_receipt_of_a_device_that_was_cut_off_is_carr
     rig.cut_off()
     rig.come_back()
     rig._next = START + 150 * MS
-    rig.runtime.request(Target('a', 1.2))
+    rig.runtime.request(StretchRequest('a', 1.2))
     rig.run(START + 1000 * MS)
     assert rig.refused == []
     assert 'cut_off' not in rig.codes()
@@ -258,7 +258,7 @@ def test_a_cut_off_that_is_never_over_refuses_the_request():
     # The coil is never reported off.
     rig.runtime.applied('a', rig.plant.time - 1, 0.01)
     rig.run(START + 500 * MS)
-    rig.runtime.request(Target('a', 1.2))
+    rig.runtime.request(StretchRequest('a', 1.2))
     rig.run(START + 11_000 * MS)
     assert (rig.status.verdict.code, rig.refused) == ('cut_off', [])
     assert 'has not acknowledged 0 T for 10 s' in rig.status.verdict.message
@@ -275,7 +275,7 @@ def test_after_a_cut_off_a_request_waits_until_the_device_hears(deaf):
     rig.hears = False
     rig.come_back()
     rig.run(rig.now + 500 * MS)
-    assert rig.runtime.request(Target('a', 1.3)).code == 'waiting'
+    assert rig.runtime.request(StretchRequest('a', 1.3)).code == 'waiting'
     rig.run(rig.now + deaf * MS)
     assert rig.status.verdict.code == ('cut_off' if deaf < 10_000 else 'unheard')
     rig.hears = True
@@ -283,7 +283,7 @@ def test_after_a_cut_off_a_request_waits_until_the_device_hears(deaf):
     if deaf > 10_000:
         assert 'commands of joint a have not arrived for 10 s' in rig.status.verdict.message
         assert rig.residual(1.0) < 1e-6
-        rig.runtime.request(Target('a', 1.3))
+        rig.runtime.request(StretchRequest('a', 1.3))
         rig.run(rig.now + 1000 * MS)
     assert rig.residual(1.3) < 1e-6
     assert rig.refused == []
@@ -305,7 +305,7 @@ def test_a_device_that_dds_has_lost_and_found_is_not_a_new_one():
     assert not any('started after the commands were sent' in x for x in rig.notes())
     assert (rig.cut, rig.refused, rig.status.unheard) == (False, [], '')
     assert {x.flux_density for t, x in rig.sent if t > rig.now - 800 * MS} == {0.0}
-    rig.runtime.request(Target('a', 1.3))
+    rig.runtime.request(StretchRequest('a', 1.3))
     rig.run(rig.now + 1000 * MS)
     assert rig.residual(1.3) < 1e-6
 
@@ -324,11 +324,11 @@ def test_after_a_cut_off_the_planner_may_go_on_by_itself_with_a_shaped_move():
 
 def test_a_move_does_not_start_from_a_state_that_samples_contradict():
     rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS))
-    rig.runtime.request(Target('a', 1.2))
+    rig.runtime.request(StretchRequest('a', 1.2))
     rig.run(START + 800 * MS)
     # The board has begun anew with its coil off, and nobody has noticed.
     rig.plant.set_state(1.0, 0.0, 0.0)
-    rig.runtime.request(Target('a', 1.05))
+    rig.runtime.request(StretchRequest('a', 1.05))
     rig.run(START + 1600 * MS)
     assert any('is at 1 on joint_states, where 1.2 was predicted' in x for x in rig.notes())
     assert rig.residual(1.05) < 1e-6
@@ -337,7 +337,7 @@ def test_a_move_does_not_start_from_a_state_that_samples_contradict():
 
 def test_a_model_that_cannot_be_followed_is_no_longer_in_the_way_once_it_is_replaced():
     rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS))
-    rig.runtime.request(Target('a', 1.2))
+    rig.runtime.request(StretchRequest('a', 1.2))
     rig.run(START + 800 * MS)
     model = rig.planner.model
     stiff = replace(model, actuator=replace(model.actuator, damping_coefficient=1e12))
@@ -345,7 +345,7 @@ def test_a_model_that_cannot_be_followed_is_no_longer_in_the_way_once_it_is_repl
     rig.runtime.request(Stop())
     rig.run(START + 1600 * MS)
     rig.runtime.change(rig.runtime.settings, {'a': model}, simultaneous=False)
-    rig.runtime.request(Target('a', 1.3))
+    rig.runtime.request(StretchRequest('a', 1.3))
     rig.run(START + 2600 * MS)
     assert any('on joint_states, where nothing was predicted: ' in x for x in rig.notes())
     assert rig.residual(1.3) < 1e-6
@@ -354,7 +354,7 @@ def test_a_model_that_cannot_be_followed_is_no_longer_in_the_way_once_it_is_repl
 @pytest.mark.parametrize('level', [-1e12, 1e300, 1.7e308])
 def test_a_report_or_a_sample_that_cannot_be_is_ignored(level):
     rig = Rig(settings=replace(QUIET, takeover_timeout=500 * MS))
-    rig.runtime.request(Target('a', 1.2))
+    rig.runtime.request(StretchRequest('a', 1.2))
     for _ in range(50):
         rig.runtime.observed('a', rig.now, 1.1, 1.0, level)
         rig.steady += 20 * MS
@@ -363,53 +363,53 @@ def test_a_report_or_a_sample_that_cannot_be_is_ignored(level):
     rig.run(rig.now + 1000 * MS)
     assert sum('T took effect is ignored' in x for x in rig.notes()) == 1
     assert any('sample of joint a ignored' in x for x in rig.notes())
-    rig.runtime.request(Target('a', 1.1))
+    rig.runtime.request(StretchRequest('a', 1.1))
     rig.run(rig.now + 1000 * MS)
     assert rig.residual(1.1) < 1e-6
 
 
 def test_a_wrong_model_is_no_contradiction():
     rig = Bench()
-    rig.runtime.request(Target('a', 1.4))
+    rig.runtime.request(StretchRequest('a', 1.4))
     rig.run(START + 500 * MS)
     rig.plant.set_state(1.33, 0.0, rig.plant.flux_density)
-    assert rig.runtime.request(Target('a', 1.3)).code == 'accepted'
+    assert rig.runtime.request(StretchRequest('a', 1.3)).code == 'accepted'
     assert not any('on joint_states' in x for x in rig.notes())
 
 
 def test_a_move_does_not_start_where_samples_have_ceased():
     rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS))
-    rig.runtime.request(Target('a', 1.2))
+    rig.runtime.request(StretchRequest('a', 1.2))
     rig.run(START + 500 * MS)
-    rig.runtime.request(Target('a', 1.3))
+    rig.runtime.request(StretchRequest('a', 1.3))
     rig.run(START + 1000 * MS)
     rig.samples = False
     rig.run(START + 8000 * MS)
-    assert rig.runtime.request(Target('a', 1.1)).code == 'waiting'
+    assert rig.runtime.request(StretchRequest('a', 1.1)).code == 'waiting'
     rig.run(START + 9000 * MS)
     assert (rig.status.verdict.code, rig.status.verdict.severity) == ('unseen', Severity.ERROR)
     assert rig.runtime.request(Stop()).severity is Severity.OK
     # Whoever has no sensor any more is not refused.
     rig.observable = False
-    assert rig.runtime.request(Target('a', 1.1)).code == 'accepted'
+    assert rig.runtime.request(StretchRequest('a', 1.1)).code == 'accepted'
 
 
 def test_a_request_is_taken_while_simulated_time_stands_still():
     rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS))
     rig.runtime.environment.one_clock = lambda: True
-    rig.runtime.request(Target('a', 1.2))
+    rig.runtime.request(StretchRequest('a', 1.2))
     rig.run(START + 1000 * MS)
-    rig.runtime.request(Target('a', 1.3))
+    rig.runtime.request(StretchRequest('a', 1.3))
     # No more samples come.
     rig.samples = False
     rig.run(START + 1300 * MS)
     rig.steady += 10_000 * MS
-    assert rig.runtime.request(Target('a', 1.2)).code == 'accepted'
+    assert rig.runtime.request(StretchRequest('a', 1.2)).code == 'accepted'
 
 
 def test_samples_that_cease_are_named_when_they_do_and_when_they_come_again():
     rig = Bench()
-    rig.runtime.request(Target('a', 1.2))
+    rig.runtime.request(StretchRequest('a', 1.2))
     rig.run(START + 3000 * MS)
     assert rig.status.unseen == ''
     rig.samples = False
@@ -441,7 +441,7 @@ def test_samples_that_cease_are_named_when_they_do_and_when_they_come_again():
 def test_samples_of_another_clock_are_refused_and_the_clocks_are_named(lag, text):
     rig = Rig(settings=PATIENT)
     rig.now += 2_000_000_000_000 * MS
-    assert rig.runtime.request(Target('a', 1.2)).code == 'waiting'
+    assert rig.runtime.request(StretchRequest('a', 1.2)).code == 'waiting'
     for _ in range(300):
         rig.runtime.observed('a', rig.now - lag * MS, 1.3, 0.0, 0.05)
         rig.steady += 2 * MS
@@ -456,7 +456,7 @@ def test_samples_of_another_clock_are_refused_and_the_clocks_are_named(lag, text
 def test_samples_that_are_late_by_a_clock_that_agrees_are_gone_on_from():
     rig = Rig(settings=PATIENT)
     rig.plant.set_state(1.3, 0.0, 0.05)
-    rig.runtime.request(Target('a', 1.2))
+    rig.runtime.request(StretchRequest('a', 1.2))
     for _ in range(300):
         rig.runtime.received('a', rig.now - MS, 0, cut_off=False)
         rig.runtime.observed('a', rig.now - 600 * MS, 1.3, 0.0, 0.05)
@@ -471,7 +471,7 @@ def test_the_offset_of_clocks_is_measured_and_named_where_commands_are_late(ahea
     rig = Bench()
     rig.samples = False
     rig.ahead = ahead
-    rig.runtime.request(Target('a', 1.2))
+    rig.runtime.request(StretchRequest('a', 1.2))
     rig.run(START + 1500 * MS)
     severity, message, values = rig.runtime.report()
     offset, error = (
@@ -479,7 +479,7 @@ def test_the_offset_of_clocks_is_measured_and_named_where_commands_are_late(ahea
     assert abs(offset - ahead / MS) <= error < 20.0
     assert severity is Severity.WARN
     assert 'ahead of' in message if ahead > 0 else 'behind' in message
-    again = rig.runtime.request(Target('a', 1.3))
+    again = rig.runtime.request(StretchRequest('a', 1.3))
     assert again.code == ('clocks_differ' if ahead > LEAD else 'accepted')
     if ahead > LEAD:
         assert 'every command would come too late' in again.message

@@ -14,7 +14,6 @@ from hmsa.model.status import Code, RefusedError
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.planner import PlannerRuntime
 from hmsa_ros.runtime.records import (
     Note,
     PlanChanged,
@@ -23,9 +22,10 @@ from hmsa_ros.runtime.records import (
     Severity,
     StatusChanged,
     Stop,
-    Target,
+    StretchRequest,
     Trajectory,
 )
+from hmsa_ros.runtime.runtime import Runtime
 from hmsa_ros.runtime.worker import Job
 
 MS = 1_000_000
@@ -98,7 +98,7 @@ class Rig:
         self.found = True
         self.group = PlannerGroup({
             x: Planner(block, self.options) for x, block in self.blocks.items()})
-        self.runtime = PlannerRuntime(
+        self.runtime = Runtime(
             self.group, settings, Environment(
                 clock=self.clock, steady=self.look, worker=SlicedWorker(self.look),
                 observable=lambda: self.observable, unheard=lambda: self.unheard,
@@ -243,7 +243,7 @@ def test_plan_that_cannot_be_computed_is_a_refusal_too(monkeypatch):
     rig.runtime.request(trajectory(*SEQUENCE))
     plan = rig.planner.plan
     monkeypatch.setattr(Planner, 'draft_setpoint', fails)
-    verdict = rig.runtime.request(Target('a', 1.2))
+    verdict = rig.runtime.request(StretchRequest('a', 1.2))
     assert (verdict.code, verdict.message) == ('not_converged', 'the integration ran out of steps')
     assert rig.planner.plan is plan
 
@@ -260,7 +260,7 @@ def test_trajectory_that_one_joint_cannot_take_none_takes(joints, text):
     assert verdict.code == 'flux_limit'
     assert 'joint c: stretch 1.5 needs a flux density of' in verdict.message
     assert rig.group.number == 0
-    assert 'joint' in rig.runtime.request(Target('knee', 1.1)).message
+    assert 'joint' in rig.runtime.request(StretchRequest('knee', 1.1)).message
 
 
 def test_some_joints_only_if_allowed_and_one_by_its_own_target():
@@ -269,8 +269,8 @@ def test_some_joints_only_if_allowed_and_one_by_its_own_target():
         replace(QUIET, allow_partial_joints=True), {}, simultaneous=True)
     assert rig.runtime.request(trajectory(*SEQUENCE, joints=('b', 'c'))).code == 'accepted'
     assert not rig.group.planners['a'].plan.segments
-    assert rig.runtime.request(Target('a', 1.3)).code == 'accepted'
-    assert rig.runtime.request(Target('a', 1.3)).code == 'unchanged'
+    assert rig.runtime.request(StretchRequest('a', 1.3)).code == 'accepted'
+    assert rig.runtime.request(StretchRequest('a', 1.3)).code == 'unchanged'
     assert rig.group.number == 2
     rig.run(START + LEAD + 3 * HOLD)
     assert max(rig.residual(1.3), rig.residual(1.4, 'b')) < 0.3 * RESIDUAL
@@ -301,7 +301,7 @@ def zigzag(count, name='long', hold=HOLD, **more):
 
 def test_long_trajectory_is_planned_beside_the_loop_with_signs_of_life_in_between():
     rig = Rig(settings=replace(QUIET, heartbeat_period=20 * MS))
-    rig.runtime.request(Target('a', 1.05))
+    rig.runtime.request(StretchRequest('a', 1.05))
     rig.run(START + LEAD + HOLD)
     rig.effort = MS // 10
     plan = rig.planner.plan
@@ -348,7 +348,7 @@ def test_of_several_planners_each_takes_no_request_but_to_stop():
     rig.runtime.request(trajectory(*SEQUENCE))
     rig.run(START + LEAD + 3 * MS)
     rig.runtime.crowded = RefusedError(Code.SEVERAL_PLANNERS, '2 planners (/a and /b): stop one')
-    assert rig.runtime.request(Target('a', 1.1)).code == 'several_planners'
+    assert rig.runtime.request(StretchRequest('a', 1.1)).code == 'several_planners'
     assert rig.runtime.request(Stop()).code == 'accepted'
 
 
@@ -357,7 +357,7 @@ def test_refused_request_leaves_the_one_alone_that_is_being_planned():
     rig.runtime.request(trajectory(*SEQUENCE))
     rig.effort = MS // 5
     rig.runtime.request(zigzag(200))
-    assert rig.runtime.request(Target('a', 9.0)).code == 'out_of_range'
+    assert rig.runtime.request(StretchRequest('a', 9.0)).code == 'out_of_range'
     while rig.runtime.wake == 0:
         rig.tick()
     assert rig.status.verdict.code == 'accepted'
@@ -463,7 +463,7 @@ def test_first_request_waits_for_the_state_in_force():
     rig.plant.set_state(1.15, 3.0, 0.06)
     assert rig.runtime.request(trajectory((1.3, HOLD))).code == 'waiting'
     assert rig.runtime.wants_samples
-    rig.runtime.request(Target('a', 1.25, name='second'))
+    rig.runtime.request(StretchRequest('a', 1.25, name='second'))
     rig.observe(age=600 * MS)
     rig.runtime.observed('knee', rig.now, 1.0, 0.0, 0.0)
     rig.runtime.observed('a', rig.now, 1.0, math.nan, 0.0)
@@ -492,13 +492,13 @@ def test_patience_with_samples_of_others_has_an_end():
 def test_nobody_is_waited_for_where_nobody_gives_samples():
     rig = Rig(settings=PATIENT)
     rig.observable = False
-    assert rig.runtime.request(Target('a', 1.1)).code == 'accepted'
+    assert rig.runtime.request(StretchRequest('a', 1.1)).code == 'accepted'
 
 
 def test_first_request_waits_until_a_plant_is_found():
     rig = Rig(settings=PATIENT)
     rig.observable, rig.unheard = False, 'nobody subscribes'
-    assert rig.runtime.request(Target('a', 1.1)).code == 'waiting'
+    assert rig.runtime.request(StretchRequest('a', 1.1)).code == 'waiting'
     rig.tick()
     rig.observable = True
     rig.observe()
@@ -513,7 +513,7 @@ def test_first_request_waits_until_a_plant_is_found():
 def test_patience_with_a_plant_that_does_not_come_has_an_end():
     rig = Rig(settings=PATIENT)
     rig.observable, rig.unheard = False, 'nobody subscribes'
-    rig.runtime.request(Target('a', 1.1))
+    rig.runtime.request(StretchRequest('a', 1.1))
     rig.steady += 501 * MS
     rig.tick()
     assert rig.status.verdict.code == 'accepted'
@@ -522,7 +522,7 @@ def test_patience_with_a_plant_that_does_not_come_has_an_end():
 
 def test_impossible_sample_is_ignored_with_a_note():
     rig = Rig(settings=PATIENT)
-    rig.runtime.request(Target('a', 1.1))
+    rig.runtime.request(StretchRequest('a', 1.1))
     rig.runtime.observed('a', rig.now, 9.0, 0.0, 0.0)
     rig.tick()
     assert rig.status.verdict.code == 'accepted'
@@ -654,18 +654,18 @@ def test_deactivated_it_comes_to_rest_and_then_sends_nothing():
     assert len(rig.sent) == sent
     assert 1.0 < rig.plant.stretch < 1.1
     assert rig.residual(rig.plant.stretch) < 0.1 * RESIDUAL
-    assert rig.runtime.request(Target('a', 1.1)).code == 'inactive'
+    assert rig.runtime.request(StretchRequest('a', 1.1)).code == 'inactive'
 
 
 def test_activated_again_it_does_not_go_on_from_what_was_seen_before():
     rig = Rig(settings=PATIENT)
     rig.observe()
-    assert rig.runtime.request(Target('a', 1.3)).code == 'accepted'
+    assert rig.runtime.request(StretchRequest('a', 1.3)).code == 'accepted'
     rig.run(START + LEAD + 3 * MS)
     rig.runtime.deactivate()
     rig.run(START + 200 * MS)
     rig.runtime.active = True
-    assert rig.runtime.request(Target('a', 1.1)).code == 'waiting'
+    assert rig.runtime.request(StretchRequest('a', 1.1)).code == 'waiting'
     rig.observe()
     rig.run(START + 400 * MS)
     assert rig.residual(1.1) < RESIDUAL
@@ -682,7 +682,7 @@ def test_clock_that_is_set_back_drops_the_plan_and_tells_so_once():
     assert 'the clock jumped back by 0.010 s' in rig.status.verdict.message
     assert (rig.status.progress.state, rig.runtime.clock_jumps) == ('idle', 5)
     assert rig.runtime.wake is None
-    assert rig.runtime.request(Target('a', 1.1)).code == 'accepted'
+    assert rig.runtime.request(StretchRequest('a', 1.1)).code == 'accepted'
     assert rig.planner.plan.levels[0].stretch == 1.0
 
 
@@ -731,15 +731,15 @@ def test_the_plan_goes_on_when_the_clock_is_set(by):
     assert [words in x for x in rig.notes()] == [True]
     assert rig.residual(1.4) < RESIDUAL
     assert rig.status.progress.state == 'at_rest'
-    assert rig.runtime.request(Target('a', 1.3)).code == 'accepted'
+    assert rig.runtime.request(StretchRequest('a', 1.3)).code == 'accepted'
     assert rig.planner.plan.segments[-1].since - rig.now == LEAD
 
 
-@pytest.mark.parametrize('again', [Target('a', 1.2), trajectory((1.2, HOLD))])
+@pytest.mark.parametrize('again', [StretchRequest('a', 1.2), trajectory((1.2, HOLD))])
 @pytest.mark.parametrize('reading', range(4))
 def test_a_request_is_planned_again_where_the_clock_is_set_back_meanwhile(reading, again):
     rig = Rig()
-    rig.runtime.request(Target('a', 1.1))
+    rig.runtime.request(StretchRequest('a', 1.1))
     rig.run(START + 300 * MS)
     before = len(rig.sent)
     rig.set_back_at = reading, START

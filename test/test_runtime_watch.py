@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from hmsa.judge import holds, judging
-from hmsa.judge.records import Setpoint
+from hmsa.judge import judging, setpoint_samples
+from hmsa.judge.records import RequestedSetpoint
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
 from hmsa.planning.group import PlannerGroup
@@ -15,8 +15,8 @@ from hmsa.planning.planner import Options, Planner
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.planner import PlannerRuntime
 from hmsa_ros.runtime.records import Note, Send, Settings, StatusChanged, Trajectory
+from hmsa_ros.runtime.runtime import Runtime
 
 MS = 1_000_000
 START = 1000 * MS
@@ -41,7 +41,7 @@ class Loop:
             period=1000 * MS // rate, time=START, measurement_delay=delay, seed=1)
         options = Options(flux_density_min=-0.5, flux_density_max=0.5, lead_time=lead)
         self.unheard = ''
-        self.runtime = PlannerRuntime(
+        self.runtime = Runtime(
             PlannerGroup({'a': Planner(block, options)}),
             Settings(takeover_timeout=0, **changes), Environment(
                 clock=lambda: self.now, steady=lambda: self.now,
@@ -343,9 +343,9 @@ def test_judging_several_joints_does_not_keep_commands_waiting(monkeypatch):
         judged.append(now)
         return judging.judge(*args, **options)
 
-    monkeypatch.setattr(holds, 'judge', judge)
+    monkeypatch.setattr(setpoint_samples, 'judge', judge)
     block, names = paper_actuator(), ('a', 'b', 'c', 'd')
-    runtime = PlannerRuntime(
+    runtime = Runtime(
         PlannerGroup({x: Planner(block, Options(
             flux_density_min=-0.5, flux_density_max=0.5)) for x in names}),
         Settings(takeover_timeout=0), Environment(
@@ -363,8 +363,8 @@ def test_judging_several_joints_does_not_keep_commands_waiting(monkeypatch):
 
 
 def test_a_setpoint_that_a_plan_comes_back_to_is_not_missed():
-    setpoint = Setpoint(1.2, 1.0, START, START + 10 * MS, None, 600.0, 30.0)
-    hold = holds.Hold(replace(setpoint, held=True))
+    setpoint = RequestedSetpoint(1.2, 1.0, START, START + 10 * MS, None, 600.0, 30.0)
+    hold = setpoint_samples.SetpointSamples(replace(setpoint, held=True))
     hold.miss('left out')
     hold.move(setpoint.arrival, corrected=True)
     assert hold.found is None

@@ -17,7 +17,7 @@ import pytest
 from std_msgs.msg import Float64
 
 from hmsa.interfaces import topics
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 
 ROOT = Path(__file__).resolve().parent.parent
 FILE = ROOT / 'config' / 'security' / 'policies.xml'
@@ -214,7 +214,7 @@ def test_policies_grant_exactly_what_the_nodes_do(tmp_path, start, ros):
         'planner', '--ros-args', *simulated, '-p', 'takeover_timeout:=60.0')
     # There to be recorded, without a coil.
     driver = start.hmsa('driver', '--ros-args', '-p', 'autostart:=false')
-    force = endpoints.publisher(ros.node, topics.DISTURBANCE_FORCE)
+    force = ros_entities.publisher(ros.node, topics.DISTURBANCE_FORCE)
     for topic in (topics.JOINT_TRAJECTORY, topics.SETPOINT):
         ros.publisher(topic.type, f'/planner/{topic.name[2:]}', topic.qos, subscribers=2)
     requests = ros.publisher(

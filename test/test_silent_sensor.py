@@ -7,7 +7,7 @@ import pytest
 from test_runtime_hosts import BEATING, Bench
 from test_runtime_planner import MS, START, trajectory
 
-from hmsa_ros.runtime.records import Severity, Target
+from hmsa_ros.runtime.records import Severity, StretchRequest
 
 
 class Watched(Bench):
@@ -26,17 +26,17 @@ SETTINGS = replace(BEATING, takeover_timeout=500 * MS)
 @pytest.mark.parametrize('silence', [300, 700, 1000, 1500, 1900])
 def test_requests_while_a_sensor_is_silent_start_as_predicted(silence, feedback):
     chance, rig = random.Random(silence), Watched(settings=replace(SETTINGS, feedback=feedback))
-    rig.runtime.request(Target('a', 1.2))
+    rig.runtime.request(StretchRequest('a', 1.2))
     rig.run(START + 1000 * MS)
-    rig.runtime.request(Target('a', 1.4))
+    rig.runtime.request(StretchRequest('a', 1.4))
     rig.run(rig.now + chance.randrange(20, 400) * MS)
     rig.samples, end = False, rig.now + silence * MS
     while rig.now < end:
         stretch = chance.choice([1.05, 1.1, 1.25, 1.3, 1.4])
-        rig.runtime.request(Target('a', stretch))
+        rig.runtime.request(StretchRequest('a', stretch))
         rig.run(min(rig.now + chance.randrange(100, 500) * MS, end))
     rig.samples = True
-    rig.runtime.request(Target('a', 1.15))
+    rig.runtime.request(StretchRequest('a', 1.15))
     rig.run(rig.now + 500 * MS)
     assert rig.status.verdict.severity is Severity.OK
     assert not any('planning continues from the sample' in x for x in rig.notes())
@@ -53,12 +53,12 @@ def test_a_sample_from_before_the_last_change_of_level_does_not_move_a_start():
     rig.samples = False
     rig.run(START + 1500 * MS)
     sent = len(rig.sent)
-    assert rig.runtime.request(Target('a', 1.3)).code == 'waiting'
+    assert rig.runtime.request(StretchRequest('a', 1.3)).code == 'waiting'
     rig.run(rig.now + 600 * MS)
     assert rig.status.verdict.code == 'unseen'
     assert {x.flux_density for _, x in rig.sent[sent:]} == {rig.sent[sent - 1][1].flux_density}
     assert rig.residual(1.1) < 1e-6
     rig.samples, rig.lost = True, False
-    rig.runtime.request(Target('a', 1.3))
+    rig.runtime.request(StretchRequest('a', 1.3))
     rig.run(rig.now + 600 * MS)
     assert rig.residual(1.3) < 1e-6

@@ -20,8 +20,8 @@ from hmsa.planning.planner import Options, Planner
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import get_shaper
-from hmsa.planning.shapers.pace import Pace
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
+from hmsa.planning.shapers.smooth_limits import SmoothLimits
 
 MS = 1_000_000
 ZETA, C1 = 0.2, 2.0
@@ -112,7 +112,7 @@ def left(move, request, force=gent):
         'grid and slow ramps'])
 def test_the_block_is_at_rest_after_a_move_without_a_step_of_the_level(
         state, target, delivery, material, force):
-    request = Request(state, target, material, WIDE, delivery)
+    request = MoveRequest(state, target, material, WIDE, delivery)
     move = get_shaper('smooth')(request)
     assert move.code is Code.SMOOTH
     assert left(move, request, force)[0] < AT_REST
@@ -126,12 +126,12 @@ def test_the_block_is_at_rest_after_a_move_without_a_step_of_the_level(
 
 
 def test_a_move_takes_the_shortest_time_that_its_limits_allow():
-    free = get_shaper('smooth')(Request(State(1.0), 1.4, PAPER, WIDE, pace=Pace(0.3)))
+    free = get_shaper('smooth')(MoveRequest(State(1.0), 1.4, PAPER, WIDE, pace=SmoothLimits(0.3)))
     for limits, delivery, pace in (
-            (Limits(-0.1, 1.1), Delivery(), Pace(0.3)),
-            (WIDE, Delivery(slew=0.5), Pace(0.3)),
-            (WIDE, Delivery(), Pace(0.3, rate=0.2))):
-        request = Request(State(1.0), 1.4, PAPER, limits, delivery, pace=pace)
+            (Limits(-0.1, 1.1), Delivery(), SmoothLimits(0.3)),
+            (WIDE, Delivery(slew=0.5), SmoothLimits(0.3)),
+            (WIDE, Delivery(), SmoothLimits(0.3, rate=0.2))):
+        request = MoveRequest(State(1.0), 1.4, PAPER, limits, delivery, pace=pace)
         move = get_shaper('smooth')(request)
         rest, path = left(move, request)
         assert rest < AT_REST
@@ -149,7 +149,7 @@ def test_a_move_takes_the_shortest_time_that_its_limits_allow():
 def test_a_slower_move_forgives_more():
     shares = []
     for periods in (0.5, 1.0, 2.0):
-        request = Request(State(1.0), 1.4, PAPER, pace=Pace(periods))
+        request = MoveRequest(State(1.0), 1.4, PAPER, pace=SmoothLimits(periods))
         move = get_shaper('smooth')(request)
         path = judged(
             [(x.time, x.load) for x in move.levels], State(1.0), move.duration + 7.0,
@@ -163,7 +163,7 @@ def test_a_slower_move_forgives_more():
 @pytest.mark.parametrize('delivery', [Delivery(), Delivery(0.1, slew=3.0), Delivery(lag=0.1)])
 def test_a_move_may_be_as_small_as_rounding(delivery):
     for away in (1e-4, 1e-8):
-        request = Request(State(1.4 + away), 1.4, PAPER, WIDE, delivery)
+        request = MoveRequest(State(1.4 + away), 1.4, PAPER, WIDE, delivery)
         move = get_shaper('smooth')(request)
         assert left(move, request)[0] < 1e-3
 
@@ -171,13 +171,13 @@ def test_a_move_may_be_as_small_as_rounding(delivery):
 def test_what_cannot_be_had_is_refused_with_the_limits():
     # Ramps of so little would take thousands of periods.
     with pytest.raises(RefusedError, match='ramps of') as error:
-        get_shaper('smooth')(Request(State(1.0), 1.4, PAPER, WIDE, Delivery(slew=1e-4)))
+        get_shaper('smooth')(MoveRequest(State(1.0), 1.4, PAPER, WIDE, Delivery(slew=1e-4)))
     assert error.value.code is Code.SLEW_LIMIT
     with pytest.raises(BadInputError, match='smooth_periods is 0'):
-        Pace(0.0)
+        SmoothLimits(0.0)
     with pytest.raises(BadInputError, match='stretch_rate_max'):
-        Pace(rate=-1.0)
-    assert get_shaper('smooth')(Request(State(1.4), 1.4, PAPER)).code is Code.HOLD
+        SmoothLimits(rate=-1.0)
+    assert get_shaper('smooth')(MoveRequest(State(1.4), 1.4, PAPER)).code is Code.HOLD
 
 
 @pytest.mark.parametrize('delivery', [Delivery(), Delivery(slew=3.0), Delivery(0.1, slew=3.0)])
@@ -185,7 +185,7 @@ def test_a_creeping_block_is_moved_smoothly_and_held_after(delivery):
     creep = Creep((0.1, 0.2), (0.4, 3.0))
     segments = plan_sequence(
         [Setpoint(1.4, 4.0), Setpoint(1.1, math.inf)],
-        Request.of(replace(PAPER, creep=creep), delivery=delivery), shaper='smooth')
+        MoveRequest.of(replace(PAPER, creep=creep), delivery=delivery), shaper='smooth')
     end = segments[1].begin + 12.0
     levels = [(x.begin + y.time, y.load) for x in segments for y in x.move.levels]
     times, stretch, _ = judged(

@@ -7,9 +7,9 @@ import pytest
 from test_runtime_hosts import BEATING, Bench
 from test_runtime_planner import HOLD, MS, QUIET, Rig, SEQUENCE, START, trajectory
 
-from hmsa.interfaces.status import Verdict
+from hmsa.interfaces.status import StatusVerdict
 from hmsa_ros.nodes.conversions import to_planner_status
-from hmsa_ros.runtime.records import Severity, StatusChanged, Stop, Target
+from hmsa_ros.runtime.records import Severity, StatusChanged, Stop, StretchRequest
 
 SECOND = 1000 * MS
 LONG = ((1.1, HOLD), (1.2, 2 * HOLD), (1.3, 20 * SECOND))
@@ -165,12 +165,12 @@ def test_a_coil_that_is_cut_off_has_stopped():
 
 def test_a_request_that_follows_a_stop_ends_it_and_a_refused_one_does_not():
     rig = stopped_in_the_middle(Bench())
-    rig.runtime.request(Target('a', 9.0, 'refused'))
+    rig.runtime.request(StretchRequest('a', 9.0, 'refused'))
     rig.run(START + 500 * MS)
     assert outcomes(rig) == ['accepted', 'stopped']
     assert rig.status.answers['refused'][0].code == 'out_of_range'
     rig = stopped_in_the_middle(Bench())
-    rig.runtime.request(Target('a', 1.3, 'taken'))
+    rig.runtime.request(StretchRequest('a', 1.3, 'taken'))
     rig.run(START + 3 * SECOND)
     assert outcomes(rig) == ['accepted']
 
@@ -179,9 +179,9 @@ def test_requests_at_once_have_a_verdict_each():
     rig = Rig(settings=replace(QUIET, takeover_timeout=0))
     names = [f'request {i}' for i in range(20)]
     for i, name in enumerate(names):
-        rig.runtime.request(Target('a', 9.0 if i % 3 else 1.1 + 0.01 * i, name))
+        rig.runtime.request(StretchRequest('a', 9.0 if i % 3 else 1.1 + 0.01 * i, name))
     rig.tick()
-    seen = Verdict.read(to_planner_status(rig.status))
+    seen = StatusVerdict.read(to_planner_status(rig.status))
     verdicts = [seen.on(x) for x in names]
     assert [x.code for x in verdicts] == [
         'out_of_range' if i % 3 else 'accepted' for i in range(20)]
@@ -194,7 +194,7 @@ def test_requests_at_once_have_a_verdict_each():
 def test_verdicts_are_repeated_for_a_while_and_in_bounded_number():
     rig = Steady(settings=BEATING)
     for i in range(200):
-        rig.runtime.request(Target('a', 9.0, f'request {i}'))
+        rig.runtime.request(StretchRequest('a', 9.0, f'request {i}'))
     rig.tick()
     assert list(rig.status.answers) == [f'request {i}' for i in range(136, 200)]
     rig.run(START + 31 * SECOND, 50 * MS)
@@ -210,7 +210,7 @@ def test_answers_of_any_content_are_read(text):
         rig.status if rig.outputs else rig.tick()[-1], answers={}))
     status.values[0].value = text
     status.values[0].key = 'answers'
-    assert Verdict.read(status).on('a') is None
+    assert StatusVerdict.read(status).on('a') is None
 
 
 def test_a_request_of_a_unique_name_that_comes_again_is_carried_out_once():

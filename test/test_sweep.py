@@ -18,11 +18,11 @@ from hmsa.model.equations import acceleration_si
 from hmsa.model.laws import LAWS
 from hmsa.model.moves import State
 from hmsa.model.parameters import ActuatorParameters
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.shapers.two_step import two_step
 from hmsa.planning.two_step import Groups, plan_two_step_batch
 from hmsa.runs.parameters import read_parameter_file, values_of
-from hmsa_studies.axes import Belief, draw, NOTHING, parse_values, Spread
+from hmsa_studies.axes import draw, NormalColumns, NOTHING, parse_values, Spread
 from hmsa_studies.residual import Actual, Errors
 from hmsa_studies.settings import InSI, Nondimensional
 from hmsa_studies.sweep import Sweep
@@ -235,7 +235,7 @@ def test_nondimensional_parameters_do_not_go_with_a_parameter_file(run, params_f
 
 def test_a_covariance_that_is_none_is_refused():
     with pytest.raises(BadInputError, match=r'is none, at b: expected'):
-        draw({}, Belief(('a', 'b'), np.zeros(2), np.array([[1.0, 2.0], [2.0, 1.0]])), 8, 0)
+        draw({}, NormalColumns(('a', 'b'), np.zeros(2), np.array([[1.0, 2.0], [2.0, 1.0]])), 8, 0)
 
 
 def test_values_are_grids_or_what_they_are_drawn_from():
@@ -300,7 +300,7 @@ def test_samples_of_an_identification_are_actuators_and_the_plan_is_the_same(run
                     float(row['actual.damping_coefficient']) / 0.6 - 1.0)
     model = InSI.of(values_of(read_parameter_file(path), 'planner', PLANNED)).setting(
         {}).material
-    move = two_step(Request(State(1.0), 1.1, model))
+    move = two_step(MoveRequest(State(1.0), 1.1, model))
     # Times of levels in SI units are whole nanoseconds.
     assert float(row['residual']) == pytest.approx(
         Actual.off(model, errors).residual(move, 1.0, 1.1, move.duration), abs=1e-6)

@@ -17,7 +17,7 @@ from hmsa.errors import BadInputError
 from hmsa.identification.files import read_belief
 from hmsa.identification.identify import identify
 from hmsa.identification.known import Known
-from hmsa.identification.recording import Recording
+from hmsa.identification.measurement import Measurement
 from hmsa.model.parameters import paper_actuator
 from hmsa.runs.bags import read_run
 from hmsa.runs.parameters import read_parameter_file
@@ -69,7 +69,7 @@ def test_a_shaper_that_cannot_plan_the_moves_is_not_chosen():
 def test_a_model_that_lacks_something_is_planned_with_smoothly():
     time, (switches, levels) = np.arange(0.0, 0.4, 1e-3), steps((1.3, 1.0, 1.2), 0.1)
     seen = simulate(time, switches, levels) + np.random.default_rng(0).normal(0.0, 1e-3, 400)
-    found = identify(Recording(time, seen, switches, levels))
+    found = identify(Measurement(time, seen, switches, levels))
     tuning = Tuning(Path(), tuple(((x,), y) for x, y in MOVES), Path(), [])
     belief = read_belief(None, [])
     chosen_for = [chosen(tuning, belief, x)[1]['shaper'] for x in (

@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from hmsa.interfaces import topics
-from hmsa_ros.nodes.endpoints import interface_class
+from hmsa_ros.nodes.ros_entities import interface_class
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIG = ROOT / 'config'

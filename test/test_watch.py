@@ -10,21 +10,21 @@ import signal
 import numpy as np
 import pytest
 
-from hmsa.interfaces.status import Verdict
-from hmsa_lab.watch.scene import as_json, History, Joint, line, Report, Scene, SLOTS
+from hmsa.interfaces.status import StatusVerdict
+from hmsa_lab.watch.scene import as_json, JointView, line, PeakHistory, Report, Scene, SLOTS
 
 WAIT_SECONDS = 60.0
 
 
 def history(values, span=10.0):
     """Return a history that ends at time 100 with equally spaced values."""
-    result = History(span)
+    result = PeakHistory(span)
     result.put(100.0 - span, 100.0, np.asarray(values, dtype=float))
     return result
 
 
 def joint(name='actuator', stretch=1.1, target=1.2):
-    return Joint(
+    return JointView(
         name, history(np.linspace(1.0, stretch, 1000)), history(np.full(1000, target)),
         stretch, 0.5, 0.0345, target, 0.065, 'stretch')
 
@@ -33,7 +33,7 @@ def scene(*joints):
     return Scene(
         'domain 42  /', 100.0, stamp=12.5, age=0.01, sample_rate=1000.0,
         joints=joints or (joint(),), progress=0.25,
-        request=Verdict(0, 'accepted', 'accepted', '', 'moving', 1, 3),
+        request=StatusVerdict(0, 'accepted', 'accepted', '', 'moving', 1, 3),
         reports=[Report('planner', 1, '2 commands sent late', {'sent': 6, 'late': 2}),
                  Report('plant', 0, 'commands in time', {'late': 0}, age=9.0)])
 
@@ -59,7 +59,7 @@ def test_a_history_forgets_what_has_left_the_chart():
 
 
 def test_a_target_that_holds_is_a_line_without_gaps():
-    history = History(10.0)
+    history = PeakHistory(10.0)
     # Looks are further apart than the slots of a history.
     for i in range(100):
         history.hold(0.1 * i, 0.1 * (i + 1), 1.2)
@@ -99,7 +99,7 @@ def test_each_joint_has_its_own_target_command_and_history(ros, ros_env, wait_un
 
     from hmsa.interfaces import topics
     from hmsa_lab.watch.listener import Listener
-    from hmsa_ros.nodes import endpoints
+    from hmsa_ros.nodes import ros_entities
     from hmsa_ros.nodes.conversions import to_time
 
     def status(name, level, joint, **values):
@@ -110,7 +110,7 @@ def test_each_joint_has_its_own_target_command_and_history(ros, ros_env, wait_un
     publish = {
         name: ros.node.create_publisher(kind, name, qos).publish for name, kind, qos in (
             ('joint_states', JointState, 100), ('diagnostics', DiagnosticArray, 10),
-            ('planner/status', DiagnosticStatus, endpoints.profile(topics.LATCHED)),
+            ('planner/status', DiagnosticStatus, ros_entities.profile(topics.LATCHED)),
             ('right/flux_density_command', MagneticField, 100))}
     publish['planner/status'](status(
         'planner: request', DiagnosticStatus.OK, 'left, right', state='moving', stretch='',
@@ -158,15 +158,15 @@ def test_garbage_on_its_topics_neither_ends_nor_misleads_it(ros, ros_env, wait_u
     from benchmarks.faults import garbage
     from hmsa.interfaces import topics
     from hmsa_lab.watch.listener import Listener
-    from hmsa_ros.nodes import endpoints
+    from hmsa_ros.nodes import ros_entities
     from hmsa_ros.nodes.conversions import to_command
 
     dice = random.Random(7)
     senders = [
         (kind, ros.node.create_publisher(kind, name, qos)) for name, kind, qos in (
             ('joint_states', JointState, 1000), ('diagnostics', DiagnosticArray, 1000),
-            ('planner/status', DiagnosticStatus, endpoints.profile(topics.LATCHED)),
-            ('planner/plan', JointTrajectory, endpoints.profile(topics.LATCHED)),
+            ('planner/status', DiagnosticStatus, ros_entities.profile(topics.LATCHED)),
+            ('planner/plan', JointTrajectory, ros_entities.profile(topics.LATCHED)),
             ('flux_density_command', type(to_command(0, 0.0, '')), 1000))]
     with Listener(span=10.0) as listener:
         def aside():

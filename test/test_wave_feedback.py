@@ -13,8 +13,8 @@ from hmsa.model.parameters import paper_actuator
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.planner import PlannerRuntime
 from hmsa_ros.runtime.records import Send, Settings, StatusChanged, Stop, Trajectory
+from hmsa_ros.runtime.runtime import Runtime
 
 MS, SECOND = 1_000_000, 1_000_000_000
 AMPLITUDE, LEAD = 0.1, 20 * MS
@@ -64,7 +64,7 @@ class Run:
         self.times, self.wanted = rows[:, 0], rows[:, 1]
         self.planner = Planner(paper_actuator(), Options(
             flux_density_min=-0.5, flux_density_max=0.5, lead_time=LEAD, path_tolerance=1e-4))
-        self.runtime = PlannerRuntime(
+        self.runtime = Runtime(
             PlannerGroup({'a': self.planner}),
             Settings(takeover_timeout=0, heartbeat_period=0, feedback=feedback),
             Environment(clock=lambda: self.now, steady=lambda: self.now))

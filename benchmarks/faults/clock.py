@@ -15,7 +15,7 @@ import rclpy
 
 from hmsa.interfaces import topics
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import to_clock
 
 _PERIOD_SECONDS = 0.001
@@ -31,7 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     rclpy.init(args=[])
     node = rclpy.create_node('clock', enable_rosout=False)
-    publisher = endpoints.publisher(node, topics.CLOCK_TOPIC)
+    publisher = ros_entities.publisher(node, topics.CLOCK_TOPIC)
     begin = monotonic()
     try:
         while rclpy.ok():

@@ -16,7 +16,7 @@ from benchmarks.faults.common import Register
 from benchmarks.faults.rig import Child, Rig
 from benchmarks.faults.table import Seen
 from hmsa.interfaces import topics
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import CUT_OFF, from_time, to_command
 
 FAULTS = Register()
@@ -44,7 +44,7 @@ class _Bench:
             'command_timeout': _TIMEOUT, 'publish_rate': 50.0, **parameters})
         self._command = rig.publisher(topics.FLUX_DENSITY_COMMAND)
         self._cut_off = 0  # time in ns that names a cut-off; 0 for none
-        endpoints.subscribe(rig.node, topics.FLUX_DENSITY_RECEIVED, self._on_receipt)
+        ros_entities.subscribe(rig.node, topics.FLUX_DENSITY_RECEIVED, self._on_receipt)
 
     def _on_receipt(self, message: TimeReference) -> None:
         cut_off = message.header.frame_id == CUT_OFF

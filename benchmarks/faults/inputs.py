@@ -13,7 +13,7 @@ from benchmarks.faults.rig import hushed, Rig
 from benchmarks.faults.table import Seen
 from hmsa.interfaces import topics
 from hmsa_ros.nodes.conversions import to_command
-from hmsa_ros.nodes.endpoints import interface_class
+from hmsa_ros.nodes.ros_entities import interface_class
 
 FAULTS = Register()
 _COUNT = 300

@@ -23,7 +23,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import MagneticField
 
 from hmsa.interfaces import topics
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.runner import spin
 
 _TICK_SECONDS = 0.0005
@@ -45,8 +45,8 @@ class Relay(Node):
         self._lost: list[Time] = []
         self._waiting: deque[tuple[float, MagneticField]] = deque()
         topic = topics.FLUX_DENSITY_COMMAND
-        self._publisher = endpoints.publisher(self, replace(topic, name=options.target))
-        self._commands = endpoints.subscribe(
+        self._publisher = ros_entities.publisher(self, replace(topic, name=options.target))
+        self._commands = ros_entities.subscribe(
             self, replace(topic, name=options.source), self._on_command)
         self.create_timer(
             _TICK_SECONDS, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))

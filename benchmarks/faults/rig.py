@@ -24,9 +24,9 @@ from std_msgs.msg import Float64
 from hmsa.errors import HmsaError
 from hmsa.interfaces import topics
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
-from hmsa_ros.nodes.endpoints import interface_class
+from hmsa_ros.nodes.ros_entities import interface_class
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 #: Maximum wait for a process to start, or for a condition, in s.
@@ -247,12 +247,12 @@ class Rig:
 
     def _subscribe(
             self, topic: topics.Topic, owner: str, callback: Callable[[Any], None]) -> None:
-        endpoints.subscribe(
+        ros_entities.subscribe(
             self.node, topic, lambda x: None if self.deaf else callback(x), owner)
 
     def publisher(self, topic: topics.Topic, owner: str = '') -> Any:
         """Return a publisher of the rig's node."""
-        return endpoints.publisher(self.node, topic, owner)
+        return ros_entities.publisher(self.node, topic, owner)
 
     def _on_sample(self, message: JointState) -> None:
         self._stamps.append(from_time(message.header.stamp))

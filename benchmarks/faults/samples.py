@@ -6,7 +6,7 @@ from benchmarks.faults.common import await_change, jump, move, pair, Register, s
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.table import Seen
 from hmsa.interfaces import topics
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 
 FAULTS = Register()
 _TARGET = 1.2
@@ -17,7 +17,7 @@ _LEFT = 0.02
 def _failing(rig: Rig, fault: str, word: str, counter: str) -> Seen:
     """Adapt with a working sensor, let it fail at rest, and move again."""
     estimates: list[tuple[str, dict[str, str]]] = []
-    endpoints.subscribe(
+    ros_entities.subscribe(
         rig.node, topics.ESTIMATE, lambda x: estimates.extend(
             (y.message, {z.key: z.value for z in y.values}) for y in x.status), topics.PLANNER)
     name = topics.JOINT_STATES.name

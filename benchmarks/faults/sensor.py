@@ -21,7 +21,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from hmsa.interfaces import topics
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.runner import spin
 
 #: Faults of the sensor.
@@ -41,8 +41,8 @@ class Sensor(Node):
         self._held: JointState | None = None
         self._last = 0.0
         topic = topics.JOINT_STATES
-        self._publisher = endpoints.publisher(self, replace(topic, name=options.target))
-        endpoints.subscribe(self, replace(topic, name=options.source), self._on_sample)
+        self._publisher = ros_entities.publisher(self, replace(topic, name=options.target))
+        ros_entities.subscribe(self, replace(topic, name=options.source), self._on_sample)
 
     def _on_sample(self, message: JointState) -> None:
         stretch = message.position[0] + self._random.gauss(0.0, _NOISE)

@@ -46,9 +46,9 @@ from hmsa.model.parameters import ActuatorParameters
 from hmsa.planning.scales import Scales, scales
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.setpoint import Setpoint
-from hmsa.planning.shapers.pace import Pace
-from hmsa.planning.shapers.request import as_errors, ERRORS, Request
-from hmsa.planning.timeline import Model
+from hmsa.planning.shapers.request import as_errors, ERRORS, MoveRequest
+from hmsa.planning.shapers.smooth_limits import SmoothLimits
+from hmsa.planning.timeline import JointModel
 from hmsa.runs.parameters import read_parameter_file, values_of
 from hmsa.table import Column, Table
 
@@ -159,7 +159,7 @@ class Actuator:
             _model(mapping_of(values, 'parameters', "'actuator.remanence': 0.1")), belief)
 
     @classmethod
-    def _of(cls, model: Model, belief: 'Belief | Path | None' = None) -> 'Actuator':
+    def _of(cls, model: JointModel, belief: 'Belief | Path | None' = None) -> 'Actuator':
         made = cls.__new__(cls)
         made.model, made._belief = model, belief
         return made
@@ -383,7 +383,7 @@ class Actuator:
                 f'{unknown[0]} has no factor: expected {", ".join(ACTUATOR_FIELDS)}')
         block = actuator_from(_checked(self.parameters) | {
             f'mismatch.{name}': number(x, f'the factor on {name}') for name, x in factors.items()})
-        return self._of(Model(replace(block, creep=self.block.creep), self.model.options))
+        return self._of(JointModel(replace(block, creep=self.block.creep), self.model.options))
 
     # -- plans and motions ---------------------------------------------------------------------
 
@@ -451,19 +451,20 @@ class Actuator:
         order, rate = whole(order, 'order'), number(max_rate, 'max_rate', '1/s')
         if limits is not None:
             low, high = limits_of(limits)
-            model = Model(model.actuator, replace(
+            model = JointModel(model.actuator, replace(
                 model.options, flux_density_min=low, flux_density_max=high))
         unit = model.units.time
         segments = plan_sequence(
             [Setpoint(x, y / unit) for x, y in zip(
                 stretches.tolist(), durations.tolist(), strict=True)],
-            Request.of(
+            MoveRequest.of(
                 model.material,
                 State(model.material.rest if start is None else number(start, 'start')),
                 limits=model.limits, units=model.units, order=order,
                 delivery=replace(model.delivery, period=grid_of(period) / unit),
                 errors=self._errors(shaper) if errors is None else as_errors(errors),
-                pace=Pace(number(periods, 'periods'), unit * (rate if rate == math.inf else number(
+                pace=SmoothLimits(
+                    number(periods, 'periods'), unit * (rate if rate == math.inf else number(
                     rate, 'max_rate', '1/s', above=0.0)))),
             shaper, short_spell)
         return Plan(self, segments, shaper)
@@ -716,7 +717,8 @@ _KEYS = tuple(x for x in Actuator.__init__.__annotations__ if x != 'return')
 
 
 def _model(
-        values: Mapping[str, Any], zeta: float | None = None, ratio: float | None = None) -> Model:
+        values: Mapping[str, Any], zeta: float | None = None,
+        ratio: float | None = None) -> JointModel:
     """Return the planning model of parameters; zeta or a ratio replace the damping coefficient."""
     if ratio is not None:
         undamped = _model(values, 0.0).material

@@ -17,8 +17,8 @@ from hmsa.files import write_text
 from hmsa.identification.files import Belief, belief_in, file_text
 from hmsa.identification.identify import identify as find
 from hmsa.identification.known import Known
+from hmsa.identification.measurement import Measurement
 from hmsa.identification.quantities import free_of
-from hmsa.identification.recording import Recording
 from hmsa.identification.result import Identification
 from hmsa.identification.runs import recording_of
 from hmsa.identification.tables import read_csv
@@ -181,7 +181,7 @@ def identify(
         if times[0] > time[0]:
             # The field is zero before the first command.
             times, levels = np.append(time[0], times), np.append(0.0, levels)
-        recording = Recording(
+        recording = Measurement(
             time - time[0], stretch, times - time[0], levels, options.slew_limit,
             coordinate=block.coordinate)
     others = {x: y for x, y in {**given, **known}.items() if y or x in known}

@@ -14,7 +14,7 @@ from hmsa.model.equations import Array
 from hmsa.model.simulation import check_stretch, longest_motion, response
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
-from hmsa.runs.levels import Level
+from hmsa.runs.levels import RecordedLevel
 from hmsa.runs.record import read_only, RecordedRequest, Run
 from hmsa.runs.tables import levels_of, samples_of, write_run
 from hmsa.table import frame, Table
@@ -357,10 +357,10 @@ def simulated(
     stretch = stretch + noise * np.random.default_rng(
         whole(seed, 'seed', least=0)).standard_normal(len(stretch))
     commands = tuple(
-        Level(stamp, level, -_AHEAD) for stamp, level in zip(
+        RecordedLevel(stamp, level, -_AHEAD) for stamp, level in zip(
             switched, levels.tolist(), strict=True))
     asked: tuple[RecordedRequest, ...] = ()
-    planned: tuple[Level, ...] = ()
+    planned: tuple[RecordedLevel, ...] = ()
     believed = truth if plan is None else plan.actuator
     if plan is not None:
         ends = np.cumsum(plan.setpoints[:, 1])
@@ -372,7 +372,7 @@ def simulated(
         predicted = response(
             believed.block, believed.model.delivery, times, levels, times, begin)
         planned = tuple(
-            Level(stamp, level, -_AHEAD, x, y) for stamp, level, x, y in zip(
+            RecordedLevel(stamp, level, -_AHEAD, x, y) for stamp, level, x, y in zip(
                 switched, levels.tolist(), *(z.tolist() for z in predicted[:2]), strict=True))
     parameters = {
         f'{node}.{name}': value for node, each in (('planner', believed), ('plant', truth))

@@ -19,7 +19,7 @@ from hmsa.planning.drafting import check_path
 from hmsa.planning.path import along, Path
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.setpoint import Setpoint
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.waves import sampled_shape, Shape, sine, triangle, Wave
 
 if TYPE_CHECKING:
@@ -175,10 +175,10 @@ def smooth_points(times: Array, stretches: Array) -> Array:
     return np.column_stack([since, *Path.smooth(since, stretches).course(since)])
 
 
-def _frame(actuator: 'Actuator') -> Request:
+def _frame(actuator: 'Actuator') -> MoveRequest:
     """Return the request to stay at rest without a field."""
     model = actuator.model
-    return Request.of(
+    return MoveRequest.of(
         model.material, limits=model.limits, units=model.units, delivery=model.delivery)
 
 

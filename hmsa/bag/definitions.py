@@ -21,7 +21,7 @@ from hmsa.bag import limits
 from hmsa.errors import BagError
 
 if TYPE_CHECKING:  # slow to import
-    from hmsa.bag.metadata import Topic
+    from hmsa.bag.metadata import BagTopic
 
 # Built-in types of .msg files.
 _BUILTIN = frozenset((
@@ -113,7 +113,7 @@ def type_hash(type_name: str) -> str:
 _NESTED = re.compile(r'^\s*(?:[A-Z]\w*|\w+/[\w/]+)\s*\[', re.MULTILINE)
 
 
-def installed(topic: 'Topic') -> 'Topic':
+def installed(topic: 'BagTopic') -> 'BagTopic':
     """
     Return a topic without a definition with that of its installed type.
 
@@ -127,7 +127,7 @@ def installed(topic: 'Topic') -> 'Topic':
     return replace(topic, definition=definition, definition_encoding=encoding)
 
 
-def make_decoder(info: 'Topic') -> Callable[[bytes], Any]:
+def make_decoder(info: 'BagTopic') -> Callable[[bytes], Any]:
     """Return the decoder of a topic's payloads; both raise `BagError` if they cannot decode."""
     from mcap.records import Schema
     from mcap_ros2.decoder import DecoderFactory

@@ -21,7 +21,7 @@ _Dumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 
 @dataclass(frozen=True)
-class Topic:
+class BagTopic:
     """A topic of a bag; ``metadata.yaml`` does not contain its definition."""
 
     name: str  #: for example ``'/joint_states'``
@@ -58,7 +58,7 @@ class BagMetadata:
     start_ns: int = NO_TIME  #: first log time; `NO_TIME` without a message
     duration_ns: int = 0
     message_count: int = 0
-    topics: tuple[Topic, ...] = ()
+    topics: tuple[BagTopic, ...] = ()
     files: tuple[FileMetadata, ...] = ()  #: in order of writing
     #: Notes of the user and the recorder.
     custom_data: Mapping[str, str] = field(default_factory=dict)
@@ -177,10 +177,10 @@ def from_map(content: Any, source: str) -> BagMetadata:
                        'bag') from error
 
 
-def _topic(entry: Any) -> Topic:
+def _topic(entry: Any) -> BagTopic:
     """Read one topic."""
     topic = entry['topic_metadata']
-    return Topic(
+    return BagTopic(
         str(topic['name']), str(topic['type']),
         profiles=qos.from_stored(topic.get('offered_qos_profiles')),
         type_hash=str(topic.get('type_description_hash') or ''),

@@ -36,7 +36,7 @@ import zstandard
 
 from hmsa import __version__
 from hmsa.bag import metadata, qos
-from hmsa.bag.metadata import Topic
+from hmsa.bag.metadata import BagTopic
 from hmsa.bag.records import MAGIC, MESSAGE, MESSAGE_FIXED, MESSAGE_HEAD
 
 LIBRARY = f'hmsa_ros {__version__}'
@@ -67,7 +67,7 @@ class OutputFile:
     messages, and ``notes_size`` that of the metadata records of the experiment.
     """
 
-    def __init__(self, path: Path, preset: str, topics: Sequence[Topic]) -> None:
+    def __init__(self, path: Path, preset: str, topics: Sequence[BagTopic]) -> None:
         self._descriptor = os.open(
             path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         self.path = path

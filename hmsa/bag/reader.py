@@ -26,14 +26,14 @@ from hmsa.bag import limits, metadata
 from hmsa.bag.definitions import make_decoder
 from hmsa.bag.folder import find
 from hmsa.bag.merge import Cursor, merge, Message
-from hmsa.bag.metadata import Topic
+from hmsa.bag.metadata import BagTopic
 from hmsa.bag.output import EXPERIMENT
-from hmsa.bag.records import Block
-from hmsa.bag.scan import Intake, ScannedFile
+from hmsa.bag.records import MessageBlock
+from hmsa.bag.scan import ReadLimits, ScannedFile
 from hmsa.bag.topics import topics_of
 from hmsa.errors import BadInputError, BagError, HmsaError
 
-__all__ = ['BagReader', 'DecodedMessage', 'Message', 'Topic', 'read_messages']
+__all__ = ['BagReader', 'DecodedMessage', 'Message', 'BagTopic', 'read_messages']
 # Later than any log time.
 _NEVER = 2**64
 
@@ -65,7 +65,7 @@ class BagReader:
         As given.
     files : tuple of pathlib.Path
         The files read, in order.
-    topics : mapping of str to Topic
+    topics : mapping of str to BagTopic
         By name, in order of appearance.
     metadata : hmsa.bag.metadata.BagMetadata or None
         Content of ``metadata.yaml``; None if it is missing or unreadable.
@@ -92,7 +92,7 @@ class BagReader:
                 f'largest chunk is {max_chunk_size} bytes: expected at least 1')
         self.path = Path(path)
         self._max_chunk_size = max_chunk_size
-        intake = Intake(max_chunk_size)
+        intake = ReadLimits(max_chunk_size)
         self.problems = intake.problems
         paths, self.metadata = find(self.path, intake.problem)
         self._files: list[ScannedFile] = []
@@ -156,7 +156,7 @@ class BagReader:
         """Return the last log time in nanoseconds, None without a message."""
         return max((block.end for block in self._filled_blocks()), default=None)
 
-    def _filled_blocks(self) -> Iterator[Block]:
+    def _filled_blocks(self) -> Iterator[MessageBlock]:
         """Return the blocks with messages."""
         for file in self._files:
             for block in file.blocks:
@@ -165,7 +165,7 @@ class BagReader:
                 if block.size and (block.end or self._has_messages(block)):
                     yield block
 
-    def _has_messages(self, block: Block) -> bool:
+    def _has_messages(self, block: MessageBlock) -> bool:
         """Return whether a block has messages, by reading it."""
         cursor = self._cursor(block)
         return cursor is not None and cursor.left
@@ -235,7 +235,7 @@ class BagReader:
         return result
 
     def _cursor(
-            self, block: Block, topics: Collection[str] | None = None, start: int = 0,
+            self, block: MessageBlock, topics: Collection[str] | None = None, start: int = 0,
             end: int = _NEVER) -> Cursor | None:
         """Return the messages of a chunk or run in the order stored; report damage."""
         file = self._files[block.file]

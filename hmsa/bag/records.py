@@ -56,7 +56,7 @@ _CLASSES: dict[int, type[Any]] = {
 
 
 @dataclass(frozen=True)
-class Block:
+class MessageBlock:
     """A chunk, or a run of messages outside chunks, and its position in the file."""
 
     file: int  #: number of the file
@@ -69,7 +69,7 @@ class Block:
     crc: int = 0  #: CRC-32 of the content; 0 for none
 
     @classmethod
-    def of_chunk(cls, file: int, offset: int, head: bytes, length: int) -> 'Block':
+    def of_chunk(cls, file: int, offset: int, head: bytes, length: int) -> 'MessageBlock':
         """Read the fields before the data of a chunk record of a length, or raise `BagError`."""
         try:
             start, end, size, crc, name = _CHUNK_HEAD.unpack_from(head)

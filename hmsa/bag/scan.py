@@ -25,7 +25,7 @@ from mcap.records import (
 
 from hmsa.bag import limits, records
 from hmsa.bag.folder import foreign
-from hmsa.bag.records import Block, MAGIC, PREFIX
+from hmsa.bag.records import MAGIC, MessageBlock, PREFIX
 from hmsa.errors import BadInputError, BagError, printable
 
 # Messages outside chunks are grouped and handled like chunks.
@@ -41,7 +41,7 @@ _PASSED_OVER = frozenset((Opcode.ATTACHMENT, Opcode.ATTACHMENT_INDEX))
 _Declared = TypeVar('_Declared', Schema, Channel)
 
 
-class Intake:
+class ReadLimits:
     """
     Limits and problems of all files of a bag.
 
@@ -87,7 +87,7 @@ class ScannedFile:
     if it is not an MCAP file.
     """
 
-    def __init__(self, intake: Intake, path: Path, number: int) -> None:
+    def __init__(self, intake: ReadLimits, path: Path, number: int) -> None:
         self.path = path
         self.closed = False
         self.said: int | None = None
@@ -140,7 +140,7 @@ class ScannedFile:
         """Reset the content."""
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        self.blocks: list[Block] = []
+        self.blocks: list[MessageBlock] = []
         self.metadata: dict[str, dict[str, str]] = {}
         self._counts = Counter[int]()
 
@@ -181,7 +181,7 @@ class ScannedFile:
             return False
         return True
 
-    def _add_block(self, block: Block, offset: int) -> None:
+    def _add_block(self, block: MessageBlock, offset: int) -> None:
         """Add a chunk unless it is too large."""
         try:
             self._intake.check_size(max(block.size, block.length), 'chunk')
@@ -238,14 +238,14 @@ class ScannedFile:
     def _end_run(self, begin: int | None, end: int) -> None:
         """Add messages outside chunks as a chunk of unknown times."""
         if begin is not None:
-            self.blocks.append(Block(self._number, begin, end - begin, end - begin, -1, -1))
+            self.blocks.append(MessageBlock(self._number, begin, end - begin, end - begin, -1, -1))
 
     def _read_record(self, offset: int, head: bytes) -> McapRecord | None:
         """Read one record that is not a message."""
         opcode, length = PREFIX.unpack_from(head)
         content = head[PREFIX.size:]
         if opcode == Opcode.CHUNK:
-            self._add_block(Block.of_chunk(self._number, offset, content, length), offset)
+            self._add_block(MessageBlock.of_chunk(self._number, offset, content, length), offset)
         elif opcode == Opcode.MESSAGE_INDEX:
             if length < 6 or struct.unpack_from('<I', content, 2)[0] != length - 6:
                 raise BagError('a message index record ends early')
@@ -357,7 +357,7 @@ class ScannedFile:
         # The index has no checksum.
         crc, = struct.unpack('<I', records.read_exactly(
             self._descriptor, 4, offset + PREFIX.size + 24))
-        self._add_block(Block(
+        self._add_block(MessageBlock(
             self._number, offset + PREFIX.size + 40 + len(index.compression.encode()),
             index.compressed_size, index.uncompressed_size, index.message_start_time,
             index.message_end_time, index.compression, crc), offset)

@@ -7,12 +7,12 @@ from mcap.records import Schema
 
 from hmsa.bag import limits, qos
 from hmsa.bag.definitions import EMPTY, installed
-from hmsa.bag.metadata import Topic
+from hmsa.bag.metadata import BagTopic
 from hmsa.bag.scan import ScannedFile
 from hmsa.errors import BagError
 
 
-def number_of(topic: Topic, known: Sequence[Topic]) -> int:
+def number_of(topic: BagTopic, known: Sequence[BagTopic]) -> int:
     """Return the number of a topic among those known, or the next one for a new topic."""
     return next((
         number for number, other in enumerate(known)
@@ -20,10 +20,10 @@ def number_of(topic: Topic, known: Sequence[Topic]) -> int:
 
 
 def topics_of(
-        files: Iterable[ScannedFile], described: Mapping[str, Topic],
-        custom_data: Mapping[str, str], problem: Callable[[str], None]) -> dict[str, Topic]:
+        files: Iterable[ScannedFile], described: Mapping[str, BagTopic],
+        custom_data: Mapping[str, str], problem: Callable[[str], None]) -> dict[str, BagTopic]:
     """Return the topics of files, with the profiles of their metadata, in order of appearance."""
-    topics: dict[str, Topic] = {}
+    topics: dict[str, BagTopic] = {}
     for file in files:
         for channel in file.channels.values():
             name, known = channel.topic, topics.get(channel.topic)
@@ -45,7 +45,7 @@ def topics_of(
             for more in () if stored is None else stored.profiles, later:
                 profiles += tuple(x for x in more if x not in profiles)
             if known is None:
-                topic = topics[name] = Topic(
+                topic = topics[name] = BagTopic(
                     name, schema.name, schema.data.decode('utf-8', 'replace'), schema.encoding,
                     profiles, channel.metadata.get('topic_type_hash', ''),
                     channel.message_encoding)
@@ -58,7 +58,7 @@ def topics_of(
     return topics
 
 
-def _defined(topic: Topic, file: str, problem: Callable[[str], None]) -> Topic:
+def _defined(topic: BagTopic, file: str, problem: Callable[[str], None]) -> BagTopic:
     """Return a topic without a definition with that of the installed type, if there is one."""
     try:
         return installed(topic)

@@ -18,14 +18,14 @@ import re
 
 from hmsa import __version__
 from hmsa.bag import metadata, qos
-from hmsa.bag.metadata import Topic
+from hmsa.bag.metadata import BagTopic
 from hmsa.bag.output import Entry, OutputFile, PRESETS
 from hmsa.bag.reader import BagReader
 from hmsa.bag.records import MESSAGE_HEAD
 from hmsa.bag.topics import number_of
 from hmsa.errors import BadInputError, BagError
 
-__all__ = ['BagWriter', 'MIN_FILE_SIZE', 'parse_custom_data', 'PRESETS', 'Topic']
+__all__ = ['BagWriter', 'MIN_FILE_SIZE', 'parse_custom_data', 'PRESETS', 'BagTopic']
 # Total size up to which changes of the custom data are written to a file at once. Later ones, of a
 # recording of hours, are in ``metadata.yaml`` at once and in the file at its end.
 _NOTES_SIZE = 2**20
@@ -88,7 +88,7 @@ class BagWriter:
         # Metadata and messages are UTF-8; the name of a folder can be any bytes.
         self._stem = re.sub('[\ud800-\udfff]', '_', self.folder.name)
         self._ros_distro = ros_distro
-        self._topics: list[Topic] = []
+        self._topics: list[BagTopic] = []
         # Files that were left, with their counts and size; None if they have no summary.
         self._left: list[tuple[metadata.FileMetadata, Counter[int], int | None]] = []
         self._counts: Counter[int] = Counter()  # messages written, by the number of their topic
@@ -152,7 +152,7 @@ class BagWriter:
         """Return the number of messages written."""
         return {topic.name: self._counts[number] for number, topic in enumerate(self._topics)}
 
-    def add_topic(self, topic: Topic) -> int:
+    def add_topic(self, topic: BagTopic) -> int:
         """Add a topic and return its number; raise `BagError` beyond `MAX_CHANNELS`."""
         topic.check()
         number = number_of(topic, self._topics)

@@ -24,7 +24,7 @@ from hmsa.interfaces.quantities import number_of
 
 if TYPE_CHECKING:
     from hmsa.identification.files import Belief
-    from hmsa.identification.recording import Recording
+    from hmsa.identification.measurement import Measurement
 
 
 def add_parser(subparsers: Any) -> None:
@@ -146,7 +146,7 @@ def known_of(text: str) -> tuple[dict[str, float], dict[str, float]]:
 
 
 def _read(
-        arguments: argparse.Namespace, belief: 'Belief') -> 'tuple[Recording, Belief, bool]':
+        arguments: argparse.Namespace, belief: 'Belief') -> 'tuple[Measurement, Belief, bool]':
     """Return the recording, prior knowledge with values of a bag, and whether there is any."""
     path: Path = arguments.recording
     if path.is_dir() or path.suffix == '.mcap':

@@ -36,10 +36,10 @@ from hmsa.interfaces.quantities import (
     default_of,
     EVERY,
     FORMS,
+    GivenNumber,
     joint_names,
     OPTIONAL,
     QUANTITIES,
-    Quantity,
 )
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def add_parser(subparsers: Any) -> None:
         JSON)
 
 
-def _option(quantity: Quantity) -> Row:
+def _option(quantity: GivenNumber) -> Row:
     """Return the option of a quantity."""
     note = ', in place of --zeta; with --beam of its tip, in place of --damping-ratio'
     if quantity is not DAMPING:
@@ -144,7 +144,7 @@ def run(arguments: argparse.Namespace) -> int:
         *(f'  hmsa {x} --ros-args --params-file {quote(str(path))}' for x in _NODES))
 
 
-def _wanted(arguments: argparse.Namespace) -> tuple[str, tuple[Quantity, ...]]:
+def _wanted(arguments: argparse.Namespace) -> tuple[str, tuple[GivenNumber, ...]]:
     """Return form and quantities of the actuator; a hyperelastic model has its own constants."""
     form = 'beam' if arguments.beam else 'block'
     if arguments.law is None:
@@ -163,7 +163,7 @@ def _wanted(arguments: argparse.Namespace) -> tuple[str, tuple[Quantity, ...]]:
 
 def _given(
         arguments: argparse.Namespace, form: str,
-        wanted: Sequence[Quantity]) -> dict[str, float]:
+        wanted: Sequence[GivenNumber]) -> dict[str, float]:
     """Return the values of the options, after checking their combination."""
     given = {x.key: value for x in (*EVERY, DAMPING)
              if (value := getattr(arguments, x.key)) is not None}

@@ -160,8 +160,8 @@ def _without_dimension(arguments: argparse.Namespace) -> int:
     from hmsa.model.units import Units
     from hmsa.planning.sequence import plan_sequence
     from hmsa.planning.setpoint import impossible, Setpoint
-    from hmsa.planning.shapers.pace import Pace
-    from hmsa.planning.shapers.request import as_errors, ERRORS, Request
+    from hmsa.planning.shapers.request import as_errors, ERRORS, MoveRequest
+    from hmsa.planning.shapers.smooth_limits import SmoothLimits
 
     if arguments.out is not None:
         raise BadInputError(
@@ -175,11 +175,11 @@ def _without_dimension(arguments: argparse.Namespace) -> int:
     try:
         segments = plan_sequence(
             [Setpoint(*x) for x in arguments.setpoints],
-            Request.of(
+            MoveRequest.of(
                 group, State(group.rest if arguments.start is None else arguments.start),
                 units=Units(time_name=f' {_TIME}', load_name=f' {_LOAD}'), order=arguments.order,
                 errors=ERRORS if errors is None else as_errors(errors),
-                pace=Pace(arguments.periods, arguments.max_rate)),
+                pace=SmoothLimits(arguments.periods, arguments.max_rate)),
             arguments.shaper or 'two_step')
     except RefusedError as error:
         if error.code is not Code.SPELL_TOO_SHORT:

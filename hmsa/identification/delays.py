@@ -10,8 +10,8 @@ from scipy.special import stdtrit
 
 from hmsa.errors import BadInputError
 from hmsa.identification.identify import identify
+from hmsa.identification.measurement import Measurement
 from hmsa.identification.quantities import DEFAULT_FREE
-from hmsa.identification.recording import Recording
 from hmsa.identification.result import Identification
 from hmsa.model.equations import Array
 from hmsa.model.parameters import ActuatorParameters
@@ -177,7 +177,7 @@ class Delays:
 
 
 def delays(
-        recording: Recording, asked: Array, field: FieldDelays | None,
+        recording: Measurement, asked: Array, field: FieldDelays | None,
         actuator: ActuatorParameters, *, lag: float | None = None) -> Delays:
     """
     Separate transport, lag and latency.
@@ -235,7 +235,7 @@ def delays(
         tuple(notes))
 
 
-def _motion(recording: Recording, actuator: ActuatorParameters, lag: float) -> Identification:
+def _motion(recording: Measurement, actuator: ActuatorParameters, lag: float) -> Identification:
     """Identify the latency for a known lag, with parameters that residuals suggest."""
     free: tuple[str, ...] = (*DEFAULT_FREE, 'sensor_latency')
     known = {'coil_time_constant': lag}

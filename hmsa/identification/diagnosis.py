@@ -7,12 +7,12 @@ import numpy as np
 
 from hmsa.errors import BadInputError
 from hmsa.identification import quantities
-from hmsa.identification.departures import GAIN, USUAL_GAIN
+from hmsa.identification.defects import GAIN, USUAL_GAIN
 from hmsa.identification.fit import Fit
+from hmsa.identification.initial_guess import segments
 from hmsa.identification.noise import autocorrelation, Whiteness
 from hmsa.identification.repeats import Repeated
-from hmsa.identification.result import Signature
-from hmsa.identification.start import segments
+from hmsa.identification.result import Defect
 from hmsa.model import equations
 from hmsa.model.equations import Array
 
@@ -145,7 +145,7 @@ def _listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f'{", ".join(names[:-1])} and {names[-1]}'
 
 
-def second_mode(fit: Fit) -> list[Signature]:
+def second_mode(fit: Fit) -> list[Defect]:
     """Search for a single sharp frequency in the residuals of evenly spaced samples."""
     time = fit.recording.time
     gaps = np.diff(time)
@@ -163,7 +163,7 @@ def second_mode(fit: Fit) -> list[Signature]:
     frequency = (place + 3) / (float(np.mean(np.diff(time))) * len(time))
     own = frequency_of(fit)
     apart = not 0.5 < frequency / own < 2.0
-    return [Signature(
+    return [Defect(
         f'a second mode at {frequency:.4g} Hz', share,
         math.sqrt(max(-2.0 * math.log(max(chance, 1e-300)), 0.0)),
         bool(share > 0.3 and chance < 1e-6 and apart and frequency > own))]
@@ -242,7 +242,7 @@ def check_plausible(fit: Fit, unknown: Collection[str]) -> None:
 
 
 def misfit(
-        fit: Fit, found: Whiteness, marks: Sequence[Signature], alike: Repeated | None) -> str:
+        fit: Fit, found: Whiteness, marks: Sequence[Defect], alike: Repeated | None) -> str:
     """Return why the model is rejected, with numbers; empty if it is not."""
     motion = float(np.std(fit.recording.stretch))
     seen = [x for x in marks if x.found]
@@ -282,7 +282,7 @@ def misfit(
     return ''
 
 
-def _remedy(seen: Sequence[Signature]) -> str:
+def _remedy(seen: Sequence[Defect]) -> str:
     """Return which parameters to free for departures nearly as large as the first."""
     names = dict.fromkeys(
         x.remedy for x in seen if x.remedy and x.share > 0.8 * seen[0].share)
@@ -290,7 +290,7 @@ def _remedy(seen: Sequence[Signature]) -> str:
     return f'; try {lines}' if lines else ''
 
 
-def cost(fit: Fit, marks: Sequence[Signature], alike: Repeated | None) -> float:
+def cost(fit: Fit, marks: Sequence[Defect], alike: Repeated | None) -> float:
     """Return the peak-to-peak error of the model, relative to a step."""
     share = max((x.share for x in marks if x.found), default=0.0)
     ends = [float(fit.response.stretch[end - 1]) for _, end, _, _ in segments(fit.recording, 1)]

@@ -16,7 +16,7 @@ import numpy as np
 
 from hmsa.errors import BadInputError
 from hmsa.identification import quantities
-from hmsa.identification.recording import Course, FEWEST
+from hmsa.identification.measurement import FEWEST, UncheckedMeasurement
 from hmsa.identification.response import respond, Response
 from hmsa.model import equations
 from hmsa.model.delivery import Delivery
@@ -26,7 +26,7 @@ from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa.model.status import RefusedError
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.setpoint import Setpoint
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 
 if TYPE_CHECKING:
     from hmsa.identification.files import Belief
@@ -195,7 +195,7 @@ class Designer:
     def _respond(
             self, times: Array, level_times: Array, levels: Array, rtol: float,
             free: Sequence[str] = ()) -> Response | None:
-        course = Course(times, level_times, levels, self._bounds.slew_limit)
+        course = UncheckedMeasurement(times, level_times, levels, self._bounds.slew_limit)
         return respond(course, self._values, free, rtol=rtol)
 
     def judge(self, level_times: Array, levels: Array) -> Program | None:
@@ -232,7 +232,7 @@ class Designer:
             np.linspace(0.0, end, 50, dtype=np.float64), level_times, levels, 1e-9)
         time, unit = self._actuator.time_unit, self._actuator.flux_density_unit
         move = None if state is None else self._planned(
-            [Setpoint(self._group.rest, math.inf)], end, Request.of(
+            [Setpoint(self._group.rest, math.inf)], end, MoveRequest.of(
                 self._group, State(float(state.stretch[-1]), float(state.rate[-1]) * time,
                                    float(levels[-1]) / unit),
                 limits=Limits(self._bounds.flux_density_min / unit,
@@ -244,7 +244,7 @@ class Designer:
 
     def _planned(
             self, setpoints: Sequence[Setpoint], begin: float,
-            request: Request | NondimensionalParameters) -> Array | None:
+            request: MoveRequest | NondimensionalParameters) -> Array | None:
         """Return times in s, from a begin on, and levels in T of a plan; None if there is none."""
         time, unit = self._actuator.time_unit, self._actuator.flux_density_unit
         try:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from hmsa.identification import quantities
-from hmsa.identification.recording import Recording
+from hmsa.identification.measurement import Measurement
 from hmsa.identification.response import respond, Response
 from hmsa.model.equations import Array
 
@@ -37,7 +37,7 @@ LEAST_SCALE = 3.0 * _NUMERICAL
 class Fit:
     """A local minimum."""
 
-    recording: Recording
+    recording: Measurement
     free: tuple[str, ...]  # columns of the Jacobian
     response: Response
     residual: Array  # measured minus simulated stretch, shape (n,)
@@ -119,7 +119,7 @@ def moved(values: Mapping[str, Any], free: Sequence[str], step: Array) -> dict[s
 
 
 def fit(
-        recording: Recording, values: Mapping[str, float], free: Sequence[str], *,
+        recording: Measurement, values: Mapping[str, float], free: Sequence[str], *,
         most: int = _MAX_PASSES, spread: Array | None = None) -> Fit | None:
     """
     Search for a minimum from start values of all quantities; None if they cannot be simulated.
@@ -134,7 +134,7 @@ def fit(
 class _Search:
     """A search in parameters and uncertain switches."""
 
-    _recording: Recording
+    _recording: Measurement
     _free: tuple[str, ...]
     _most: int
     _spread: Array

@@ -8,15 +8,15 @@ import numpy as np
 
 from hmsa.errors import BadInputError
 from hmsa.identification import diagnosis, quantities
-from hmsa.identification.departures import dead_band
+from hmsa.identification.defects import dead_band
 from hmsa.identification.fit import Fit, fit, robust_scale
+from hmsa.identification.initial_guess import begins_at_rest, segments
 from hmsa.identification.intervals import estimates_of, Precision, precision_of, stamp_error
+from hmsa.identification.measurement import Measurement
 from hmsa.identification.noise import errors_of_stamps, whiteness
-from hmsa.identification.recording import Recording
 from hmsa.identification.repeats import repeated
-from hmsa.identification.result import Identification, Verdict
+from hmsa.identification.result import Identification, IdentificationVerdict
 from hmsa.identification.search import rivals, search, unmoved
-from hmsa.identification.start import begins_at_rest, segments
 from hmsa.interfaces.actuator import parameters_of
 from hmsa.model.equations import Array
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
@@ -30,7 +30,7 @@ _SHAPED = 0.15
 
 
 def identify(
-        recording: Recording, free: Sequence[str] = quantities.DEFAULT_FREE, *,
+        recording: Measurement, free: Sequence[str] = quantities.DEFAULT_FREE, *,
         actuator: ActuatorParameters | None = None, known: Mapping[str, float] | None = None,
         uncertain: Mapping[str, float] | None = None) -> Identification:
     """
@@ -174,7 +174,7 @@ def _conclude(
     still = set() if lost else unmoved(best)
     if not distant and not others and not still:
         diagnosis.check_plausible(best, lost)
-    verdict: Verdict = 'model_rejected'
+    verdict: IdentificationVerdict = 'model_rejected'
     reason = diagnosis.misfit(best, found, marks, alike)
     if weak:
         # Errors of the model widen all intervals, and may be why nothing is determined.

@@ -8,7 +8,7 @@ import numpy as np
 
 from hmsa.errors import BadInputError
 from hmsa.identification import diagnosis, quantities
-from hmsa.identification.departures import Departures, departures
+from hmsa.identification.defects import Departures, departures
 from hmsa.identification.fit import Fit, fit, LEAST_SCALE, moved
 from hmsa.identification.noise import Whiteness, whiteness, widening
 from hmsa.identification.response import respond

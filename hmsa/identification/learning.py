@@ -41,7 +41,7 @@ Places = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class SequenceRepeat:
     """
     A repeat of a sequence; times in s from its first level.
 
@@ -73,7 +73,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Target:
+class TargetWindow:
     """A stretch, and the start and end in s of its setpoint, including the move."""
 
     stretch: float
@@ -84,7 +84,7 @@ class Target:
 
 
 @dataclass(frozen=True)
-class Left:
+class RemainingError:
     """Errors that a repeat leaves at a target, as fractions of the step."""
 
     vibration: float  #: peak to peak in the first period
@@ -97,7 +97,7 @@ class Learnt:
 
     level_times: Array  #: shape (m,), in s
     levels: Array  #: shape (m,), in T
-    left: tuple[tuple[Left, ...], ...]  #: by repeat and target
+    left: tuple[tuple[RemainingError, ...], ...]  #: by repeat and target
     best: int  #: index of the repeat with the smallest residual
     frequency: float  #: of the second mode in Hz; NaN if none is found
 
@@ -106,7 +106,8 @@ class _Sequence:
     """Knots of a sequence, and its windows of rest."""
 
     def __init__(
-            self, first: Trial, targets: Sequence[Target], actuator: ActuatorParameters) -> None:
+            self, first: SequenceRepeat, targets: Sequence[TargetWindow],
+            actuator: ActuatorParameters) -> None:
         self.targets, self.actuator = targets, actuator
         unit = actuator.time_unit
         self.period = 2.0 * math.pi * unit / np.array([
@@ -146,7 +147,7 @@ class _Sequence:
         if min(map(abs, self.steps)) < 1e-6:
             raise BadInputError('a setpoint repeats the one before: expected steps')
 
-    def levels(self, trial: Trial) -> Array:
+    def levels(self, trial: SequenceRepeat) -> Array:
         """Return the levels of a repeat, read in the middle between times."""
         gaps = np.diff(self.times, append=self.times[-1] + 2e-3)
         return trial.at(self.times + 0.5 * np.minimum(gaps, 0.05))
@@ -170,7 +171,7 @@ class _Sequence:
             for x, target, step in zip(
                 self.windows(time), self.targets, self.steps, strict=True)])
 
-    def left(self, trial: Trial, mode: '_Mode | None') -> tuple[Left, ...]:
+    def left(self, trial: SequenceRepeat, mode: '_Mode | None') -> tuple[RemainingError, ...]:
         """Return the residual of a repeat, at the frequencies of the model and a second mode."""
         found = []
         for x, target, step, period in zip(
@@ -181,7 +182,7 @@ class _Sequence:
             fitted = _ringing(time[:len(first)], [
                 2.0 * math.pi / float(period), *([] if mode is None else [mode.frequency])])
             curve = fitted @ np.linalg.lstsq(fitted, first, rcond=1e-6)[0]
-            found.append(Left(float(np.ptp(curve)), float(np.mean(off))))
+            found.append(RemainingError(float(np.ptp(curve)), float(np.mean(off))))
         return tuple(found)
 
     def simulated(self, levels: Array, time: Array) -> Array:
@@ -192,7 +193,7 @@ class _Sequence:
             np.maximum(time, self.times[0] - 1.0) / unit, self.actuator.nondimensional)[0]
         return found
 
-    def delay(self, trial: Trial) -> float:
+    def delay(self, trial: SequenceRepeat) -> float:
         """Return the delay of the samples after the model in s, due to lag and latency."""
         seen, shown = trial.stretch, self.simulated(self.levels(trial), trial.time)
         delays = float(np.min(self.period)) * _DELAYS
@@ -240,7 +241,7 @@ class _Mode:
         return found
 
 
-def _second_mode(sequence: _Sequence, trial: Trial, noise: float) -> _Mode | None:
+def _second_mode(sequence: _Sequence, trial: SequenceRepeat, noise: float) -> _Mode | None:
     """Find a mode that the levels excite, other than the first one and its second harmonic."""
     levels = sequence.levels(trial)
     places = sequence.windows(trial.time)
@@ -281,7 +282,8 @@ def _second_mode(sequence: _Sequence, trial: Trial, noise: float) -> _Mode | Non
 
 
 def learn(
-        trials: Sequence[Trial], targets: Sequence[Target], actuator: ActuatorParameters,
+        trials: Sequence[SequenceRepeat], targets: Sequence[TargetWindow],
+        actuator: ActuatorParameters,
         limits: tuple[float, float] = (-math.inf, math.inf)) -> Learnt:
     """
     Return the levels to send next.

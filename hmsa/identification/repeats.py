@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from hmsa.identification.fit import Fit
-from hmsa.identification.start import segments
+from hmsa.identification.initial_guess import segments
 from hmsa.model.equations import Array
 
 # Numbers of random draws: first, and if the p-value is not clearly above a limit.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hmsa import motion
 from hmsa.errors import BadInputError
 from hmsa.identification import quantities
-from hmsa.identification.recording import Course, pieces, Recording
+from hmsa.identification.measurement import Measurement, pieces, UncheckedMeasurement
 from hmsa.model.creep import Creep
 from hmsa.model.equations import Array
 from hmsa.model.law import KIND, pack
@@ -108,7 +108,7 @@ def _packed(limit: float, c1: float, law: Elastic | None) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Setup:
+class ResponseArguments:
     """Arguments of the motion for some values, and the chain rule to the free parameters."""
 
     theta: Array  # with indices as in `hmsa.motion.theta`
@@ -122,7 +122,7 @@ class Setup:
     @classmethod
     def of(
             cls, values: Mapping[str, Any], free: Sequence[str], more: Sequence[int] = ()
-    ) -> 'Setup':
+    ) -> 'ResponseArguments':
         """
         Return the setup for values from `quantities.complete`, with its own arrays.
 
@@ -151,7 +151,8 @@ class Setup:
 
 
 def respond(
-        recording: Recording | Course, values: Mapping[str, float], free: Sequence[str], *,
+        recording: Measurement | UncheckedMeasurement, values: Mapping[str, float],
+        free: Sequence[str], *,
         rtol: float = RTOL, shifts: Array | None = None, more: Sequence[int] = ()
 ) -> Response | None:
     """
@@ -166,7 +167,7 @@ def respond(
         values = quantities.complete(values, free)
     except BadInputError:
         return None
-    setup = Setup.of(values, free, more)
+    setup = ResponseArguments.of(values, free, more)
     theta, material, wanted = setup.theta, setup.material, setup.wanted
     times = recording.time - values['sensor_latency']
     begin = float(recording.time[0])

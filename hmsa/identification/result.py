@@ -6,14 +6,14 @@ import math
 from typing import Any, Literal
 
 from hmsa.identification.fit import Fit
+from hmsa.identification.measurement import Measurement
 from hmsa.identification.noise import Whiteness
 from hmsa.identification.quantities import actuator_of, modulus_of
-from hmsa.identification.recording import Recording
 from hmsa.model.equations import Array
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.table import Column, Table
 
-Verdict = Literal['identified', 'not_identifiable', 'model_rejected']
+IdentificationVerdict = Literal['identified', 'not_identifiable', 'model_rejected']
 #: Correlation from which two parameters count as confounded.
 CONFOUNDED = 0.95
 #: Maximum error of the model, relative to a step, that may be accepted.
@@ -49,7 +49,7 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Signature:
+class Defect:
     """
     A departure from the model, tested on the residuals.
 
@@ -119,7 +119,7 @@ class Identification:
 
     """
 
-    verdict: Verdict
+    verdict: IdentificationVerdict
     reason: str
     warnings: tuple[str, ...]
     parameters: dict[str, Estimate]
@@ -129,10 +129,10 @@ class Identification:
     residual_rms: float
     samples: int
     outliers: int
-    recording: Recording
+    recording: Measurement
     fit: Fit
     whiteness: Whiteness
-    signatures: tuple[Signature, ...]
+    signatures: tuple[Defect, ...]
     widened: float
     values: Mapping[str, Any]
     starts: int

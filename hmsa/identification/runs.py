@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from hmsa.errors import BadInputError
-from hmsa.identification.recording import Recording
+from hmsa.identification.measurement import Measurement
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs.bags import read_run
@@ -16,7 +16,7 @@ from hmsa.runs.record import Run
 
 def read_bag(
         path: Path, *, joint: str = '', actuator: ActuatorParameters | None = None
-) -> tuple[Recording, ActuatorParameters, dict[str, float]]:
+) -> tuple[Measurement, ActuatorParameters, dict[str, float]]:
     """
     Read the recording of one actuator from a bag: a folder, or an ``.mcap`` file.
 
@@ -29,7 +29,7 @@ def read_bag(
 
 def recording_of(
         run: Run, actuator: ActuatorParameters | None = None
-) -> tuple[Recording, ActuatorParameters, dict[str, float]]:
+) -> tuple[Measurement, ActuatorParameters, dict[str, float]]:
     """Return the recording of a run, as `read_bag`; raise `BadInputError` if it has no level."""
     block = actuator or run.planner
     # A recorder receives earlier latched changes after the first new one.
@@ -55,7 +55,7 @@ def recording_of(
             "the recording does not contain the actuator's parameters: what is not identified is "
             'that of the example block; name a parameter file (--params-file)',)
     return (
-        Recording(
+        Measurement(
             (run.time - zero) / NANOSECONDS, run.stretch, stamps[keep], fields[keep],
             slew or math.inf, 0.0, run.label, notes, block.coordinate),
         block,

@@ -9,10 +9,10 @@ from hmsa import motion
 from hmsa.errors import BadInputError
 from hmsa.identification import diagnosis
 from hmsa.identification.fit import Fit, fit, loss, robust_scale
+from hmsa.identification.initial_guess import at_units, scan, seeks_time, segments, starts, static
+from hmsa.identification.measurement import Measurement
 from hmsa.identification.quantities import STATIC
-from hmsa.identification.recording import Recording
-from hmsa.identification.response import respond, sensed, Setup
-from hmsa.identification.start import at_units, scan, seeks_time, segments, starts, static
+from hmsa.identification.response import respond, ResponseArguments, sensed
 from hmsa.model.equations import Array
 
 # Ratio of residuals to their increments up to which they are white enough for a first check.
@@ -56,7 +56,7 @@ def _good(found: Fit) -> bool:
 
 
 def search(
-        recording: Recording, values: Mapping[str, float], free: Sequence[str]
+        recording: Measurement, values: Mapping[str, float], free: Sequence[str]
 ) -> tuple[Fit, int, int]:
     """
     Return the best fit, the number of fits, and how many of them agree with it.
@@ -111,7 +111,7 @@ def _settled(found: Sequence[Fit]) -> bool:
     return agreed >= _ENOUGH and _near(best)
 
 
-def _miss(recording: Recording, candidate: Mapping[str, float]) -> float:
+def _miss(recording: Measurement, candidate: Mapping[str, float]) -> float:
     """Return the mean absolute deviation of the simulated from the recorded motion."""
     response = respond(recording, candidate, (), rtol=1e-4)
     return math.inf if response is None else float(
@@ -119,7 +119,7 @@ def _miss(recording: Recording, candidate: Mapping[str, float]) -> float:
 
 
 def _descended(
-        found: list[Fit], recording: Recording, start: Mapping[str, float], free: Sequence[str]
+        found: list[Fit], recording: Measurement, start: Mapping[str, float], free: Sequence[str]
 ) -> bool:
     """Add the fit from a start, in full if it may become the best; return whether there is one."""
     few = any(x.converged for x in found)
@@ -175,7 +175,7 @@ def unmoved(best: Fit) -> set[str]:
     from scipy.special import fdtrc
 
     recording, values = best.recording, best.values
-    setup = Setup.of(values, best.free)
+    setup = ResponseArguments.of(values, best.free)
     place = recording.place(recording.time - values['sensor_latency'])
     levels, which = np.unique(recording.levels[place], return_inverse=True)
     rests: Array = np.empty(len(levels))

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 
 from hmsa.errors import BadInputError
-from hmsa.identification.learning import learn, Learnt, Target, Trial
+from hmsa.identification.learning import learn, Learnt, SequenceRepeat, TargetWindow
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs.levels import ROUNDED
 from hmsa.runs.record import Run
 from hmsa.runs.setpoints import setpoints_of
 
 
-def learn_from(runs: Sequence[Run]) -> tuple[Learnt, list[Target]]:
+def learn_from(runs: Sequence[Run]) -> tuple[Learnt, list[TargetWindow]]:
     """
     Learn from runs of one sequence.
 
@@ -46,7 +46,7 @@ def learn_from(runs: Sequence[Run]) -> tuple[Learnt, list[Target]]:
     ends = [x.begins for x in requested[1:]] + [
         requested[-1].end if requested[-1].end is not None else begins[0] + last]
     targets = [
-        Target(x.target, max((x.begins - begins[0]) / NANOSECONDS, 0.0),
+        TargetWindow(x.target, max((x.begins - begins[0]) / NANOSECONDS, 0.0),
                (end - begins[0]) / NANOSECONDS,
                None if x.arrival is None else (x.arrival - begins[0]) / NANOSECONDS)
         for x, end in zip(requested, ends, strict=True)]
@@ -71,7 +71,7 @@ def _begin(run: Run) -> int:
         'levels that took effect')
 
 
-def _trial(run: Run, begin: int) -> Trial:
+def _trial(run: Run, begin: int) -> SequenceRepeat:
     """Return a repeat, with times from its first level."""
     since = (run.time - begin) / NANOSECONDS
     levels = [x for x in run.levels if x.stamp >= begin]
@@ -79,12 +79,12 @@ def _trial(run: Run, begin: int) -> Trial:
     # Of levels at the same time the last one applies.
     keep = np.append(np.diff(times) > 0.0, True)
     seen = (since >= 0.0) & np.isfinite(run.stretch)
-    return Trial(
+    return SequenceRepeat(
         since[seen], run.stretch[seen], times[keep],
         np.array([x.flux_density for x in levels])[keep])
 
 
-def sequence_text(found: Learnt, targets: Sequence[Target], runs: Sequence[Path]) -> str:
+def sequence_text(found: Learnt, targets: Sequence[TargetWindow], runs: Sequence[Path]) -> str:
     """Return a learnt sequence as YAML for ``hmsa run --levels``."""
     end = targets[-1].end
     rows = [*zip(found.level_times.tolist(), found.levels.tolist(), strict=True),

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa.columns import read_table, Table
+from hmsa.columns import CsvColumns, read_table
 from hmsa.errors import BadInputError
-from hmsa.identification.recording import FEWEST, Recording
+from hmsa.identification.measurement import FEWEST, Measurement
 from hmsa.model.equations import Array
 from hmsa.model.laws.coordinate import Coordinate, STRETCH
 
@@ -55,7 +55,7 @@ def read_levels(path: Path, notes: list[str] | None = None) -> tuple[Array, Arra
 
 def read_csv(
         path: Path, commands: Path | None = None, *, slew_limit: float = math.inf,
-        coordinate: Coordinate = STRETCH, rest_length: float | None = None) -> Recording:
+        coordinate: Coordinate = STRETCH, rest_length: float | None = None) -> Measurement:
     """
     Read a recording from CSV, with notes on rows that were left out.
 
@@ -95,12 +95,12 @@ def read_csv(
         times, levels, earlier = _sampled_levels(
             path, time, table.columns['flux_density'][keep], notes)
     # Subtract the first time: seconds since an epoch leave few digits for differences.
-    return Recording(
+    return Measurement(
         time - time[:1], stretch, times - time[:1], levels, slew_limit, earlier, str(path),
         tuple(dict.fromkeys(notes)), coordinate)
 
 
-def _kept(path: Path, table: Table, notes: list[str]) -> NDArray[np.int64]:
+def _kept(path: Path, table: CsvColumns, notes: list[str]) -> NDArray[np.int64]:
     """Return the usable rows by time, and note the others; raise `BadInputError` for too many."""
     time, stretch = table.columns['time'], table.columns['stretch']
     places: NDArray[np.int64] = np.flatnonzero(np.isfinite(time) & np.isfinite(stretch))
@@ -126,7 +126,7 @@ def _kept(path: Path, table: Table, notes: list[str]) -> NDArray[np.int64]:
 
 
 def _ordered(
-        path: Path, table: Table, places: NDArray[np.int64], notes: list[str]
+        path: Path, table: CsvColumns, places: NDArray[np.int64], notes: list[str]
 ) -> NDArray[np.int64]:
     """Return rows sorted by time; raise `BadInputError` if a clock was set back."""
     time = table.columns['time'][places]

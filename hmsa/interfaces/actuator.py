@@ -12,7 +12,7 @@ from hmsa.model.laws import LAWS
 from hmsa.model.parameters import ActuatorParameters
 
 if TYPE_CHECKING:
-    from hmsa.planning.timeline import Model
+    from hmsa.planning.timeline import JointModel
 
 
 def completed(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -51,11 +51,11 @@ def actuator_from(
 
 
 def model_from(
-        values: Mapping[str, Any], modulus: float | None = None, period: int = 0) -> 'Model':
+        values: Mapping[str, Any], modulus: float | None = None, period: int = 0) -> 'JointModel':
     """Return the planning model of the parameters `PLANNED`, on a command grid in ns."""
-    from hmsa.planning.timeline import Model, Options  # not always needed
+    from hmsa.planning.timeline import JointModel, Options  # not always needed
 
-    return Model(planned_from(values, modulus), Options(
+    return JointModel(planned_from(values, modulus), Options(
         flux_density_min=values['flux_density_min'], flux_density_max=values['flux_density_max'],
         period=period, slew_limit=values['slew_limit'] or math.inf,
         coil_time_constant=values['coil_time_constant'],

@@ -70,7 +70,7 @@ def number_of(text: str, unit: str, words: str) -> float:
 
 
 @dataclass(frozen=True)
-class Quantity:
+class GivenNumber:
     """A number given by the user."""
 
     key: str  # name in the code and, with hyphens, of the option
@@ -88,7 +88,7 @@ class Quantity:
     def of(
             cls, key: str, spec: ParameterSpec, text: str, usual: tuple[float, float],
             source: str, hints: tuple[tuple[float, float, str], ...] = (), *,
-            follows: bool = False) -> 'Quantity':
+            follows: bool = False) -> 'GivenNumber':
         """Return the quantity of a node parameter; its default may follow from others."""
         default = spec.default if isinstance(spec.default, float) and not follows else None
         return cls(
@@ -135,93 +135,93 @@ class Quantity:
             f'{high:g}{self._unit}, {self.source}')
 
 
-QUANTITIES: tuple[Quantity, ...] = (
-    Quantity.of(
+QUANTITIES: tuple[GivenNumber, ...] = (
+    GivenNumber.of(
         'half_length', _BLOCK['half_length'], 'half length L of the block, across the field',
         (1e-5, 0.1), f'from printed swimmers to moulded grippers in {_REVIEW}',
         ((0.5, 1e3, 'did you mean mm?'),)),
-    Quantity.of(
+    GivenNumber.of(
         'half_thickness', _BLOCK['half_thickness'],
         'half thickness H of the block, along the field', (1e-5, 0.1),
         f'from printed swimmers to moulded grippers in {_REVIEW}',
         ((0.5, 1e3, 'did you mean mm?'),), follows=True),
-    Quantity.of(
+    GivenNumber.of(
         'shear_modulus', _BLOCK['shear_modulus'], 'shear modulus G', (1e3, 3e6),
         f'from silicone gels to filled rubber; 303 kPa in {_ZHAO}',
         ((1e10, 1e12, 'metals have 25 to 80 GPa'), (1e8, 1e10, 'that is a hard plastic'),
          (1.0, 999.0, 'did you mean kPa?'), (0.0, 1.0, 'did you mean MPa?'))),
-    Quantity.of(
+    GivenNumber.of(
         'density', _BLOCK['density'], 'density rho', (900.0, 4000.0),
         'silicone of 1000 to 1200 kg/m^3 with up to 40 % by volume of NdFeB powder of '
         '7600 kg/m^3',
         ((0.8, 1.3, 'that is air, or did you mean g/cm^3?'),
          (1.3, 10.0, 'did you mean g/cm^3?'), (7000.0, 9000.0, 'that is solid metal'))),
-    Quantity.of(
+    GivenNumber.of(
         'remanence', _BLOCK['remanence'], 'remanence Br along the thickness',
         (0.005, 0.4),
         'isotropic NdFeB powder of 0.7 to 0.9 T diluted to 1 to 40 % by volume; 0.143 T in '
         + _ZHAO,
         ((1.5, 1e3, 'the strongest sintered NdFeB magnets, grade N55, have 1.5 T; did you mean '
           'mT?'), (0.9, 1.5, 'that is a solid magnet'))),
-    Quantity.of(
+    GivenNumber.of(
         'j_lim', _BLOCK['chain_limit'],
         'Gent limiting extensibility J_lim', (0.5, 200.0),
         'Gent, Rubber Chem. Technol. 69 (1996) 59, fits rubber with some 30 to 100; the paper '
         'takes 1 to 5'),
-    Quantity(
+    GivenNumber(
         'zeta', '', 'damping zeta, c/(8 L H sqrt(rho G))', '', ZETA, 0.0, 1e12, (0.005, 2.0),
         'where the paper takes 0.02 to 1.1'),
-    Quantity.of(
+    GivenNumber.of(
         'flux_max', FLUX_DENSITY_MAX, "coil's maximum flux density", (1e-3, 2.0),
         'from Helmholtz coils, some 1 to 50 mT, to electromagnets, whose iron saturates near '
         '2 T', ((2.0, 1e3, 'did you mean mT?'),)),
-    Quantity.of(
+    GivenNumber.of(
         'flux_min', FLUX_DENSITY_MIN,
         "coil's minimum flux density, negative in the other direction", (-2.0, 0.0),
         'since at 0 T the block is at rest, and coils reach some 2 T',
         ((-1e3, -2.0, 'did you mean mT?'),), follows=True),
-    Quantity.of(
+    GivenNumber.of(
         'slew_limit', SLEW_LIMIT, "rate of the amplifier's ramps, 0 for steps",
         (0.0, math.inf), ''),
 )
-BY_KEY: Mapping[str, Quantity] = {x.key: x for x in QUANTITIES}
+BY_KEY: Mapping[str, GivenNumber] = {x.key: x for x in QUANTITIES}
 _STRIPS = f'from printed strips to fingers in {_REVIEW}'
 #: Quantities of a beam, whose sizes are full ones.
-BEAM: tuple[Quantity, ...] = (
-    Quantity(
+BEAM: tuple[GivenNumber, ...] = (
+    GivenNumber(
         'length', 'actuator.half_length', 'free length of the beam, from clamp to tip', 'm', 0.025,
         1e-9, 1e3, (1e-4, 0.2), _STRIPS, ((0.5, 1e3, 'did you mean mm?'),)),
-    Quantity(
+    GivenNumber(
         'thickness', 'actuator.half_thickness', 'thickness of the section, along the field', 'm',
         0.001, 1e-9, 1e3, (1e-5, 0.02), _STRIPS, ((0.1, 1e3, 'did you mean mm?'),)),
-    Quantity(
+    GivenNumber(
         'width', 'law.width', 'width of the section, across the field', 'm', 0.005, 1e-9, 1e3,
         (1e-5, 0.1), _STRIPS, ((0.5, 1e3, 'did you mean mm?'),)),
-    Quantity(
+    GivenNumber(
         'youngs_modulus', 'law.youngs_modulus', "Young's modulus E, 3 G of an elastomer", 'Pa',
         1e6, 1e-3, 1e12, (3e3, 1e7), f'from silicone gels to filled rubber; 909 kPa in {_ZHAO}',
         ((1e9, 1e12, 'that is a hard plastic or a metal'), (0.0, 3e3, 'did you mean kPa?'))),
     BY_KEY['density'],
     replace(
         BY_KEY['remanence'], text='remanence Br along the length'),
-    Quantity(
+    GivenNumber(
         'damping_ratio', '', 'damping ratio about rest, from the ringing', '', 0.05, 0.0,
         1e3, (0.005, 0.9), 'of silicone strips in air'),
     *(BY_KEY[x] for x in ('flux_max', 'flux_min', 'slew_limit')),
 )
 #: Quantities by form of the actuator, by default a block.
-FORMS: Mapping[str, tuple[Quantity, ...]] = {'beam': BEAM, 'block': QUANTITIES}
+FORMS: Mapping[str, tuple[GivenNumber, ...]] = {'beam': BEAM, 'block': QUANTITIES}
 #: All quantities, each once.
 EVERY = tuple({x.key: x for form in (BEAM, QUANTITIES) for x in form}.values())
 #: Alternative to zeta.
-DAMPING = Quantity.of(
+DAMPING = GivenNumber.of(
     'damping', _BLOCK['damping_coefficient'], 'damping coefficient c', (0.0, math.inf), '',
     follows=True)
 #: Quantities with a default; all others are given, or set by --yes.
 OPTIONAL = ('flux_min', 'slew_limit')
 
 
-def default_of(quantity: Quantity, given: Mapping[str, float]) -> float:
+def default_of(quantity: GivenNumber, given: Mapping[str, float]) -> float:
     """Return a default in SI units: a cube, and a coil with symmetric limits."""
     if quantity.default is not None:
         return quantity.default

@@ -46,7 +46,7 @@ def _object(text: str) -> Mapping[str, object]:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class StatusVerdict:
     """
     The planner's verdict on its last request.
 
@@ -77,7 +77,7 @@ class Verdict:
     plan: int = 0
     answers: Mapping[str, object] = field(default_factory=dict)
 
-    def on(self, request: str) -> 'Verdict | None':
+    def on(self, request: str) -> 'StatusVerdict | None':
         """Return the verdict on a recent request by its name, None if it is not known."""
         if self.request == request:
             return self
@@ -110,7 +110,7 @@ class Verdict:
         return self.failure or 'predicted, not measured'
 
     @classmethod
-    def read(cls, status: Any) -> 'Verdict':
+    def read(cls, status: Any) -> 'StatusVerdict':
         """Read a DiagnosticStatus published by the planner."""
         values = texts(status)
         return cls(

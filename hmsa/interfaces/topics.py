@@ -2,8 +2,8 @@
 Names, types, quality of service and meaning of all topics and services, without ROS.
 
 All names are relative or private, so that namespaces and remapping work; only ``/clock`` and
-``/diagnostics`` are absolute, as usual in ROS. `hmsa_ros.nodes.endpoints` creates them with rclpy,
-and the reference documentation is generated from this module.
+``/diagnostics`` are absolute, as usual in ROS. `hmsa_ros.nodes.ros_entities` creates them with
+rclpy, and the reference documentation is generated from this module.
 """
 
 from collections.abc import Mapping, Sequence

@@ -49,7 +49,7 @@ _NORMAL = 1.4826
 _MOST_ALIKE = 0.98
 
 
-class Figure(NamedTuple):
+class BoundedValue(NamedTuple):
     """A value, its standard deviation and its bounds."""
 
     value: float
@@ -59,11 +59,11 @@ class Figure(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Fit:
+class VibrationFit:
     """Result of a fit of samples."""
 
-    offset: Figure
-    vibration: Figure  #: peak to peak in the period after time 0
+    offset: BoundedValue
+    vibration: BoundedValue  #: peak to peak in the period after time 0
     frequency: float  #: in rad/s
     noise: float  #: standard deviation of a sample
     usual: float  #: robust standard deviation, insensitive to single events
@@ -72,7 +72,7 @@ class Fit:
 
 def fit(
         time: Array, rest: Array, frequency: float, decay: float,
-        settles: Callable[[Fit], bool] = lambda _: False) -> Fit | None:
+        settles: Callable[[VibrationFit], bool] = lambda _: False) -> VibrationFit | None:
     """
     Fit samples: times in s, from 0 on and increasing, and deviations from the target.
 
@@ -239,7 +239,7 @@ def _refined(problems: _Problems, solved: _Solved, coarse: _Sinusoids) -> _Solve
     return solved
 
 
-def _bounds(problems: _Problems, number: int, tried: _Solved, searched: float) -> Fit:
+def _bounds(problems: _Problems, number: int, tried: _Solved, searched: float) -> VibrationFit:
     """Return the values of the best fit of a problem, with bounds over all possible fits."""
     count = len(problems.time)
     place = int(np.argmin(tried.squares))
@@ -274,12 +274,12 @@ def _bounds(problems: _Problems, number: int, tried: _Solved, searched: float) -
     mine = int(np.flatnonzero(possible == place)[0])
     unit = math.sqrt(scale)
     usual = slack[possible] >= searched
-    return Fit(
-        Figure(
+    return VibrationFit(
+        BoundedValue(
             float(within.offset[mine]), unit * float(shift[mine]),
             float(np.min((within.offset - near * shift)[usual])),
             float(np.max((within.offset + near * shift)[usual]))),
-        Figure(
+        BoundedValue(
             float(swing[mine]), unit * float(deviation[mine]),
             float(max(np.min(swing - reach * deviation), 0.0)),
             float(np.max((swing + near * deviation)[usual]))),

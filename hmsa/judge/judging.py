@@ -13,12 +13,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa.judge.fit import FEWEST, Figure, Fit, fit
+from hmsa.judge.fit import BoundedValue, FEWEST, fit, VibrationFit
 from hmsa.judge.records import (
     Finding,
     PERIODS,
-    Sensor,
-    Setpoint,
+    RequestedSetpoint,
+    SensorModel,
     Tolerances,
     unobserved,
     VERDICTS,
@@ -50,13 +50,13 @@ _SURER = 1.5
 _FADED = 1e-9
 # Number of changes below which the rounding of a sensor is not tested.
 _FEW_CHANGES = 3
-_NO_SENSOR = Sensor()
+_NO_SENSOR = SensorModel()
 
 
 def judge(
-        time: Stamps, stretch: Array, setpoint: Setpoint,
+        time: Stamps, stretch: Array, setpoint: RequestedSetpoint,
         tolerances: Tolerances = Tolerances(), *,  # noqa: B008
-        sensor: Sensor = _NO_SENSOR) -> Finding:
+        sensor: SensorModel = _NO_SENSOR) -> Finding:
     """
     Judge samples of a setpoint.
 
@@ -98,8 +98,8 @@ def judge(
 
 
 def _judged(
-        stamps: Stamps, values: Array, setpoint: Setpoint, tolerances: Tolerances,
-        sensor: Sensor, begin: int) -> Finding:
+        stamps: Stamps, values: Array, setpoint: RequestedSetpoint, tolerances: Tolerances,
+        sensor: SensorModel, begin: int) -> Finding:
     """Judge usable samples of a setpoint from a time in ns on."""
     held = stamps >= begin
     if setpoint.end is not None and not setpoint.held and begin < setpoint.end:
@@ -162,7 +162,7 @@ def _judged(
         'sensor look the same')
 
 
-def _largest(stamps: Stamps, rest: Array, setpoint: Setpoint) -> float:
+def _largest(stamps: Stamps, rest: Array, setpoint: RequestedSetpoint) -> float:
     """Return the largest peak-to-peak motion within a period of a window."""
     period = setpoint.period
     most = 0.0
@@ -177,8 +177,8 @@ def _largest(stamps: Stamps, rest: Array, setpoint: Setpoint) -> float:
 # -- samples ------------------------------------------------------------------------------------
 
 def _usable(
-        time: Stamps, stretch: Array, setpoint: Setpoint,
-        sensor: Sensor) -> tuple[Stamps, Array, str]:
+        time: Stamps, stretch: Array, setpoint: RequestedSetpoint,
+        sensor: SensorModel) -> tuple[Stamps, Array, str]:
     """Return the valid samples by time, corrected for the sensor, and the reason if none is."""
     stamps = np.asarray(time, dtype=np.int64)
     values = np.asarray(stretch, dtype=np.float64)
@@ -201,7 +201,7 @@ def _usable(
     return stamps, values, _frozen(values, setpoint)
 
 
-def _frozen(values: Array, setpoint: Setpoint) -> str:
+def _frozen(values: Array, setpoint: RequestedSetpoint) -> str:
     """Return a message if a sensor is constant at the end after motion; empty if not."""
     changes = np.abs(np.diff(values))
     moved = np.flatnonzero(changes)
@@ -222,7 +222,8 @@ def _frozen(values: Array, setpoint: Setpoint) -> str:
 
 
 def _thinned(
-        stamps: Stamps, values: Array, begin: int, setpoint: Setpoint) -> tuple[Stamps, Array]:
+        stamps: Stamps, values: Array, begin: int, setpoint: RequestedSetpoint
+) -> tuple[Stamps, Array]:
     """Return the mean sample of each part of a period, in which the vibration hardly changes."""
     part = max(setpoint.period // _KEPT, 1)
     _, first, counts = np.unique(
@@ -231,7 +232,7 @@ def _thinned(
     return begin + after, np.add.reduceat(values, first) / counts
 
 
-def _looks(stamps: Stamps, begin: int, setpoint: Setpoint) -> Iterator[slice]:
+def _looks(stamps: Stamps, begin: int, setpoint: RequestedSetpoint) -> Iterator[slice]:
     """Yield the samples of each window: adjacent at first, then ever farther apart."""
     length = setpoint.look
     if len(stamps) > 1:
@@ -254,7 +255,7 @@ def _looks(stamps: Stamps, begin: int, setpoint: Setpoint) -> Iterator[slice]:
             yield part
 
 
-def _too_few(setpoint: Setpoint, stamps: Stamps) -> Finding:
+def _too_few(setpoint: RequestedSetpoint, stamps: Stamps) -> Finding:
     """Return the finding for too few samples, with advice."""
     span = float(stamps[-1] - stamps[0]) / NANOSECONDS if len(stamps) else 0.0
     period = 2.0 * math.pi / setpoint.frequency
@@ -272,14 +273,16 @@ def _too_few(setpoint: Setpoint, stamps: Stamps) -> Finding:
 
 # -- the rule -----------------------------------------------------------------------------------
 
-def _settles(found: Fit, *, decided: Callable[[Fit], Finding], nothing: float) -> bool:
+def _settles(
+        found: VibrationFit, *, decided: Callable[[VibrationFit], Finding], nothing: float
+) -> bool:
     """Return whether a window is decided, and its fit residual is negligible."""
     return found.noise < nothing and not decided(found).open
 
 
 def _decided(
-        found: Fit, count: int, setpoint: Setpoint, limits: tuple[float, float],
-        sensor: Sensor, moves: bool | None) -> Finding:
+        found: VibrationFit, count: int, setpoint: RequestedSetpoint, limits: tuple[float, float],
+        sensor: SensorModel, moves: bool | None) -> Finding:
     """Decide on a window by its fit; ``moves`` states, in later ones, whether motion was seen."""
     offset, vibration = _widened(found.offset, sensor.std(setpoint.target)), found.vibration
     allowed, swing = limits
@@ -309,19 +312,20 @@ def _decided(
         frequency, found.noise)
 
 
-def _widened(figure: Figure, std: float) -> Figure:
+def _widened(figure: BoundedValue, std: float) -> BoundedValue:
     """Return a value with the uncertainty of the sensor included."""
     if not std:
         return figure
     value, own, low, high = figure
-    return Figure(
+    return BoundedValue(
         value, math.hypot(own, std), value - math.hypot(value - low, 3.0 * std),
         value + math.hypot(high - value, 3.0 * std))
 
 
 def _open(
-        offset: Figure, vibration: Figure, limits: tuple[float, float], setpoint: Setpoint,
-        sensor: Sensor) -> str:
+        offset: BoundedValue, vibration: BoundedValue, limits: tuple[float, float],
+        setpoint: RequestedSetpoint,
+        sensor: SensorModel) -> str:
     """Return which bounds are too wide and how to narrow them, as the rest of a sentence."""
     parts, more = [], 1.0
     for figure, limit, name in zip(
@@ -341,7 +345,7 @@ def _open(
     return f', but {" and ".join(parts)} cannot be ruled out: {mend}'
 
 
-def _distance(offset: float, setpoint: Setpoint) -> str:
+def _distance(offset: float, setpoint: RequestedSetpoint) -> str:
     direction = setpoint.target - setpoint.start
     if math.isnan(setpoint.percent(offset)):
         side = 'below' if offset < 0.0 else 'above'

@@ -21,7 +21,7 @@ _NO_STEP = 1e-9
 
 
 @dataclass(frozen=True)
-class Setpoint:
+class RequestedSetpoint:
     """
     A setpoint as it was requested; times in ns.
 
@@ -100,7 +100,7 @@ class Tolerances:
     vibration: float = 0.02  #: maximum vibration, peak to peak, as a fraction of the step
     stretch: float = 1e-3  #: minimum of both tolerances, for small steps
 
-    def of(self, setpoint: Setpoint) -> tuple[float, float]:
+    def of(self, setpoint: RequestedSetpoint) -> tuple[float, float]:
         """Return the maximum steady-state error and vibration at a setpoint, in stretch."""
         return (max(self.arrival * setpoint.step, self.stretch),
                 max(self.vibration * setpoint.step, self.stretch))
@@ -114,7 +114,7 @@ class GoalTolerances(Tolerances):
     rate: float = 0.0  #: maximum remaining rate, in 1/s
     time: int = 0  #: after the arrival, in ns
 
-    def of(self, setpoint: Setpoint) -> tuple[float, float]:
+    def of(self, setpoint: RequestedSetpoint) -> tuple[float, float]:
         """Return the maximum steady-state error and vibration at a setpoint, in stretch."""
         offset, vibration = super().of(setpoint)
         own = [2.0 * self.position] * (self.position > 0.0) + [
@@ -123,7 +123,7 @@ class GoalTolerances(Tolerances):
 
 
 @dataclass(frozen=True)
-class Sensor:
+class SensorModel:
     """
     Properties of the sensor: it reports bias plus gain times stretch, with a latency.
 
@@ -144,7 +144,7 @@ class Sensor:
         return {f'{_SENSOR}{key}': f'{x:.9g}' for key, x in asdict(self).items()}
 
     @classmethod
-    def of(cls, values: Mapping[str, str]) -> 'Sensor':
+    def of(cls, values: Mapping[str, str]) -> 'SensorModel':
         """
         Return the sensor from values of `to_dict` among others; missing ones have defaults.
 
@@ -170,7 +170,7 @@ class Finding:
 
     verdict: Code  #: one of `VERDICTS`
     message: str
-    setpoint: Setpoint
+    setpoint: RequestedSetpoint
     samples: int = 0
     offset: float = math.nan  #: mean stretch minus target
     offset_std: float = math.nan
@@ -231,7 +231,7 @@ def worst(findings: Iterable[Finding]) -> Finding | None:
     return max(findings, key=lambda x: x.rank, default=None)
 
 
-def unobserved(setpoint: Setpoint, reason: str = '', samples: int = 0) -> Finding:
+def unobserved(setpoint: RequestedSetpoint, reason: str = '', samples: int = 0) -> Finding:
     """Return the finding for a setpoint without valid samples, with a reason."""
     return Finding(
         Code.UNOBSERVED,
@@ -239,7 +239,7 @@ def unobserved(setpoint: Setpoint, reason: str = '', samples: int = 0) -> Findin
         f'{reason and ": "}{reason}', setpoint, samples)
 
 
-def missed(setpoint: Setpoint, reason: str) -> Finding:
+def missed(setpoint: RequestedSetpoint, reason: str) -> Finding:
     """Return the finding for a setpoint that was not carried out, with a reason."""
     return Finding(
         Code.MISSED, f'{setpoint.where}: {setpoint.target:.6g} was missed: {reason}', setpoint)

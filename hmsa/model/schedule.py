@@ -14,7 +14,7 @@ from typing import Generic, TypeVar
 T = TypeVar('T')
 
 
-def obeyed(x: float, y: float, z: float) -> bool:
+def is_axial_field(x: float, y: float, z: float) -> bool:
     """Return whether a field in T is a valid command: finite, and along z."""
     return math.isfinite(z) and x == 0.0 == y
 

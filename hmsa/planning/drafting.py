@@ -22,9 +22,9 @@ from hmsa.planning.sequence import Segment, segments
 from hmsa.planning.setpoint import impossible, Setpoint
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.free import through
-from hmsa.planning.shapers.request import Request, Shaper
+from hmsa.planning.shapers.request import MoveRequest, Shaper
 from hmsa.planning.stopping import brake, holdable
-from hmsa.planning.timeline import Draft, Model, Plan, PlannedLevel, PlannedSegment
+from hmsa.planning.timeline import Draft, JointModel, PlannedLevel, PlannedSegment, Timeline
 
 #: Stretch, rate in 1/s and acceleration in 1/s^2; the acceleration is NaN if not given.
 PathPoint = tuple[float, float, float]
@@ -53,11 +53,11 @@ def proceed() -> None:
 
 
 @dataclass(frozen=True)
-class Outset:
+class PlanStart:
     """Start of a draft: a state predicted at a time in ns."""
 
-    plan: Plan
-    model: Model
+    plan: Timeline
+    model: JointModel
     begin: int  #: earliest time in ns
     state: State
     #: Index of the first level of the plan whose prediction is no longer valid.
@@ -99,7 +99,7 @@ def check_target(stretch: float, rest: float) -> None:
 
 
 def draft_sequence(
-        outset: Outset, points: Sequence[tuple[float, int]], base: int,
+        outset: PlanStart, points: Sequence[tuple[float, int]], base: int,
         now: int) -> Draft | None:
     """
     Draft checked points (stretch, end in ns) from a start in ns; None if they change nothing.
@@ -156,7 +156,7 @@ def check_path(points: Sequence[tuple[PathPoint, int]], rest: float) -> None:
 
 
 def draft_path(
-        outset: Outset, points: Sequence[tuple[PathPoint, int]], base: int,
+        outset: PlanStart, points: Sequence[tuple[PathPoint, int]], base: int,
         now: int) -> Draft:
     """
     Draft a checked path from a start in ns, or join it if it has begun.
@@ -193,7 +193,7 @@ def draft_path(
         path=path.scaled(1.0 / unit))
 
 
-def draft_path_anew(outset: Outset) -> Draft:
+def draft_path_anew(outset: PlanStart) -> Draft:
     """
     Draft the rest of the running path again, with a return to it within half a natural period.
 
@@ -212,7 +212,7 @@ def draft_path_anew(outset: Outset) -> Draft:
 
 
 def _along(
-        outset: Outset, wanted: Path, target: float, tolerance: float,
+        outset: PlanStart, wanted: Path, target: float, tolerance: float,
         **known: Any) -> Draft:
     """Follow a path to rest at a target; further fields of its segment are given."""
     move = along(
@@ -223,7 +223,7 @@ def _along(
     return replace(draft, segments=(replace(draft.segments[0], **known),))
 
 
-def draft_setpoints(outset: Outset, setpoints: Sequence[Setpoint]) -> Draft | None:
+def draft_setpoints(outset: PlanStart, setpoints: Sequence[Setpoint]) -> Draft | None:
     """Draft setpoints; None if the only one is the last of the plan and has begun."""
     planned = outset.plan.segments
     if len(setpoints) == 1 and planned and planned[-1].stretch == setpoints[0].stretch \
@@ -232,7 +232,7 @@ def draft_setpoints(outset: Outset, setpoints: Sequence[Setpoint]) -> Draft | No
     return draft_moves(outset, setpoints)
 
 
-def draft_stop(outset: Outset) -> Draft:
+def draft_stop(outset: PlanStart) -> Draft:
     """Draft a stop: rest as near as the flux density limits allow."""
     # A two-step command with the hardest braking load as beta_p: that load up to the first turning
     # point, then the load that holds this point. If a single brake is impossible (on a command
@@ -264,20 +264,20 @@ def draft_stop(outset: Outset) -> Draft:
         outset, [Setpoint(holdable(model, state.stretch), math.inf)], 'step')
 
 
-def _settled(model: Model, state: State) -> bool:
+def _settled(model: JointModel, state: State) -> bool:
     """Return whether the field of a lagging coil already holds the stretch."""
     return model.delivery.lag == 0.0 or math.isclose(
         state.load, model.holding(state.stretch), rel_tol=_SETTLED, abs_tol=_SETTLED)
 
 
-def later_starts(model: Model, stretch: float, begin: int) -> Iterator[int]:
+def later_starts(model: JointModel, stretch: float, begin: int) -> Iterator[int]:
     """Yield times in ns at which to try in turn; ``stretch`` is that at the first of them."""
     period = 2.0 * math.pi / model.frequency(stretch)
     for share in _PATIENCE:
         yield model.on_grid(begin + model.ns(share * period))
 
 
-def draft_resumption(outset: Outset, arrival: int | None = None) -> Draft | None:
+def draft_resumption(outset: PlanStart, arrival: int | None = None) -> Draft | None:
     """
     Draft the rest of the running plan again, up to where both agree; None if nothing is left.
 
@@ -311,7 +311,7 @@ def draft_resumption(outset: Outset, arrival: int | None = None) -> Draft | None
     return None
 
 
-def _left(outset: Outset, index: int) -> Iterator[Setpoint]:
+def _left(outset: PlanStart, index: int) -> Iterator[Setpoint]:
     """Yield the setpoints of the running plan from an index on, with their remaining durations."""
     planned = outset.plan.segments
     left = outset.begin
@@ -322,7 +322,7 @@ def _left(outset: Outset, index: int) -> Iterator[Setpoint]:
     yield Setpoint(planned[-1].stretch, math.inf)
 
 
-def _meeting(outset: Outset, state: State, following: int) -> int | None:
+def _meeting(outset: PlanStart, state: State, following: int) -> int | None:
     """Return the index of the level at which the running plan continues a state, else None."""
     planned = outset.plan.segments[following]
     place = outset.plan.place(planned.begin)
@@ -335,7 +335,7 @@ def _meeting(outset: Outset, state: State, following: int) -> int | None:
 
 
 def draft_moves(
-        outset: Outset, setpoints: Iterable[Setpoint], shaper: str = '',
+        outset: PlanStart, setpoints: Iterable[Setpoint], shaper: str = '',
         first: Shaper | None = None, index: int | None = None) -> Draft:
     """
     Draft setpoints on the timeline; the default shaper is that of the options.
@@ -361,16 +361,16 @@ def draft_moves(
     return Draft(outset.begin, tuple(levels), tuple(placed))
 
 
-def _frame(model: Model, state: State) -> Request:
+def _frame(model: JointModel, state: State) -> MoveRequest:
     """Return the request to stay in a state."""
     options = model.options
-    return Request(
+    return MoveRequest(
         state, state.stretch, model.material, model.limits, model.delivery, options.order,
         model.units, options.errors, model.pace)
 
 
 def _placed(
-        model: Model, begin: int, check: Check,
+        model: JointModel, begin: int, check: Check,
         segment: Segment) -> tuple[list[PlannedLevel], PlannedSegment]:
     """Place a planned move on the timeline, in SI units."""
     start = begin + model.ns(segment.begin)

@@ -16,7 +16,7 @@ from hmsa.model.status import RefusedError
 from hmsa.planning.drafting import Check, proceed
 from hmsa.planning.history import Deviation
 from hmsa.planning.planner import Planner
-from hmsa.planning.timeline import Draft, Plan, PlannedSegment
+from hmsa.planning.timeline import Draft, PlannedSegment, Timeline
 
 # Maximum number of successive replans without a command in time.
 _ATTEMPTS = 3
@@ -227,7 +227,7 @@ def _rests(draft: Draft, segment: PlannedSegment) -> bool:
             level.state.load, model.holding(level.stretch), rel_tol=_AT_REST, abs_tol=_AT_REST))
 
 
-def _samples(plan: Plan, stamps: Sequence[int]) -> list[tuple[float, float, float]]:
+def _samples(plan: Timeline, stamps: Sequence[int]) -> list[tuple[float, float, float]]:
     """Return stretch, rate in 1/s and flux density in T of a plan at increasing times in ns."""
     samples: list[tuple[float, float, float]] = []
     for place, group in groupby(stamps, key=plan.place):
@@ -237,7 +237,7 @@ def _samples(plan: Plan, stamps: Sequence[int]) -> list[tuple[float, float, floa
     return samples
 
 
-def _changes(plan: Plan, now: int) -> Iterable[int]:
+def _changes(plan: Timeline, now: int) -> Iterable[int]:
     """Return the next times after now at which the progress of a plan changes."""
     place = bisect_right(plan.segments, now, key=lambda x: x.since)
     for segment in plan.segments[place:place + 1]:
@@ -247,7 +247,7 @@ def _changes(plan: Plan, now: int) -> Iterable[int]:
             yield segment.arrival
 
 
-def _progress(plan: Plan, now: int) -> Progress:
+def _progress(plan: Timeline, now: int) -> Progress:
     """Return the progress of a plan."""
     count = len(plan.segments) - plan.kept
     place = plan.under_way(now)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import math
 from typing import Any
 
-from hmsa.planning.timeline import Plan, PlannedLevel
+from hmsa.planning.timeline import PlannedLevel, Timeline
 
 # Tolerance within which a prediction agrees with the planned one, so that the rest of the plan
 # remains valid: rounding timestamps by half a nanosecond changes the stretch by about 1e-8 at full
@@ -38,7 +38,7 @@ class Deviation:
 class History:
     """A plan, and the part of it that has happened."""
 
-    plan: Plan
+    plan: Timeline
     sent: int = 1  #: number of levels sent, from the first on; at least 1
     known: int = 0  #: index of the last level known to have taken effect
     #: Index of the first level, not sent yet, whose prediction is no longer valid.

@@ -1,12 +1,12 @@
 """
 Paths of the stretch to follow, such as a dense trajectory with velocities.
 
-The stretch is a flat output (`hmsa.planning.flat`). Commands are steps of the load (zero-order
-hold) or ramps. The double integral of a sequence of steps is a quadratic spline, and the error of
-the stretch follows from the error of this double integral. The levels are therefore those whose
-spline is nearest, in the mean square, to the double integral of the load (of the amplifier output
-if the field lags). They are as long as the tolerance allows. The last ones are corrected to end
-exactly at rest.
+The stretch is a flat output (`hmsa.planning.inverse_dynamics`). Commands are steps of the load
+(zero-order hold) or ramps. The double integral of a sequence of steps is a quadratic spline, and
+the error of the stretch follows from the error of this double integral. The levels are therefore
+those whose spline is nearest, in the mean square, to the double integral of the load (of the
+amplifier output if the field lags). They are as long as the tolerance allows. The last ones are
+corrected to end exactly at rest.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,10 +23,10 @@ from hmsa.model.equations import Array
 from hmsa.model.moves import Level, Move, State
 from hmsa.model.simulation import follow, followed_by, sampled
 from hmsa.model.status import Code, RefusedError
-from hmsa.planning.flat import held_along, loads_for
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.inverse_dynamics import held_along, loads_for
+from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.shapers.two_step import two_step
-from hmsa.planning.shooting import Attempt, kept, solve, Template
+from hmsa.planning.shooting import Attempt, solve, Template, within_limits
 
 #: Stretch, rate and acceleration, shape (n,) each, at times from the start.
 Course = Callable[[Array], tuple[Array, Array, Array]]
@@ -151,7 +151,7 @@ def _quintic(spans: Array, x: Array, v: Array, a: Array) -> Array:
 
 
 def along(
-        request: Request, path: Path, tolerance: float,
+        request: MoveRequest, path: Path, tolerance: float,
         check: Callable[[], None] = lambda: None) -> Move:
     """
     Follow a path to rest at its end, the target of the request.
@@ -173,7 +173,7 @@ def along(
 class _Follower:
     """Computation of the levels of a path, block by block."""
 
-    def __init__(self, request: Request, path: Path, tolerance: float) -> None:
+    def __init__(self, request: MoveRequest, path: Path, tolerance: float) -> None:
         self._request, self._path = request, path
         self.range, self.edges = _edges(request, path, tolerance)
         self._allowed = tolerance * self.range
@@ -340,7 +340,7 @@ class _Follower:
         begin = int(np.searchsorted(edges, end - _ENDING * 2.0 * math.pi / request.frequency))
         begin = max(min(begin, len(edges) - 1 - _FEWEST // 2), len(edges) - 1 - _LAST, 0)
         rest = replace(request, state=self._states[begin])
-        found = kept(self._ended(rest, begin), request)
+        found = within_limits(self._ended(rest, begin), request)
         if found is None:
             # The actuator is off the path at its end: add a move to rest.
             begin = len(edges) - 1
@@ -360,7 +360,7 @@ class _Follower:
         return Move(Code.PATH, levels, since + found[1], self._words(
             float(np.max(away)), float(times[np.argmax(away)])))
 
-    def _ended(self, request: Request, begin: int) -> Attempt:
+    def _ended(self, request: MoveRequest, begin: int) -> Attempt:
         """Return the last levels, from edge ``begin`` on, corrected to end at rest."""
         edges, delivery = self.edges[begin:] - self.edges[begin], request.delivery
         levels = np.array([x.load for x in self._levels[begin:]])
@@ -431,7 +431,7 @@ def _ramped(levels: Array, load: float, spans: Array, slew: float) -> tuple[Arra
     return twice + first[:-1, np.newaxis] * spans * _AT.T + second, first[1:]
 
 
-def _edges(request: Request, path: Path, tolerance: float) -> tuple[float, Array]:
+def _edges(request: MoveRequest, path: Path, tolerance: float) -> tuple[float, Array]:
     """Return the range of a path, the start times of its levels and its end."""
     material, delivery, breaks = request.material, request.delivery, path.breaks
     packed = material.packed

@@ -18,11 +18,11 @@ from hmsa.model.simulation import check_stretch
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning import drafting
-from hmsa.planning.drafting import Check, Outset, PathPoint, proceed
-from hmsa.planning.raw import check_levels, draft_levels
+from hmsa.planning.drafting import Check, PathPoint, PlanStart, proceed
+from hmsa.planning.given_levels import check_levels, draft_levels
 from hmsa.planning.running import RunningPlan
 from hmsa.planning.setpoint import Setpoint
-from hmsa.planning.timeline import Draft, Model, Options, Plan
+from hmsa.planning.timeline import Draft, JointModel, Options, Timeline
 
 __all__ = ['Options', 'Planner']
 
@@ -38,7 +38,7 @@ class Planner(RunningPlan):
             stretch: float | None = None) -> None:
         """Start at rest."""
         super().__init__(
-            Model(actuator, options), actuator.rest if stretch is None else stretch)
+            JointModel(actuator, options), actuator.rest if stretch is None else stretch)
         #: Returns the estimate of stretch, rate in 1/s and branch states at a time in ns; None to
         #: use the prediction.
         self.believed: Callable[[int], Believed | None] = lambda time: None
@@ -68,7 +68,7 @@ class Planner(RunningPlan):
         """Plan the next requests with other options or for another block, after checks."""
         self.take_model(self.checked_model(options, actuator or self.model.actuator))
 
-    def checked_model(self, options: Options, actuator: ActuatorParameters) -> Model:
+    def checked_model(self, options: Options, actuator: ActuatorParameters) -> JointModel:
         """
         Return the model of options and an actuator that can hold the present position.
 
@@ -81,14 +81,14 @@ class Planner(RunningPlan):
             raise BadInputError(
                 f'parameter law.name would turn {was} into {made}: expected a law that has {was}, '
                 'or a planner that is started with the other')
-        model = Model(actuator, options)
+        model = JointModel(actuator, options)
         segments = self.plan.segments
         check_stretch(
             segments[-1].stretch if segments else self.plan.levels[-1].stretch,
             model.material, 'the stretch that is held')
         return model
 
-    def take_model(self, model: Model) -> None:
+    def take_model(self, model: JointModel) -> None:
         """Plan the next requests with a model; the running plan does not change."""
         if model is not self.model:
             self.model = model
@@ -97,15 +97,15 @@ class Planner(RunningPlan):
     # -- requests ------------------------------------------------------------------------------
 
     def request(
-            self, points: Sequence[tuple[float, int]], stamp: int | None, now: int) -> Plan:
+            self, points: Sequence[tuple[float, int]], stamp: int | None, now: int) -> Timeline:
         """Plan and take a setpoint sequence; see `draft_request`."""
         return self.take(self.draft_request(points, stamp, now), now)
 
-    def setpoint(self, stretch: float, now: int) -> Plan:
+    def setpoint(self, stretch: float, now: int) -> Timeline:
         """Move to one stretch as soon as possible and hold it."""
         return self.take(self.draft_setpoint(stretch, now), now)
 
-    def stop(self, now: int) -> Plan:
+    def stop(self, now: int) -> Timeline:
         """Drop the rest of the plan and come to rest as near as the flux density limits allow."""
         return self.take(self.draft_stop(now), now)
 
@@ -180,7 +180,7 @@ class Planner(RunningPlan):
         return drafting.draft_resumption(outset)
 
     def draft_path_anew(
-            self, begin: int, model: Model, believed: Believed | None) -> Draft:
+            self, begin: int, model: JointModel, believed: Believed | None) -> Draft:
         """Draft the rest of the running path again with a model, from an estimated state."""
         return drafting.draft_path_anew(self._from(begin, model, believed))
 
@@ -192,7 +192,7 @@ class Planner(RunningPlan):
         held, wanted = (float(equilibrium_stretch(model.load(x), model.material)) for x in (
             self.plan.level(begin).flux_density, flux_density))
         draft = drafting.draft_moves(
-            Outset(self.plan, model, begin, replace(state, stretch=held, rate=0.0)),
+            PlanStart(self.plan, model, begin, replace(state, stretch=held, rate=0.0)),
             [Setpoint(wanted, math.inf)])
         segment = self.plan.segments[place]
         anew = replace(draft.segments[0], stretch=segment.stretch, since=segment.since)
@@ -211,21 +211,21 @@ class Planner(RunningPlan):
         soonest = self.soonest(now)
         return soonest if stamp is None else self.model.on_grid(max(stamp, soonest))
 
-    def _begin(self, stamp: int | None, now: int) -> tuple[int, Outset]:
+    def _begin(self, stamp: int | None, now: int) -> tuple[int, PlanStart]:
         """Return the start of a request in ns, and the earliest outset for it."""
         begin = self.start(stamp, now)
         return begin if stamp is None else stamp, self._outset(begin)
 
-    def _outset(self, begin: int) -> Outset:
+    def _outset(self, begin: int) -> PlanStart:
         return self._from(begin, self.model, self.believed(begin + self.delay))
 
-    def _from(self, begin: int, model: Model, believed: Believed | None) -> Outset:
+    def _from(self, begin: int, model: JointModel, believed: Believed | None) -> PlanStart:
         state = model.taken_from(self._delayed(begin), self.model)
         if believed is not None:
             state = replace(
                 state, stretch=believed[0], rate=believed[1] * model.units.time,
                 followed=believed[2] or state.followed)
-        return Outset(self.plan, model, begin, state, self._history.stale, self.check)
+        return PlanStart(self.plan, model, begin, state, self._history.stale, self.check)
 
     def as_sent(self, time: int) -> bool:
         """Return whether the level at a time in ns belongs to commanded levels or a path."""

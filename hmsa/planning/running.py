@@ -14,7 +14,14 @@ from hmsa.model.moves import State
 from hmsa.model.simulation import check_stretch, longest_motion
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.history import Deviation, History
-from hmsa.planning.timeline import ALWAYS, Draft, Model, Plan, PlannedLevel, PlannedSegment
+from hmsa.planning.timeline import (
+    ALWAYS,
+    Draft,
+    JointModel,
+    PlannedLevel,
+    PlannedSegment,
+    Timeline,
+)
 
 # Rates of a sample below this fraction of the natural frequency are rest. If the model predicts
 # motion there, the model is in error.
@@ -38,7 +45,7 @@ class RunningPlan:
     ``revision`` increases with every change of the future: earlier drafts are then invalid.
     """
 
-    def __init__(self, model: Model, stretch: float) -> None:
+    def __init__(self, model: JointModel, stretch: float) -> None:
         """Start at rest."""
         check_stretch(stretch, model.material, 'initial stretch')
         self.model = model
@@ -46,14 +53,14 @@ class RunningPlan:
         self.delay = 0
         self._strayed = 0.0
         self._initial = stretch
-        self._history = History(Plan(0, (), ()))
+        self._history = History(Timeline(0, (), ()))
         # Levels before those of the plan, in order.
         self._past: list[PlannedLevel] = []
         self.revision = 0
         self.restart()
 
     @property
-    def plan(self) -> Plan:
+    def plan(self) -> Timeline:
         """Levels that took effect recently, and the plan from the present level on."""
         return self._history.plan
 
@@ -72,7 +79,7 @@ class RunningPlan:
 
     def _begin_with(self, level: PlannedLevel, *, keep: bool = False) -> None:
         """Start a new plan from a level, optionally with setpoints and unsent levels kept."""
-        old = self.plan if keep else Plan(self.plan.number, (), ())
+        old = self.plan if keep else Timeline(self.plan.number, (), ())
         ahead = old.levels[self._history.sent:]
         self._past.clear()
         self._history = History(
@@ -124,10 +131,10 @@ class RunningPlan:
         """Drop setpoints and levels not known to have taken effect, as no plant obeys them."""
         count = self._history.known + 1
         plan = self._history.predicted(count).plan
-        self._history = History(Plan(plan.number, plan.levels[:count], ()), count, count - 1)
+        self._history = History(Timeline(plan.number, plan.levels[:count], ()), count, count - 1)
         self.revision += 1
 
-    def take(self, draft: Draft | None, now: int) -> Plan:
+    def take(self, draft: Draft | None, now: int) -> Timeline:
         """Replace the plan from the start of a draft of this revision on; return the plan."""
         if draft is None:
             return self.plan
@@ -145,7 +152,8 @@ class RunningPlan:
         before = _running(old, begin, now) if new else old.segments[:draft.resumed]
         stale = history.stale
         self._history = History(
-            Plan(old.number + new, old.levels[first:kept] + draft.levels, before + draft.segments,
+            Timeline(
+                old.number + new, old.levels[first:kept] + draft.levels, before + draft.segments,
                  len(before) if new else min(old.kept, len(before))),
             min(history.sent, kept) - first, max(min(history.known, kept - 1) - first, 0),
             stale - first if stale is not None and stale < kept else None)
@@ -300,7 +308,7 @@ class RunningPlan:
         return None if index < 0 else (index, self.plan.segments[index])
 
 
-def _running(plan: Plan, begin: int, now: int) -> tuple[PlannedSegment, ...]:
+def _running(plan: Timeline, begin: int, now: int) -> tuple[PlannedSegment, ...]:
     """Return the setpoints of a plan from the current one to those that a draft replaces."""
     end = bisect_left(plan.segments, begin, key=lambda x: x.since)
     running = plan.segments[max(min(plan.under_way(now), end - 1), 0):end]

@@ -18,7 +18,7 @@ from hmsa.model.status import Code, RefusedError
 from hmsa.motion import STRETCH
 from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import creeping, get_shaper
-from hmsa.planning.shapers.request import Request, Shaper, Work
+from hmsa.planning.shapers.request import MoveRequest, Shaper, StepBudget
 
 #: Options for a setpoint that ends before the move to it.
 SHORT_SPELL = ('refuse', 'continue')
@@ -60,7 +60,7 @@ class Segment:
 
 
 def plan_sequence(
-        setpoints: Sequence[Setpoint], frame: Request | NondimensionalParameters,
+        setpoints: Sequence[Setpoint], frame: MoveRequest | NondimensionalParameters,
         shaper: str | Shaper = 'two_step', short_spell: str = 'refuse') -> tuple[Segment, ...]:
     """
     Plan a sequence of setpoints.
@@ -95,7 +95,7 @@ def plan_sequence(
     if not setpoints:
         raise RefusedError(Code.BAD_INPUT, 'no setpoint given: expected at least one')
     check_short_spell(short_spell)
-    begin = frame if isinstance(frame, Request) else Request.of(frame)
+    begin = frame if isinstance(frame, MoveRequest) else MoveRequest.of(frame)
     shape = get_shaper(shaper) if isinstance(shaper, str) else shaper
     return tuple(segments(begin, setpoints, shape, short_spell))
 
@@ -108,7 +108,7 @@ def check_short_spell(value: str) -> None:
 
 
 def segments(
-        frame: Request, setpoints: Iterable[Setpoint], shaper: Shaper, short_spell: str, *,
+        frame: MoveRequest, setpoints: Iterable[Setpoint], shaper: Shaper, short_spell: str, *,
         first: Shaper | None = None) -> Generator[Segment, None, None]:
     """
     Plan one setpoint after another; the first may have its own shaper.
@@ -124,7 +124,7 @@ def segments(
     setpoint = next(upcoming, None)
     while setpoint is not None:
         following = next(upcoming, None)
-        request = replace(frame, state=state, target=setpoint.stretch, work=Work())
+        request = replace(frame, state=state, target=setpoint.stretch, work=StepBudget())
         move = creeping.held(
             request, _rounded(shape(request), frame.delivery),
             math.inf if following is None else setpoint.span)
@@ -150,7 +150,7 @@ def segments(
         shape = shaper
 
 
-def _cut(request: Request, move: Move, span: float, *, last: bool) -> Move:
+def _cut(request: MoveRequest, move: Move, span: float, *, last: bool) -> Move:
     """Return a move that is cut at the end of its setpoint; the last one is completed."""
     units = request.units
     return replace(
@@ -167,7 +167,7 @@ def _rounded(move: Move, delivery: Delivery) -> Move:
         delivery.rounded(move.duration), move.reason)
 
 
-def _follow(request: Request, move: Move, span: float) -> State:
+def _follow(request: MoveRequest, move: Move, span: float) -> State:
     """Return the state at the end of a duration, or at the end of the last ramp."""
     material, delivery = request.material, request.delivery
     end = move.levels[-1].time if math.isinf(move.duration) else move.duration
@@ -191,7 +191,7 @@ def _follow(request: Request, move: Move, span: float) -> State:
     return follow(move.levels, request.start, end, material, delivery)
 
 
-def _check_known(request: Request, levels: Sequence[Level], ends: tuple[float, float]) -> None:
+def _check_known(request: MoveRequest, levels: Sequence[Level], ends: tuple[float, float]) -> None:
     """
     Refuse a move that leaves the range of the elastic model, or collapses.
 

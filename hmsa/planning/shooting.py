@@ -24,7 +24,7 @@ from hmsa.model.moves import Level
 from hmsa.model.simulation import followed_by
 
 if TYPE_CHECKING:
-    from hmsa.planning.shapers.request import Request
+    from hmsa.planning.shapers.request import MoveRequest
 
 # Factor on the guessed duration of the last ramp, for the period that follows it.
 _MORE = 1.25
@@ -68,7 +68,7 @@ def _derivatives(count: int, unknowns: tuple[tuple[str, int], ...]) -> tuple[Arr
 
 
 def solve(
-        template: Template, request: 'Request', delivery: Delivery | None = None, *,
+        template: Template, request: 'MoveRequest', delivery: Delivery | None = None, *,
         wait: float = 0.0) -> Attempt:
     """
     Solve a template for rest at the target; the default delivery is that of the request.
@@ -102,17 +102,17 @@ def solve(
     return levels, duration
 
 
-def kept(found: Attempt, request: 'Request') -> Attempt:
+def within_limits(found: Attempt, request: 'MoveRequest') -> Attempt:
     """Return a command if it keeps the load limits, else None."""
     return found if found is not None and request.keeps(found[0]) else None
 
 
-def first_kept(guesses: Iterable[Template], request: 'Request') -> Attempt:
+def first_kept(guesses: Iterable[Template], request: 'MoveRequest') -> Attempt:
     """Return the first solution among the guesses that keeps the load limits, else None."""
-    return next(filter(None, (kept(solve(x, request), request) for x in guesses)), None)
+    return next(filter(None, (within_limits(solve(x, request), request) for x in guesses)), None)
 
 
-def soonest_kept(guesses: Iterable[tuple[float, Template]], request: 'Request') -> Attempt:
+def soonest_kept(guesses: Iterable[tuple[float, Template]], request: 'MoveRequest') -> Attempt:
     """
     Return the solution with the earliest rest that keeps the load limits, else None.
 
@@ -122,13 +122,13 @@ def soonest_kept(guesses: Iterable[tuple[float, Template]], request: 'Request') 
     for duration, guess in sorted(guesses, key=itemgetter(0)):
         if best is not None and duration >= best[1]:
             break
-        found = kept(solve(guess, request), request)
+        found = within_limits(solve(guess, request), request)
         if found is not None and (best is None or found[1] < best[1]):
             best = found
     return best
 
 
-def approach(
+def continuation(
         ideal: tuple[Level, ...],
         closer: Callable[[tuple[Level, ...], float, float], Attempt], shortest: float) -> Attempt:
     """Follow levels from ideal to real hardware, in strides down to a given fraction."""
@@ -148,7 +148,7 @@ def approach(
     return found
 
 
-def on_time(found: Attempt, request: 'Request') -> Attempt:
+def on_time(found: Attempt, request: 'MoveRequest') -> Attempt:
     """Solve again for the first loads, with times rounded to those that commands can have."""
     if found is None or request.delivery.resolution == 0.0:
         return found

@@ -7,7 +7,7 @@ from hmsa import motion
 from hmsa.model.equations import equilibrium_stretch
 from hmsa.model.moves import State
 from hmsa.model.simulation import RTOL
-from hmsa.planning.timeline import Model
+from hmsa.planning.timeline import JointModel
 
 # Stretch rates below this fraction of the natural frequency are rounding errors.
 _AT_REST = 1e-6
@@ -27,7 +27,7 @@ class Brake:
     stretch: float
 
 
-def brake(model: Model, state: State, share: float = 1.0) -> Brake:
+def brake(model: JointModel, state: State, share: float = 1.0) -> Brake:
     """Return the load that stops a motion, and its duration; a share of 1 brakes hardest."""
     # The share interpolates between the load that holds the stretch and the opposite limit. The
     # duration is also 0 if the motion cannot be followed to a turning point.
@@ -67,7 +67,7 @@ def brake(model: Model, state: State, share: float = 1.0) -> Brake:
     return Brake(float(load), aim, stretch)
 
 
-def holdable(model: Model, stretch: float) -> float:
+def holdable(model: JointModel, stretch: float) -> float:
     """Return the nearest stretch that a flux density within the limits holds."""
     load = model.holding(stretch)
     least, most = model.limits.minimum, model.limits.maximum

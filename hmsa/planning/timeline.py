@@ -27,8 +27,8 @@ from hmsa.model.units import NANOSECONDS, Units
 from hmsa.planning.path import Path
 from hmsa.planning.sequence import check_short_spell
 from hmsa.planning.shapers import creeping, get_shaper
-from hmsa.planning.shapers.pace import PACE, Pace
 from hmsa.planning.shapers.request import as_errors, ERRORS
+from hmsa.planning.shapers.smooth_limits import PACE, SmoothLimits
 
 #: Options that describe coil and block, and can be estimated.
 ESTIMATED = ('coil_time_constant', 'constant_force')
@@ -58,11 +58,11 @@ class Options:
     path_tolerance: float = 1e-6
     #: Relative errors of G, damping coefficient and J_lim that minimax must tolerate.
     errors: Uncertainty = ERRORS
-    pace: Pace = PACE  #: of the shaper smooth; the rate in 1/s
+    pace: SmoothLimits = PACE  #: of the shaper smooth; the rate in 1/s
 
 
 @dataclass(frozen=True)
-class Model:
+class JointModel:
     """All data of a prediction: the block and how commands reach it."""
 
     actuator: ActuatorParameters
@@ -71,7 +71,7 @@ class Model:
     units: Units = field(init=False)  #: scales of the dimensionless time and load
     limits: Limits = field(init=False)
     delivery: Delivery = field(init=False)  #: dimensionless, like limits and pace
-    pace: Pace = field(init=False)
+    pace: SmoothLimits = field(init=False)
     pull: float = field(init=False)  #: load of the constant force
 
     def __post_init__(self) -> None:
@@ -142,7 +142,7 @@ class Model:
         """Predict the state after a load has been commanded for a dimensionless time."""
         return follow((Level(0.0, load),), state, duration, self.material, self.delivery)
 
-    def taken_from(self, state: State, other: 'Model') -> State:
+    def taken_from(self, state: State, other: 'JointModel') -> State:
         """Return a state of another model in the units of this one."""
         if other is self:
             return state
@@ -164,7 +164,7 @@ class PlannedLevel:
     stamp: int  #: start time in ns
     flux_density: float  #: in T
     state: State  #: in the units of the model
-    model: Model = field(repr=False)  #: of the motion from the timestamp on
+    model: JointModel = field(repr=False)  #: of the motion from the timestamp on
     #: Timestamp in ns with which it was sent, if it was delayed by an earlier, late level.
     sent_for: int | None = None
 
@@ -263,7 +263,7 @@ class PlannedSegment:
 
 
 @dataclass(frozen=True)
-class Plan:
+class Timeline:
     """The plan from the present level on."""
 
     number: int  #: counts accepted requests from 1; 0 before the first
@@ -271,7 +271,7 @@ class Plan:
     segments: tuple[PlannedSegment, ...]  #: by time
     kept: int = 0  #: number of segments, from the first on, that belong to earlier requests
 
-    def shifted(self, span: int) -> 'Plan':
+    def shifted(self, span: int) -> 'Timeline':
         """Return the plan with all times shifted by some ns."""
         return replace(
             self, levels=tuple(x.shifted(span) for x in self.levels),

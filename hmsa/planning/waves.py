@@ -14,9 +14,9 @@ import numpy as np
 from hmsa.errors import BadInputError
 from hmsa.model import law
 from hmsa.model.equations import Array, elastic_force
-from hmsa.planning.flat import fade, loads_for
+from hmsa.planning.inverse_dynamics import fade, loads_for
 from hmsa.planning.path import Path
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 
 #: Value and two derivatives with respect to the phase, whose period is 1, shape (n,) each.
 Shape = Callable[[Array], tuple[Array, Array, Array]]
@@ -97,7 +97,7 @@ class Wave:
     mean: float  #: stretch
     amplitude: float  #: of the stretch, above 0
 
-    def path(self, request: Request, frequency: float, last: float, cycles: float) -> Path:
+    def path(self, request: MoveRequest, frequency: float, last: float, cycles: float) -> Path:
         """Return the path of a wave or sweep from rest, with a number of cycles, to rest."""
         start = request.state.stretch
         period = 2.0 * math.pi / float(
@@ -138,7 +138,7 @@ class Wave:
                   for a, b, rate in zip(ends, edges, rates, strict=False)]
         return Path(np.append(np.concatenate(breaks), edges[-1]), course)
 
-    def within(self, request: Request, frequency: float) -> bool:
+    def within(self, request: MoveRequest, frequency: float) -> bool:
         """Return whether the limits of field and slew rate allow the wave at a frequency."""
         material, delivery, limits = request.material, request.delivery, request.limits
         packed = material.packed
@@ -159,7 +159,7 @@ class Wave:
         return bool(limits.minimum <= found.min() and found.max() <= limits.maximum
                     and np.max(np.abs(_growth(found, step))) <= _SLEW_SHARE * delivery.slew)
 
-    def reach(self, request: Request) -> list[tuple[float, float]]:
+    def reach(self, request: MoveRequest) -> list[tuple[float, float]]:
         """Return the frequency bands that limits allow; the first may start at 0."""
         natural = float(law.natural_frequency(self.mean, request.material.packed))
         looked = (_LOOK * natural / (2.0 * math.pi)).tolist()
@@ -175,7 +175,7 @@ class Wave:
         edges += [math.inf] if held[-1] else []
         return list(zip(edges[::2], edges[1::2], strict=True))
 
-    def _edge(self, request: Request, low: float, high: float) -> float:
+    def _edge(self, request: MoveRequest, low: float, high: float) -> float:
         """Return the frequency between two at which limits begin or cease to allow the wave."""
         allowed = self.within(request, low)
         while high - low > _EDGE * high:

@@ -10,9 +10,9 @@ from hmsa.judge.records import Tolerances
 from hmsa.model.equations import Array
 from hmsa.model.residual import percent
 from hmsa.model.units import NANOSECONDS
-from hmsa.report.curves import Curve
+from hmsa.report.curves import TimeCurve
 from hmsa.report.evaluation import evaluate, Evaluation, MoveResult, verdicts
-from hmsa.runs.levels import lateness_of, Level, without_repeats
+from hmsa.runs.levels import lateness_of, RecordedLevel, without_repeats
 from hmsa.runs.record import Run, Times
 
 # A change of level that took effect within this time in s of its timestamp was on time: the clock
@@ -26,7 +26,7 @@ _SAME_CLOCK = 60.0
 class Timing:
     """Timing of commands and samples; all arrays are in s."""
 
-    commands: tuple[Level, ...]  #: commands that change the level, in the order received
+    commands: tuple[RecordedLevel, ...]  #: commands that change the level, in the order received
     repeats: int  #: number of commands that repeat the level
     #: Shape (m,): timestamp minus recording time of each command; below 0 if late. Empty if
     #: recorder and timestamps used different clocks.
@@ -127,7 +127,7 @@ def reach(parts: Sequence[Part], number: int) -> float:
         110.0 * x.error for x in results_of(parts, number) if math.isfinite(x.error))]))
 
 
-def around(x: MoveResult, curve: Curve) -> tuple[Array, Array]:
+def around(x: MoveResult, curve: TimeCurve) -> tuple[Array, Array]:
     """Return a curve around an arrival: time in the move in s, and error in % of the step."""
     inside = curve.between(x.begin, min(x.end, x.begin + _PANEL_SPAN * max(x.arrival, 1e-9)))
     return inside.time - x.begin, 100.0 * (inside.stretch - x.stretch) / abs(x.step)

@@ -55,7 +55,7 @@ def _curves(group: Sequence[Part], number: int, grid: Array) -> Array:
 
 
 def _draw_band(
-        figure: style.Picture, panel: Any, look: looks.Look, label: str, grid: Array,
+        figure: style.Picture, panel: Any, look: looks.LineStyle, label: str, grid: Array,
         curves: Array) -> None:
     known = np.isfinite(curves).all(axis=0) if len(curves) else np.zeros(len(grid), dtype=bool)
     if not known.any():

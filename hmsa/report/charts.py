@@ -18,7 +18,7 @@ from hmsa.model.residual import RESOLVED
 from hmsa.model.units import NANOSECONDS
 from hmsa.report import looks
 from hmsa.report.arrivals import around, Part, reach, results_of, span, title
-from hmsa.report.curves import BUCKETS, Curve, decimate, numbers
+from hmsa.report.curves import BUCKETS, decimate, numbers, TimeCurve
 from hmsa.report.evaluation import MoveResult
 from hmsa.report.looks import BLACK, BLUE, GREY, VERMILION
 from hmsa.runs.levels import held_at
@@ -306,7 +306,7 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
                 data.append(_curve(
                     part, kind, *decimate(unit.of(time), distance, _PANEL_BUCKETS)))
         time, distance = around(result, found.recorded)
-        samples, away = around(result, Curve(found.time, part.run.stretch, part.run.rate))
+        samples, away = around(result, TimeCurve(found.time, part.run.stretch, part.run.rate))
         data += _recorded(
             part, unit.of(time), distance, (unit.of(samples), away), buckets=_PANEL_BUCKETS)
     arrivals = sorted({float(unit.of(x.arrival)) for x in results_of(parts, number)})

@@ -19,22 +19,22 @@ _DIGITS = 9
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class TimeCurve:
     """A motion over time; NaN where unknown, which leaves a gap in the drawn line."""
 
     time: Array  #: in s, shape (n,)
     stretch: Array  #: shape (n,)
     rate: Array  #: in 1/s, shape (n,)
 
-    def between(self, begin: float, end: float) -> 'Curve':
+    def between(self, begin: float, end: float) -> 'TimeCurve':
         """Return the part between two times, inclusive."""
         inside = (self.time >= begin) & (self.time <= end)
-        return Curve(self.time[inside], self.stretch[inside], self.rate[inside])
+        return TimeCurve(self.time[inside], self.stretch[inside], self.rate[inside])
 
-    def at(self, time: Array) -> 'Curve':
+    def at(self, time: Array) -> 'TimeCurve':
         """Return the curve at a subset of its times."""
         places = np.searchsorted(self.time, time)
-        return Curve(time, self.stretch[places], self.rate[places])
+        return TimeCurve(time, self.stretch[places], self.rate[places])
 
 
 def fine(time: Array, period: float) -> Array:
@@ -47,7 +47,7 @@ def fine(time: Array, period: float) -> Array:
     return np.union1d(time, np.arange(time[0], time[-1], spacing, dtype=np.float64))
 
 
-def through(samples: Curve, period: float) -> Curve:
+def through(samples: TimeCurve, period: float) -> TimeCurve:
     """
     Return the cubic Hermite curve through samples of stretch and rate.
 
@@ -58,7 +58,7 @@ def through(samples: Curve, period: float) -> Curve:
         x[finite] for x in (samples.time, samples.stretch, samples.rate))
     grid = fine(time, period)
     if len(time) < 2 or grid is time:
-        return Curve(time, stretch, rate)
+        return TimeCurve(time, stretch, rate)
     places = np.searchsorted(time, grid)
     # Importing SciPy's interpolation takes longer than the whole report.
     after = np.clip(places, 1, None)
@@ -73,7 +73,7 @@ def through(samples: Curve, period: float) -> Curve:
     inside = time[np.minimum(places, len(time) - 1)] != grid
     gap = inside & (np.diff(time)[np.clip(places - 1, 0, None)] > _GAP * period)
     values[gap] = slopes[gap] = np.nan
-    return Curve(grid, values, slopes)
+    return TimeCurve(grid, values, slopes)
 
 
 def decimate(x: Array, y: Array, buckets: int = BUCKETS) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from hmsa.errors import HmsaError
 from hmsa.interfaces.topics import PLANNER
-from hmsa.judge.records import Finding, Setpoint, Tolerances
+from hmsa.judge.records import Finding, RequestedSetpoint, Tolerances
 from hmsa.model.delivery import Delivery
 from hmsa.model.equations import (
     Array,
@@ -26,9 +26,9 @@ from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.residual import residual_vibration
 from hmsa.model.simulation import follow, response, sampled
 from hmsa.model.units import NANOSECONDS
-from hmsa.report.curves import Curve, fine, through
+from hmsa.report.curves import fine, through, TimeCurve
 from hmsa.report.outcome import findings_of, tolerances_of
-from hmsa.runs.levels import in_force, Level, without_repeats
+from hmsa.runs.levels import in_force, RecordedLevel, without_repeats
 from hmsa.runs.parameters import creep_of
 from hmsa.runs.record import Run, Times
 from hmsa.runs.setpoints import Requested, SAME, setpoints_of, start_of
@@ -42,7 +42,7 @@ _MOST_PERIODS = 1e6
 
 
 @dataclass(frozen=True)
-class Move:
+class CommandedMove:
     """One setpoint as it was commanded; timestamps in ns."""
 
     stretch: float  #: target
@@ -98,16 +98,18 @@ class Evaluation:
     zero: int
     time: Array  #: times of the samples in s, shape (n,)
     start: float  #: stretch at rest before the first move
-    levels: tuple[Level, ...]  #: commands that took effect and changed the level, by timestamp
-    moves: tuple[Move, ...]  #: setpoints
+    levels: tuple[
+        RecordedLevel, ...]  #: commands that took effect and changed the level, by timestamp
+    moves: tuple[CommandedMove, ...]  #: setpoints
     results: tuple[MoveResult, ...]  #: one per move
-    recorded: Curve  #: through the samples
+    recorded: TimeCurve  #: through the samples
     #: simulated for unshaped steps; NaN without a move, and for steps too large or too long to
     #: simulate
-    plain: Curve
-    plan: tuple[Level, ...]  #: planned changes of level that were not replanned, by timestamp
+    plain: TimeCurve
+    plan: tuple[
+        RecordedLevel, ...]  #: planned changes of level that were not replanned, by timestamp
     #: predicted by the plan, at the samples and between them; NaN before and without a plan
-    planned: Curve
+    planned: TimeCurve
     findings: tuple[Finding, ...] = ()  #: one per requested setpoint
 
     def seconds(self, stamp: int) -> float:
@@ -157,7 +159,7 @@ def evaluate(run: Run, tolerances: Tolerances | None = None) -> Evaluation:
     time = (run.time - first) / NANOSECONDS
     period = run.plant.period
     plain = _plain(run, time, found, first, start)
-    recorded = through(Curve(time, run.stretch, run.rate), period)
+    recorded = through(TimeCurve(time, run.stretch, run.rate), period)
     tolerances = tolerances or tolerances_of(run)
     results = [_measure(
         run, time, recorded, plain, x, first, asked[x.place].setpoint, tolerances) for x in found]
@@ -168,11 +170,11 @@ def evaluate(run: Run, tolerances: Tolerances | None = None) -> Evaluation:
             x.stamp for x in plan if run.time[0] <= x.stamp <= run.time[-1]]]).astype(np.int64))
     return Evaluation(
         first, time, start, levels, found, tuple(results), recorded, plain, plan,
-        Curve((stamps - first) / NANOSECONDS, *_predict(run, plan, stamps)),
+        TimeCurve((stamps - first) / NANOSECONDS, *_predict(run, plan, stamps)),
         tuple(findings_of(run, tolerances, asked=asked)))
 
 
-def _first(run: Run, levels: Sequence[Level], asked: Sequence[Requested]) -> int:
+def _first(run: Run, levels: Sequence[RecordedLevel], asked: Sequence[Requested]) -> int:
     """Return the begin of the first level in ns, skipping the level that an earlier run left."""
     begins = asked[0].setpoint.begins if asked else int(run.time[0])
     later = [x for x in levels if x.stamp >= begins]
@@ -184,7 +186,8 @@ def _first(run: Run, levels: Sequence[Level], asked: Sequence[Requested]) -> int
     return next((x for x in later if x.flux_density != held), later[0]).stamp
 
 
-def find_moves(run: Run, levels: Sequence[Level], setpoints: Sequence[Requested]) -> list[Move]:
+def find_moves(run: Run, levels: Sequence[RecordedLevel], setpoints: Sequence[Requested]) -> list[
+        CommandedMove]:
     """Return the moves whose planned arrival lies within the recording."""
     last = int(run.time[-1])
     moves = []
@@ -199,16 +202,17 @@ def find_moves(run: Run, levels: Sequence[Level], setpoints: Sequence[Requested]
             arrival = inside[0].stamp + round(math.pi / setpoint.frequency * NANOSECONDS)
             inside = [x for x in inside if x.stamp <= arrival]
         if arrival < end:
-            moves.append(Move(
+            moves.append(CommandedMove(
                 setpoint.target, setpoint.start, inside[0].stamp, arrival, end,
                 tuple(x.flux_density for x in inside), place))
     return moves
 
 
 def _plain(
-        run: Run, time: Array, moves: Sequence[Move], zero: int, start: float) -> Curve:
+        run: Run, time: Array, moves: Sequence[CommandedMove], zero: int,
+        start: float) -> TimeCurve:
     """Simulate unshaped steps, at the samples and between them."""
-    nothing = Curve(time, np.full_like(time, np.nan), np.full_like(time, np.nan))
+    nothing = TimeCurve(time, np.full_like(time, np.nan), np.full_like(time, np.nan))
     begins = np.array([(x.begin - zero) / NANOSECONDS for x in moves])
     if not moves or time[-1] - begins[0] > _MOST_PERIODS * run.plant.period:
         return nothing
@@ -225,7 +229,7 @@ def _plain(
             np.array([x.flux_densities[-1] for x in moves]), grid, start)
     except HmsaError:
         return nothing
-    return Curve(*(np.concatenate(x) for x in (
+    return TimeCurve(*(np.concatenate(x) for x in (
         (before, grid), (np.full_like(before, start), stretch), (np.zeros_like(before), rate))))
 
 
@@ -238,8 +242,9 @@ def _delivery(run: Run, actuator: ActuatorParameters, node: str) -> Delivery:
 
 
 def _measure(
-        run: Run, time: Array, recorded: Curve, plain: Curve, move: Move, zero: int,
-        setpoint: Setpoint, tolerances: Tolerances) -> MoveResult:
+        run: Run, time: Array, recorded: TimeCurve, plain: TimeCurve, move: CommandedMove,
+        zero: int,
+        setpoint: RequestedSetpoint, tolerances: Tolerances) -> MoveResult:
     """Evaluate one setpoint."""
     step = move.stretch - move.start
     begin, arrival, end = (
@@ -268,14 +273,14 @@ def _measure(
         moved=moved, place=move.place)
 
 
-def _settled(curve: Curve, target: float, allowed: float) -> float:
+def _settled(curve: TimeCurve, target: float, allowed: float) -> float:
     """Return the time in s from which a curve stays within a distance of the target; else NaN."""
     off = np.flatnonzero(np.abs(curve.stretch - target) > allowed)
     place = int(off[-1]) + 1 if len(off) else 0
     return float(curve.time[place]) if place < len(curve.time) else math.nan
 
 
-def _predict(run: Run, plan: Sequence[Level], stamps: Times) -> tuple[Array, Array]:
+def _predict(run: Run, plan: Sequence[RecordedLevel], stamps: Times) -> tuple[Array, Array]:
     """Return the stretch and rate that the plan predicts, simulated from point to point."""
     predicted = np.full((2, len(stamps)), np.nan)
     actuator: ActuatorParameters = run.planner

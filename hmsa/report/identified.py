@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from hmsa.identification.recording import Course
+from hmsa.identification.measurement import UncheckedMeasurement
 from hmsa.identification.response import respond
 from hmsa.identification.result import Identification
 from hmsa.model.equations import Array
@@ -85,7 +85,8 @@ def _fitted(found: Identification) -> tuple[Array, Array]:
     step = _FINE * found.values['time_unit']
     dense = recording.time if end - begin >= _MOST_FINE * step else np.union1d(
         recording.time, np.arange(begin, end, step, dtype=np.float64))
-    course = Course(dense, recording.level_times, recording.levels, recording.slew_limit,
+    course = UncheckedMeasurement(
+        dense, recording.level_times, recording.levels, recording.slew_limit,
                     at_rest=recording.at_rest)
     response = None if recording.earlier else respond(course, found.values, ())
     if response is None:

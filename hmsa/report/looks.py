@@ -18,7 +18,7 @@ DARK = {
 
 
 @dataclass(frozen=True)
-class Look:
+class LineStyle:
     """The style of a curve."""
 
     colour: str
@@ -40,25 +40,25 @@ class Look:
             {'dash': dash} if dash else {})
 
 
-RECORDED = Look(BLUE, 1.6, order=3)
-PLAIN = Look(VERMILION, 1.0, (4.0, 1.5))
-PLAN = Look(BLACK, 1.1, (1.0, 2.0), order=4)
-FIELD = Look(ORANGE, 1.1, (6.0, 1.5, 1.0, 1.5))
-TARGET = Look(GREY, 0.9, (2.0, 2.0), order=1)
-ARRIVAL = Look(BLACK, 0.8, (1.0, 1.5), order=1)
+RECORDED = LineStyle(BLUE, 1.6, order=3)
+PLAIN = LineStyle(VERMILION, 1.0, (4.0, 1.5))
+PLAN = LineStyle(BLACK, 1.1, (1.0, 2.0), order=4)
+FIELD = LineStyle(ORANGE, 1.1, (6.0, 1.5, 1.0, 1.5))
+TARGET = LineStyle(GREY, 0.9, (2.0, 2.0), order=1)
+ARRIVAL = LineStyle(BLACK, 0.8, (1.0, 1.5), order=1)
 
 #: Styles of the shapers, by name.
 SHAPERS = {
-    'two_step': Look(BLUE, 1.8, (), 'o', 6),
-    'robust': Look(GREEN, 1.3, (5.0, 1.5), 's', 5),
-    'minimax': Look(SKY_BLUE, 1.5, (5.0, 1.0, 1.0, 1.0), 'D', 5),
-    'minimum_time': Look(ORANGE, 1.5, (8.0, 2.0), '^', 4),
-    'smooth': Look(INDIGO, 1.3, (1.0, 1.0), 'P', 4),
-    'step': Look(VERMILION, 1.2, (3.0, 2.0), 'X', 3),
-    'zv': Look(SILVER, 1.5, (8.0, 1.5, 1.0, 1.5), 'v', 3),
-    'zvd': Look(GREY, 1.2, (2.0, 1.0), '<', 3),
-    'ei': Look(BLACK, 1.0, (6.0, 1.0, 1.0, 1.0, 1.0, 1.0), '>', 3),
-    'umzv': Look(PURPLE, 1.2, (1.0, 2.5), 'p', 3),
+    'two_step': LineStyle(BLUE, 1.8, (), 'o', 6),
+    'robust': LineStyle(GREEN, 1.3, (5.0, 1.5), 's', 5),
+    'minimax': LineStyle(SKY_BLUE, 1.5, (5.0, 1.0, 1.0, 1.0), 'D', 5),
+    'minimum_time': LineStyle(ORANGE, 1.5, (8.0, 2.0), '^', 4),
+    'smooth': LineStyle(INDIGO, 1.3, (1.0, 1.0), 'P', 4),
+    'step': LineStyle(VERMILION, 1.2, (3.0, 2.0), 'X', 3),
+    'zv': LineStyle(SILVER, 1.5, (8.0, 1.5, 1.0, 1.5), 'v', 3),
+    'zvd': LineStyle(GREY, 1.2, (2.0, 1.0), '<', 3),
+    'ei': LineStyle(BLACK, 1.0, (6.0, 1.0, 1.0, 1.0, 1.0, 1.0), '>', 3),
+    'umzv': LineStyle(PURPLE, 1.2, (1.0, 2.5), 'p', 3),
 }
 #: Styles of unnamed curves, such as those of several runs, in order. The first is solid: dashed
 #: curves on top of it remain distinguishable.
@@ -67,7 +67,7 @@ CASES = tuple(replace(SHAPERS[x], order=RECORDED.order) for x in (
 RUNS = tuple(x.colour for x in CASES)
 
 
-def case(number: int) -> Look:
+def case(number: int) -> LineStyle:
     """Return the style of a curve by its index: `CASES`, then the same with other dashes."""
     turn, place = divmod(number, len(CASES))
     other = CASES[(place + 3 * turn) % len(CASES)]

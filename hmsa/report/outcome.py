@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from hmsa.interfaces.parameters import number_of
-from hmsa.judge.holds import Hold
-from hmsa.judge.records import Finding, Sensor, Tolerances, unobserved
+from hmsa.judge.records import Finding, SensorModel, Tolerances, unobserved
+from hmsa.judge.setpoint_samples import SetpointSamples
 from hmsa.model.equations import equilibrium_stretch
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
@@ -19,7 +19,7 @@ from hmsa.table import Column, Table
 
 _LEFT_OUT = 'no time was left for it'
 _CUT_SHORT = 'the samples end before its arrival'
-_SENSOR = Sensor()
+_SENSOR = SensorModel()
 # Later than any timestamp, in ns.
 _END = 2**62
 # Maximum number of rows in the table of levels.
@@ -45,7 +45,7 @@ def _judged(run: Run, asked: Requested, tolerances: Tolerances) -> Finding:
     """Judge a setpoint as the planner does, with samples and plans in order of arrival."""
     joints = run.parameters.get('planner.joints')
     several = isinstance(joints, list) and len(joints) > 1
-    hold = Hold(replace(
+    hold = SetpointSamples(replace(
         asked.setpoint, joint=run.joint if several else '', held=asked.last))
     moves, sensors = list(asked.moves), list(run.sensors)
     sensor = _SENSOR

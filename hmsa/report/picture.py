@@ -18,7 +18,7 @@ from hmsa.report.arrivals import (
     worst,
 )
 from hmsa.report.charts import commanded, time_unit, TimeUnit
-from hmsa.report.curves import Curve, decimate
+from hmsa.report.curves import decimate, TimeCurve
 from hmsa.report.paper import Paper
 
 # Maximum number of samples in a panel that are also drawn as points.
@@ -111,7 +111,7 @@ def _shown_times(parts: Sequence[Part]) -> tuple[float, float]:
 
 def _draw_recorded(
         panel: Axes, part: Part, curve: tuple[Any, Any], samples: tuple[Any, Any],
-        look: looks.Look, *, alone: bool, **more: Any) -> None:
+        look: looks.LineStyle, *, alone: bool, **more: Any) -> None:
     """Draw the curve through the samples, and the samples as points if they are few."""
     label = part.run.origin if alone else part.run.label
     panel.plot(*curve, **{**look.line(), **more}, label=label)
@@ -123,7 +123,7 @@ def _draw_recorded(
 
 
 def _draw_run(
-        axes: dict[str, Axes], part: Part, unit: TimeUnit, look: looks.Look,
+        axes: dict[str, Axes], part: Part, unit: TimeUnit, look: looks.LineStyle,
         times: tuple[float, float], *, alone: bool) -> None:
     run, found = part.run, part.evaluation
     if found.levels:
@@ -137,7 +137,7 @@ def _draw_run(
             label='target')
     plain, curve, samples = (
         x.between(*times) for x in (
-            found.plain, found.recorded, Curve(found.time, run.stretch, run.rate)))
+            found.plain, found.recorded, TimeCurve(found.time, run.stretch, run.rate)))
     dense: dict[str, Any] = {} if times[1] - times[0] <= _DASHED * run.plant.period else {
         'linestyle': '-', 'linewidth': _THIN}
     if alone and np.isfinite(plain.stretch).any():
@@ -161,12 +161,12 @@ def _draw_run(
 
 
 def _draw_arrival(
-        panel: Axes, part: Part, number: int, look: looks.Look, *, alone: bool) -> None:
+        panel: Axes, part: Part, number: int, look: looks.LineStyle, *, alone: bool) -> None:
     """Draw the zoom on one arrival, in ms and percent of the step."""
     found, result = part.evaluation, part.evaluation.results[number]
     end = span([part], number)
 
-    def shown(curve: Curve) -> tuple[Any, Any]:
+    def shown(curve: TimeCurve) -> tuple[Any, Any]:
         time, distance = around(result, curve)
         return 1e3 * time[time <= end], distance[time <= end]
 
@@ -175,7 +175,7 @@ def _draw_arrival(
             *decimate(*shown(found.plain)), **style.UNSHAPED, label='unshaped steps (simulated)')
     _draw_recorded(
         panel, part, decimate(*shown(found.recorded)),
-        shown(Curve(found.time, part.run.stretch, part.run.rate)), look, alone=alone)
+        shown(TimeCurve(found.time, part.run.stretch, part.run.rate)), look, alone=alone)
     # For an unshaped step, the arrival of a two-step command.
     panel.axvline(1e3 * result.arrival, **style.ARRIVAL, label='end of the move')
 

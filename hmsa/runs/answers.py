@@ -11,7 +11,7 @@ from collections.abc import Collection, Container, Iterable, Iterator, Sequence
 from typing import Protocol
 
 from hmsa.model.status import Code
-from hmsa.runs.record import Verdict
+from hmsa.runs.record import RecordedVerdict
 
 # In ns: maximum delay of recording relative to a message sent later.
 _LATE = 50_000_000
@@ -21,7 +21,7 @@ _PLANNED = 2_000_000_000
 _IDLE = {Code.UNCHANGED.value, Code.SUPERSEDED.value}
 
 
-class Request(Protocol):
+class RecordedRequest(Protocol):
     """A request: the time of recording, in ns, and its name, if any."""
 
     @property
@@ -33,7 +33,7 @@ class Request(Protocol):
         """Name, empty if there is none."""
 
 
-def beginning(verdicts: Iterable[Verdict], number: int = 0) -> Iterator[Verdict]:
+def beginning(verdicts: Iterable[RecordedVerdict], number: int = 0) -> Iterator[RecordedVerdict]:
     """Yield the first verdict on each new plan; after a restart, a planner counts from 0."""
     for verdict in verdicts:
         if verdict.plan not in (0, number):
@@ -41,7 +41,7 @@ def beginning(verdicts: Iterable[Verdict], number: int = 0) -> Iterator[Verdict]
         number = verdict.plan
 
 
-def plans_of(verdicts: Sequence[Verdict], plans: Sequence[int]) -> dict[int, int]:
+def plans_of(verdicts: Sequence[RecordedVerdict], plans: Sequence[int]) -> dict[int, int]:
     """
     Return the plans that were published right before a verdict, if only recording times are known.
 
@@ -58,8 +58,8 @@ def plans_of(verdicts: Sequence[Verdict], plans: Sequence[int]) -> dict[int, int
 
 
 def answered(
-        requests: Sequence[Request], verdicts: Sequence[Verdict],
-        ) -> tuple[list[tuple[Verdict | None, bool]], list[Verdict]]:
+        requests: Sequence[RecordedRequest], verdicts: Sequence[RecordedVerdict],
+        ) -> tuple[list[tuple[RecordedVerdict | None, bool]], list[RecordedVerdict]]:
     """
     Return the answer of each request and whether it was accepted, and verdicts on other new plans.
 
@@ -68,7 +68,7 @@ def answered(
     """
     begun = list(beginning(verdicts))
     new = {x.sent: x for x in begun}
-    named: dict[str, Verdict] = {}
+    named: dict[str, RecordedVerdict] = {}
     for verdict in verdicts:
         if verdict.request and (verdict.request not in named or (
                 verdict.sent in new and named[verdict.request].sent not in new)):
@@ -76,7 +76,7 @@ def answered(
     unnamed = {x.sent: x for x in _answers(verdicts, new) if not x.request or not begun}
     times = list(unnamed)
     claimed: set[int] = set()
-    found: list[tuple[Verdict | None, bool]] = []
+    found: list[tuple[RecordedVerdict | None, bool]] = []
     for request in requests:
         answer = named.get(request.name)
         if answer is None and not (request.name and begun):
@@ -93,9 +93,10 @@ def answered(
     return found, [x for x in begun if x.sent not in claimed and x is not verdicts[0]]
 
 
-def _answers(verdicts: Sequence[Verdict], new: Collection[int]) -> Iterator[Verdict]:
+def _answers(verdicts: Sequence[RecordedVerdict], new: Collection[int]) -> Iterator[
+        RecordedVerdict]:
     """Yield the verdicts that may answer a request; ``new`` are times of those on new plans."""
-    before: Verdict | None = None
+    before: RecordedVerdict | None = None
     for verdict in verdicts:
         fresh = before is None or (verdict.code, verdict.message) != (before.code, before.message)
         if verdict.sent in new or fresh and (

@@ -19,14 +19,14 @@ from hmsa.bag.info import BagSummary, summarize
 from hmsa.bag.reader import BagReader, Message
 from hmsa.errors import assume, BadInputError, BagError, MissingWarning
 from hmsa.interfaces.status import whole
-from hmsa.judge.records import Sensor
-from hmsa.model.schedule import obeyed
+from hmsa.judge.records import SensorModel
+from hmsa.model.schedule import is_axial_field
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs import answers
 from hmsa.runs import topics as roles
-from hmsa.runs.levels import Level
+from hmsa.runs.levels import RecordedLevel
 from hmsa.runs.parameters import actuators, named_joint, recorded
-from hmsa.runs.record import LearntSensor, RecordedRequest, Run, Verdict
+from hmsa.runs.record import LearntSensor, RecordedRequest, RecordedVerdict, Run
 from hmsa.runs.samples import nanoseconds_of, SampleReader
 from hmsa.runs.topics import topics_by_joint
 
@@ -190,17 +190,17 @@ class _Collected:
 
     def __init__(self) -> None:
         self.samples = SampleReader()
-        self.commands: defaultdict[str, list[Level]] = defaultdict(list)
-        self.applied: defaultdict[str, list[Level]] = defaultdict(list)
+        self.commands: defaultdict[str, list[RecordedLevel]] = defaultdict(list)
+        self.applied: defaultdict[str, list[RecordedLevel]] = defaultdict(list)
         self.forces: defaultdict[str, list[tuple[int, int, float]]] = defaultdict(list)
         self.refused = Counter[str]()
         # Of all joints; plans and verdicts are assigned after sorting.
         self.plans: list[_Trajectory] = []
         self.requests: list[_Trajectory] = []
         self.stops: list[int] = []  # recording times of plans without a request
-        self.verdicts: list[Verdict] = []
+        self.verdicts: list[RecordedVerdict] = []
         # Plans and verdicts, with the time of publishing by the planner's clock.
-        self.published: list[tuple[int, _Trajectory | Verdict]] = []
+        self.published: list[tuple[int, _Trajectory | RecordedVerdict]] = []
         # With the joint of each.
         self.sensors: list[tuple[str, LearntSensor]] = []
         self.notes: list[str] = []
@@ -227,10 +227,10 @@ class _Collected:
             self.samples.take(sent, content)
         elif role in (roles.COMMAND, roles.APPLIED):
             vector = content.magnetic_field
-            if obeyed(vector.x, vector.y, vector.z):
+            if is_axial_field(vector.x, vector.y, vector.z):
                 stamp = nanoseconds_of(content.header.stamp)
                 kept = self.commands if role == roles.COMMAND else self.applied
-                kept[joint].append(Level(
+                kept[joint].append(RecordedLevel(
                     stamp or (sent if role == roles.COMMAND else 0), float(vector.z), sent))
             else:
                 self.refused[joint] += 1
@@ -248,12 +248,13 @@ class _Collected:
                 (_Point(None, (float(content.data),), (), ()),), ''))
         elif role == roles.ESTIMATE:
             self.sensors += (
-                (x.hardware_id, LearntSensor(sent, Sensor.of({y.key: y.value for y in x.values})))
+                (x.hardware_id, LearntSensor(
+                    sent, SensorModel.of({y.key: y.value for y in x.values})))
                 for x in content.status)
         else:
             level = content.level[0] if isinstance(content.level, bytes) else int(content.level)
             values = {x.key: x.value for x in content.values}
-            self.published.append((message.publish_time, Verdict(
+            self.published.append((message.publish_time, RecordedVerdict(
                 sent, _LEVELS[min(level, 2)], values.get('code', ''), content.message,
                 whole(values.get('plan')), values.get('request', ''))))
 
@@ -274,14 +275,14 @@ class _Collected:
         for i in range(1, len(times)):
             times[i] = max(times[i], times[i - 1] + _APART)
         for (_, one), sent in zip(self.published, times, strict=True):
-            kept: list[Any] = self.verdicts if isinstance(one, Verdict) else self.plans
+            kept: list[Any] = self.verdicts if isinstance(one, RecordedVerdict) else self.plans
             kept.append(replace(one, sent=sent))
         self._answer(times)
 
     def _pair(self) -> None:
         """Put plans right before their verdicts if only recording times are known."""
         verdicts = sorted(
-            (x for _, x in self.published if isinstance(x, Verdict)), key=lambda x: x.sent)
+            (x for _, x in self.published if isinstance(x, RecordedVerdict)), key=lambda x: x.sent)
         before = answers.plans_of(verdicts, sorted(
             x.sent for _, x in self.published if isinstance(x, _Trajectory)))
         self.published = [
@@ -297,7 +298,7 @@ class _Collected:
         """
         plans = {x.sent for x in self.plans}
 
-        def announced(verdict: Verdict) -> int:
+        def announced(verdict: RecordedVerdict) -> int:
             place = bisect_left(times, verdict.sent)
             return times[place - (place > 0 and times[place - 1] in plans)]
 
@@ -318,14 +319,15 @@ class _Collected:
                 sent = min(max(sent, before + 1), begun - 1)
             self.requests[i] = replace(request, sent=sent, taken=taken)
 
-    def _plans(self, joint: str) -> Iterator[tuple[Level, ...]]:
+    def _plans(self, joint: str) -> Iterator[tuple[RecordedLevel, ...]]:
         """Yield the plans of a joint, and those without joint names."""
         for plan in self.plans:
             place = _place(plan.joints, joint)
             if place is None:
                 continue
             levels = [
-                Level(plan.stamp + (x.time or 0), x.effort[place], plan.sent, x.positions[place],
+                RecordedLevel(
+                    plan.stamp + (x.time or 0), x.effort[place], plan.sent, x.positions[place],
                       x.velocities[place])
                 for x in plan.points
                 if min(len(x.positions), len(x.velocities), len(x.effort)) > place]
@@ -397,7 +399,7 @@ class _Collected:
             'on a machine that is less busy.'))
 
 
-def _begun(levels: Sequence[Level], first: int) -> tuple[Level, ...]:
+def _begun(levels: Sequence[RecordedLevel], first: int) -> tuple[RecordedLevel, ...]:
     """Return the changes that took effect; time 0 means before the first sample."""
     known = any(0 < x.stamp <= first for x in levels)
     return tuple(

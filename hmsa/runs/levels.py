@@ -18,7 +18,7 @@ ROUNDED_STAMP = 100_000
 
 
 @dataclass(frozen=True)
-class Level:
+class RecordedLevel:
     """A command, or a change of level in a plan."""
 
     stamp: int  # start time in ns
@@ -28,22 +28,22 @@ class Level:
     rate: float = math.nan  # predicted at the timestamp, in 1/s
 
 
-def in_force(messages: Iterable[Sequence[Level]]) -> tuple[Level, ...]:
+def in_force(messages: Iterable[Sequence[RecordedLevel]]) -> tuple[RecordedLevel, ...]:
     """Return the remaining levels; each message replaces all at or after its first timestamp."""
-    levels: Superseding[Level] = Superseding()
+    levels: Superseding[RecordedLevel] = Superseding()
     for message in messages:
         for level in sorted(message, key=lambda x: x.stamp):
             levels.put(level.stamp, level)
     return tuple(levels)
 
 
-def held_at(levels: Sequence[Level], stamps: NDArray[np.int64]) -> Array:
+def held_at(levels: Sequence[RecordedLevel], stamps: NDArray[np.int64]) -> Array:
     """Return the level in T at timestamps in ns, for levels by time; NaN before the first."""
     place = np.searchsorted([x.stamp for x in levels], stamps, side='right')
     return np.array([math.nan, *(x.flux_density for x in levels)])[place]
 
 
-def without_repeats(commands: Sequence[Level]) -> tuple[tuple[Level, ...], int]:
+def without_repeats(commands: Sequence[RecordedLevel]) -> tuple[tuple[RecordedLevel, ...], int]:
     """Return the commands that change the level, and the number of those that do not."""
     schedule = CommandSchedule(math.nan)
     kept = tuple(x for x in commands if schedule.insert(x.stamp, x.flux_density))
@@ -51,7 +51,8 @@ def without_repeats(commands: Sequence[Level]) -> tuple[tuple[Level, ...], int]:
 
 
 def lateness_of(
-        commands: Sequence[Level], applied: Sequence[Level], last: int) -> tuple[Array, int]:
+        commands: Sequence[RecordedLevel], applied: Sequence[RecordedLevel],
+        last: int) -> tuple[Array, int]:
     """
     Return the lateness of each command, and the number of commands that never took effect.
 
@@ -69,7 +70,7 @@ def lateness_of(
     same = _same_for(commands)
     # The level when the first command was due; reported levels may be older.
     begin = standing[0].stamp if standing else 0
-    before: Level | None = max(
+    before: RecordedLevel | None = max(
         (x for x in applied if x.stamp <= begin), key=lambda x: x.stamp,
         default=min(applied, key=lambda x: x.stamp))
     for i, command in enumerate(standing):
@@ -85,7 +86,7 @@ def lateness_of(
     return result, unapplied
 
 
-def _same_for(commands: Sequence[Level]) -> Callable[[Level, Level], bool]:
+def _same_for(commands: Sequence[RecordedLevel]) -> Callable[[RecordedLevel, RecordedLevel], bool]:
     """Return a function that tests whether two levels are equal up to rounding by hardware."""
     rounding = ROUNDED * max((abs(x.flux_density) for x in commands), default=0.0)
     return lambda one, other: abs(one.flux_density - other.flux_density) <= rounding

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from hmsa.errors import BadInputError
 from hmsa.interfaces.parameters import number_of
-from hmsa.judge.records import Sensor
+from hmsa.judge.records import SensorModel
 from hmsa.model.equations import Array
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
-from hmsa.runs.levels import in_force, Level
+from hmsa.runs.levels import in_force, RecordedLevel
 from hmsa.runs.parameters import of_joint
 from hmsa.runs.topics import APPLIED
 
@@ -47,7 +47,7 @@ class RecordedRequest:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class RecordedVerdict:
     """The planner's verdict on a request."""
 
     sent: int  # recording time in ns
@@ -63,7 +63,7 @@ class LearntSensor:
     """The planner's estimate of a sensor from a time on."""
 
     sent: int  # recording time in ns
-    sensor: Sensor
+    sensor: SensorModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,12 +78,12 @@ class Run:
     stretch: Array  # shape (n,)
     rate: Array  # shape (n,): in 1/s, computed from the stretch if not recorded
     flux_density: Array  # shape (n,): in T, NaN if not recorded
-    commands: tuple[Level, ...] = ()
-    applied: tuple[Level, ...] = ()  # changes of the field that took effect, as reported
+    commands: tuple[RecordedLevel, ...] = ()
+    applied: tuple[RecordedLevel, ...] = ()  # changes of the field that took effect, as reported
     forces: tuple[tuple[int, int, float], ...] = ()  # recording time, timestamp (ns), newtons
-    plans: tuple[tuple[Level, ...], ...] = ()
+    plans: tuple[tuple[RecordedLevel, ...], ...] = ()
     requests: tuple[RecordedRequest, ...] = ()
-    verdicts: tuple[Verdict, ...] = ()  # each once
+    verdicts: tuple[RecordedVerdict, ...] = ()  # each once
     stops: tuple[int, ...] = ()  # recording times in ns of plans without a recorded request
     sensors: tuple[LearntSensor, ...] = ()  # by time; the given sensor applies before
     # Parameters of the nodes, by ``'node.name'``
@@ -122,7 +122,7 @@ class Run:
         return value if value is not None and 0.0 <= value < math.inf else 0.0
 
     @property
-    def reported(self) -> tuple[Level, ...]:
+    def reported(self) -> tuple[RecordedLevel, ...]:
         """
         Levels that the plant reported as applied, by time.
 
@@ -133,7 +133,7 @@ class Run:
         return tuple(sorted(self.applied, key=lambda x: x.stamp))
 
     @property
-    def levels(self) -> tuple[Level, ...]:
+    def levels(self) -> tuple[RecordedLevel, ...]:
         """
         Changes of the field, by time.
 
@@ -149,5 +149,5 @@ class Run:
         values = self.flux_density[known]
         places = known[np.append(True, values[1:] != values[:-1])] if len(known) else known
         return tuple(
-            Level(int(self.time[i]), float(self.flux_density[i]), int(self.logged[i]))
+            RecordedLevel(int(self.time[i]), float(self.flux_density[i]), int(self.logged[i]))
             for i in places)

@@ -12,13 +12,13 @@ import math
 
 import numpy as np
 
-from hmsa.judge.records import Setpoint
+from hmsa.judge.records import RequestedSetpoint
 from hmsa.model.equations import Array, equilibrium_stretch, natural_frequency, stretch_limits
 from hmsa.model.law import critical_zeta
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs.levels import (
     in_force,
-    Level,
+    RecordedLevel,
     ROUNDED,
     ROUNDED_STAMP,
     without_repeats,
@@ -41,7 +41,7 @@ _NEEDED = {'replanned', 'saturated'}
 class Requested:
     """A setpoint as it was requested, with its result."""
 
-    setpoint: Setpoint
+    setpoint: RequestedSetpoint
     due: int | None  #: requested end in ns; None if it was to be held on
     last: bool = False  #: whether it is held after the end of the sequence
     #: Recording times of changed plans, and their arrivals, in ns; None if it was skipped.
@@ -91,7 +91,7 @@ def setpoints_of(run: Run) -> list[Requested]:
 
 # -- requests -----------------------------------------------------------------------------------
 
-def _acts(run: Run, levels: Sequence[Level]) -> list[_Act]:
+def _acts(run: Run, levels: Sequence[RecordedLevel]) -> list[_Act]:
     """Return the changes of the plan, by time."""
     acts = [_Act(x, x.sent, _begin(run, x, levels)) for x in run.requests
             if x.taken and all(math.isfinite(y) for y, _ in x.points)]
@@ -99,7 +99,7 @@ def _acts(run: Run, levels: Sequence[Level]) -> list[_Act]:
     return sorted(acts, key=lambda x: x.sent)
 
 
-def _begin(run: Run, request: RecordedRequest, levels: Sequence[Level]) -> int:
+def _begin(run: Run, request: RecordedRequest, levels: Sequence[RecordedLevel]) -> int:
     """Return the start of a request's execution in ns."""
     later = [x for x in levels if x.sent >= request.sent]
     place = next((i for i, x in enumerate(run.plans) if x and x[0].sent >= request.sent), None)
@@ -109,7 +109,7 @@ def _begin(run: Run, request: RecordedRequest, levels: Sequence[Level]) -> int:
         run.number('planner.lead_time') * NANOSECONDS))
 
 
-def _under_way(run: Run, place: int, levels: Sequence[Level]) -> int | None:
+def _under_way(run: Run, place: int, levels: Sequence[RecordedLevel]) -> int | None:
     """
     Return the time of the first level sent for a plan, if the plan starts with one already sent.
 
@@ -129,7 +129,7 @@ def _under_way(run: Run, place: int, levels: Sequence[Level]) -> int | None:
         for x in new) else None
 
 
-def _in_force(run: Run, level: Level) -> bool:
+def _in_force(run: Run, level: RecordedLevel) -> bool:
     """Return whether a level equals, up to rounding, the last field measured before its time."""
     place = int(np.searchsorted(run.time, level.stamp)) - 1
     return place >= 0 and math.isclose(
@@ -156,18 +156,18 @@ def _new(run: Run, place: int | None) -> int | None:
     return None if fresh == math.inf else int(fresh)
 
 
-def _uncommanded(run: Run, level: Level) -> bool:
+def _uncommanded(run: Run, level: RecordedLevel) -> bool:
     """Return whether no command has a level's timestamp: simulated time of a recorder lags."""
     return bool(run.commands) and all(x.stamp != level.stamp for x in run.commands)
 
 
-def _begun(plan: Sequence[Level], before: Sequence[Level]) -> bool:
+def _begun(plan: Sequence[RecordedLevel], before: Sequence[RecordedLevel]) -> bool:
     """Return whether the first level was already applied, perhaps not at its planned time."""
     return bool(before) and plan[0].stamp < plan[0].sent
 
 
 def _fresh(
-        plan: Sequence[Level], before: Sequence[Level],
+        plan: Sequence[RecordedLevel], before: Sequence[RecordedLevel],
         sent: Container[int] | None = None) -> float:
     """
     Return the time from which a plan differs from the previous one; infinite if it continues it.
@@ -201,7 +201,7 @@ def start_of(run: Run, stamp: int) -> float:
 
 def _of(
         run: Run, act: _Act, request: RecordedRequest, after: _Act | None,
-        levels: Sequence[Level], start: float) -> Iterator[Requested]:
+        levels: Sequence[RecordedLevel], start: float) -> Iterator[Requested]:
     """Yield the setpoints of a request."""
     base = request.stamp or act.begin
     points = [(x, None if y is None else base + y) for x, y in request.points]
@@ -235,27 +235,28 @@ def _of(
 
 
 def _described(
-        run: Run, target: float, start: float, begins: int, end: int | None) -> Setpoint:
+        run: Run, target: float, start: float, begins: int, end: int | None) -> RequestedSetpoint:
     """Return a setpoint with frequency, decay and range from the planner's model."""
     material, unit = run.planner.nondimensional, run.planner.time_unit
     low, high = stretch_limits(material)
     inside = min(max(target, low + SAME), high - SAME)
     omega = float(natural_frequency(inside, material)) / unit
     decay = material.zeta / critical_zeta(inside, material.packed) * omega
-    return Setpoint(target, start, begins, None, end, omega, decay, possible=(low, high))
+    return RequestedSetpoint(target, start, begins, None, end, omega, decay, possible=(low, high))
 
 
-def _within(levels: Sequence[Level], setpoint: Setpoint) -> list[Level]:
+def _within(levels: Sequence[RecordedLevel], setpoint: RequestedSetpoint) -> list[RecordedLevel]:
     """Return the changes of level during a setpoint."""
     end = math.inf if setpoint.end is None else setpoint.end
     return [x for x in levels if setpoint.begins <= x.stamp < end]
 
 
 def _arrivals(
-        run: Run, plans: Sequence[Sequence[Level]], sent: Container[int] | None,
-        setpoint: Setpoint, earliest: int, *, last: bool) -> Iterator[tuple[int, int | None]]:
+        run: Run, plans: Sequence[Sequence[RecordedLevel]], sent: Container[int] | None,
+        setpoint: RequestedSetpoint, earliest: int, *,
+        last: bool) -> Iterator[tuple[int, int | None]]:
     """Yield the recording times of plans that change a setpoint, and the arrival of each."""
-    before: Sequence[Level] = ()
+    before: Sequence[RecordedLevel] = ()
     arrival = None
     rests: set[int] = set()  # timestamps of the final levels in any plan
     for plan in plans:
@@ -284,7 +285,7 @@ def _arrivals(
         arrival = found if found is not None else arrival
 
 
-def _rest(run: Run, plan: Sequence[Level], setpoint: Setpoint) -> int | None:
+def _rest(run: Run, plan: Sequence[RecordedLevel], setpoint: RequestedSetpoint) -> int | None:
     """Return the time at which a plan rests at a setpoint; None if it does not."""
     for share, slow in _AT_REST:
         for level in _within(plan, setpoint):
@@ -295,7 +296,7 @@ def _rest(run: Run, plan: Sequence[Level], setpoint: Setpoint) -> int | None:
     return _by_levels(run, plan, setpoint)
 
 
-def _ramp(run: Run, levels: Sequence[Level], level: Level) -> int:
+def _ramp(run: Run, levels: Sequence[RecordedLevel], level: RecordedLevel) -> int:
     """Return the duration in ns of the amplifier's ramp to a level."""
     slew = run.number('plant.slew_limit') or run.number('planner.slew_limit')
     before = max((x for x in levels if x.stamp < level.stamp), key=lambda x: x.stamp, default=None)
@@ -305,7 +306,8 @@ def _ramp(run: Run, levels: Sequence[Level], level: Level) -> int:
     return round(min(abs(level.flux_density - before.flux_density) / slew, 1e6) * NANOSECONDS)
 
 
-def _by_levels(run: Run, levels: Sequence[Level], setpoint: Setpoint) -> int | None:
+def _by_levels(
+        run: Run, levels: Sequence[RecordedLevel], setpoint: RequestedSetpoint) -> int | None:
     """Return the start of the level that holds a setpoint; None if a single step leads to it."""
     inside = _within(levels, setpoint)
     if setpoint.step <= SAME:
@@ -319,14 +321,14 @@ def _by_levels(run: Run, levels: Sequence[Level], setpoint: Setpoint) -> int | N
     return None if held is None else held.stamp + _ramp(run, levels, held)
 
 
-def balance(run: Run, levels: Sequence[Level]) -> Array:
+def balance(run: Run, levels: Sequence[RecordedLevel]) -> Array:
     """Return the equilibrium stretches of levels with the planner's parameters."""
     return equilibrium_stretch(
         [run.planner.units.of_level(x.flux_density) for x in levels],
         run.planner.nondimensional)
 
 
-def _held(run: Run, levels: Sequence[Level]) -> list[Requested]:
+def _held(run: Run, levels: Sequence[RecordedLevel]) -> list[Requested]:
     """Return setpoints of a run without requests: levels that are held for a period."""
     held = balance(run, levels)
     found: list[Requested] = []

@@ -24,7 +24,7 @@ from hmsa.interfaces.parameters import number_of
 from hmsa.model.creep import Creep
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs.bags import read_runs
-from hmsa.runs.levels import in_force, lateness_of, Level, without_repeats
+from hmsa.runs.levels import in_force, lateness_of, RecordedLevel, without_repeats
 from hmsa.runs.parameters import creep_of, of_joint
 from hmsa.runs.record import Run
 from hmsa.runs.topics import APPLIED, COMMAND, FORCE, JOINT_STATES
@@ -186,7 +186,7 @@ def _unapplied(run: Run) -> int:
     # The initial level may be sent again without a change.
     known = run.applied
     if math.isfinite(field := float(run.flux_density[0])):
-        known = Level(int(run.time[0]), field, int(run.logged[0])), *known
+        known = RecordedLevel(int(run.time[0]), field, int(run.logged[0])), *known
     if not known:
         return sum(x.stamp < last for x in in_force((x,) for x in commands))
     return lateness_of(commands, known, last)[1]

@@ -14,15 +14,15 @@ import numpy as np
 
 from hmsa.errors import HmsaError
 from hmsa.planning.planner import Planner
-from hmsa.planning.timeline import Model
-from hmsa_lab.adapt.estimator import Estimate
+from hmsa.planning.timeline import JointModel
+from hmsa_lab.adapt.estimator import StateEstimate
 from hmsa_lab.adapt.expected_error import (
     AT_REST,
+    CandidateLevels,
     CLEARLY,
-    Course,
     expect,
+    ExpectedError,
     MUCH,
-    Outcome,
     worthwhile,
 )
 from hmsa_lab.adapt.motion import rest
@@ -36,7 +36,8 @@ _STEP = 0.15
 
 
 def clearly_better(
-        estimate: Estimate, model: Model, used: Model, start: float, target: float, *,
+        estimate: StateEstimate, model: JointModel, used: JointModel, start: float, target: float,
+        *,
         given: bool, shown: bool) -> bool:
     """
     Return whether moves planned with a model have a clearly smaller predicted error.
@@ -57,19 +58,21 @@ def clearly_better(
         little=0.0 if given else _LITTLE, share=CLEARLY if given else AT_REST)
 
 
-def _together(outcomes: Sequence[Outcome]) -> Outcome:
+def _together(outcomes: Sequence[ExpectedError]) -> ExpectedError:
     """Return the average predicted error of several moves."""
     count = len(outcomes)
     size = len(outcomes[0].misses)
     covariance = np.zeros((count, size, count, size))
     for i, each in enumerate(outcomes):
         covariance[i, :, i] = each.covariance / count
-    return Outcome(
+    return ExpectedError(
         np.concatenate([x.misses for x in outcomes]) / math.sqrt(count),
         covariance.reshape(count * size, -1))
 
 
-def _left(estimate: Estimate, model: Model, start: float, target: float) -> Outcome | None:
+def _left(
+        estimate: StateEstimate, model: JointModel, start: float, target: float
+) -> ExpectedError | None:
     """
     Return the predicted error of a move from rest that is planned with a model.
 
@@ -85,15 +88,15 @@ def _left(estimate: Estimate, model: Model, start: float, target: float) -> Outc
     resting = _at_rest(estimate, holding)
     if arrival is None or resting is None:
         return None
-    left = expect(resting, Course(
+    left = expect(resting, CandidateLevels(
         tuple((x.stamp, x.flux_density) for x in plan.levels if x.stamp >= 0), arrival, target,
         holding), model.options.slew_limit)
     step = abs(target - start)
-    return Outcome(left.misses / step, left.covariance / step ** 2) if math.isfinite(
+    return ExpectedError(left.misses / step, left.covariance / step ** 2) if math.isfinite(
         left.size) else None
 
 
-def _at_rest(estimate: Estimate, level: float) -> Estimate | None:
+def _at_rest(estimate: StateEstimate, level: float) -> StateEstimate | None:
     """Return the estimate at time 0 after a level in T has been in force for a long time."""
     values = {x: y for x, y in estimate.values.items() if x != 'behind'}
     at = rest(values, estimate.free, level)

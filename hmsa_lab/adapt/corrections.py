@@ -11,30 +11,30 @@ import numpy as np
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Planner
-from hmsa.planning.timeline import Draft, Model, Plan, PlannedLevel
-from hmsa_lab.adapt.estimator import Estimate
+from hmsa.planning.timeline import Draft, JointModel, PlannedLevel, Timeline
+from hmsa_lab.adapt.adaptive_joint import AdaptiveJoint
+from hmsa_lab.adapt.estimator import StateEstimate
 from hmsa_lab.adapt.expected_error import (
     Ahead,
     AT_REST,
+    CandidateLevels,
     caution,
     CLEARLY,
-    Course,
     expect,
     expect_along,
+    ExpectedError,
     LITTLE,
     MUCH,
-    Outcome,
     SHARE,
     worthwhile,
 )
-from hmsa_lab.adapt.joint import Joint
-from hmsa_lab.adapt.learnt import alike, as_of_path, believed, learnt_model
-from hmsa_lab.adapt.ledger import Moves
+from hmsa_lab.adapt.learnt import as_of_path, initial_state, learnt_model, same_parameters
+from hmsa_lab.adapt.messages import confounded
 from hmsa_lab.adapt.motion import rest
-from hmsa_lab.adapt.words import confounded
+from hmsa_lab.adapt.move_errors import Moves
 from hmsa_ros.runtime.environment import Clock
+from hmsa_ros.runtime.planning_task import PlanningTask, Replanning, replanning
 from hmsa_ros.runtime.records import Severity, Verdict
-from hmsa_ros.runtime.slices import Replanning, replanning, Work
 from hmsa_ros.runtime.weighing import LEAST_STEP, step_of
 
 if TYPE_CHECKING:
@@ -84,10 +84,10 @@ class Corrections:
         return {name: self._slowly(joints[name], draft) if name in joints else draft
                 for name, draft in drafts.items()}
 
-    def _slowly(self, joint: Joint, draft: Draft) -> Draft:
+    def _slowly(self, joint: AdaptiveJoint, draft: Draft) -> Draft:
         segment, *rest = draft.segments
         estimate = joint.foreseen(draft.begin)
-        joint.moves = Moves(not alike(draft.levels[-1].model, joint.given))
+        joint.moves = Moves(not same_parameters(draft.levels[-1].model, joint.given))
         joint.next_update = joint.next_sample = joint.waits = 0
         if estimate is None or segment.arrival is None or segment.code in (
                 Code.LEVELS, Code.PATH):
@@ -109,7 +109,7 @@ class Corrections:
         joint.waits = arrival
         return replace(draft, segments=(replace(segment, arrival=arrival), *rest))
 
-    def due(self, now: int) -> Iterator[Work]:
+    def due(self, now: int) -> Iterator[PlanningTask]:
         """Yield corrections that may help at a time in ns; `take` adopts the results."""
         for joint in self._feedback.taken_back():
             yield self._work(joint, _take_back)
@@ -131,10 +131,11 @@ class Corrections:
                 yield self._work(joint, _correct)
 
     def _work(
-            self, joint: Joint, make: Callable[[Joint, int], Replanning | None]) -> Work:
+            self, joint: AdaptiveJoint,
+            make: Callable[[AdaptiveJoint, int], Replanning | None]) -> PlanningTask:
         return replanning(joint.name, joint.planner, partial(make, joint), corrects=True)
 
-    def _rejoin(self, joint: Joint, now: int) -> Replanning | None:
+    def _rejoin(self, joint: AdaptiveJoint, now: int) -> Replanning | None:
         """Replan the rest of a path with the current estimate, if that follows it more closely."""
         planner, begun = joint.planner, self._clock()
         begin = planner.soonest(now + joint.planning)
@@ -144,7 +145,7 @@ class Corrections:
         model = learnt_model(
             planner.model, estimate, planner.plan.segments[-1].stretch, _CREEPS)
         model = as_of_path(model, planner.model, estimate)
-        state = believed(estimate, creeps=bool(model.actuator.creep))
+        state = initial_state(estimate, creeps=bool(model.actuator.creep))
 
         def adopt(draft: Draft | None) -> Draft | None:
             spent = self._clock() - begun
@@ -161,7 +162,7 @@ class Corrections:
 
         return Replanning(lambda plan: plan.draft_path_anew(begin, model, state), adopt)
 
-    def take(self, work: Work, drafts: Mapping[str, Draft], now: int) -> Verdict | None:
+    def take(self, work: PlanningTask, drafts: Mapping[str, Draft], now: int) -> Verdict | None:
         """Adopt a correction made for a time in ns; None if nothing changes."""
         name, = work.joints
         joint, draft = self._feedback.joints.get(name), drafts.get(name)
@@ -183,7 +184,7 @@ class Corrections:
         return Verdict(Severity.OK, Code.CORRECTED, f'corrected from samples: {words}')
 
 
-def _take_back(joint: Joint, now: int) -> Replanning | None:
+def _take_back(joint: AdaptiveJoint, now: int) -> Replanning | None:
     """Replan the rest with the model in force, discarding earlier corrections."""
     planner = joint.planner
     plan, model, soonest = planner.plan, planner.model, planner.soonest(now)
@@ -204,31 +205,31 @@ def _take_back(joint: Joint, now: int) -> Replanning | None:
         _trim(joint, now, level=holding))
 
 
-def _trim(joint: Joint, now: int, *, level: float) -> Replanning:
+def _trim(joint: AdaptiveJoint, now: int, *, level: float) -> Replanning:
     """Hold the setpoint with another level in T."""
     return Replanning(lambda plan: plan.draft_trim(now, level))
 
 
-def _arrival(joint: Joint, now: int) -> int:
+def _arrival(joint: AdaptiveJoint, now: int) -> int:
     """Return the arrival in ns of a move that has time for corrections; else 0."""
     planner = joint.planner
     left = joint.waits - planner.soonest(now)
     return joint.waits if left >= _SHORTEST * planner.model.units.time * NANOSECONDS else 0
 
 
-def _may_gain(joint: Joint, estimate: Estimate, now: int) -> bool:
+def _may_gain(joint: AdaptiveJoint, estimate: StateEstimate, now: int) -> bool:
     """Return whether the predicted error of a plan exceeds the smallest useful gain."""
     share = _LITTLE if _arrival(joint, now) else _GAIN if joint.shown(now) else MUCH
     course, gain = course_of(joint.planner.plan, estimate.time, share)
     return expect(estimate, course, joint.planner.options.slew_limit).size > gain
 
 
-def _saturates(joint: Joint, draft: Draft) -> bool:
+def _saturates(joint: AdaptiveJoint, draft: Draft) -> bool:
     """Return whether a draft has a level beyond the limit of a saturated amplifier."""
     return max(abs(x.flux_density) for x in draft.levels) > joint.largest
 
 
-def _correct(joint: Joint, now: int) -> Replanning:
+def _correct(joint: AdaptiveJoint, now: int) -> Replanning:
     """Replan the rest if that reduces the predicted error."""
     arrival = _arrival(joint, now)
 
@@ -242,7 +243,7 @@ def _correct(joint: Joint, now: int) -> Replanning:
     return Replanning(draft, partial(_gains, joint, arrival))
 
 
-def _gains(joint: Joint, arrival: int, draft: Draft | None) -> Draft | None:
+def _gains(joint: AdaptiveJoint, arrival: int, draft: Draft | None) -> Draft | None:
     """Return a correction if it reduces the predicted error."""
     planner = joint.planner
     estimate = None if draft is None else joint.state(draft.begin)
@@ -269,7 +270,7 @@ def _gains(joint: Joint, arrival: int, draft: Draft | None) -> Draft | None:
     return draft
 
 
-def _leaves_path(joint: Joint, now: int) -> bool:
+def _leaves_path(joint: AdaptiveJoint, now: int) -> bool:
     """Return whether an actuator may deviate from its path; checked every natural period."""
     planner = joint.planner
     begin = planner.soonest(now + joint.planning)
@@ -284,8 +285,8 @@ def _leaves_path(joint: Joint, now: int) -> bool:
 
 
 def _leaves(
-        estimate: Estimate, planner: Planner, levels: Sequence[PlannedLevel],
-        ahead: Ahead) -> Outcome:
+        estimate: StateEstimate, planner: Planner, levels: Sequence[PlannedLevel],
+        ahead: Ahead) -> ExpectedError:
     """Return the predicted deviation from a path with levels from the estimate's time on."""
     first, begin = planner.plan.place(estimate.time - 1), estimate.time
     end = begin + round(ahead.times[-1] * NANOSECONDS)
@@ -295,7 +296,9 @@ def _leaves(
         estimate, [(x.stamp, x.flux_density) for x in course], ahead, planner.options.slew_limit)
 
 
-def _nearer(joint: Joint, before: Outcome, after: Outcome, estimate: Estimate) -> bool:
+def _nearer(
+        joint: AdaptiveJoint, before: ExpectedError, after: ExpectedError, estimate: StateEstimate
+) -> bool:
     """Return whether a new course of a path is to replace that in force."""
     plan = joint.planner.plan
     path = plan.segments[plan.under_way(estimate.time)].path
@@ -305,28 +308,28 @@ def _nearer(joint: Joint, before: Outcome, after: Outcome, estimate: Estimate) -
         share=SHARE if joint.adapted(plan.level(estimate.time).model) else CLEARLY)
 
 
-def _drafted(draft: Draft, plan: Plan) -> Course:
+def _drafted(draft: Draft, plan: Timeline) -> CandidateLevels:
     """Return the course of the first setpoint of a draft that replaces a plan."""
     segment, *rest = draft.segments
     before = _until(plan, plan.place(draft.begin - 1) + 1)
-    return Course(
+    return CandidateLevels(
         tuple((x.stamp, x.flux_density) for x in (*before, *draft.levels)
               if not rest or x.stamp < rest[0].begin),
         segment.arrival or draft.begin, segment.stretch, before[0].flux_density,
         _relaxed(draft.levels[0].model, segment.stretch) if rest else math.nan)
 
 
-def _relaxed(model: Model, stretch: float) -> float:
+def _relaxed(model: JointModel, stretch: float) -> float:
     """Return the final level in T of a tail cut by the next setpoint; NaN without creep."""
     return model.flux_density(model.holding(stretch)) if model.material.creep else math.nan
 
 
-def _until(plan: Plan, place: int) -> Sequence[PlannedLevel]:
+def _until(plan: Timeline, place: int) -> Sequence[PlannedLevel]:
     """Return the last levels before a place, which affect the field of a coil with lag."""
     return plan.levels[max(place - _BEFORE, 0):place]
 
 
-def course_of(plan: Plan, begin: int, gain: float) -> tuple[Course, float]:
+def course_of(plan: Timeline, begin: int, gain: float) -> tuple[CandidateLevels, float]:
     """Return the course from a time in ns to the end of its setpoint, and the minimum gain."""
     levels, place = plan.levels, max(plan.under_way(begin), 0)
     segment = plan.segments[place]
@@ -334,7 +337,7 @@ def course_of(plan: Plan, begin: int, gain: float) -> tuple[Course, float]:
     first = plan.place(begin)
     kept = [x for x in levels[first:] if end is None or x.stamp < end or x is levels[first]]
     course = [*_until(plan, first), *kept]
-    return Course(
+    return CandidateLevels(
         tuple((x.stamp, x.flux_density) for x in course),
         segment.arrival or kept[-1].stamp, segment.stretch, course[0].flux_density,
         math.nan if end is None else _relaxed(kept[-1].model, segment.stretch)), max(
@@ -362,7 +365,7 @@ def _ahead(planner: Planner, begin: int) -> Ahead | None:
     return Ahead(times, segment.path.course(times + since)[0])
 
 
-def _trimmed(joint: Joint, estimate: Estimate) -> float | None:
+def _trimmed(joint: AdaptiveJoint, estimate: StateEstimate) -> float | None:
     """
     Return the level in T that holds a setpoint against a constant force.
 

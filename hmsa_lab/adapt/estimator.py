@@ -24,13 +24,13 @@ from hmsa.model.creep import Creep
 from hmsa.model.equations import Array
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.units import NANOSECONDS
-from hmsa.planning.timeline import ESTIMATED, Model
+from hmsa.planning.timeline import ESTIMATED, JointModel
 from hmsa.planning.timeline import Options as PlannerOptions
-from hmsa_lab.adapt.motion import follow, Levels, Motion, rest
+from hmsa_lab.adapt.hypotheses import Hypotheses
+from hmsa_lab.adapt.motion import follow, Levels, ModelMotion, rest
 from hmsa_lab.adapt.prior import Prior
 from hmsa_lab.adapt.screening import Screening
-from hmsa_lab.adapt.suspects import Suspects
-from hmsa_lab.adapt.window import Doubt, Rest, Solution, Trial, Window
+from hmsa_lab.adapt.window import BiasCase, Rest, Simulation, Solution, Window
 
 # Initial noise, before it is estimated, and minimum noise.
 _FIRST_NOISE, _LEAST_NOISE = 1e-3, 2e-6
@@ -63,7 +63,7 @@ _KEPT, _LONGEST, _FEWEST = 0.5, 200.0, 20
 
 
 @dataclass(frozen=True)
-class Options:
+class EstimatorOptions:
     """Options of the estimator."""
 
     window: int = 600  # maximum number of samples in the horizon
@@ -80,7 +80,7 @@ class Options:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class StateEstimate:
     """Estimated state and parameters at a time."""
 
     time: int  # in ns
@@ -94,7 +94,7 @@ class Estimate:
     off: Array  # expected minus most probable values
     # As `off` for plans, where other parameters represent an apparent gain of the sensor.
     instead: Array
-    doubt: Doubt
+    doubt: BiasCase
     gain: int  # index of a suspected gain of the sensor about rest; -1 for none
     noise: float  # standard deviation of a sample
     trusted: bool  # whether it may be used for plans
@@ -114,11 +114,11 @@ class Estimate:
         return found
 
     @property
-    def doubted(self) -> 'Estimate':
+    def doubted(self) -> 'StateEstimate':
         """The estimate with possible errors of a constant force and the gain of the sensor."""
         return replace(self, off=self.doubt.off, covariance=self.doubt.covariance)
 
-    def sure_of(self, first: int) -> 'Estimate':
+    def sure_of(self, first: int) -> 'StateEstimate':
         """Return the estimate as if all quantities from index ``first`` on were known."""
         covariance, known = self.covariance, slice(first, -2)
         cross = covariance[:, known]
@@ -129,7 +129,7 @@ class Estimate:
             self, covariance=left, off=np.zeros_like(self.off),
             instead=np.zeros_like(self.off))
 
-    def model(self, options: PlannerOptions, sure: float = CREEPS) -> Model:
+    def model(self, options: PlannerOptions, sure: float = CREEPS) -> JointModel:
         """
         Return the model to plan with; estimates replace options.
 
@@ -150,7 +150,7 @@ class Estimate:
             spread[np.ix_(known, known)], hermitian=True) @ left[known]
         z[known] = kept
         found = replace(self, values=complete(values_at(self.values, self.free, z), self.free))
-        return Model(
+        return JointModel(
             replace(found.block(sure), creep=block.creep),
             replace(options, **{x: found.values[x] for x in ESTIMATED}))
 
@@ -158,9 +158,9 @@ class Estimate:
 class Estimator:
     """Estimator of one actuator."""
 
-    def __init__(self, prior: Prior, options: Options | None = None) -> None:
+    def __init__(self, prior: Prior, options: EstimatorOptions | None = None) -> None:
         self.prior = prior
-        self.options = options or Options()
+        self.options = options or EstimatorOptions()
         self.noise = self.options.noise or _FIRST_NOISE
         self.screening = Screening(self.options.gate, prior.coordinate)
         # If False, parameters stay fixed from the next update on.
@@ -214,7 +214,7 @@ class Estimator:
         del self._pending[:-limit]
         return True
 
-    def update(self, time: int) -> Estimate | None:
+    def update(self, time: int) -> StateEstimate | None:
         """
         Process samples, and predict the state at a time in ns.
 
@@ -241,7 +241,7 @@ class Estimator:
         self._go_along(window, found, until)
         return estimate
 
-    def predict(self, time: int) -> Estimate | None:
+    def predict(self, time: int) -> StateEstimate | None:
         """
         Return the estimate for a future time in ns, without processing samples.
 
@@ -264,7 +264,7 @@ class Estimator:
 
     def _follow(
             self, found: Solution, window: Window, time: float, free: Sequence[str] = ()
-    ) -> Motion | None:
+    ) -> ModelMotion | None:
         """Return the motion of a solution at a time in s."""
         return follow(
             found.here.values, free, (float(found.z[-2]), float(found.z[-1])), self._as_levels(),
@@ -316,7 +316,7 @@ class Estimator:
         covariance[-2:, -2:] = np.diag(np.square([off, off * frequency]))
         window = Window(
             dict(prior.values), prior.free, np.append(mean, [stretch, 0.0]), covariance,
-            _bounds(self.prior), 0.0, np.zeros(0), np.zeros(0), Suspects(
+            _bounds(self.prior), 0.0, np.zeros(0), np.zeros(0), Hypotheses(
                 prior.free, prior.suspects, prior.named,
                 coordinates(self.prior.values, self.prior.free),
                 1.0 / np.diag(self.prior.covariance)),
@@ -325,7 +325,7 @@ class Estimator:
         window.settle(window.mean, _AT_REST)
         return window
 
-    def _take(self, window: Window, levels: Levels, until: float) -> Trial | None:
+    def _take(self, window: Window, levels: Levels, until: float) -> Simulation | None:
         """
         Move waiting samples that fit the estimated motion into the window.
 
@@ -361,7 +361,7 @@ class Estimator:
         self.noise = math.exp(
             (1.0 - gain) * math.log(self.noise) + gain * math.log(seen))
 
-    def _estimate(self, time: int, found: Solution, window: Window) -> Estimate:
+    def _estimate(self, time: int, found: Solution, window: Window) -> StateEstimate:
         state, covariance, off, doubt = found.at_end()
         values = found.here.values
         if found.here.motion.behind:
@@ -372,12 +372,12 @@ class Estimator:
             np.maximum(np.diag(covariance), np.diag(doubt.covariance)), np.diag(covariance))
         if self._fixed is not None:
             covariance[:-2, :-2], off = self._fixed, np.zeros_like(off)
-            variances, doubt = np.diag(covariance), Doubt(off, covariance)
+            variances, doubt = np.diag(covariance), BiasCase(off, covariance)
         deviations = {
             name: abs(derivative(name, values[name])) * math.sqrt(variances[i])
             for i, name in enumerate(self.prior.free)}
         trouble = self.screening.trouble or self._strange(found.z)
-        return Estimate(
+        return StateEstimate(
             time, float(state[-2]), float(state[-1]), values, self.prior.free, deviations,
             covariance, off, found.instead, doubt, window.suspects.gain, self.noise,
             not trouble, trouble)
@@ -437,7 +437,8 @@ class Estimator:
             found.z[:-2], [here.motion.stretch[place], here.motion.rate[place]]),
             here=here, covariance=moved.covariance if at is None else found.covariance,
             off=np.zeros_like(found.off), instead=np.zeros_like(found.off),
-            doubt=Doubt(np.zeros_like(found.off), moved.covariance) if at is None else found.doubt)
+            doubt=BiasCase(
+                np.zeros_like(found.off), moved.covariance) if at is None else found.doubt)
         first = bisect_right(self._levels, self._origin, key=lambda x: x[0]) - 1
         # The field of a lagging coil depends on a few levels more.
         del self._levels[:max(first - 8, 0)]

@@ -18,8 +18,8 @@ import numpy as np
 from hmsa.model.equations import Array
 from hmsa.model.laws.coordinate import coordinate_of
 from hmsa.model.units import NANOSECONDS
-from hmsa_lab.adapt.estimator import Estimate
-from hmsa_lab.adapt.motion import follow, Levels, Motion, rest
+from hmsa_lab.adapt.estimator import StateEstimate
+from hmsa_lab.adapt.motion import follow, Levels, ModelMotion, rest
 
 #: Maximum error after a correction, relative to that of the present course, while more corrections
 #: are possible, and at rest.
@@ -50,7 +50,7 @@ def caution(count: int, noise: float) -> float:
 
 
 @dataclass(frozen=True)
-class Course:
+class CandidateLevels:
     """Levels to a target."""
 
     # Timestamp in ns and level in T, by time; the last level is held.
@@ -67,7 +67,7 @@ class Course:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class ExpectedError:
     """Expected error of a course."""
 
     misses: Array  # expected errors of stretch, of rate, and of the target
@@ -78,7 +78,7 @@ class Outcome:
         """Root of the expected squared vibration and distance from the target together."""
         return math.sqrt(float(self.misses @ self.misses) + float(np.trace(self.covariance)))
 
-    def apart(self, other: 'Outcome') -> float:
+    def apart(self, other: 'ExpectedError') -> float:
         """Return the distance between the expected errors of two courses."""
         return float(np.linalg.norm(self.misses - other.misses))
 
@@ -91,12 +91,12 @@ class Ahead(NamedTuple):
 
 
 #: Outcome of a motion that cannot be simulated.
-_NOWHERE = Outcome(np.full(3, math.inf), np.zeros((3, 3)))
+_NOWHERE = ExpectedError(np.full(3, math.inf), np.zeros((3, 3)))
 
 
 def expect(
-        estimate: Estimate, course: Course, slew_limit: float = math.inf,
-        until: int = 0) -> Outcome:
+        estimate: StateEstimate, course: CandidateLevels, slew_limit: float = math.inf,
+        until: int = 0) -> ExpectedError:
     """
     Return the expected error of a course; infinite if the motion cannot be simulated.
 
@@ -132,8 +132,8 @@ def expect(
 
 
 def expect_along(
-        estimate: Estimate, levels: Sequence[tuple[int, float]], ahead: Ahead,
-        slew_limit: float = math.inf) -> Outcome:
+        estimate: StateEstimate, levels: Sequence[tuple[int, float]], ahead: Ahead,
+        slew_limit: float = math.inf) -> ExpectedError:
     """Return the expected RMS deviation of levels (timestamp in ns, T) from a path."""
     motion = _motion(estimate, levels, slew_limit, ahead.times)
     if motion is None:
@@ -143,8 +143,8 @@ def expect_along(
 
 
 def _motion(
-        estimate: Estimate, levels: Sequence[tuple[int, float]], slew_limit: float,
-        times: Array) -> Motion | None:
+        estimate: StateEstimate, levels: Sequence[tuple[int, float]], slew_limit: float,
+        times: Array) -> ModelMotion | None:
     """Return the motion at times in s after that of an estimate; None if impossible."""
     return follow(
         estimate.values, estimate.free, (estimate.stretch, estimate.rate),
@@ -152,14 +152,14 @@ def _motion(
                np.array([x for _, x in levels]), slew_limit), 0.0, times)
 
 
-def _outcome(estimate: Estimate, misses: Array, rows: Array) -> Outcome:
+def _outcome(estimate: StateEstimate, misses: Array, rows: Array) -> ExpectedError:
     """Return an outcome from the most probable errors and their derivatives."""
     off = rows @ estimate.off
-    return Outcome(misses + off, rows @ estimate.covariance @ rows.T - np.outer(off, off))
+    return ExpectedError(misses + off, rows @ estimate.covariance @ rows.T - np.outer(off, off))
 
 
 def worthwhile(
-        before: Outcome, after: Outcome, least: float = 0.0, *, little: float,
+        before: ExpectedError, after: ExpectedError, least: float = 0.0, *, little: float,
         share: float = SHARE) -> bool:
     """
     Return whether another course has a sufficiently smaller error, and gains at least ``least``.

@@ -4,20 +4,20 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
-from hmsa.judge.holds import Hold
-from hmsa.judge.records import Sensor
+from hmsa.judge.records import SensorModel
+from hmsa.judge.setpoint_samples import SetpointSamples
 from hmsa.offload import ANSWER, Awaited, Doing, goes_on, here
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Believed
-from hmsa.planning.timeline import Model
+from hmsa.planning.timeline import JointModel
+from hmsa_lab.adapt.adaptive_joint import AdaptiveJoint, RESTING
 from hmsa_lab.adapt.corrections import Corrections
-from hmsa_lab.adapt.joint import Joint, RESTING
-from hmsa_lab.adapt.learnt import alike, save
-from hmsa_lab.adapt.words import differences
+from hmsa_lab.adapt.learnt import same_parameters, save
+from hmsa_lab.adapt.messages import differences
 from hmsa_ros.runtime.environment import Clock
 from hmsa_ros.runtime.follower import as_held, Follower
+from hmsa_ros.runtime.planning_task import Drafts, PlanningTask
 from hmsa_ros.runtime.records import EstimateChanged, Output, Settings, Severity, Verdict
-from hmsa_ros.runtime.slices import Drafts, Work
 
 # Interval in ns at which the estimate is published.
 _REPORT = 200_000_000
@@ -44,11 +44,11 @@ class Feedback(Follower):
         """Begin; ``report_ended`` is called with the reason why feedback of a joint has ended."""
         super().__init__(group, settings, doing)
         self._outputs, self._clock, self._report_ended = outputs, clock, report_ended
-        self.joints: dict[str, Joint] = {}
+        self.joints: dict[str, AdaptiveJoint] = {}
         self._corrections = Corrections(self, clock)
         self.corrections = 0  # number of corrected plans
         self._seldom = 1.0  # factor of the delay between updates
-        self._ended: list[Joint] = []  # joints whose plans are to be reverted
+        self._ended: list[AdaptiveJoint] = []  # joints whose plans are to be reverted
         for name, planner in group.planners.items():
             planner.believed = partial(self._believed, name)
         self._begin({name: x.model for name, x in group.planners.items()})
@@ -65,7 +65,7 @@ class Feedback(Follower):
     def _believed(self, name: str, time: int) -> Believed | None:
         joint = self.joints.get(name)
         return as_held(self._group.planners[name], time) if joint is None else (
-            joint.believed(time))
+            joint.initial_state(time))
 
     def restart(self) -> None:
         """Discard the estimates: plan with the given parameters, from the predicted state."""
@@ -73,16 +73,18 @@ class Feedback(Follower):
             joint.planner.take_model(joint.given)
         self._begin({name: x.given for name, x in self.joints.items()})
 
-    def _begin(self, models: Mapping[str, Model]) -> None:
+    def _begin(self, models: Mapping[str, JointModel]) -> None:
         """Begin without samples, with models as given."""
         for joint in self.joints.values():
             # Without an estimate, corrections that are being drafted have no result.
             joint.latest = None
         self.joints = {
-            name: Joint(name, self._group.planners[name], model, self._settings, self._clock())
+            name: AdaptiveJoint(
+                name, self._group.planners[name], model, self._settings, self._clock())
             for name, model in models.items()} if self.on else {}
 
-    def change(self, settings: Settings, models: Mapping[str, Model]) -> Mapping[str, Model]:
+    def change(self, settings: Settings, models: Mapping[str, JointModel]) -> Mapping[
+            str, JointModel]:
         """
         Adopt new settings and given models; return the models to plan with.
 
@@ -136,11 +138,11 @@ class Feedback(Follower):
         """Return the drafts of a request with more time for moves to be corrected."""
         return self._corrections.cautious(drafts)
 
-    def due(self, now: int) -> Iterator[Work]:
+    def due(self, now: int) -> Iterator[PlanningTask]:
         """Yield corrections that may help at a time in ns."""
         return self._corrections.due(now)
 
-    def take(self, work: Work, drafts: Drafts, now: int) -> Verdict | None:
+    def take(self, work: PlanningTask, drafts: Drafts, now: int) -> Verdict | None:
         """Adopt a correction made for a time in ns; None if nothing changes."""
         return self._corrections.take(work, drafts, now)
 
@@ -149,9 +151,9 @@ class Feedback(Follower):
         joint = self.joints.get(name)
         return joint is not None and joint.adapted() and joint.state(self._clock()) is not None
 
-    def sensor(self, name: str) -> Sensor:
+    def sensor(self, name: str) -> SensorModel:
         """Return the sensor of a joint as estimated; as given where there is no estimate."""
-        return self.joints[name].sensor if name in self.joints else Sensor()
+        return self.joints[name].sensor if name in self.joints else SensorModel()
 
     # -- looks at samples ----------------------------------------------------------------------
 
@@ -172,7 +174,7 @@ class Feedback(Follower):
         for joint in self.joints.values():
             joint.not_before = max(joint.not_before, now + round(self._seldom * RESTING))
 
-    def spent(self, joint: Joint, time: int) -> None:
+    def spent(self, joint: AdaptiveJoint, time: int) -> None:
         """Delay the next update, since work for a joint has taken a time in ns."""
         rest = round(_IDLE * len(self.joints) * self._seldom * time)
         joint.not_before = max(joint.not_before, self._clock() + rest)
@@ -210,7 +212,7 @@ class Feedback(Follower):
             return True
         return busy
 
-    def _look(self, joint: Joint, looking: Iterator[None], now: int) -> bool:
+    def _look(self, joint: AdaptiveJoint, looking: Iterator[None], now: int) -> bool:
         """Continue an update; return whether it has ended, which takes long."""
         begun = self._clock()
         if goes_on(looking):
@@ -227,7 +229,7 @@ class Feedback(Follower):
         joint.ready = len(joint.audits)
         return True
 
-    def _report(self, joint: Joint, now: int) -> None:
+    def _report(self, joint: AdaptiveJoint, now: int) -> None:
         found, mode = joint.latest, self._settings.feedback
         bad = joint.trust.why or found is not None and mode == 'observe' and differences(
             found, joint.estimator.prior.values)
@@ -239,14 +241,14 @@ class Feedback(Follower):
 
     # -- results -------------------------------------------------------------------------------
 
-    def audit(self, name: str, hold: Hold) -> None:
+    def audit(self, name: str, hold: SetpointSamples) -> None:
         """Audit a setpoint of a joint, once all samples that have arrived are processed."""
         joint = self.joints.get(name)
         if joint is not None and joint.adapts and not joint.trust.ended and (
                 hold not in joint.audits):
             joint.audits.append(hold)
 
-    def _audit(self, joint: Joint, hold: Hold) -> Awaited[None]:
+    def _audit(self, joint: AdaptiveJoint, hold: SetpointSamples) -> Awaited[None]:
         """Decide by the samples of a setpoint whether feedback ends."""
         if joint.lost or joint.trust.ended or joint.trust.why or (
                 joint.estimator.screening.trouble):
@@ -262,12 +264,12 @@ class Feedback(Follower):
         self._ended.append(joint)
         self._report_ended(joint.words(self._clock()))
 
-    def taken_back(self) -> list[Joint]:
+    def taken_back(self) -> list[AdaptiveJoint]:
         """Return joints, once each, whose plans must be reverted to the given parameters."""
         found, self._ended = self._ended, []
         return found
 
-    def news(self) -> Iterator[Joint]:
+    def news(self) -> Iterator[AdaptiveJoint]:
         """Plan with the best known parameters, and yield joints with new estimates to use."""
         for joint in self.joints.values():
             if not joint.adapts or not joint.news or joint.choosing is not None:
@@ -276,7 +278,7 @@ class Feedback(Follower):
             latest = joint.acting
             if latest is None:
                 joint.used = joint.learnt(joint.given)
-                if not alike(joint.used, joint.planner.model):
+                if not same_parameters(joint.used, joint.planner.model):
                     joint.planner.take_model(joint.used)
             elif joint.may_choose(latest):
                 joint.choosing = joint.choose(latest, self.doing)

@@ -14,12 +14,12 @@ from hmsa.identification.files import known_lines
 from hmsa.identification.known import Known
 from hmsa.identification.quantities import BRANCHES, derivative, QUANTITIES, values_of
 from hmsa.interfaces.actuator import parameters_of
-from hmsa.judge.records import Sensor
+from hmsa.judge.records import SensorModel
 from hmsa.model.laws.coordinate import coordinate_of
 from hmsa.model.simulation import check_stretch
 from hmsa.planning.planner import Believed
-from hmsa.planning.timeline import Model
-from hmsa_lab.adapt.estimator import CREEPS, Estimate
+from hmsa.planning.timeline import JointModel
+from hmsa_lab.adapt.estimator import CREEPS, StateEstimate
 from hmsa_lab.adapt.motion import followed, rest
 from hmsa_lab.adapt.prior import Prior
 
@@ -38,7 +38,8 @@ _SHOWS = 3.0
 
 
 def learnt_model(
-        model: Model, estimate: Estimate, held: float, sure: float = CREEPS) -> Model:
+        model: JointModel, estimate: StateEstimate, held: float,
+        sure: float = CREEPS) -> JointModel:
     """
     Return a model with an estimate's parameters, or the same model if these cannot hold a stretch.
 
@@ -53,7 +54,7 @@ def learnt_model(
     return found
 
 
-def as_of_path(model: Model, before: Model, estimate: Estimate) -> Model:
+def as_of_path(model: JointModel, before: JointModel, estimate: StateEstimate) -> JointModel:
     """
     Return a model learnt from a path, with the force of the previous model unless it is known.
 
@@ -67,13 +68,13 @@ def as_of_path(model: Model, before: Model, estimate: Estimate) -> Model:
     return replace(model, options=replace(model.options, constant_force=force))
 
 
-def believed(estimate: Estimate, *, creeps: bool) -> Believed:
+def initial_state(estimate: StateEstimate, *, creeps: bool) -> Believed:
     """Return the initial state of a plan, with or without creep."""
     return estimate.stretch, estimate.rate, (
         followed(estimate.values, estimate.stretch) if creeps else ())
 
 
-def differs(model: Model, estimate: Estimate) -> bool:
+def differs(model: JointModel, estimate: StateEstimate) -> bool:
     """Return whether an estimate differs significantly from a model."""
     creep = model.actuator.creep
     if bool(creep) is not bool(estimate.actuator.creep):
@@ -88,7 +89,7 @@ def differs(model: Model, estimate: Estimate) -> bool:
     return False
 
 
-def alike(model: Model, other: Model) -> bool:
+def same_parameters(model: JointModel, other: JointModel) -> bool:
     """Return whether two models differ by less than a significant change."""
     one, two = (values_of(x.actuator, x.others) for x in (model, other))
     return model.actuator.creep == other.actuator.creep and all(
@@ -96,7 +97,7 @@ def alike(model: Model, other: Model) -> bool:
         else one[x] == two[x] for x in one)
 
 
-def sensor_of(found: Estimate, prior: Prior) -> Sensor:
+def sensor_of(found: StateEstimate, prior: Prior) -> SensorModel:
     """
     Return the sensor according to an estimate; undetermined figures keep their given values.
 
@@ -112,10 +113,10 @@ def sensor_of(found: Estimate, prior: Prior) -> Sensor:
         pair = [found.free.index(x) for x in ('stretch_bias', 'stretch_gain')]
         (one, both), (_, two) = found.covariance[np.ix_(pair, pair)]
         together = float(both / math.sqrt(one * two))
-    return Sensor(**figures, together=together)
+    return SensorModel(**figures, together=together)
 
 
-def _shows_bias(found: Estimate) -> bool:
+def _shows_bias(found: StateEstimate) -> bool:
     """
     Return whether samples show that a sensor may have a bias.
 
@@ -132,7 +133,7 @@ def _shows_bias(found: Estimate) -> bool:
                for off, by in ((value, itself), (shown, itself + at[2])))
 
 
-def known_of(estimate: Estimate) -> Known:
+def known_of(estimate: StateEstimate) -> Known:
     """Return the uncertainty of the parameters of an estimate."""
     # A suspected parameter that is not in use has no standard deviation.
     places = [i for i, x in enumerate(estimate.free)
@@ -144,7 +145,7 @@ def known_of(estimate: Estimate) -> Known:
         names, values, np.outer(scale, scale) * estimate.covariance[np.ix_(places, places)])
 
 
-def file_text(estimates: Mapping[str, Estimate], now: datetime) -> str:
+def file_text(estimates: Mapping[str, StateEstimate], now: datetime) -> str:
     """Return a parameter file with the learnt values by joint; '' names all joints."""
     lines = [
         f'# Parameters that feedback learnt until {now.isoformat(" ", "seconds")}.',
@@ -163,7 +164,7 @@ def file_text(estimates: Mapping[str, Estimate], now: datetime) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def save(file: str, estimates: Mapping[str, Estimate | None], *, by_joint: bool) -> str:
+def save(file: str, estimates: Mapping[str, StateEstimate | None], *, by_joint: bool) -> str:
     """
     Write the learnt parameters by joint, and return a confirmation.
 
@@ -171,7 +172,7 @@ def save(file: str, estimates: Mapping[str, Estimate | None], *, by_joint: bool)
     """
     if not file:
         raise BadInputError('parameter feedback_file is empty: expected the file to write to')
-    found: dict[str, Estimate] = {}
+    found: dict[str, StateEstimate] = {}
     for name, estimate in estimates.items():
         if estimate is None or not estimate.trusted:
             why = 'no samples yet' if estimate is None else estimate.trouble

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from hmsa.identification.recording import pieces
-from hmsa.identification.response import Setup
+from hmsa.identification.measurement import pieces
+from hmsa.identification.response import ResponseArguments
 from hmsa.model.delivery import late
 from hmsa.model.equations import Array
 from hmsa.model.law import elastic_force, natural_frequency
@@ -44,7 +44,7 @@ class Levels:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class ModelMotion:
     """A simulated motion of the block."""
 
     stretch: Array  # shape (n,)
@@ -57,7 +57,7 @@ class Motion:
 
 def follow(
         values: Mapping[str, Any], free: Sequence[str], state: tuple[float, float],
-        levels: Levels, begin: float, times: Array) -> Motion | None:
+        levels: Levels, begin: float, times: Array) -> ModelMotion | None:
     """
     Simulate a motion from stretch and rate (1/s) at ``begin`` in s until the given times.
 
@@ -66,7 +66,7 @@ def follow(
     relaxed. Earlier levels count if the field lags. Return None if the motion meets the limits
     of the chains.
     """
-    setup = Setup.of(values, free, (places.STRETCH, places.RATE))
+    setup = ResponseArguments.of(values, free, (places.STRETCH, places.RATE))
     theta, wanted = setup.theta, setup.wanted
     theta[places.STRETCH], theta[places.RATE] = state
     start = np.zeros(len(wanted))
@@ -89,7 +89,7 @@ def follow(
             theta, setup.material, setup.branches, wanted, start, starts, heights, slopes, field,
             field_lag, times, _RTOL, stretch, rate, raw, raw_rate, behind, behind_last):
         return None
-    return Motion(
+    return ModelMotion(
         stretch, rate, raw @ setup.mixing, raw_rate @ setup.mixing, tuple(behind_last.tolist()))
 
 
@@ -98,7 +98,7 @@ def followed(values: Mapping[str, Any], stretch: float) -> tuple[float, ...]:
     holds = 'creep' in values or values['viscoelastic_ratio'] > 0.0
     if not (holds and any(values.get('behind', ()))):
         return ()
-    force = float(elastic_force(stretch, Setup.of(values, ()).material))
+    force = float(elastic_force(stretch, ResponseArguments.of(values, ()).material))
     return tuple(force + x for x in values['behind'])
 
 
@@ -109,7 +109,7 @@ def held(
     by = followed(values, stretch)
     if not by:
         return rest(values, (), level)
-    theta = Setup.of(values, ()).theta
+    theta = ResponseArguments.of(values, ()).theta
     a, k, f = theta[[places.STIFFNESS, places.DRIVE, places.FORCE]]
     ratios = theta[places.FIRST_BRANCH::places.BRANCH].tolist()
     pull = k * level + f + a * sum(x * y for x, y in zip(ratios, by, strict=True))
@@ -126,7 +126,7 @@ def rest(
     The result contains the stretch, the natural frequency there in 1/s, and the derivatives of the
     stretch by the coordinates of the free parameters, shape (p,).
     """
-    setup = Setup.of(values, free)
+    setup = ResponseArguments.of(values, free)
     slopes = np.zeros(len(setup.wanted))
     stretch = motion_rest(setup.theta, setup.material, level, setup.wanted, slopes)
     if math.isnan(stretch):

@@ -1,7 +1,7 @@
 """When an estimate is used, and which parameters plans use otherwise."""
 
 from hmsa.model.units import NANOSECONDS
-from hmsa.planning.timeline import Model, Plan
+from hmsa.planning.timeline import JointModel, Timeline
 from hmsa_lab.adapt.estimator import Estimator
 
 # Number of successive updates with samples that do not fit until the estimator restarts.
@@ -25,7 +25,7 @@ class Trust:
 
     def __init__(self, begin: int, *, at_once: bool) -> None:
         # Model of the last move that arrived, as measured.
-        self.confirmed: Model | None = None
+        self.confirmed: JointModel | None = None
         self.beginnings = 0  # number of restarts
         self.acts = at_once
         self.why = ''  # why samples are not trusted; empty if they are
@@ -51,7 +51,7 @@ class Trust:
         self._moves = 2 ** max(self._failures - 1, 0)
         return True
 
-    def fits(self, plan: Plan, unit: float, estimator: Estimator, now: int) -> bool:
+    def fits(self, plan: Timeline, unit: float, estimator: Estimator, now: int) -> bool:
         """Record that samples fit at a time in ns; return whether to restart as too few did."""
         # The time scale is in s.
         self._doubts = 0
@@ -72,7 +72,7 @@ class Trust:
             self.why = ''
         return False
 
-    def confirm(self, model: Model, left: float) -> None:
+    def confirm(self, model: JointModel, left: float) -> None:
         """Record the error of a move planned with a model, as a fraction of its step."""
         if self.acts and left < _CONFIRMS:
             self.confirmed = model

@@ -20,8 +20,8 @@ from hmsa.identification.quantities import complete, QUANTITIES, values_at
 from hmsa.identification.response import sensed
 from hmsa.model.equations import Array
 from hmsa.model.laws.coordinate import coordinate_of
-from hmsa_lab.adapt.motion import follow, Levels, Motion, rest
-from hmsa_lab.adapt.suspects import GAIN, inverse, Look, optimum, Others, Suspects
+from hmsa_lab.adapt.hypotheses import Evidence, GAIN, Hypotheses, inverse, optimum, Others
+from hmsa_lab.adapt.motion import follow, Levels, ModelMotion, rest
 
 # Maximum Gauss-Newton iterations, halvings of each step, and small step in standard deviations.
 _PASSES, _HALVINGS, _SMALL = 4, 4, 0.1
@@ -33,17 +33,17 @@ _POOR = 1.0
 _STRIDE = 0.3
 
 
-class Trial(NamedTuple):
+class Simulation(NamedTuple):
     """Simulation of the samples for some coordinates."""
 
     values: dict[str, Any]  # of all quantities
-    motion: Motion  # at the samples, and last at the requested time
+    motion: ModelMotion  # at the samples, and last at the requested time
     residual: Array  # measured minus simulated, shape (n,)
     by: Array  # derivatives of the reading by the coordinates, shape (n, q)
     weights: Array  # weight of each sample, 0 to 1
     cost: float  # negative log probability
 
-    def moved(self, values: dict[str, Any], step: Array) -> 'Trial':
+    def moved(self, values: dict[str, Any], step: Array) -> 'Simulation':
         """Return the linearised simulation after a small step of the coordinates."""
         motion = replace(
             self.motion, stretch=self.motion.stretch + self.motion.by @ step,
@@ -52,17 +52,17 @@ class Trial(NamedTuple):
             values=values, motion=motion, residual=self.residual - self.by @ step)
 
 
-class Found(NamedTuple):
+class Optimum(NamedTuple):
     """The most probable values of the estimated coordinates."""
 
     z: Array
-    here: Trial
+    here: Simulation
     matrix: Array  # second derivatives of the cost
     gradient: Array  # negative first derivatives
     loose: NDArray[np.bool_]  # which coordinates vary
 
 
-class Doubt(NamedTuple):
+class BiasCase(NamedTuple):
     """Expectation if a constant force and the gain of the sensor may be in error, too."""
 
     off: Array  # expected minus most probable coordinates, shape (q,)
@@ -74,23 +74,23 @@ class Solution:
     """The most probable motion."""
 
     z: Array  # coordinates, initial stretch and rate, shape (q,)
-    here: Trial  # simulation with these
+    here: Simulation  # simulation with these
     covariance: Array  # about z
     off: Array  # expected values minus z, shape (q,)
     # As `off` for plans, where other parameters represent an apparent gain of the sensor.
     instead: Array
-    doubt: Doubt
+    doubt: BiasCase
 
-    def at_end(self) -> tuple[Array, Array, Array, Doubt]:
+    def at_end(self) -> tuple[Array, Array, Array, BiasCase]:
         """Return coordinates and state at the requested time, their covariance and `off`."""
         motion = self.here.motion
         change = transport(motion, -1)
         state = np.append(self.z[:-2], [motion.stretch[-1], motion.rate[-1]])
-        return state, change @ self.covariance @ change.T, change @ self.off, Doubt(
+        return state, change @ self.covariance @ change.T, change @ self.off, BiasCase(
             change @ self.doubt.off, change @ self.doubt.covariance @ change.T)
 
 
-def transport(motion: Motion, place: int) -> Array:
+def transport(motion: ModelMotion, place: int) -> Array:
     """Return the derivative of coordinates and state at a sample by those at the start."""
     size = motion.by.shape[1]
     change = np.eye(size)
@@ -120,7 +120,7 @@ class Window:
     begin: float  # time of the estimated stretch and rate
     time: Array  # of the samples, not before the begin
     stretch: Array
-    suspects: Suspects
+    suspects: Hypotheses
     suspected: tuple[int, ...] = ()  # indices of suspects that are estimated
     weighed: int = 0  # number of samples when these were chosen
     others: Others = Others(1.0, *(np.zeros(()),) * 3)  # effect of other sets
@@ -163,7 +163,7 @@ class Window:
             self.covariance -= np.outer(share, pull)
 
     def rest_on(
-            self, at: Rest, count: int, begin: float, here: Trial, noise: float,
+            self, at: Rest, count: int, begin: float, here: Simulation, noise: float,
             drift: Array) -> 'Window':
         """Return the window, entirely at rest, without the first samples; as `move_on`."""
         before, weights = at.weight, here.weights[:count]
@@ -177,7 +177,8 @@ class Window:
                 shown=shown / weight if weight else 0.0, weight=weight))
 
     def solve(
-            self, z: Array, levels: Levels, noise: float, until: float, here: Trial | None = None
+            self, z: Array, levels: Levels, noise: float, until: float,
+            here: Simulation | None = None
     ) -> Solution | None:
         """
         Estimate the most probable motion from initial coordinates; None if there is none.
@@ -185,7 +186,7 @@ class Window:
         The noise is the standard deviation of a sample. The motion extends to a time that is not
         before the last sample. The result of `simulate` at the coordinates may be given.
         """
-        def descend(z: Array, here: Trial | None = None) -> Found | None:
+        def descend(z: Array, here: Simulation | None = None) -> Optimum | None:
             return self._descend(z, here, levels, noise, until)
 
         found = descend(z, here) or descend(self._at_ease(self.mean))
@@ -209,22 +210,22 @@ class Window:
             found.z, found.here, sure * inverse(found.matrix, found.loose) + square,
             np.broadcast_to(off, z.shape), np.broadcast_to(instead, z.shape), self._doubt(found))
 
-    def _doubt(self, found: Found) -> Doubt:
+    def _doubt(self, found: Optimum) -> BiasCase:
         """Return the expectation if a constant force and a gain may be in error, too."""
         loose = found.loose | self.suspects.of(('constant_force', GAIN), len(found.loose))
         covariance = inverse(found.matrix, loose)
         off = covariance @ found.gradient
-        return Doubt(off, covariance + np.outer(off, off))
+        return BiasCase(off, covariance + np.outer(off, off))
 
-    def _is_poor(self, found: Found, noise: float) -> bool:
+    def _is_poor(self, found: Optimum, noise: float) -> bool:
         """Return whether the estimated quantities explain the samples poorly."""
         return loss(found.here.residual, noise, convex=True) > _POOR * len(self.time)
 
     def _look(
-            self, found: Found, descend: Callable[[Array], Found | None]) -> Found:
+            self, found: Optimum, descend: Callable[[Array], Optimum | None]) -> Optimum:
         """Choose the suspects to estimate, and return the most probable coordinates then."""
         self.weighed, before = len(self.time), self.suspected
-        self.suspected, self.others = Look(
+        self.suspected, self.others = Evidence(
             self.suspects, found.z, found.matrix, found.gradient,
             *self._room(found.z)).choose(before)
         if self.suspected == before:
@@ -232,8 +233,8 @@ class Window:
         return descend(self._at_ease(found.z)) or found
 
     def _descend(
-            self, z: Array, here: Trial | None, levels: Levels, noise: float, until: float
-    ) -> Found | None:
+            self, z: Array, here: Simulation | None, levels: Levels, noise: float, until: float
+    ) -> Optimum | None:
         """
         Search the most probable values of the estimated coordinates.
 
@@ -262,7 +263,7 @@ class Window:
             if there is None:
                 break
             z, here = self._bounded(z + step), there
-        return Found(z, here, matrix, gradient, loose)
+        return Optimum(z, here, matrix, gradient, loose)
 
     def _at_ease(self, z: Array) -> Array:
         """Return coordinates with the given values for those that are not estimated."""
@@ -291,7 +292,7 @@ class Window:
             np.maximum(low, -longest), np.minimum(high, longest))
 
     def simulate(
-            self, z: Array, levels: Levels, noise: float, until: float) -> Trial | None:
+            self, z: Array, levels: Levels, noise: float, until: float) -> Simulation | None:
         """Return the simulation of the samples for coordinates."""
         values, times = self.values_at(z), np.append(self.time, until)
         motion = follow(
@@ -306,7 +307,7 @@ class Window:
         apart = z - self.mean
         cost = loss(residual, noise, convex=True) + 0.5 * float(
             apart @ self.information @ apart)
-        return Trial(
+        return Simulation(
             values, motion, residual, self._about_rest(values, by[:n]),
             weights_of(residual, noise, convex=True), cost)
 
@@ -318,7 +319,7 @@ class Window:
         return by
 
     def move_on(
-            self, count: int, begin: float, z: Array, here: Trial, noise: float,
+            self, count: int, begin: float, z: Array, here: Simulation, noise: float,
             drift: Array) -> 'Window':
         """
         Return the window without the first samples, which become part of the prior.

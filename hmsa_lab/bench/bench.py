@@ -26,16 +26,16 @@ LEAD, _BEAT, SILENCE, _START, _LOOK = 0.1, 0.05, 1.0, 10.0, 2e-3
 _PATIENCE = 10
 
 
-class Seen(NamedTuple):
+class PhaseResults(NamedTuple):
     """Results of a phase."""
 
     changes: list[Change]
     samples: list[Sample]
     asked: list[tuple[int, float]]
 
-    def joined(self, more: 'Seen') -> 'Seen':
+    def joined(self, more: 'PhaseResults') -> 'PhaseResults':
         """Return the results of this phase and a later one together."""
-        return Seen(
+        return PhaseResults(
             self.changes + more.changes, self.samples + more.samples, self.asked + more.asked)
 
     @property
@@ -116,7 +116,7 @@ class Bench:
                     self.worker.receive(0, *self._newest)
             self.worker.look_after()
 
-    def run(self, seconds: float, levels: Sequence[float] = ()) -> Seen:
+    def run(self, seconds: float, levels: Sequence[float] = ()) -> PhaseResults:
         """Wait, with levels in T spread over the time; the last one stays."""
         begin, apart = time_ns() + round(LEAD * NANOSECONDS), seconds / max(len(levels), 1)
         asked = [(begin + round(i * apart * NANOSECONDS), x) for i, x in enumerate(levels)]
@@ -128,9 +128,9 @@ class Bench:
             begun = monotonic()
             sleep(_LOOK)
             self.slept.append(monotonic() - begun - _LOOK)
-        return Seen(self.worker.device.changes(), self.worker.device.samples(), asked)
+        return PhaseResults(self.worker.device.changes(), self.worker.device.samples(), asked)
 
-    def hold(self, seconds: float, levels: Sequence[float]) -> Seen:
+    def hold(self, seconds: float, levels: Sequence[float]) -> PhaseResults:
         """Run until the last level is set; raise `HmsaError` if that fails."""
         seen = self.run(seconds, levels)
         for _ in range(_PATIENCE):
@@ -144,7 +144,7 @@ class Bench:
             'check-driver')
 
 
-def matched(seen: Seen) -> list[tuple[Change, tuple[int, float]]]:
+def matched(seen: PhaseResults) -> list[tuple[Change, tuple[int, float]]]:
     """Return pairs of change and requested level: the first change in the level's time."""
     found, changes = [], list(seen.changes)
     for i, (stamp, level) in enumerate(seen.asked):

@@ -20,7 +20,7 @@ import numpy as np
 from hmsa.errors import BadInputError
 from hmsa.model.equations import Array
 from hmsa.model.units import NANOSECONDS
-from hmsa_lab.bench.bench import Bench, matched, Seen, SILENCE
+from hmsa_lab.bench.bench import Bench, matched, PhaseResults, SILENCE
 from hmsa_ros.device.hardware import Calls, Instrument, load
 from hmsa_ros.device.protocol import StateLostError
 
@@ -92,7 +92,7 @@ class _TimedCalls(Calls):
             self.durations.setdefault(method, []).append(monotonic() - begun)
 
 
-class Trial:
+class ConformanceTrial:
     """
     A trial of a class of hardware.
 
@@ -195,7 +195,7 @@ class Trial:
         return Bench(
             self.name, self._settings, self._level, self._rate, self._joint, self._calls)
 
-    def _timed(self, bench: Bench) -> Seen:
+    def _timed(self, bench: Bench) -> PhaseResults:
         """Time a series of levels, repeated a few times if the host overslept."""
         for _ in range(_TRIES):
             bench.slept.clear()
@@ -214,7 +214,7 @@ class Trial:
 
     # -- levels --------------------------------------------------------------------------------
 
-    def _check_levels(self, phases: Sequence[Seen], timed: Seen) -> None:
+    def _check_levels(self, phases: Sequence[PhaseResults], timed: PhaseResults) -> None:
         wrong = max((
             abs(change.level - asked[1]) for x in phases for change, asked in matched(x)),
             default=math.inf)
@@ -237,7 +237,7 @@ class Trial:
 
     # -- samples -------------------------------------------------------------------------------
 
-    def _check_samples(self, phases: Sequence[Seen], timed: Seen) -> None:
+    def _check_samples(self, phases: Sequence[PhaseResults], timed: PhaseResults) -> None:
         samples = [y for x in phases for y in x.samples]
         if not any(np.isfinite(x.stretch[0]) for x in samples):
             self._untried.append('samples: read returned none')
@@ -271,7 +271,7 @@ class Trial:
             f'{rate:.3g} samples a second, read at {self._rate:g} Hz',
             'read must return sooner, or --rate be that of the sensor')
 
-    def _check_response(self, rest: Seen, up: Seen, down: Seen) -> None:
+    def _check_response(self, rest: PhaseResults, up: PhaseResults, down: PhaseResults) -> None:
         means = [float(np.mean(x)) if len(x) else math.nan for x in (
             y.stretch[len(y.stretch) // 2:] for y in (rest, up, down))]
         spread = float(np.std(rest.stretch)) if len(rest.stretch) else math.nan
@@ -373,7 +373,7 @@ class Trial:
                 'give calls a time limit of their own; nothing else is written meanwhile')
 
 
-def _lateness(seen: Seen) -> list[float]:
+def _lateness(seen: PhaseResults) -> list[float]:
     """Return the lateness of levels in s."""
     return [(x.stamp - stamp) / NANOSECONDS for x, (stamp, _) in matched(seen)]
 

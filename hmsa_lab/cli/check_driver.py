@@ -45,11 +45,11 @@ def run(arguments: argparse.Namespace) -> int:
         If the folder of the page does not exist, or a setting is invalid.
 
     """
-    from hmsa_lab.bench.conformance import Trial
+    from hmsa_lab.bench.conformance import ConformanceTrial
 
     check_targets(arguments.report)
     with progress(lines=PATIENCE) as update:
-        found = Trial(
+        found = ConformanceTrial(
             arguments.hardware, arguments.joint, settings_of(arguments), level=arguments.limit,
             rate=arguments.rate).run(update)
     if arguments.report is not None:

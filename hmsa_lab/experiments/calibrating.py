@@ -10,15 +10,15 @@ import numpy as np
 
 from hmsa.errors import HmsaError
 from hmsa.identification.delays import Delays, delays, field_delays
-from hmsa.identification.recording import Recording
+from hmsa.identification.measurement import Measurement
 from hmsa.model.equations import Array
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.units import NANOSECONDS
-from hmsa_lab.bench.bench import Bench, LEAD, matched, Seen
+from hmsa_lab.bench.bench import Bench, LEAD, matched, PhaseResults
 from hmsa_lab.bench.calibration import loop
 from hmsa_ros.device.hardware import described, readings
 
-Progress = Callable[[str, float], None]
+CalibrationProgress = Callable[[str, float], None]
 # Duration of levels in periods of the actuator, and minimum in s.
 _PERIODS, _SHORTEST = (0.8, 1.6), 0.12
 # Ranges of levels as fractions of the limit, used alternately.
@@ -71,7 +71,7 @@ def steps_of(actuator: ActuatorParameters, limit: float, count: int) -> list[tup
 
 def measure_delays(
         bench: Bench, steps: Sequence[tuple[float, float]], probe: Any,
-        actuator: ActuatorParameters, lag: float | None, progress: Progress) -> Delays:
+        actuator: ActuatorParameters, lag: float | None, progress: CalibrationProgress) -> Delays:
     """
     Step through levels, and determine transport delay, lag and latency.
 
@@ -101,7 +101,7 @@ def measure_delays(
         If hardware or probe fail, or the recording is insufficient.
 
     """
-    seen = Seen([], [], [])
+    seen = PhaseResults([], [], [])
     reader = None if probe is None else _Reader(probe)
     try:
         for i, (level, seconds) in enumerate(steps):
@@ -125,7 +125,7 @@ def measure_delays(
     begins, levels = seconds_of([x.stamp for x, _ in pairs]), np.array([x.level for x, _ in pairs])
     times = sorted(samples)
     return delays(
-        Recording(
+        Measurement(
             seconds_of(times), np.array([samples[x] for x in times]), np.append(0.0, begins),
             np.append(0.0, levels), label=bench.name),
         np.append(math.nan, seconds_of([stamp for _, (stamp, _) in pairs])),
@@ -136,7 +136,7 @@ def measure_delays(
 
 def hold_staircase(
         bench: Bench, limit: float, steps: int, settle: float,
-        gauge: Callable[[float], float] | None, progress: Progress
+        gauge: Callable[[float], float] | None, progress: CalibrationProgress
 ) -> tuple[Array, Array, Array, float]:
     """
     Apply a slow staircase of levels up, down and back.

@@ -19,8 +19,8 @@ from hmsa.identification.excitation import Bounds, excite
 from hmsa.identification.files import Belief, belief_in, file_text, read_belief
 from hmsa.identification.identify import identify
 from hmsa.identification.known import PREFIX
+from hmsa.identification.measurement import Measurement
 from hmsa.identification.quantities import free_of
-from hmsa.identification.recording import Recording
 from hmsa.identification.result import Identification
 from hmsa.identification.runs import recording_of
 from hmsa.interfaces.topics import PLANNER
@@ -32,7 +32,7 @@ from hmsa.report.looks import RUNS
 from hmsa.runs.bags import read_run
 from hmsa.runs.parameters import Entries
 from hmsa.runs.record import Run
-from hmsa_ros.clients.experiment import conduct, Experiment, prepare, Progress
+from hmsa_ros.clients.experiment import conduct, Experiment, ExperimentProgress, prepare
 
 if TYPE_CHECKING:
     from hmsa_ros.clients.processes import NodeProcess
@@ -102,7 +102,7 @@ class Tuned:
             'hmsa run --feedback adapt')
 
 
-def tune(tuning: Tuning, progress: Progress) -> Tuned:
+def tune(tuning: Tuning, progress: ExperimentProgress) -> Tuned:
     """
     Carry out a tuning.
 
@@ -180,7 +180,7 @@ def _of_planner(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _run(
-        tuning: Tuning, name: str, progress: Progress, settings: Mapping[str, Any],
+        tuning: Tuning, name: str, progress: ExperimentProgress, settings: Mapping[str, Any],
         levels: Sequence[tuple[float, float]] = ()) -> Run:
     """Run setpoints, or levels, with settings of the planner if it is started here."""
     parameters = {f'{PLANNER}:{x}': y for x, y in _of_planner(settings).items()}
@@ -216,7 +216,7 @@ def excitation(tuning: Tuning, belief: Belief, rate: float) -> list[tuple[float,
 
 
 def identified(
-        tuning: Tuning, belief: Belief, recording: Recording, block: ActuatorParameters,
+        tuning: Tuning, belief: Belief, recording: Measurement, block: ActuatorParameters,
         coil: Mapping[str, float]) -> Identification:
     """Identify, with parameters indicated by the residuals added (see `recording_of`)."""
     known = {**coil, **belief.others, **tuning.known}

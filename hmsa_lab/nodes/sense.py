@@ -20,7 +20,7 @@ from hmsa.model.units import NANOSECONDS
 from hmsa_lab.bench.assembly import SensorScale
 from hmsa_lab.bench.readings import Readings
 from hmsa_lab.nodes import fields
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import from_time, to_status, to_time
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare
@@ -177,7 +177,7 @@ class SenseNode(ManagedNode):
         self._published = self._useless = 0
         self._newest = self._heard = 0
         self._trouble = ''
-        self._publisher = endpoints.publisher(self, topics.JOINT_STATES)
+        self._publisher = ros_entities.publisher(self, topics.JOINT_STATES)
         self._type = values['type']
         if self._type:
             self._subscribe()
@@ -205,7 +205,7 @@ class SenseNode(ManagedNode):
 
     def _subscribe(self) -> None:
         values, take = self._values, self._readings.take_reference
-        kind = endpoints.interface_class(self._type)
+        kind = ros_entities.interface_class(self._type)
         makes = partial(reader, self._type, kind, values['field'])
         each: dict[str, list[Callable[[Any], None]]] = {self._topic: [
             partial(self._take, makes(values['element']))]}
@@ -215,7 +215,7 @@ class SenseNode(ManagedNode):
             each.setdefault(self._reference, []).insert(0, partial(
                 self._pass_on, read, lambda stamp, reading, now: take(stamp, reading)))
         for name, takes in each.items():
-            endpoints.subscribe(
+            ros_entities.subscribe(
                 self, topics.Topic(name, self._type, _QUALITY),
                 lambda message, takes=takes: [take(message) for take in takes])
 

@@ -18,9 +18,9 @@ from hmsa.interfaces import topics
 from hmsa_lab.bench.assembly import Assembly, parts
 from hmsa_lab.nodes import fields
 from hmsa_ros.device.hardware import is_number
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import to_time
-from hmsa_ros.nodes.visitor import leave, visit
+from hmsa_ros.nodes.temporary_node import leave, visit
 
 # In s: wait for a subscriber at the start, interval of checks, wait for the last acknowledgement.
 _PATIENCE, _LOOK, _LAST = 8.0, 0.02, 0.3
@@ -52,8 +52,8 @@ class _Topic:
                     found = self._node.get_subscriptions_info_by_topic(self.name)
                     type_name = found[0].topic_type if found else ''
                 if type_name and self._publisher is None:
-                    self.kind = endpoints.interface_class(type_name)
-                    self._publisher = endpoints.publisher(
+                    self.kind = ros_entities.interface_class(type_name)
+                    self._publisher = ros_entities.publisher(
                         self._node, topics.Topic(self.name, type_name, topics.RELIABLE))
             self.type = type_name
             self._require_subscriber()

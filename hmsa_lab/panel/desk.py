@@ -20,13 +20,13 @@ from hmsa.files import finite
 from hmsa.interfaces import topics
 from hmsa.interfaces.status import real, texts
 from hmsa_lab.panel.interlock import InterlockSwitch
-from hmsa_lab.panel.recording import Recording
+from hmsa_lab.panel.recorder import PanelRecorder
 from hmsa_lab.panel.server import Server
 from hmsa_lab.watch.listener import Listener
-from hmsa_lab.watch.scene import as_json, History, LEVELS, Scene, SLOTS
+from hmsa_lab.watch.scene import as_json, LEVELS, PeakHistory, Scene, SLOTS
 from hmsa_ros.clients.client import PlannerClient
 from hmsa_ros.clients.link import Stopping
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.service_call import ServiceCall
 from hmsa_ros.runtime.records import FEEDBACK_MODES as MODES
 
@@ -73,9 +73,9 @@ class Desk:
             node, GetParameters, f'{topics.PLANNER}/get_parameters',
             GetParameters.Request(names=['feedback', 'use_sim_time']))
         self._set: ServiceCall | None = None
-        endpoints.subscribe(node, topics.ESTIMATE, self._on_estimate, topics.PLANNER)
+        ros_entities.subscribe(node, topics.ESTIMATE, self._on_estimate, topics.PLANNER)
         self._interlock = InterlockSwitch(node)
-        self._recording = Recording(out, namespace, joints)
+        self._recording = PanelRecorder(out, namespace, joints)
         self._estimates: dict[str, dict[str, Any]] = {}
         self._known: Mapping[str, Any] = {}
         self._next_ask = 0.0
@@ -287,6 +287,6 @@ class Desk:
             'interlock': {'present': self._interlock.present, 'closed': self._interlock.closed}}
 
 
-def _tail(history: History, now: float, count: int) -> list[list[float]]:
+def _tail(history: PeakHistory, now: float, count: int) -> list[list[float]]:
     """Return minima and maxima in the last slots of a history."""
     return [np.round(side[-count:], 7).tolist() for side in history.ranges(now)]

@@ -6,7 +6,7 @@ from rclpy.node import Node
 from std_msgs.msg import Bool
 
 from hmsa.interfaces.topics import DRIVER, INTERLOCK
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 
 # Interval of repeats in s, well within the default interlock_timeout of a driver.
 _REPEAT_SECONDS = 0.1
@@ -21,7 +21,7 @@ class InterlockSwitch:
     """
 
     def __init__(self, node: Node) -> None:
-        self._publisher = endpoints.publisher(node, INTERLOCK, DRIVER)
+        self._publisher = ros_entities.publisher(node, INTERLOCK, DRIVER)
         self.closed: bool | None = None  #: as last requested; None before the first request
         self._next = math.inf
 

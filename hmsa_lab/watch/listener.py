@@ -17,17 +17,17 @@ from sensor_msgs.msg import JointState
 
 from hmsa.errors import BadInputError, printable
 from hmsa.interfaces import topics
-from hmsa.interfaces.status import real, texts, Verdict, whole
+from hmsa.interfaces.status import real, StatusVerdict, texts, whole
 from hmsa.model.laws.coordinate import COORDINATES
 from hmsa.model.schedule import CommandSchedule
 from hmsa.model.units import NANOSECONDS
-from hmsa_lab.watch.scene import History, Joint, Report, Scene
-from hmsa_ros.nodes import endpoints
+from hmsa_lab.watch.scene import JointView, PeakHistory, Report, Scene
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
 from hmsa_ros.nodes.conversions import from_time
-from hmsa_ros.nodes.endpoints import interface_class
-from hmsa_ros.nodes.presence import Presence
-from hmsa_ros.nodes.visitor import leave, visit
+from hmsa_ros.nodes.duplicate_nodes import Presence
+from hmsa_ros.nodes.ros_entities import interface_class
+from hmsa_ros.nodes.temporary_node import leave, visit
 
 # Number of samples kept since the last look: all of them at 1 kHz.
 _SAMPLES = 200
@@ -92,9 +92,9 @@ class Listener:
         self._plan = self._subscribe(topics.PLAN)
         self._diagnostics = self._subscribe(topics.DIAGNOSTICS, _REPORT_QOS)
         self._commands: dict[str, tuple[_Source, CommandSchedule]] = {}
-        self._joints: dict[str, Joint] = {}
+        self._joints: dict[str, JointView] = {}
         self._heard: dict[tuple[str, str, str], tuple[float, Report]] = {}
-        self._request: Verdict | None = None
+        self._request: StatusVerdict | None = None
         self._targets: dict[str, float] = {}
         self._coordinates: dict[str, str] = {}
         self._planned_joints: tuple[str, ...] = ()
@@ -120,7 +120,7 @@ class Listener:
     def _subscribe(self, topic: topics.Topic, qos: topics.Quality | None = None) -> _Source:
         source = _Source(
             self._node.resolve_topic_name(topics.from_outside(topic.name, topics.PLANNER)),
-            interface_class(topic.type), endpoints.listen(
+            interface_class(topic.type), ros_entities.listen(
                 self._node, replace(topic, qos=qos or topic.qos), topics.PLANNER))
         self._sources.append(source)
         return source
@@ -184,7 +184,7 @@ class Listener:
             self._targets = {
                 key.rpartition('.')[0] or printable(message.hardware_id): real(value)
                 for key, value in values.items() if key.rpartition('.')[2] == 'stretch'}
-            self._request = Verdict.read(message)
+            self._request = StatusVerdict.read(message)
 
     def _take_samples(self, now: float) -> None:
         arrived = self._samples.subscription.take()
@@ -219,9 +219,9 @@ class Listener:
         for i, name in enumerate(names):
             joint = self._joints.get(name)
             if joint is None:
-                joint = self._joints[name] = Joint(
-                    name, History(self._span), History(self._span),
-                    fluxes=History(self._span))
+                joint = self._joints[name] = JointView(
+                    name, PeakHistory(self._span), PeakHistory(self._span),
+                    fluxes=PeakHistory(self._span))
             joint.stretch = float(stretches[-1, i])
             joint.rate = newest.velocity[i] if i < len(newest.velocity) else math.nan
             joint.flux_density = newest.effort[i] if i < len(newest.effort) else math.nan

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hmsa.files import finite
-from hmsa.interfaces.status import Verdict
+from hmsa.interfaces.status import StatusVerdict
 from hmsa.model.equations import Array
 from hmsa.model.laws.coordinate import POSITION
 from hmsa.model.units import flux_text
@@ -24,7 +24,7 @@ TROUBLES = ('late', 'replanned', 'lost', 'refused', 'failed', 'timeouts')
 _SILENT_AFTER = 3.5
 
 
-class History:
+class PeakHistory:
     """Minimum and maximum in each slot of the last ``span`` seconds, so that peaks are kept."""
 
     def __init__(self, span: float, slots: int = SLOTS) -> None:
@@ -63,7 +63,7 @@ class History:
 
 
 @dataclass
-class Joint:
+class JointView:
     """
     One actuator: newest sample, target and command (in SI, NaN if unknown), and its charts.
 
@@ -71,15 +71,15 @@ class Joint:
     """
 
     name: str
-    stretches: History
-    targets: History
+    stretches: PeakHistory
+    targets: PeakHistory
     stretch: float = math.nan
     rate: float = math.nan
     flux_density: float = math.nan
     target: float = math.nan
     commanded: float = math.nan
     coordinate: str = POSITION
-    fluxes: History = field(default_factory=lambda: History(10.0))
+    fluxes: PeakHistory = field(default_factory=lambda: PeakHistory(10.0))
 
 
 @dataclass
@@ -108,8 +108,8 @@ class Scene:
     stamp: float = math.nan
     age: float = math.nan
     sample_rate: float = math.nan
-    joints: Sequence[Joint] = field(default_factory=list)
-    request: Verdict | None = None
+    joints: Sequence[JointView] = field(default_factory=list)
+    request: StatusVerdict | None = None
     progress: float = math.nan
     reports: Sequence[Report] = field(default_factory=list)
     waiting: Sequence[str] = field(default_factory=list)
@@ -145,7 +145,7 @@ def _number(value: float) -> str:
     return f'{value:.5f}' if math.isfinite(value) else '?'
 
 
-def _level(joint: Joint) -> str:
+def _level(joint: JointView) -> str:
     value = joint.flux_density
     return flux_text(value, '+.3f') if math.isfinite(value) else '?'
 

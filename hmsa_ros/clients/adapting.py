@@ -19,7 +19,7 @@ from hmsa.planning.planner import Options, Planner
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.runtime.loop import Loop
-from hmsa_ros.runtime.records import Settings, Target
+from hmsa_ros.runtime.records import Settings, StretchRequest
 
 #: Error factor of the shear modulus, unknown to the planner.
 FACTOR = 1.2
@@ -57,7 +57,7 @@ def _carry_out(
     seen, results, before = [], [], 1.0
     for target in _TARGETS:
         begin = loop.now
-        loop.runtime.request(Target(_JOINT, target))
+        loop.runtime.request(StretchRequest(_JOINT, target))
         # The arrival as planned, before any correction.
         arrival = (planner.plan.segments[-1].arrival or begin) * 1e-9
         while loop.now < begin + _HOLD * 1e9:

@@ -17,18 +17,18 @@ from rosgraph_msgs.msg import Clock
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.interfaces import topics
-from hmsa.interfaces.status import Verdict
+from hmsa.interfaces.status import StatusVerdict
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.clients import graph
 from hmsa_ros.clients.experiment import check_stretches
 from hmsa_ros.clients.link import Link, SILENCE
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
-from hmsa_ros.nodes.presence import LATELY_SECONDS, Presence
+from hmsa_ros.nodes.duplicate_nodes import LATELY_SECONDS, Presence
 from hmsa_ros.nodes.service_call import ServiceCall
-from hmsa_ros.nodes.visitor import SLICE_SECONDS
+from hmsa_ros.nodes.temporary_node import SLICE_SECONDS
 
 # Time in s for an existing planner node to subscribe: configuration takes a fraction of a second,
 # much longer on a busy machine.
@@ -122,7 +122,7 @@ class PlannerClient(Link):
         if self._begun is None:
             self._begun = monotonic()
         # A subscriber that cannot be reached holds nobody up.
-        return (endpoints.matched(self.node, self._publisher, self._planner)
+        return (ros_entities.matched(self.node, self._publisher, self._planner)
                 or monotonic() - self._begun > _MATCHED_SECONDS)
 
     def _is_there(self, name: str) -> bool:
@@ -180,7 +180,7 @@ class PlannerClient(Link):
             return monotonic() - since >= _SETTLED_SECONDS
 
         def subscribed() -> bool:
-            heard = endpoints.subscribers_of(self.node, self._publisher.topic_name).values()
+            heard = ros_entities.subscribers_of(self.node, self._publisher.topic_name).values()
             return not graph.recorders(self.node).isdisjoint(heard) and (
                 self._publisher.get_subscription_count() >= len(heard))
 
@@ -200,7 +200,7 @@ class PlannerClient(Link):
     def send(
             self, setpoints: Sequence[tuple[float | Sequence[float], float]],
             levels: Sequence[tuple[float, float]] = (),
-            path: Sequence[Sequence[float]] = ()) -> Verdict:
+            path: Sequence[Sequence[float]] = ()) -> StatusVerdict:
         """
         Send a sequence that begins now, and wait for the verdict.
 
@@ -284,7 +284,7 @@ class PlannerClient(Link):
         """Return the speed of simulated time relative to real time, 1 without simulated time."""
         if not self.node.count_publishers(topics.CLOCK_TOPIC.name):
             return 1.0
-        clock = endpoints.listen(self.node, topics.CLOCK_TOPIC)
+        clock = ros_entities.listen(self.node, topics.CLOCK_TOPIC)
         seen: list[tuple[float, float]] = []
 
         def measured() -> bool:
@@ -303,8 +303,8 @@ class PlannerClient(Link):
         return (seen[-1][1] - seen[0][1]) / (seen[-1][0] - seen[0][0])
 
     def follow(
-            self, verdict: Verdict, *, each: Callable[[Verdict], None] | None = None,
-            timeout: float) -> Verdict:
+            self, verdict: StatusVerdict, *, each: Callable[[StatusVerdict], None] | None = None,
+            timeout: float) -> StatusVerdict:
         """
         Wait until a sequence has been carried out and, if measured, judged completely.
 
@@ -381,7 +381,7 @@ def _slower_time(node: Node, timeout: float) -> Iterator[Callable[[], float]]:
     if not node.count_publishers(topics.CLOCK_TOPIC.name):
         yield monotonic
         return
-    clock = endpoints.listen(node, topics.CLOCK_TOPIC)
+    clock = ros_entities.listen(node, topics.CLOCK_TOPIC)
     passed, heard, before = 0.0, monotonic(), math.nan
 
     def time() -> float:

@@ -21,16 +21,16 @@ from hmsa.files import make_folder
 from hmsa.interfaces import topics
 from hmsa.interfaces.actuator import actuator_from
 from hmsa.interfaces.parameters import BLOCK
-from hmsa.interfaces.status import Verdict
+from hmsa.interfaces.status import StatusVerdict
 from hmsa.interfaces.topics import PLANNER, PLANT
 from hmsa.runs.parameters import values_of
 from hmsa_ros.clients.processes import NodeProcess, Session
 
 if TYPE_CHECKING:
-    from hmsa_ros.clients.watch import Watch
+    from hmsa_ros.clients.experiment_client import ExperimentClient
 
 Setpoints = Sequence[tuple[Sequence[float], float]]
-Progress = Callable[[str, float], None]
+ExperimentProgress = Callable[[str, float], None]
 #: Time limit in s for the start of nodes, and for time that does not advance.
 START_SECONDS = 20.0
 
@@ -98,7 +98,7 @@ class Conducted:
     exits: dict[str, int]  #: exit statuses by process
     measured: bool  #: whether there were samples
     notes: tuple[str, ...]
-    verdict: Verdict  #: last verdict of the planner
+    verdict: StatusVerdict  #: last verdict of the planner
     seconds: dict[str, float]  #: real durations by phase
     pace: float  #: speed of the nodes' time relative to real time
 
@@ -124,7 +124,7 @@ def prepare(folder: Path) -> None:
     make_folder(folder)
 
 
-def conduct(experiment: Experiment, progress: Progress) -> Conducted:
+def conduct(experiment: Experiment, progress: ExperimentProgress) -> Conducted:
     """
     Carry out an experiment.
 
@@ -157,9 +157,9 @@ def conduct(experiment: Experiment, progress: Progress) -> Conducted:
                 ENDING.check()
                 session.start(node)
         # ROS is imported here, while the nodes import it too.
-        from hmsa_ros.clients.watch import Watch
+        from hmsa_ros.clients.experiment_client import ExperimentClient
 
-        with Watch(experiment, session.check) as watch:
+        with ExperimentClient(experiment, session.check) as watch:
             try:
                 _begin(experiment, session, watch)
                 times.append(monotonic())
@@ -201,7 +201,7 @@ def _closed(bag: Path) -> bool:
         return False
 
 
-def _begin(experiment: Experiment, session: Session, watch: 'Watch') -> None:
+def _begin(experiment: Experiment, session: Session, watch: 'ExperimentClient') -> None:
     """Check the running nodes, and wait for the recorder."""
     watch.find_planner(session.check)
     watch.read_parameters()
@@ -224,7 +224,9 @@ def recorder_of(experiment: Experiment, simulated: bool) -> NodeProcess:
         'record.topics': experiment.topics()}, experiment.namespace)
 
 
-def _carry_out(experiment: Experiment, watch: 'Watch', progress: Progress) -> Verdict:
+def _carry_out(
+        experiment: Experiment, watch: 'ExperimentClient', progress: ExperimentProgress
+) -> StatusVerdict:
     """Send the sequence, and wait until the duration of the last setpoint is over."""
     verdict = watch.send(experiment.setpoints, experiment.levels, experiment.path)
     begin = watch.now

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from rclpy.node import Node
 
 from hmsa.interfaces import topics
-from hmsa_ros.nodes.endpoints import publishers_of, subscribers_of
+from hmsa_ros.nodes.ros_entities import publishers_of, subscribers_of
 
 
 def unheard(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:

@@ -16,10 +16,10 @@ from trajectory_msgs.msg import JointTrajectory
 from hmsa.ending import ENDING
 from hmsa.errors import HmsaError
 from hmsa.interfaces import topics
-from hmsa.interfaces.status import Verdict
+from hmsa.interfaces.status import StatusVerdict
 from hmsa.model.status import Code
-from hmsa_ros.nodes import endpoints
-from hmsa_ros.nodes.visitor import SLICE_SECONDS, Visitor
+from hmsa_ros.nodes import ros_entities
+from hmsa_ros.nodes.temporary_node import SLICE_SECONDS, Visitor
 
 # Time limit in s for a stop, perhaps in slow motion; and time until it is sent again to a planner
 # that has not answered, as one that was just discovered may not have received it.
@@ -33,7 +33,7 @@ _FAILED = (Code.SUPERSEDED, Code.VIBRATING)
 # Codes of errors that say whether the coil is off, or what to do.
 _KNOWN = (*_FAILED, Code.UNHEARD, Code.CUT_OFF, Code.INTERLOCK)
 #: Verdict before the first status.
-SILENCE = Verdict(0, 'no reply from the planner yet', '', '', '', 0, 0)
+SILENCE = StatusVerdict(0, 'no reply from the planner yet', '', '', '', 0, 0)
 
 
 class Link(Visitor):
@@ -54,13 +54,13 @@ class Link(Visitor):
         self._namespace = namespace
         self._planner = f'/{namespace.strip("/")}/{topics.PLANNER}'.replace('//', '/')
         #: Last verdict of the planner.
-        self.verdict: Verdict = SILENCE
-        endpoints.subscribe(self.node, topics.STATUS, self._on_status, topics.PLANNER)
-        self._publisher = endpoints.publisher(
+        self.verdict: StatusVerdict = SILENCE
+        ros_entities.subscribe(self.node, topics.STATUS, self._on_status, topics.PLANNER)
+        self._publisher = ros_entities.publisher(
             self.node, topics.JOINT_TRAJECTORY, topics.PLANNER)
 
     def _on_status(self, message: DiagnosticStatus) -> None:
-        self.verdict = Verdict.read(message)
+        self.verdict = StatusVerdict.read(message)
 
     @property
     def planner(self) -> str:
@@ -87,9 +87,9 @@ class Link(Visitor):
     def listened(self) -> bool:
         """Whether the planner subscribes to the requests, as far as known."""
         return bool(self._publisher.get_subscription_count()) and self._planner in (
-            endpoints.subscribers_of(self.node, self._publisher.topic_name).values())
+            ros_entities.subscribers_of(self.node, self._publisher.topic_name).values())
 
-    def stop(self) -> Verdict:
+    def stop(self) -> StatusVerdict:
         """
         Stop the planner before anything else is known of it, and wait for the result.
 
@@ -143,8 +143,8 @@ class Stopping:
     def __init__(self, link: Link) -> None:
         self._link, self._begin = link, monotonic()
         self._name, self._sent = uuid4().hex, -math.inf
-        self._verdict: Verdict | None = None
-        self.done: Verdict | None = None
+        self._verdict: StatusVerdict | None = None
+        self.done: StatusVerdict | None = None
         self.failure: str | None = None
         self.go_on()
 

@@ -18,7 +18,7 @@ from rclpy.validate_topic_name import validate_topic_name
 
 from hmsa.errors import BadInputError
 from hmsa_ros.nodes.service_call import ServiceCall
-from hmsa_ros.nodes.visitor import Visitor
+from hmsa_ros.nodes.temporary_node import Visitor
 
 
 def _ask(

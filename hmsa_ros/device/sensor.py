@@ -14,7 +14,7 @@ from hmsa_ros.device.protocol import Sample
 T = TypeVar('T')
 
 
-class Transport(Generic[T]):
+class Delay(Generic[T]):
     """
     Items in transit with a constant delay in ns.
 
@@ -95,7 +95,7 @@ class Sensor:
         self._exact = all(x == SensorErrors() for x in errors)
         self._noisy = bool(np.any(self._deviations))
         self._random = np.random.default_rng(seed)
-        self._transport: Transport[Sample] = Transport(delay)
+        self._transport: Delay[Sample] = Delay(delay)
 
     def forget(self) -> None:
         """Discard the samples in transit."""

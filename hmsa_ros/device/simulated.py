@@ -8,7 +8,7 @@ from hmsa.model.equations import Array
 from hmsa.model.simulation import too_large
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.protocol import Change, Kind, Sample
-from hmsa_ros.device.sensor import Sensor, SensorErrors, Transport
+from hmsa_ros.device.sensor import Delay, Sensor, SensorErrors
 from hmsa_ros.device.watchdog import Device, Fallback, GuardedJoint
 from hmsa_ros.timekeeping import clock_set_words
 
@@ -57,7 +57,7 @@ class SimulatedDevice(Device):
         self._actuators = Actuators([x.setup for x in joints], time=time)
         self._present = time  # newest time of the clock, which the simulation may lag behind
         self._sensor = Sensor([x.errors for x in joints], measurement_delay, seed)
-        self._transit: Transport[tuple[int, int, float]] = Transport(command_delay)
+        self._transit: Delay[tuple[int, int, float]] = Delay(command_delay)
         self._changes += [Change(i, time, self.level(i)) for i in range(len(joints))]
 
     # -- state ---------------------------------------------------------------------------------

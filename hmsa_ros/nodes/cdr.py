@@ -24,7 +24,7 @@ _LITTLE = b'\x00\x01'
 _BIG = b'\x00\x00'
 
 
-class Cursor:
+class CdrReader:
     """Read CDR, the wire format of messages, in which each value is aligned to its size."""
 
     def __init__(self, data: bytes) -> None:
@@ -75,7 +75,7 @@ class Cursor:
 def stamp_of(data: bytes) -> int:
     """Return the timestamp in ns of a serialized message that begins with a header, else 0."""
     try:
-        return Cursor(data).time()
+        return CdrReader(data).time()
     except BadInputError:
         return 0
 
@@ -107,7 +107,7 @@ def read_trajectory(data: bytes) -> Trajectory:
         If it cannot be decoded.
 
     """
-    cursor = Cursor(data)
+    cursor = CdrReader(data)
     stamp, name = cursor.time(), cursor.text()
     many = cursor.count()
     if many > _MOST_JOINTS:
@@ -134,7 +134,7 @@ class _Points:
     contain stretch, rate and acceleration of each joint; an omitted acceleration is NaN.
     """
 
-    cursor: Cursor
+    cursor: CdrReader
     names: Sequence[str]
     count: int
     wanted: str
@@ -167,7 +167,7 @@ class _Points:
                 yield found[0], cursor.time()
 
 
-def _sizes(cursor: Cursor) -> list[int]:
+def _sizes(cursor: CdrReader) -> list[int]:
     """Return the length of each field of the next point; an empty list if it is truncated."""
     try:
         ahead = copy(cursor)

@@ -10,9 +10,9 @@ from std_msgs.msg import Float64
 from hmsa.errors import BadInputError
 from hmsa.interfaces import topics
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.nodes import conversions, endpoints
-from hmsa_ros.runtime.planner import PlannerRuntime
-from hmsa_ros.runtime.records import Send, Target
+from hmsa_ros.nodes import conversions, ros_entities
+from hmsa_ros.runtime.records import Send, StretchRequest
+from hmsa_ros.runtime.runtime import Runtime
 from hmsa_ros.runtime.throttle import Throttle
 
 # Time in ns after which all topics of a device that runs are discovered.
@@ -23,20 +23,20 @@ class JointChannel:
     """Publishers and subscriptions of one joint; ``serve`` is called after each message."""
 
     def __init__(
-            self, node: Node, joint: str, joints: Sequence[str], runtime: PlannerRuntime,
+            self, node: Node, joint: str, joints: Sequence[str], runtime: Runtime,
             serve: Callable[[], None], *, linked: bool = False) -> None:
         """Create them; a linked device passes its reports on directly."""
         self._node, self._joint, self._runtime, self._serve = node, joint, runtime, serve
         self._ignored_due = Throttle()
-        self._command = endpoints.publisher(
+        self._command = ros_entities.publisher(
             node, topics.of_joint(topics.FLUX_DENSITY_COMMAND, joint, joints))
-        endpoints.subscribe(
+        ros_entities.subscribe(
             node, topics.of_joint(topics.SETPOINT, joint, joints), self._on_setpoint)
         self._applied = self._received = ''
         self._discovered = monotonic_ns() + _DISCOVERY
         if not linked:
             self._applied, self._received = (
-                endpoints.subscribe(
+                ros_entities.subscribe(
                     node, topics.of_joint(topic, joint, joints), take).topic_name
                 for topic, take in (
                     (topics.FLUX_DENSITY_APPLIED, self._on_applied),
@@ -66,7 +66,7 @@ class JointChannel:
     def reporters(self) -> frozenset[bytes]:
         """Identifiers of the publishers of applied levels."""
         return frozenset(
-            endpoints.publishers_of(self._node, self._applied) if self._applied else ())
+            ros_entities.publishers_of(self._node, self._applied) if self._applied else ())
 
     def unheard(self) -> str:
         """Return why commands are not carried out; empty if they are."""
@@ -85,7 +85,7 @@ class JointChannel:
         return ''
 
     def _on_setpoint(self, message: Float64) -> None:
-        self._runtime.request(Target(self._joint, message.data))
+        self._runtime.request(StretchRequest(self._joint, message.data))
         self._serve()
 
     def _on_received(self, message: TimeReference) -> None:

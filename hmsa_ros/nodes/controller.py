@@ -16,14 +16,14 @@ from rclpy.node import Node
 from hmsa.interfaces import topics
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.protocol import Change, Sample
-from hmsa_ros.nodes import conversions, endpoints
+from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.device_node import DeviceNode, TICK_SECONDS
 from hmsa_ros.nodes.driver import DriverNode, HARDWARE, SHORT
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.runtime.cycles import Cycles
-from hmsa_ros.runtime.environment import Seen
+from hmsa_ros.runtime.environment import ObservedSample
 from hmsa_ros.runtime.records import Output, Send
 from hmsa_ros.timekeeping import steady_ns
 
@@ -88,12 +88,12 @@ class LinkedPlanner(PlannerNode):
             joint, in_force=bool(refuses), locked=refuses == conversions.INTERLOCK,
             time=cut_off_time)
 
-    def _glance(self) -> Iterator[tuple[str, Seen]]:
+    def _glance(self) -> Iterator[tuple[str, ObservedSample]]:
         if self._seen is not None:
             joints, sample = self._seen
             self._seen = None
             for name, stretch, rate, flux_density in _each(joints, sample):
-                yield name, Seen(sample.time, stretch, rate, flux_density)
+                yield name, ObservedSample(sample.time, stretch, rate, flux_density)
 
     def now(self) -> int:
         """Return the time in ns, from the plant if that publishes the clock."""
@@ -141,7 +141,7 @@ class Linked(DeviceNode):
         self.cycles = Cycles(round(TICK_SECONDS * 1e9))
         super().__init__()  # type: ignore[call-arg]  # the constructor of the device node
         planner.plant = self
-        self._of_loop = endpoints.publisher(self, topics.DIAGNOSTICS)
+        self._of_loop = ros_entities.publisher(self, topics.DIAGNOSTICS)
         self.keep(
             self.every(TICK_SECONDS, self._cycle), self.every(1.0, self._report_loop),
             self._of_loop)

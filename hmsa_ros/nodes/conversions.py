@@ -15,7 +15,7 @@ from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from hmsa.errors import BadInputError
-from hmsa.model.schedule import obeyed
+from hmsa.model.schedule import is_axial_field
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes.capture import decode
 
@@ -61,7 +61,7 @@ def from_command(message: MagneticField) -> tuple[int, float]:
 
     """
     field = message.magnetic_field
-    if not obeyed(field.x, field.y, field.z):
+    if not is_axial_field(field.x, field.y, field.z):
         raise BadInputError(
             f'flux density command ({field.x:g}, {field.y:g}, {field.z:g}) T: expected a finite '
             'field along z, with x = y = 0')

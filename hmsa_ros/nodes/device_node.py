@@ -20,12 +20,12 @@ from hmsa_ros.device.health import judge_commands
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.device.watchdog import Fallback, SAFE_FLUX
 from hmsa_ros.device.worker import STALL
-from hmsa_ros.nodes import conversions, endpoints
+from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.capture import decode, RawSubscription
+from hmsa_ros.nodes.duplicate_nodes import Presence
+from hmsa_ros.nodes.fast_publisher import Outlet
 from hmsa_ros.nodes.managed import ManagedNode, silence
-from hmsa_ros.nodes.outlet import Outlet
 from hmsa_ros.nodes.parameters import JointParameters, JOINTS
-from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.runtime.throttle import Throttle
 from hmsa_ros.timekeeping import steady_ns
 
@@ -98,7 +98,7 @@ class DeviceJoint:
         self.received = self.refused = self.refused_source = 0
         self.late = self.latest = self.failed = 0
         self._applied, self._received = (
-            Outlet(endpoints.publisher(node, topics.of_joint(x, self.name, names)))
+            Outlet(ros_entities.publisher(node, topics.of_joint(x, self.name, names)))
             for x in (topics.FLUX_DENSITY_APPLIED, topics.FLUX_DENSITY_RECEIVED))
         # Timestamp of the newest command; its time of arrival in ns, 0 if a receipt was published;
         # and the time of the last receipt by the steady clock.
@@ -110,8 +110,8 @@ class DeviceJoint:
         self._first: bytes | None = None
         self._only_first = node.values[COMMAND_SOURCE.name] == 'first'
         self._commands: Any = (
-            endpoints.listen(node, self._topic) if self._only_first or node.companion
-            else endpoints.subscribe(node, self._topic, self._on_command))
+            ros_entities.listen(node, self._topic) if self._only_first or node.companion
+            else ros_entities.subscribe(node, self._topic, self._on_command))
 
     # -- out -----------------------------------------------------------------------------------
 
@@ -179,14 +179,14 @@ class DeviceJoint:
         """Return whether commands of a publisher on the topic are obeyed."""
         if companion := self._node.companion:
             if publisher not in self._publishers:
-                self._publishers = endpoints.publishers_of(self._node, self._topic.name)
+                self._publishers = ros_entities.publishers_of(self._node, self._topic.name)
                 self._first = next(
                     (x for x, node in self._publishers.items() if node == companion), None)
             if self._publishers.get(publisher) == companion:
                 return False
         if not self._only_first:
             return True
-        if self._first in (None, publisher) or self._first not in endpoints.publishers_of(
+        if self._first in (None, publisher) or self._first not in ros_entities.publishers_of(
                 self._node, self._topic.name):
             self._first = publisher
             return True
@@ -256,9 +256,9 @@ class SamplePublisher:
     """
 
     def __init__(self, node: Node, names: Sequence[str], *, scalars: bool) -> None:
-        self._states = Outlet(endpoints.publisher(node, topics.JOINT_STATES))
+        self._states = Outlet(ros_entities.publisher(node, topics.JOINT_STATES))
         self._scalars = [
-            tuple(Outlet(endpoints.publisher(node, topics.of_joint(x, name, names)))
+            tuple(Outlet(ros_entities.publisher(node, topics.of_joint(x, name, names)))
                   for x in (topics.STRETCH, topics.STRETCH_RATE))
             for name in names] if scalars else []
         count = len(names)

@@ -22,7 +22,7 @@ from hmsa_ros.device.hardware import Calls, load, OPTIONAL
 from hmsa_ros.device.health import judge_hardware, judge_interlock
 from hmsa_ros.device.interlock import Interlock
 from hmsa_ros.device.worker import HardwareWorker
-from hmsa_ros.nodes import conversions, endpoints
+from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.capture import decode
 from hmsa_ros.nodes.device_node import COMMON, DeviceJoint, DeviceNode, FALLBACK, fallback_from
 from hmsa_ros.nodes.managed import AUTOSTART
@@ -153,7 +153,7 @@ class DriverNode(DeviceNode):
                     f'waiting for {name}: it has not started yet, or its first write not returned')
         self.device = self.worker.device
         self.get_logger().info(_described(self.device, self.values))
-        self._lock = endpoints.listen(self, topics.INTERLOCK)
+        self._lock = ros_entities.listen(self, topics.INTERLOCK)
         self._mind_interlock()
         self._open(DeviceJoint)
 
@@ -188,7 +188,7 @@ class DriverNode(DeviceNode):
                 closed = False
             self._interlock.receive(
                 taken.publisher, now, closed=closed,
-                present=lambda: endpoints.publishers_of(self, topics.INTERLOCK.name))
+                present=lambda: ros_entities.publishers_of(self, topics.INTERLOCK.name))
         before, why = self.worker.locked, self._interlock.look(now)
         self.worker.lock(why)
         if bool(why) != bool(before):

@@ -21,13 +21,13 @@ from trajectory_msgs.msg import JointTrajectoryPoint
 from hmsa.errors import BadInputError
 from hmsa.interfaces import topics
 from hmsa.planning import path
-from hmsa_ros.nodes import conversions, endpoints
+from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.capture import RawSubscription
 from hmsa_ros.nodes.cdr import read_trajectory
 from hmsa_ros.nodes.managed import ManagedNode
-from hmsa_ros.runtime.goals import ErrorCode, Goals, Outcome
-from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.goals import ErrorCode, GoalResult, Goals
 from hmsa_ros.runtime.records import Severity, StatusChanged, Trajectory
+from hmsa_ros.runtime.runtime import Runtime
 
 # Rate of feedback and states in Hz, as for a joint_trajectory_controller.
 _RATE = 20.0
@@ -44,7 +44,7 @@ class FollowJointTrajectory:
     """
 
     def __init__(
-            self, node: ManagedNode, runtime: PlannerRuntime, serve: Callable[[], None],
+            self, node: ManagedNode, runtime: Runtime, serve: Callable[[], None],
             action: Any, state: Any) -> None:
         """Create the server, which exists as long as the node and rejects goals meanwhile."""
         self._node, self._serve, self._action, self._state = node, serve, action, state
@@ -52,17 +52,17 @@ class FollowJointTrajectory:
         self._accepted = ''
         self._handles: dict[str, ServerGoalHandle] = {}
         # Results of goals that their clients have not received yet.
-        self._outcomes: dict[str, Outcome] = {}
+        self._outcomes: dict[str, GoalResult] = {}
         self.begin(runtime)
         path.prepare()
-        self._publisher = endpoints.publisher(node, topics.FOLLOW.state)
+        self._publisher = ros_entities.publisher(node, topics.FOLLOW.state)
         node.keep(self._publisher, node.every(1.0 / _RATE, self._tick))
         self._server = ActionServer(
             node, action, topics.FOLLOW.name, lambda handle: action.Result(),
             goal_callback=self._on_goal, handle_accepted_callback=self._on_accepted,
             cancel_callback=self._on_cancel)
 
-    def begin(self, runtime: PlannerRuntime) -> None:
+    def begin(self, runtime: Runtime) -> None:
         """Serve goals for a runtime from now on."""
         self._runtime, self._goals = runtime, Goals(runtime, self._outcomes.__setitem__)
 
@@ -107,7 +107,7 @@ class FollowJointTrajectory:
         watched = bool(self._publisher.get_subscription_count())
         if not self._runtime.active:
             for name in self._handles:
-                self._outcomes.setdefault(name, Outcome(
+                self._outcomes.setdefault(name, GoalResult(
                     'aborted', ErrorCode.INVALID_GOAL, 'the planner was deactivated'))
             self.begin(self._runtime)
         self._listen(wanted=watched or bool(self._handles))
@@ -123,7 +123,7 @@ class FollowJointTrajectory:
     def _listen(self, *, wanted: bool) -> None:
         """Process samples while they are needed."""
         if wanted and self._samples is None:
-            self._samples = endpoints.listen(self._node, topics.JOINT_STATES)
+            self._samples = ros_entities.listen(self._node, topics.JOINT_STATES)
         if self._samples is None:
             return
         taken = self._samples.take()

@@ -23,10 +23,10 @@ from rosgraph_msgs.msg import Clock
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.interfaces import topics
 from hmsa.interfaces.parameters import ParameterSpec
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.address import AddressWatch
 from hmsa_ros.nodes.conversions import to_diagnostics, to_status
-from hmsa_ros.nodes.outlet import Outlet
+from hmsa_ros.nodes.fast_publisher import Outlet
 from hmsa_ros.nodes.parameters import (
     check_former_names,
     check_names,
@@ -119,12 +119,12 @@ class ManagedNode(LifecycleNode):
                 response.success, response.message = False, str(error)
             return response
 
-        self.create_service(endpoints.interface_class(service.type), service.name, answer)
+        self.create_service(ros_entities.interface_class(service.type), service.name, answer)
 
     def diagnose(
             self, report: Callable[[], Iterable[DiagnosticStatus]]) -> Callable[[], None]:
         """Publish statuses once a second; return a function that publishes immediately."""
-        publisher = Outlet(endpoints.publisher(self, topics.DIAGNOSTICS))
+        publisher = Outlet(ros_entities.publisher(self, topics.DIAGNOSTICS))
 
         def publish() -> None:
             statuses = [*report()]

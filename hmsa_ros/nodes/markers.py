@@ -34,7 +34,7 @@ from hmsa.interfaces.parameters import ParameterSpec
 from hmsa.model.laws.bending import centreline, tangent
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import to_duration, to_time
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import JointParameters
@@ -62,7 +62,7 @@ _LOOKS = {
 
 
 @dataclass(frozen=True)
-class Block:
+class MarkerBlock:
     """
     Constant properties of a joint.
 
@@ -86,7 +86,7 @@ class Block:
             raise BadInputError('joint is empty: expected a name')
 
     @classmethod
-    def of(cls, joint: str, actuator: ActuatorParameters) -> 'Block':
+    def of(cls, joint: str, actuator: ActuatorParameters) -> 'MarkerBlock':
         """Return the block of a joint's parameters."""
         length, thickness = actuator.half_length, actuator.half_thickness
         section = 0.0 if actuator.law is None else actuator.law.section
@@ -126,7 +126,7 @@ class Block:
         return side, side, 2.0 * self.half_thickness * stretch
 
 
-class State(NamedTuple):
+class MarkerState(NamedTuple):
     """Stretch, or deflection of a beam, and flux density along z in T of a joint."""
 
     stretch: float
@@ -134,10 +134,10 @@ class State(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Scene:
+class MarkerLayout:
     """Layout and scale of the joints."""
 
-    blocks: tuple[Block, ...]  #: one for each joint, in the order of ``joints``
+    blocks: tuple[MarkerBlock, ...]  #: one for each joint, in the order of ``joints``
     frame: str  #: frame of the markers
     scale: float = 1.0  #: metres shown per metre, greater than 0; 1 is true to size
     #: seconds after which a viewer removes a marker that was not sent again, 0 for never
@@ -153,7 +153,7 @@ class Scene:
              pitch * ((rows - 1) / 2 - number // ROW))
             for number in range(count)]
 
-    def states(self, stamp: int, states: Sequence[State]) -> MarkerArray:
+    def states(self, stamp: int, states: Sequence[MarkerState]) -> MarkerArray:
         """Return block, arrows and label of each joint; an unknown field deletes its arrow."""
         return MarkerArray(markers=[
             marker for drawing, state in zip(self._drawings(stamp), states, strict=True)
@@ -174,12 +174,12 @@ class Scene:
 class _Drawing:
     """Markers of one joint of a scene at a timestamp in ns; x and y of its middle in m."""
 
-    scene: Scene
+    scene: MarkerLayout
     stamp: int
-    block: Block
+    block: MarkerBlock
     place: tuple[float, float]
 
-    def state(self, state: State) -> Iterable[Marker]:
+    def state(self, state: MarkerState) -> Iterable[Marker]:
         """Yield block, arrows and label."""
         block = self.block
         yield self.body(BLOCK, state.stretch)
@@ -267,22 +267,22 @@ _LIFETIME_SECONDS = 2.0
 _LIFETIME_PERIODS = 10.0
 
 
-def scene_from(values: JointParameters, lifetime: float = 0.0) -> Scene:
+def scene_from(values: JointParameters, lifetime: float = 0.0) -> MarkerLayout:
     """Return the scene of a node's joints, one block each; lifetime in s, 0 for unlimited."""
-    return Scene(
-        tuple(Block.of(name, actuator_from(values.of(name))) for name in values.names),
+    return MarkerLayout(
+        tuple(MarkerBlock.of(name, actuator_from(values.of(name))) for name in values.names),
         values[MARKER_FRAME.name], values[MARKER_SCALE.name], lifetime)
 
 
 def show_states(
         node: ManagedNode, values: JointParameters, pace: float,
-        states: Callable[[], tuple[int, Sequence[State]]]) -> None:
+        states: Callable[[], tuple[int, Sequence[MarkerState]]]) -> None:
     """
     Publish the state of the joints at ``marker_rate``, with a timestamp in ns, if subscribed to.
 
     ``pace`` is the node's time, which lifetimes refer to, per second of real time; 0 if unlimited.
     """
-    publisher = endpoints.publisher(node, topics.MARKERS)
+    publisher = ros_entities.publisher(node, topics.MARKERS)
     rate: float = values[MARKER_RATE.name]
     if rate == 0.0:
         return
@@ -301,7 +301,7 @@ class TargetMarkers:
     """Publish the targets of the joints whenever they change."""
 
     def __init__(self, node: Node, values: JointParameters) -> None:
-        self._publisher = endpoints.publisher(node, topics.MARKERS)
+        self._publisher = ros_entities.publisher(node, topics.MARKERS)
         self._scene = scene_from(values)
         self._shown: Any = None
 

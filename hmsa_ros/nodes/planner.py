@@ -20,19 +20,19 @@ from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.offload import Offload
 from hmsa.plugins import FOLLOWER, registered
-from hmsa_ros.nodes import conversions, endpoints
+from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
 from hmsa_ros.nodes.cdr import read_trajectory, stamp_of
 from hmsa_ros.nodes.channel import JointChannel
+from hmsa_ros.nodes.duplicate_nodes import Presence
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.markers import TargetMarkers
 from hmsa_ros.nodes.parameters import declare_joints
 from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from, SPECS
-from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.runtime import records
-from hmsa_ros.runtime.environment import Environment, Seen
-from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.environment import Environment, ObservedSample
+from hmsa_ros.runtime.runtime import Runtime
 from hmsa_ros.runtime.worker import PlanningThread
 from hmsa_ros.timekeeping import steady_ns, StepWatch
 
@@ -57,7 +57,7 @@ _READ_NS, _AT_ONCE = 10_000_000, 25
 
 
 class PlannerNode(ManagedNode):
-    """Connect `hmsa_ros.runtime.planner.PlannerRuntime` to topics, services and the clock."""
+    """Connect `hmsa_ros.runtime.runtime.Runtime` to topics, services and the clock."""
 
     #: Whether a linked device in the same process serves the runtime.
     linked = False
@@ -88,8 +88,8 @@ class PlannerNode(ManagedNode):
         self.on_change(self._take_parameters)
         self.autostart()
 
-    def _new_runtime(self) -> PlannerRuntime:
-        runtime = PlannerRuntime(
+    def _new_runtime(self) -> Runtime:
+        runtime = Runtime(
             group_from(self._settings), settings_from(self._settings), Environment(
                 self.now, worker=self._worker, one_clock=self._one_clock,
                 observable=self._observable, unheard=self._unheard,
@@ -114,11 +114,11 @@ class PlannerNode(ManagedNode):
         self._channels = {x: JointChannel(
             self, x, names, self._runtime, self._serve_soon, linked=self.linked) for x in names}
         if not self.linked:
-            self._newest = endpoints.listen(self, _NEWEST)
+            self._newest = ros_entities.listen(self, _NEWEST)
         self._plan, self._status, self._estimate = (
-            endpoints.publisher(self, x) for x in (topics.PLAN, topics.STATUS, topics.ESTIMATE))
+            ros_entities.publisher(self, x) for x in (topics.PLAN, topics.STATUS, topics.ESTIMATE))
         self._targets = TargetMarkers(self, self._settings)
-        endpoints.subscribe(self, topics.JOINT_TRAJECTORY, self._on_trajectory, raw=True)
+        ros_entities.subscribe(self, topics.JOINT_TRAJECTORY, self._on_trajectory, raw=True)
         self.offer(topics.STOP, self._on_stop)
         self.offer(topics.RESET_ESTIMATE, lambda: (True, self._runtime.follower.reset()))
         self.offer(topics.SAVE_ESTIMATE, lambda: (
@@ -144,7 +144,7 @@ class PlannerNode(ManagedNode):
         """Return the action server, or None if its messages are not installed."""
         try:
             interfaces = [
-                endpoints.interface_class(x.type) for x in (topics.FOLLOW, topics.FOLLOW.state)]
+                ros_entities.interface_class(x.type) for x in (topics.FOLLOW, topics.FOLLOW.state)]
         except BagError:
             self.get_logger().info(
                 f'no action {topics.FOLLOW.name}: it needs the package control_msgs')
@@ -227,7 +227,7 @@ class PlannerNode(ManagedNode):
         """Return the age of a received message in ns, by the node's clock."""
         return 0 if self._one_clock() else max(time_ns() - taken.received_ns, 0)
 
-    def _glance(self) -> Iterator[tuple[str, Seen]]:
+    def _glance(self) -> Iterator[tuple[str, ObservedSample]]:
         """Yield the newest samples, if any, without decoding all of them."""
         missing = set(self._channels)
         for taken in reversed([] if self._newest is None else self._newest.take()):
@@ -238,7 +238,7 @@ class PlannerNode(ManagedNode):
                     if name in missing:
                         missing.discard(name)
                         ago = self._ago(taken)
-                        yield name, Seen(
+                        yield name, ObservedSample(
                             stamp, *values,
                             None if self._one_clock() else self.now() - ago - stamp,
                             self._runtime.environment.steady() - ago)
@@ -276,7 +276,7 @@ class PlannerNode(ManagedNode):
 
     def _follow_clock(self) -> None:
         if self._ticks is None:
-            self._ticks = endpoints.listen(self, topics.CLOCK_TOPIC)
+            self._ticks = ros_entities.listen(self, topics.CLOCK_TOPIC)
 
     def _on_jump(self, jump: TimeJump) -> None:
         if jump.delta.nanoseconds < 0:
@@ -323,7 +323,7 @@ class PlannerNode(ManagedNode):
         if wanted:
             self._listen_until = monotonic_ns() + _LINGER_NS
         if wanted and self._samples is None:
-            self._samples = endpoints.listen(self, _SAMPLES)
+            self._samples = ros_entities.listen(self, _SAMPLES)
         elif self._samples is not None and monotonic_ns() > self._listen_until:
             self._samples.destroy()
             self._samples = None

@@ -19,9 +19,9 @@ from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa.planning.sequence import SHORT_SPELL
 from hmsa.planning.shapers import SHAPERS
-from hmsa.planning.shapers.pace import LEAST_PERIODS, MOST_PERIODS, Pace
 from hmsa.planning.shapers.request import ERRORS, LARGEST_ERROR, MOST_ORDER
-from hmsa.planning.timeline import Model
+from hmsa.planning.shapers.smooth_limits import LEAST_PERIODS, MOST_PERIODS, SmoothLimits
+from hmsa.planning.timeline import JointModel
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.markers import MARKER_SCALE
 from hmsa_ros.nodes.parameters import JointParameters, JOINTS
@@ -210,7 +210,7 @@ def options_from(values: Mapping[str, Any]) -> Options:
         else _nanoseconds(values['command_period']),
         slew_limit=values['slew_limit'] or math.inf, order=values['robust_order'],
         errors=errors_from(values['minimax_file'], values['minimax_errors']),
-        pace=Pace(values['smooth_periods'], values['stretch_rate_max'] or math.inf))
+        pace=SmoothLimits(values['smooth_periods'], values['stretch_rate_max'] or math.inf))
 
 
 def _nanoseconds(seconds: float) -> int:
@@ -247,7 +247,7 @@ def group_from(values: JointParameters) -> PlannerGroup:
     return PlannerGroup(planners, simultaneous=values['simultaneous_arrival'])
 
 
-def models_from(values: JointParameters, group: PlannerGroup) -> dict[str, Model]:
+def models_from(values: JointParameters, group: PlannerGroup) -> dict[str, JointModel]:
     """Return the checked models that parameters describe, by joint; the planners do not change."""
     return values.each(lambda name, own: group.planners[name].checked_model(
         options_from(own), planned_from(own)))

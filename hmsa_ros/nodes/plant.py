@@ -15,15 +15,21 @@ from hmsa.interfaces import topics
 from hmsa.interfaces.actuator import planned_from
 from hmsa.interfaces.parameters import ParameterSpec
 from hmsa.model.actuators import check_stretch, Setup, unheld
-from hmsa.model.pacer import Pacer
+from hmsa.model.real_time_factor import RealTimeFactor
 from hmsa.model.sampling import too_few_samples
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.nodes import conversions, endpoints
+from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.device_node import COMMON, DeviceJoint, DeviceNode, FALLBACK, fallback_from
 from hmsa_ros.nodes.managed import AUTOSTART
-from hmsa_ros.nodes.markers import MARKER_FRAME, MARKER_RATE, MARKER_SCALE, show_states, State
+from hmsa_ros.nodes.markers import (
+    MARKER_FRAME,
+    MARKER_RATE,
+    MARKER_SCALE,
+    MarkerState,
+    show_states,
+)
 from hmsa_ros.nodes.parameters import declare_joints, JointParameters
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.timekeeping import steady_ns, StepWatch
@@ -65,7 +71,7 @@ class PlantJoint(DeviceJoint):
 
     def __init__(self, node: DeviceNode, number: int) -> None:
         super().__init__(node, number)
-        endpoints.subscribe(node, topics.of_joint(
+        ros_entities.subscribe(node, topics.of_joint(
             topics.DISTURBANCE_FORCE, self.name, node.values.names), self._on_force)
 
     def _on_force(self, message: WrenchStamped) -> None:
@@ -160,7 +166,7 @@ class PlantNode(DeviceNode):
         super().__init__(topics.PLANT)
         self.values = declare_joints(self, PARAMETERS, OWN)
         self.on_change(self._take_parameters)
-        self._pacer = Pacer(0, 1.0)
+        self._pacer = RealTimeFactor(0, 1.0)
         self._clock_seen = 0
         self._steps = StepWatch()
         self.autostart()
@@ -194,7 +200,7 @@ class PlantNode(DeviceNode):
             time=start, command_delay=round(values['command_delay'] * NANOSECONDS),
             measurement_delay=round(values['measurement_delay'] * NANOSECONDS),
             seed=values['seed'])
-        self._pacer = Pacer(start, factor, paused=values['start_paused'])
+        self._pacer = RealTimeFactor(start, factor, paused=values['start_paused'])
         self._clock_published = 0
         self._measured = (start, monotonic_ns())
         self._clocks_warned = False
@@ -202,7 +208,7 @@ class PlantNode(DeviceNode):
         self._fell = 0
 
         self._clock_publisher = (
-            endpoints.publisher(self, topics.CLOCK_TOPIC) if self._authority else None)
+            ros_entities.publisher(self, topics.CLOCK_TOPIC) if self._authority else None)
         self._open(PlantJoint)
         show_states(self, values, factor, self._states)
         self.offer(topics.RESET, self._on_reset)
@@ -290,10 +296,10 @@ class PlantNode(DeviceNode):
 
     # -- other publications --------------------------------------------------------------------
 
-    def _states(self) -> tuple[int, list[State]]:
+    def _states(self) -> tuple[int, list[MarkerState]]:
         """Return time and state of the joints, for viewers."""
         device = self.device
-        return device.time, [State(*x) for x in zip(
+        return device.time, [MarkerState(*x) for x in zip(
             device.stretch.tolist(), device.flux_density.tolist(), strict=True)]
 
     def _publish_clock(self, steady: int) -> None:

@@ -27,16 +27,16 @@ from hmsa.bag.reader import BagReader
 from hmsa.errors import BadInputError, BagError, HmsaError, listed
 from hmsa.interfaces import topics
 from hmsa.interfaces.parameters import duration_from, duration_specs, ParameterSpec
-from hmsa_ros.nodes import endpoints
-from hmsa_ros.nodes.audience import Audience, Followers
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import to_clock, to_status
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare
+from hmsa_ros.nodes.playback_publishers import create_senders, full_name, latched, NAMED_AT_MOST
+from hmsa_ros.nodes.required_subscribers import Audience, Followers
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.selection import Filter
-from hmsa_ros.nodes.senders import create_senders, full_name, latched, NAMED_AT_MOST
+from hmsa_ros.recording.playback_clock import PlaybackClock
 from hmsa_ros.recording.sender import CLOCK_WHILE_WAITING_SECONDS, ClockOut, Excerpt, Sender
-from hmsa_ros.recording.transport import Transport
 
 _POLL_SECONDS = 0.02
 # Reliable messages that found the receiver's queue full are sent again when a heartbeat of Fast
@@ -115,7 +115,7 @@ class Player(ManagedNode):
         super().__init__(topics.PLAYER)
         self._values = declare(self, PARAMETERS)
         self.failure: HmsaError | None = None
-        self._transport = Transport(0, 1.0)
+        self._transport = PlaybackClock(0, 1.0)
         self._transport.stop()
         self._thread: threading.Thread | None = None
         self.on_change(self._take_parameters)
@@ -161,7 +161,7 @@ class Player(ManagedNode):
         self._followers = Followers(self, followers)
         # While inactive, it is paused.
         self._resumes = not values['play.start_paused']
-        self._transport = Transport(
+        self._transport = PlaybackClock(
             self._excerpt.start, self.get_parameter('play.rate').value)
         self._sender = Sender(
             self._reader, {name: x.publish for name, x in self._senders.items()},
@@ -226,7 +226,7 @@ class Player(ManagedNode):
                 f'{self._reader.path} reaches to {latest * 1e-9:.0f} s: expected less than '
                 f'{_LATEST_CLOCK // 10**9} s for /clock')
         # Published first, so that nodes that wait for it can get ready.
-        self._clock_publisher = endpoints.publisher(self, topics.CLOCK_TOPIC)
+        self._clock_publisher = ros_entities.publisher(self, topics.CLOCK_TOPIC)
         self._send_clock(self._excerpt.start)
         return ClockOut(self._send_clock, frequency, on_publish)
 
@@ -241,7 +241,7 @@ class Player(ManagedNode):
 
     # Sending, in the player's thread ---------------------------------------------------------
 
-    def _run(self, transport: Transport) -> None:
+    def _run(self, transport: PlaybackClock) -> None:
         """Play, then end the process."""
         # If the system grants it.
         with contextlib.suppress(OSError):
@@ -265,7 +265,7 @@ class Player(ManagedNode):
             transport.stop()
             self.finished = True
 
-    def _wait_for_audience(self, transport: Transport) -> None:
+    def _wait_for_audience(self, transport: PlaybackClock) -> None:
         """Wait until the required subscribers are present."""
         begin = next_clock = time.monotonic()
         timeout = self._values['play.wait_for_subscribers_timeout']
@@ -284,7 +284,7 @@ class Player(ManagedNode):
                     'or remove it from play.wait_for_subscribers, play.wait_for_nodes and '
                     'play.wait_for_recorder')
 
-    def _wait_for_followers(self, transport: Transport) -> None:
+    def _wait_for_followers(self, transport: PlaybackClock) -> None:
         """Wait while nodes that follow the clock get closer to its present time."""
         limit = duration_from(self._values, 'play.wait_acked_timeout') * 1e-9
         behind, since = self._followers.behind(self._excerpt.end), time.monotonic()
@@ -300,7 +300,7 @@ class Player(ManagedNode):
                     'expected samples until the end of the bag; look at their publisher')
                 break
 
-    def _finish(self, transport: Transport) -> None:
+    def _finish(self, transport: PlaybackClock) -> None:
         """Wait for acknowledgements, and report the number of messages."""
         self._report_problems()
         limit = duration_from(self._values, 'play.wait_acked_timeout')

@@ -7,7 +7,7 @@ from rclpy.qos import LivelinessPolicy, QoSProfile
 
 from hmsa.bag.qos import Qos
 from hmsa.interfaces.topics import Quality
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 
 # Depth of a republished topic whose recorded depth is unknown, as for publishers discovered over
 # DDS.
@@ -31,7 +31,7 @@ def subscription(offered: Iterable[Qos], depth: int) -> QoSProfile:
     profiles = list(offered)
     reliable = all(profile.reliability == 'reliable' for profile in profiles)
     latched = all(profile.durability == 'transient_local' for profile in profiles)
-    return endpoints.profile(Quality(depth, reliable, latched))
+    return ros_entities.profile(Quality(depth, reliable, latched))
 
 
 def publisher(recorded: Sequence[Qos]) -> QoSProfile:
@@ -43,7 +43,7 @@ def publisher(recorded: Sequence[Qos]) -> QoSProfile:
     reliable = not recorded or any(
         profile.reliability in ('reliable', 'system_default') for profile in recorded)
     depth = min(MAX_DEPTH, max((profile.depth for profile in recorded), default=0))
-    profile = endpoints.profile(Quality(
+    profile = ros_entities.profile(Quality(
         depth or (min(MAX_DEPTH, len(recorded)) if latched else PUBLISHER_DEPTH),
         reliable, latched))
     alike = set(recorded)

@@ -2,7 +2,7 @@
 Recorder: writes topics to a bag, and counts and reports lost messages.
 
 The node's own executor serves discovery, services and diagnostics. Messages bypass it: `Capture`
-takes them from their subscriptions in a thread, `Recording` writes them in another.
+takes them from their subscriptions in a thread, `WriterThread` writes them in another.
 
 As a managed node, it opens the bag when it is configured, records while it is active, and closes
 the bag when it is cleaned up.
@@ -29,7 +29,7 @@ from hmsa.bag.writer import BagWriter, parse_custom_data
 from hmsa.errors import BadInputError, BagError
 from hmsa.interfaces import topics
 from hmsa.interfaces.parameters import duration_from, duration_specs, ParameterSpec
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.capture import Capture, decode, SimulatedTime, Taken
 from hmsa_ros.nodes.conversions import from_time, to_status
 from hmsa_ros.nodes.managed import ManagedNode
@@ -39,7 +39,7 @@ from hmsa_ros.nodes.selection import Selection
 from hmsa_ros.nodes.service_call import RemoteParameters
 from hmsa_ros.nodes.subscribing import Subscriptions
 from hmsa_ros.recording.reception import figures, judge, RecordedTopic
-from hmsa_ros.recording.recording import Limits, lost_by_topic, Recording, Status
+from hmsa_ros.recording.writer_thread import lost_by_topic, RecordingLimits, Status, WriterThread
 
 PARAMETERS = (
     ParameterSpec(
@@ -124,7 +124,7 @@ class Recorder(ManagedNode):
         # Number of topics with a publisher at the last look, and of nodes whose parameters are
         # stored.
         self._matched = self._known = 0
-        limits = Limits(
+        limits = RecordingLimits(
             values['storage.flush_period'], values['storage.max_bagfile_size'],
             values['storage.max_bagfile_duration'] * 10**9, values['storage.max_cache_size'],
             round(values['record.snapshot_duration'] * 1e9)
@@ -135,14 +135,14 @@ class Recorder(ManagedNode):
             custom_data={**self._experiment, **parse_custom_data(values['storage.custom_data'])},
             ros_distro=os.environ.get('ROS_DISTRO', 'jazzy'), fsync=values['storage.fsync'])
         self.folder: Path = writer.folder
-        self._recording = Recording(writer, limits, self.complain)
+        self._recording = WriterThread(writer, limits, self.complain)
         self._capture = Capture(self._deliver)
         self._recorded = Subscriptions(
             self, selection, self._recording, self._capture, values['record.queue_depth'],
             limits.cache_size)
         self._closed = False
         if self._sim_time is not None:
-            self._capture.add(self._sim_time, endpoints.listen(self, replace(
+            self._capture.add(self._sim_time, ros_entities.listen(self, replace(
                 topics.CLOCK_TOPIC, qos=topics.Quality(1000, reliable=False))))
         self._capture.start()
         self.offer(topics.PAUSE, lambda: self._set_paused(True))

@@ -22,7 +22,7 @@ from rclpy.task import Future
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError, complain, HmsaError
 from hmsa_ros.nodes.parameters import unread_files
-from hmsa_ros.nodes.visitor import start_ros
+from hmsa_ros.nodes.temporary_node import start_ros
 
 # On this rclpy (7.1), EventsExecutor.spin() without a time limit busy-loops and delivers nothing.
 # Waiting in slices for a future that never completes works as documented.

@@ -8,14 +8,14 @@ from rclpy.qos import QoSProfile
 
 from hmsa.bag.definitions import message_definition, type_hash
 from hmsa.bag.qos import Qos
-from hmsa.bag.writer import Topic
+from hmsa.bag.writer import BagTopic
 from hmsa.errors import BagError
 from hmsa_ros.nodes.capture import Capture, RawSubscription
-from hmsa_ros.nodes.endpoints import interface_class
 from hmsa_ros.nodes.qos import stored, subscription
+from hmsa_ros.nodes.ros_entities import interface_class
 from hmsa_ros.nodes.selection import Selection
 from hmsa_ros.recording.reception import RecordedTopic
-from hmsa_ros.recording.recording import Recording
+from hmsa_ros.recording.writer_thread import WriterThread
 
 # Share of the memory for waiting messages that the queues of the middleware may take: these serve
 # while the recorder gets no processor, its own queue while the disk is slow.
@@ -36,7 +36,7 @@ class Subscriptions:
     """
 
     def __init__(
-            self, node: Node, selection: Selection, recording: Recording, capture: Capture,
+            self, node: Node, selection: Selection, recording: WriterThread, capture: Capture,
             depth: int, cache_size: int) -> None:
         self.topics: dict[str, RecordedTopic] = {}
         self._node = node
@@ -138,7 +138,7 @@ class Subscriptions:
 
     def _describe(
             self, name: str, type_name: str, offered: tuple[Qos, ...],
-            hashes: Iterable[str]) -> Topic:
+            hashes: Iterable[str]) -> BagTopic:
         """Return the description of a topic for the bag."""
         try:
             encoding, definition = message_definition(type_name)
@@ -146,7 +146,7 @@ class Subscriptions:
             self._warn(f'topic {name} is recorded without definition: {error}')
             encoding, definition = '', ''
         known = {text for text in hashes if text.startswith('RIHS01_')}
-        return Topic(
+        return BagTopic(
             name, type_name, definition, encoding, offered,
             known.pop() if len(known) == 1 else '' if known else type_hash(type_name))
 

@@ -9,7 +9,7 @@ from itertools import islice
 import time
 
 from hmsa.bag.reader import BagReader, Message
-from hmsa_ros.recording.transport import PlayingInterruptedError, Transport
+from hmsa_ros.recording.playback_clock import PlaybackClock, PlayingInterruptedError
 
 _POLL_SECONDS = 0.02
 # Number of batches that share the messages and the memory read ahead.
@@ -44,7 +44,7 @@ class ReadAhead:
             self._ahead.append(self._thread.submit(self._batch))
             yield from batch
 
-    def wait(self, transport: Transport) -> None:
+    def wait(self, transport: PlaybackClock) -> None:
         """Wait for the first messages, the end, or an interruption."""
         while not (self._ahead[0].done() or transport.interrupted):
             wait([self._ahead[0]], _POLL_SECONDS)
@@ -91,7 +91,7 @@ class Sender:
 
     def __init__(
             self, reader: BagReader, out: Mapping[str, Callable[[bytes], object]],
-            latched: Mapping[str, int], transport: Transport, excerpt: Excerpt,
+            latched: Mapping[str, int], transport: PlaybackClock, excerpt: Excerpt,
             clock: ClockOut | None = None) -> None:
         self._reader = reader
         self._out = out

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from hmsa.errors import excerpt
 from hmsa.model.status import Code, RefusedError
-from hmsa_ros.runtime.records import Request, Settings, Target, Trajectory
+from hmsa_ros.runtime.records import Request, Settings, StretchRequest, Trajectory
 
 
 def check_ready(now: int, *, active: bool) -> None:
@@ -27,7 +27,7 @@ def check_joints(request: Request, joints: Sequence[str], settings: Settings) ->
     Raises `RefusedError` if a joint is unknown, repeated or missing, or if there are too many
     setpoints.
     """
-    if isinstance(request, Target) and request.joint not in joints:
+    if isinstance(request, StretchRequest) and request.joint not in joints:
         raise RefusedError(
             Code.UNKNOWN_JOINT, f'joint {request.joint!r}: expected one of {", ".join(joints)}')
     if not isinstance(request, Trajectory):

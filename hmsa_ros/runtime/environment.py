@@ -11,7 +11,7 @@ from hmsa_ros.timekeeping import steady_ns
 Clock = Callable[[], int]
 
 
-class Seen(NamedTuple):
+class ObservedSample(NamedTuple):
     """A sample of a joint."""
 
     stamp: int  # in ns
@@ -31,7 +31,7 @@ class Environment:
     carries out commands.
     """
 
-    clock: Clock  #: clock of the timestamps and of `hmsa_ros.runtime.planner.PlannerRuntime.tick`
+    clock: Clock  #: clock of the timestamps and of `hmsa_ros.runtime.runtime.Runtime.tick`
     steady: Clock = steady_ns  #: clock of timeouts and slices
     worker: Worker = field(default_factory=Inline)  #: plans requests
     #: Whether all nodes share one clock, such as simulated time.
@@ -47,4 +47,4 @@ class Environment:
     #: Identifiers of the publishers of applied levels of a joint.
     reporters: Callable[[str], frozenset[bytes]] = lambda joint: frozenset()
     #: New samples by joint, which requests are checked against.
-    glance: Callable[[], Iterable[tuple[str, Seen]]] = tuple
+    glance: Callable[[], Iterable[tuple[str, ObservedSample]]] = tuple

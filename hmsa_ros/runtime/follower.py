@@ -5,17 +5,17 @@ from functools import partial
 from typing import Any
 
 from hmsa.errors import BadInputError
-from hmsa.judge.holds import Hold
-from hmsa.judge.records import Sensor
+from hmsa.judge.records import SensorModel
+from hmsa.judge.setpoint_samples import SetpointSamples
 from hmsa.model.equations import equilibrium_stretch, stretch_limits
 from hmsa.offload import Awaited, Doing, here
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Believed, Planner
-from hmsa.planning.timeline import Model
+from hmsa.planning.timeline import JointModel
 from hmsa.plugins import FOLLOWER, registered
 from hmsa_ros.runtime.environment import Clock
+from hmsa_ros.runtime.planning_task import Drafts, PlanningTask
 from hmsa_ros.runtime.records import Output, Settings, Verdict
-from hmsa_ros.runtime.slices import Drafts, Work
 
 
 class Follower:
@@ -57,7 +57,7 @@ class Follower:
     def applied(self, joint: str, stamp: int, flux_density: float) -> None:
         """Record that a level in T has taken effect, before the plan does."""
 
-    def audit(self, joint: str, hold: Hold) -> None:
+    def audit(self, joint: str, hold: SetpointSamples) -> None:
         """Audit a setpoint of a joint, once all samples that have arrived are processed."""
 
     # -- plans ---------------------------------------------------------------------------------
@@ -73,11 +73,11 @@ class Follower:
         """Return the drafts of a request with more time for moves to be corrected."""
         return drafts
 
-    def due(self, now: int) -> Iterator[Work]:
+    def due(self, now: int) -> Iterator[PlanningTask]:
         """Yield corrections that may help at a time in ns."""
         return iter(())
 
-    def take(self, work: Work, drafts: Drafts, now: int) -> Verdict | None:
+    def take(self, work: PlanningTask, drafts: Drafts, now: int) -> Verdict | None:
         """Adopt a correction made for a time in ns; None if nothing changes."""
         return None
 
@@ -85,9 +85,9 @@ class Follower:
         """Return whether plans for a joint begin from its estimate."""
         return False
 
-    def sensor(self, joint: str) -> Sensor:
+    def sensor(self, joint: str) -> SensorModel:
         """Return the sensor of a joint as estimated; as given where there is no estimate."""
-        return Sensor()
+        return SensorModel()
 
     def do(self, *work: Any) -> Awaited[Any]:
         """Execute work with `doing` if samples are used, else in this process."""
@@ -98,7 +98,8 @@ class Follower:
     def restart(self) -> None:
         """Discard the estimates."""
 
-    def change(self, settings: Settings, models: Mapping[str, Model]) -> Mapping[str, Model]:
+    def change(self, settings: Settings, models: Mapping[str, JointModel]) -> Mapping[
+            str, JointModel]:
         """Adopt new settings and given models; return the models to plan with."""
         self._settings = settings
         return models

@@ -13,14 +13,14 @@ import math
 import numpy as np
 
 from hmsa.errors import excerpt
-from hmsa.judge.holds import AHEAD
 from hmsa.judge.records import Finding, GoalTolerances
+from hmsa.judge.setpoint_samples import AHEAD
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.path import Path
-from hmsa.planning.timeline import Plan
-from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa.planning.timeline import Timeline
 from hmsa_ros.runtime.records import Severity, StatusChanged, Stop, Trajectory, Verdict
+from hmsa_ros.runtime.runtime import Runtime
 
 #: Joint name and its tolerances of stretch and rate (1/s): 0 for the default, -1 for none.
 Tolerance = tuple[str, float, float]
@@ -51,7 +51,7 @@ class ErrorCode(IntEnum):
 
 
 @dataclass(frozen=True)
-class Outcome:
+class GoalResult:
     """Result of a goal: ``succeeded``, ``aborted`` or ``canceled``, and the reason."""
 
     state: str
@@ -69,11 +69,11 @@ class _Goal:
     duration: int = 0  # in ns
     paths: dict[str, Path] = field(default_factory=dict)  # in s from the begin of the goal
 
-    def dropped(self, message: str, code: ErrorCode = ErrorCode.INVALID_GOAL) -> Outcome:
+    def dropped(self, message: str, code: ErrorCode = ErrorCode.INVALID_GOAL) -> GoalResult:
         """Return the result of a goal that is not completed."""
         if self.canceled:
-            return Outcome('canceled', ErrorCode.SUCCESSFUL, message)
-        return Outcome('aborted', code, message)
+            return GoalResult('canceled', ErrorCode.SUCCESSFUL, message)
+        return GoalResult('aborted', code, message)
 
 
 class Goals:
@@ -81,11 +81,11 @@ class Goals:
     The goals of a planner, of which one is carried out.
 
     The caller passes statuses to `update` and samples to `observe`; ``ended`` is called with the
-    name of a goal and its `Outcome`.
+    name of a goal and its `GoalResult`.
     """
 
     def __init__(
-            self, runtime: PlannerRuntime, ended: Callable[[str, Outcome], None]) -> None:
+            self, runtime: Runtime, ended: Callable[[str, GoalResult], None]) -> None:
         self._runtime, self._ended = runtime, ended
         self._goals: dict[str, _Goal] = {}
         self._seen: dict[str, tuple[int, Point]] = {}
@@ -145,7 +145,7 @@ class Goals:
             if outcome is not None:
                 self._end(name, outcome)
 
-    def _fares(self, name: str, goal: _Goal, status: StatusChanged) -> Outcome | None:
+    def _fares(self, name: str, goal: _Goal, status: StatusChanged) -> GoalResult | None:
         verdict, state = status.verdict, status.progress.state
         answered = verdict.request == name and verdict.code is not Code.WAITING
         if answered and (goal.plan is None or goal.canceled):
@@ -154,7 +154,7 @@ class Goals:
             if goal.canceled and verdict.code in (Code.STOPPED, Code.VIBRATING):
                 return goal.dropped(verdict.message)
             if goal.canceled and verdict.code is Code.UNHEARD:
-                return Outcome('aborted', ErrorCode.INVALID_GOAL, verdict.message)
+                return GoalResult('aborted', ErrorCode.INVALID_GOAL, verdict.message)
             if verdict.severity is Severity.ERROR or verdict.code is Code.SUPERSEDED:
                 return goal.dropped(verdict.message, ErrorCode.of(verdict.code))
             if not goal.canceled:
@@ -194,7 +194,7 @@ class Goals:
                 joint: Path.through(times, x, v, None if np.isnan(a[0]) else a)
                 for joint, (x, v, a) in zip(request.joints, rows.transpose(1, 2, 0), strict=True)}
 
-    def _plan(self, goal: _Goal) -> Plan:
+    def _plan(self, goal: _Goal) -> Timeline:
         return self._runtime.group.planners[goal.request.joints[0]].plan
 
     def _after(self, goal: _Goal, time: int) -> int:
@@ -202,7 +202,7 @@ class Goals:
         segments = self._plan(goal).segments
         return time - goal.begin - (segments[-1].since if segments else 0)
 
-    def _end(self, name: str, outcome: Outcome) -> None:
+    def _end(self, name: str, outcome: GoalResult) -> None:
         if self._goals.pop(name, None) is not None:
             self._ended(name, outcome)
 
@@ -229,7 +229,7 @@ class Goals:
                 goal.path[joint], strict=True)
             for what, got, desired, most in errors:
                 if 0 <= after <= goal.duration and most and abs(got - desired) > most:
-                    self._end(name, Outcome(
+                    self._end(name, GoalResult(
                         'aborted', ErrorCode.PATH_TOLERANCE_VIOLATED,
                         f'joint {joint} has {what} {got:.6g} at {after / NANOSECONDS:.3f} s: '
                         f'expected {desired:.6g} within {most:.3g}'))
@@ -279,19 +279,19 @@ def _tolerances(
     return found
 
 
-def _measured(request: Trajectory, status: StatusChanged) -> Outcome:
+def _measured(request: Trajectory, status: StatusChanged) -> GoalResult:
     """Return the result of a goal whose motion is over, according to the samples."""
     worst, code = status.worst, ErrorCode.GOAL_TOLERANCE_VIOLATED
     if worst is None or worst.verdict is Code.UNOBSERVED:
         known = '' if worst is None else worst.message
         why = '; '.join(filter(None, (known, status.unheard))) or 'nothing was measured'
-        return Outcome(
+        return GoalResult(
             'aborted', code, f'{why}: expected samples on joint_states that show the arrival')
     # Another request for the same stretch may have been judged with other tolerances.
     for finding in (worst, *(status.findings.get(x, worst) for x in request.joints)):
         if failure := _failure(request, finding):
-            return Outcome('aborted', code, failure)
-    return Outcome('succeeded', ErrorCode.SUCCESSFUL, worst.message)
+            return GoalResult('aborted', code, failure)
+    return GoalResult('succeeded', ErrorCode.SUCCESSFUL, worst.message)
 
 
 def _failure(request: Trajectory, finding: Finding) -> str:

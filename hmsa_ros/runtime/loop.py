@@ -1,7 +1,7 @@
 """
 Run the controller and a device in one loop, in simulated time, as fast as possible.
 
-The controller is `hmsa_ros.runtime.planner.PlannerRuntime`, as in the nodes. The loop passes it
+The controller is `hmsa_ros.runtime.runtime.Runtime`, as in the nodes. The loop passes it
 the time, the applied levels and the samples.
 """
 
@@ -12,14 +12,14 @@ from hmsa.model.equations import Array
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup
 from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.planner import PlannerRuntime
 from hmsa_ros.runtime.records import Output, Send, Settings
+from hmsa_ros.runtime.runtime import Runtime
 
 # Time to wait, in ns, while the controller waits for something.
 _PATIENCE = NANOSECONDS // 1000
 
 
-class SimulatedDevice(Protocol):
+class LoopDevice(Protocol):
     """A device that carries out commands; times in ns, fields in T, joints by number."""
 
     @property
@@ -59,10 +59,10 @@ class Loop:
     """
 
     def __init__(
-            self, group: PlannerGroup, settings: Settings, device: SimulatedDevice) -> None:
+            self, group: PlannerGroup, settings: Settings, device: LoopDevice) -> None:
         self.now = device.time  #: in ns
         self.device = device
-        self.runtime = PlannerRuntime(
+        self.runtime = Runtime(
             group, settings, Environment(
                 clock=lambda: self.now, steady=lambda: self.now, one_clock=lambda: True))
         self.runtime.active = True

@@ -94,7 +94,7 @@ class Trajectory:
 
 
 @dataclass(frozen=True)
-class Target:
+class StretchRequest:
     """A request to go to a stretch now and to hold it."""
 
     joint: str
@@ -114,7 +114,7 @@ class Stop:
     name: str = ''
 
 
-Request = Trajectory | Target | Stop
+Request = Trajectory | StretchRequest | Stop
 
 
 # -- out ----------------------------------------------------------------------------------------

@@ -8,8 +8,9 @@ from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup, Progress
 from hmsa.planning.timeline import PlannedSegment
+from hmsa_ros.runtime.arrival_monitor import ArrivalMonitor
+from hmsa_ros.runtime.deviations import Deviations
 from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.following import Following
 from hmsa_ros.runtime.records import (
     Output,
     PlanChanged,
@@ -19,7 +20,6 @@ from hmsa_ros.runtime.records import (
     Trajectory,
     Verdict,
 )
-from hmsa_ros.runtime.watching import Watch
 
 # Changes of level in one preview, and the delay in ns until a preview shows a correction: a
 # preview takes time to make, and corrections of several joints arrive together.
@@ -35,7 +35,7 @@ class Reporting:
     """Verdicts, progress, previews and notes that wait to be published."""
 
     def __init__(
-            self, group: PlannerGroup, following: Following, watch: Watch,
+            self, group: PlannerGroup, following: Deviations, watch: ArrivalMonitor,
             environment: Environment, outputs: list[Output], note: Callable[[str], None],
             *looks: Callable[[], str]) -> None:
         """Begin without a verdict; ``looks`` return the values of `unheard` and `unseen`."""

@@ -7,10 +7,10 @@ from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.timeline import ALWAYS
-from hmsa_ros.runtime.devices import Devices
+from hmsa_ros.runtime.arrival_monitor import ArrivalMonitor
+from hmsa_ros.runtime.command_link import CommandLink
 from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.records import Severity, Verdict
-from hmsa_ros.runtime.watching import Watch
 
 # Time in ns by the steady clock, after the planned rest, until a stop counts as not acknowledged:
 # receipts arrive five times a second, and a busy machine delays them.
@@ -35,8 +35,9 @@ class Stops:
     """
 
     def __init__(
-            self, group: PlannerGroup, devices: Devices, newest: Mapping[str, tuple[int, float]],
-            watch: Watch, environment: Environment, unheard: Callable[[], str],
+            self, group: PlannerGroup, devices: CommandLink,
+            newest: Mapping[str, tuple[int, float]],
+            watch: ArrivalMonitor, environment: Environment, unheard: Callable[[], str],
             tolerances: Callable[[], Tolerances]) -> None:
         """
         Begin without a stop.

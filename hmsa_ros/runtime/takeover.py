@@ -7,7 +7,7 @@ from hmsa.errors import BadInputError, HmsaError
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Planner
-from hmsa_ros.runtime.environment import Environment, Seen
+from hmsa_ros.runtime.environment import Environment, ObservedSample
 from hmsa_ros.runtime.receipts import Receipts
 from hmsa_ros.runtime.records import Settings
 
@@ -47,7 +47,7 @@ class Takeover:
         # Whether the positions of the joints are known, or assumed at rest.
         self.engaged = False
         # The newest sample of each joint.
-        self._samples: dict[str, Seen] = {}
+        self._samples: dict[str, ObservedSample] = {}
         # Joints to check before they are planned for, and those that may not be where predicted.
         self._unsure: set[str] = set()
         self._doubted: set[str] = set()
@@ -67,7 +67,7 @@ class Takeover:
         else:
             self.engaged = True
 
-    def observe(self, joint: str, seen: Seen) -> None:
+    def observe(self, joint: str, seen: ObservedSample) -> None:
         """Record a sample; ignore unknown joints, NaN values and samples out of order."""
         if joint not in self._planners or not math.isfinite(
                 seen.stretch + seen.rate + seen.flux_density):
@@ -127,7 +127,7 @@ class Takeover:
                     f'no sample of joint {name} on joint_states: it is assumed at rest where '
                     'it began (initial_stretch)')
 
-    def _take(self, name: str, seen: Seen, *, keep: bool = False) -> bool:
+    def _take(self, name: str, seen: ObservedSample, *, keep: bool = False) -> bool:
         """Start a joint from a sample; return whether it can. ``keep`` retains its setpoints."""
         level = self._newest.get(name)
         try:
@@ -141,7 +141,7 @@ class Takeover:
 
     # -- clocks --------------------------------------------------------------------------------
 
-    def _check_age(self, name: str, seen: Seen, settings: Settings) -> None:
+    def _check_age(self, name: str, seen: ObservedSample, settings: Settings) -> None:
         """Refuse a sample that is older or newer than possible by the planner's clock."""
         if seen.lag is None and abs(self._around.clock() - seen.stamp) <= _ANOTHER_CLOCK:
             return
@@ -161,7 +161,7 @@ class Takeover:
                'The clocks differ, or samples are that late: set the clocks of planner, plant and '
                'sensor by one source, or see what delays samples'))
 
-    def _check_ahead(self, name: str, seen: Seen) -> None:
+    def _check_ahead(self, name: str, seen: ObservedSample) -> None:
         """Refuse to command a device whose clock is so far ahead that all commands are late."""
         lead = self._planners[name].options.lead_time
         if seen.lag is None or -seen.lag <= lead:
@@ -211,19 +211,20 @@ class Takeover:
         self._settle()
         return True
 
-    def _is_current(self, seen: Seen, settings: Settings) -> bool:
+    def _is_current(self, seen: ObservedSample, settings: Settings) -> bool:
         """Return whether a sample is recent by the steady clock, or by a shared one, if paused."""
         return self._around.steady() - seen.came <= _RECENT or self._around.one_clock() and (
             abs(self._around.clock() - seen.stamp) <= settings.takeover_max_age)
 
-    def _is_outdated(self, name: str, seen: Seen) -> bool:
+    def _is_outdated(self, name: str, seen: ObservedSample) -> bool:
         """Return whether the level of a joint has changed since a sample that can be."""
         planner, level = self._planners[name], self._newest.get(name)
         return planner.follows(seen.flux_density) and seen.stamp < max(
             planner.changed(self._around.clock()), 0 if level is None else level[0])
 
     def _is_over(
-            self, name: str, seen: Seen, settings: Settings, *, outdated: bool = False) -> bool:
+            self, name: str, seen: ObservedSample, settings: Settings, *,
+            outdated: bool = False) -> bool:
         """Wait for a new sample; return True after a vain wait, or refuse to continue without."""
         steady = self._around.steady()
         if self._look_until is None:
@@ -247,7 +248,7 @@ class Takeover:
         self._unsure.clear()
         self._doubted &= {keep}
 
-    def _compare(self, name: str, seen: Seen, settings: Settings, *, keep: bool) -> None:
+    def _compare(self, name: str, seen: ObservedSample, settings: Settings, *, keep: bool) -> None:
         """Continue from a sample if it contradicts the prediction for its time."""
         self._check_age(name, seen, settings)
         self._check_ahead(name, seen)
@@ -268,7 +269,7 @@ class Takeover:
             # The model of the plan cannot be followed, and may have been set by mistake.
             return math.nan
 
-    def _contradicts(self, name: str, seen: Seen) -> bool:
+    def _contradicts(self, name: str, seen: ObservedSample) -> bool:
         """Return whether a sample contradicts the plan that was in force at its time."""
         predicted = self._predicted(name, seen.stamp)
         return not abs(seen.stretch - predicted) <= _tolerance(

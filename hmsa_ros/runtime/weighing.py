@@ -17,7 +17,7 @@ from hmsa.errors import HmsaError
 from hmsa.model.moves import Level
 from hmsa.model.simulation import sampled
 from hmsa.model.units import NANOSECONDS
-from hmsa.planning.timeline import Draft, Plan, PlannedLevel
+from hmsa.planning.timeline import Draft, PlannedLevel, Timeline
 from hmsa_ros.runtime.lateness import Lateness
 
 #: Smaller steps are replaced by this one.
@@ -46,12 +46,12 @@ class Aim:
     end: int | None  #: begin of the next setpoint; None if there is none
 
 
-def step_of(plan: Plan, place: int) -> float:
+def step_of(plan: Timeline, place: int) -> float:
     """Return the step of a setpoint by its place in a plan, at least `LEAST_STEP`."""
     return LEAST_STEP if place < 0 else max(plan.step(place), LEAST_STEP)
 
 
-def aims(plan: Plan, now: int) -> list[Aim]:
+def aims(plan: Timeline, now: int) -> list[Aim]:
     """Return the setpoint that is under way at a time in ns, and the next ones."""
     found: list[Aim] = []
     unit = plan.levels[-1].model.units.time * NANOSECONDS
@@ -125,7 +125,7 @@ def _looks(
 
 
 def compared(
-        plan: Plan, start: PlannedLevel, levels: Sequence[PlannedLevel], draft: Draft,
+        plan: Timeline, start: PlannedLevel, levels: Sequence[PlannedLevel], draft: Draft,
         lateness: Lateness) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the predicted errors of a plan from a start on, and of a draft in its place."""
     first = max(plan.under_way(draft.begin), 0)
@@ -145,7 +145,7 @@ def compared(
         expected(start, replanned, wanted, lateness) + 2.0 * out)
 
 
-def worthwhile(
+def better_than_keeping(
         before: NDArray[np.float64], after: NDArray[np.float64], *, news: bool,
         unsure: bool) -> bool:
     """

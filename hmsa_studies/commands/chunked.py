@@ -13,7 +13,7 @@ from hmsa.errors import BadInputError
 
 if TYPE_CHECKING:
     from hmsa_studies.chunks import Chunks, Study
-    from hmsa_studies.engine import Outcome
+    from hmsa_studies.engine import ChunkCounts
     from hmsa_studies.executors import Start
 
 
@@ -57,7 +57,7 @@ def shard_of(arguments: argparse.Namespace) -> tuple[int, int]:
 
 def compute_chunks(
         study: 'Study', folder: Path, arguments: argparse.Namespace, start: 'Start', words: str,
-        finish: 'Callable[[Chunks, Outcome], int]') -> int:
+        finish: 'Callable[[Chunks, ChunkCounts], int]') -> int:
     """Compute the requested chunks of a study, and `finish` it if all chunks exist."""
     from hmsa.files import require_arrow
     from hmsa_studies.chunks import Chunks

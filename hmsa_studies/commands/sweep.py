@@ -27,7 +27,7 @@ from hmsa_studies.commands import chunked
 if TYPE_CHECKING:
     from hmsa.model.equations import Array
     from hmsa_studies.chunks import Chunks
-    from hmsa_studies.engine import Outcome
+    from hmsa_studies.engine import ChunkCounts
     from hmsa_studies.sweep import Sweep
     from hmsa_studies.views import View
 
@@ -276,7 +276,7 @@ def _plan_in_chunks(
     start, known = chunked.engine(arguments, 1 if small else cores())
     _estimate(sweep, folder, known, chunked.shard_of(arguments))
 
-    def finish(chunks: 'Chunks', outcome: 'Outcome') -> int:
+    def finish(chunks: 'Chunks', outcome: 'ChunkCounts') -> int:
         _report(sweep.size, chunks.merge(table, picture.add))
         pictures = picture.draw(changed=outcome.computed > 0)
         if table.parent.resolve() != chunks.folder and arguments.shard is None:

@@ -8,7 +8,7 @@ FLOW_CONSTANTS = 2
 
 
 @dataclass(frozen=True)
-class Constant:
+class FlowConstant:
     """One constant of a flow rule, with one value per branch."""
 
     name: str  #: of the parameter, after ``viscoelastic.``
@@ -25,7 +25,7 @@ class Flow:
     kind: int
     rate: str  #: formula in that stress x, in units of G, and the relaxation time tau
     source: str  #: publication
-    constants: tuple[Constant, ...] = ()
+    constants: tuple[FlowConstant, ...] = ()
     #: Maps the constants to the relaxation rate at a stress of the shear modulus, relative to
     #: that given by the relaxation time.
     hastens: Callable[..., float] = lambda: 1.0

@@ -8,7 +8,7 @@ import math
 
 from hmsa.model.moves import Limits, Move
 from hmsa.model.status import Code, RefusedError
-from hmsa.planning.shapers.request import Request, Shaper, Work
+from hmsa.planning.shapers.request import MoveRequest, Shaper, StepBudget
 
 # Codes of refusals that may be due to a limit.
 _SEARCHED = (Code.FLUX_LIMIT, Code.SLEW_LIMIT, Code.NO_TWO_STEP, Code.NOT_CONVERGED)
@@ -32,11 +32,11 @@ def advised(
     asked = sooner or shaper
 
     @wraps(shaper)
-    def shape(request: Request) -> Move:
+    def shape(request: MoveRequest) -> Move:
         try:
             return shaper(request)
         except RefusedError as error:
-            there = replace(request, work=Work(_ADVISING, advising=True))
+            there = replace(request, work=StepBudget(_ADVISING, advising=True))
             ways = _ways(asked, there) if error.code in _SEARCHED else []
             what, _, advice = str(error).partition(': expected ')
             if not ways or (advice and ways == [('flux',)] and error.code is Code.FLUX_LIMIT):
@@ -48,7 +48,7 @@ def advised(
     return shape
 
 
-def _ways(shaper: Shaper, request: Request) -> list[tuple[str, ...]]:
+def _ways(shaper: Shaper, request: MoveRequest) -> list[tuple[str, ...]]:
     """Return the smallest sets of limits whose removal makes a command possible."""
     delivery, limits = request.delivery, request.limits
     there = [name for name, limited in (
@@ -63,7 +63,8 @@ def _ways(shaper: Shaper, request: Request) -> list[tuple[str, ...]]:
 
 
 def _advice(
-        shaper: Shaper, request: Request, names: Sequence[str], factors: Sequence[float]) -> str:
+        shaper: Shaper, request: MoveRequest, names: Sequence[str],
+        factors: Sequence[float]) -> str:
     """Return relaxed values of some limits for which a command exists, as text."""
     factor = next(x for x in factors if x == math.inf or _succeeds(
         shaper, eased(request, names, x)))
@@ -80,7 +81,7 @@ def _advice(
     return ' and '.join(words[x] for x in names)
 
 
-def eased(request: Request, names: Sequence[str], factor: float) -> Request:
+def eased(request: MoveRequest, names: Sequence[str], factor: float) -> MoveRequest:
     """Return a request with limits (flux, slew, period, lag) relaxed by a factor, or removed."""
     delivery, limits = request.delivery, request.limits
     if 'flux' in names:
@@ -94,7 +95,7 @@ def eased(request: Request, names: Sequence[str], factor: float) -> Request:
         lag=delivery.lag / (factor if 'lag' in names else 1.0)))
 
 
-def _succeeds(shaper: Shaper, request: Request) -> bool:
+def _succeeds(shaper: Shaper, request: MoveRequest) -> bool:
     try:
         shaper(request)
     except RefusedError:

@@ -25,7 +25,7 @@ from hmsa.model.simulation import (
     with_followed,
 )
 from hmsa.model.status import Code, RefusedError
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 
 # Minimum move, and safety factor on the computed vibration of a tail.
 _LEAST_MOVE, _SURE = 1e-3, 1.25
@@ -50,7 +50,7 @@ def carried(
     return found if np.all(np.isfinite(found)) else ()
 
 
-def arrival(request: Request, found: Move) -> State:
+def arrival(request: MoveRequest, found: Move) -> State:
     """Return the state that a move reaches, at rest at the target."""
     end = request.start
     if found.duration > 0.0:
@@ -62,7 +62,7 @@ def arrival(request: Request, found: Move) -> State:
         request.target, 0.0, end.load, end.amplifier, followed_by(end, request.material))
 
 
-def held(request: Request, found: Move, span: float) -> Move:
+def held(request: MoveRequest, found: Move, span: float) -> Move:
     """
     Return a move with the tail of levels that keeps it at rest while branches relax.
 
@@ -109,7 +109,7 @@ def held(request: Request, found: Move, span: float) -> Move:
 
 
 def _passed(
-        request: Request, levels: Sequence[Level], times: Array) -> tuple[State, ...]:
+        request: MoveRequest, levels: Sequence[Level], times: Array) -> tuple[State, ...]:
     """Return the states at the start of levels during which the block is not at rest."""
     delivery = request.delivery
     rows, _ = ramps(levels, request.load, float(times[-1]), delivery.slew)
@@ -125,7 +125,7 @@ def _passed(
 
 
 def _ramped(
-        request: Request, times: Array, changes: Array, found: Move) -> tuple[Array, float]:
+        request: MoveRequest, times: Array, changes: Array, found: Move) -> tuple[Array, float]:
     """Return how much earlier to command ramped levels, and the vibration that ramps add."""
     delivery, packed = request.delivery, request.material.packed
     ramps: Array = np.abs(changes) / delivery.slew
@@ -145,7 +145,7 @@ def _ramped(
     return late, float(more / inertia)
 
 
-def _first(request: Request, found: Move, change: float) -> tuple[float, float]:
+def _first(request: MoveRequest, found: Move, change: float) -> tuple[float, float]:
     """Return how much earlier to change the level at arrival, and the uncompensated ramp time."""
     slew, ramp = request.delivery.slew, abs(change) / request.delivery.slew
     levels = found.until(found.duration).levels

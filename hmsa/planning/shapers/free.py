@@ -17,7 +17,7 @@ from hmsa.model import law
 from hmsa.model.moves import Level, Move
 from hmsa.model.simulation import followed_by
 from hmsa.model.status import Code, RefusedError
-from hmsa.planning.shapers.request import AT_REST, Request
+from hmsa.planning.shapers.request import AT_REST, MoveRequest
 from hmsa.planning.shooting import (
     Attempt,
     first_kept,
@@ -34,7 +34,7 @@ _SWINGS = (0.3, 0.1, 0.7, 0.03, 1.2)
 _NUMBERS = {2: 'two', 3: 'three'}
 
 
-def at_rest(request: Request) -> bool:
+def at_rest(request: MoveRequest) -> bool:
     """Return whether stretch, rate and (if it lags) field are those of the target."""
     state, packed = request.state, request.material.packed
     if abs(state.stretch - request.target) > AT_REST or not request.still:
@@ -45,7 +45,7 @@ def at_rest(request: Request) -> bool:
         request.load - holding) * (not math.isinf(delivery.slew))) <= AT_REST * stiffness
 
 
-def free_heights(request: Request) -> Attempt:
+def free_heights(request: MoveRequest) -> Attempt:
     """Return the shortest levels of free heights that keep the limits, else None."""
     delivery = request.delivery
     if delivery.period > 0.0 or delivery.lag > 0.0 or math.isinf(delivery.slew):
@@ -54,7 +54,7 @@ def free_heights(request: Request) -> Attempt:
     return on_time(found, request)
 
 
-def free_levels(request: Request) -> Move:
+def free_levels(request: MoveRequest) -> Move:
     """Come to rest with levels of free heights; raise `RefusedError` if none keep the limits."""
     found = free_heights(request)
     if found is None:
@@ -62,7 +62,7 @@ def free_levels(request: Request) -> Move:
     return Move(Code.MINIMUM_TIME, *found, no_single(request))
 
 
-def through(request: Request, duration: float) -> Move:
+def through(request: MoveRequest, duration: float) -> Move:
     """
     Come to rest after a given time with levels of equal duration.
 
@@ -82,7 +82,7 @@ def through(request: Request, duration: float) -> Move:
     return Move(Code.MINIMUM_TIME, *found)
 
 
-def no_single(request: Request) -> str:
+def no_single(request: MoveRequest) -> str:
     """Return the reason why levels of free heights are used."""
     settled = ' and a push that settles the field' if request.delivery.lag > 0.0 else ''
     return (f'no single intermediate flux density{settled} within the limits leads as soon from '
@@ -90,7 +90,7 @@ def no_single(request: Request) -> str:
             f'{_NUMBERS[request.unknowns]} are used')
 
 
-def _equal(request: Request) -> Iterator[Template]:
+def _equal(request: MoveRequest) -> Iterator[Template]:
     """Yield guesses of levels with equal durations."""
     delivery, holding, count = request.delivery, request.holding_load(), request.unknowns
     half, before = math.pi / request.frequency, 0.0
@@ -106,7 +106,7 @@ def _equal(request: Request) -> Iterator[Template]:
                 *(Level((1 + i) * each, holding) for i in range(count))])
 
 
-def _swings(request: Request) -> Iterator[tuple[float, Template]]:
+def _swings(request: MoveRequest) -> Iterator[tuple[float, Template]]:
     """Yield guesses of two levels that ramps just reach, with their durations."""
     slew, start, holding = request.delivery.slew, request.load, request.holding_load()
     longest = 0.5 * math.pi / request.frequency
@@ -122,7 +122,7 @@ def _swings(request: Request) -> Iterator[tuple[float, Template]]:
                 np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]))
 
 
-def _refusal(request: Request) -> tuple[Code, str]:
+def _refusal(request: MoveRequest) -> tuple[Code, str]:
     units, delivery, limits = request.units, request.delivery, request.limits
     slow, ramps = delivery.slew < math.inf, f'ramps of {units.slew_text(delivery.slew)}'
     if delivery.lag > 0.0:

@@ -18,7 +18,7 @@ from hmsa.model.moves import Level, Move
 from hmsa.model.status import Code
 from hmsa.planning.shapers.creeping import arrival
 from hmsa.planning.shapers.modes import oscillation
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 
 #: Impulses (time, weight) for a root -decay + i frequency of the motion, by time.
 Impulses = Callable[[complex], list[tuple[float, float]]]
@@ -28,22 +28,22 @@ _EI_TOLERANCE = 0.05
 _PASSES = 6
 
 
-def step(request: Request) -> Move:
+def step(request: MoveRequest) -> Move:
     """Apply the holding level at once, the paper's unshaped input; the motion rings down."""
     return request.plain(Code.STEP, '')
 
 
-def zv(request: Request) -> Move:
+def zv(request: MoveRequest) -> Move:
     """Two impulses, half a damped period apart."""
     return shaped(request, _spaced(1.0, 1.0))
 
 
-def zvd(request: Request) -> Move:
+def zvd(request: MoveRequest) -> Move:
     """Three impulses, a ZV shaper convolved with itself."""
     return shaped(request, _spaced(1.0, 2.0, 1.0))
 
 
-def ei(request: Request) -> Move:
+def ei(request: MoveRequest) -> Move:
     """
     Three impulses, insensitive at the cost of 5 % vibration at the design point.
 
@@ -65,7 +65,7 @@ def _spaced(*weights: float) -> Impulses:
     return impulses
 
 
-def shaped(request: Request, impulses: Impulses) -> Move:
+def shaped(request: MoveRequest, impulses: Impulses) -> Move:
     """Shape the step with impulses for the motion linearised about the target."""
     holding = request.holding_load()
     material, target = request.material, request.target

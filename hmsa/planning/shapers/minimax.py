@@ -29,7 +29,7 @@ from hmsa.model.simulation import flow_rates, followed_by, with_followed
 from hmsa.model.status import Code
 from hmsa.planning.shapers.creeping import arrival
 from hmsa.planning.shapers.modes import oscillation
-from hmsa.planning.shapers.request import as_errors, AT_REST, LARGEST_ERROR, Request
+from hmsa.planning.shapers.request import as_errors, AT_REST, LARGEST_ERROR, MoveRequest
 from hmsa.planning.shapers.robust import robust
 
 #: Minimum number of levels besides the holding level, with steps and with ramps, and number of
@@ -68,7 +68,7 @@ _AT_REST = 1e-5
 _KEPT = 256
 
 
-def minimax(request: Request) -> Move:
+def minimax(request: MoveRequest) -> Move:
     """
     Command a move with minimum worst-case vibration for errors within ``request.errors``.
 
@@ -94,7 +94,7 @@ def minimax(request: Request) -> Move:
 
 
 @lru_cache(maxsize=_KEPT)
-def _kept(request: Request) -> Move:
+def _kept(request: MoveRequest) -> Move:
     return _designed(request)
 
 
@@ -115,7 +115,7 @@ class _Case:
     tail: Array  #: (2, n), vibration due to the tail of levels for the branches of the model
 
 
-def _cases(request: Request, holding: float) -> list[_Case]:
+def _cases(request: MoveRequest, holding: float) -> list[_Case]:
     """Return the nominal actuator, and others in and on the box or ellipsoid of errors."""
     errors = request.errors
     offs: list[tuple[float, ...]] = [(0.0, 0.0, 0.0, 0.0)]
@@ -131,7 +131,7 @@ def _cases(request: Request, holding: float) -> list[_Case]:
     return [x for x in found if x is not None]
 
 
-def _case(request: Request, holding: float, errors: Errors) -> _Case | None:
+def _case(request: MoveRequest, holding: float, errors: Errors) -> _Case | None:
     """Return an actuator with errors, None if it does not oscillate about its equilibrium."""
     state, nominal = request.state, request.material.packed
     stiffer, faster = errors.stiffer, errors.faster
@@ -158,7 +158,7 @@ def _case(request: Request, holding: float, errors: Errors) -> _Case | None:
 
 
 def left(
-        request: Request, cases: Sequence[_Case], levels: Sequence[Level],
+        request: MoveRequest, cases: Sequence[_Case], levels: Sequence[Level],
         arrival: float) -> Array:
     """Return the vibration after a command, (n, 2); infinite if the integration fails."""
     delivery = request.delivery
@@ -192,7 +192,7 @@ def largest(vibration: Array) -> float:
     return math.sqrt((vibration * vibration).sum(axis=1).max())
 
 
-def _designed(request: Request) -> Move:
+def _designed(request: MoveRequest) -> Move:
     chain = robust(request)
     if chain.code not in (Code.ROBUST, Code.TWO_STEP):
         return chain
@@ -224,7 +224,7 @@ class _Frame:
     room: Array  #: maximum change from each level to the next, by ramps
 
 
-def _frame(request: Request, chain: Move, length: float) -> _Frame | None:
+def _frame(request: MoveRequest, chain: Move, length: float) -> _Frame | None:
     """Return the frame of a command as long as the chain, with a push of given lags, or None."""
     delivery, limits, holding = request.delivery, request.limits, chain.levels[-1].load
     bounds = [request.field, *(x.load for x in chain.levels)]
@@ -267,7 +267,7 @@ def _frame(request: Request, chain: Move, length: float) -> _Frame | None:
 
 
 def _search(
-        request: Request, cases: Sequence[_Case], chain: Move,
+        request: MoveRequest, cases: Sequence[_Case], chain: Move,
         frame: _Frame) -> tuple[tuple[Level, ...], float]:
     """Return levels, and the largest vibration over all cases."""
     low, high = frame.low, frame.high
@@ -328,7 +328,7 @@ def _search(
     return command or _command(request, chain, frame, loads), largest(now)
 
 
-def _reached(request: Request, frame: _Frame, loads: Array) -> Array:
+def _reached(request: MoveRequest, frame: _Frame, loads: Array) -> Array:
     """Return the loads within the bounds that ramps can reach."""
     loads = np.clip(loads, frame.low, frame.high)
     if math.isinf(request.delivery.slew):
@@ -341,7 +341,7 @@ def _reached(request: Request, frame: _Frame, loads: Array) -> Array:
 
 
 def _command(
-        request: Request, chain: Move, frame: _Frame, loads: Array,
+        request: MoveRequest, chain: Move, frame: _Frame, loads: Array,
         like: Sequence[Level] = ()) -> tuple[Level, ...]:
     """
     Return levels, the push that settles a lagging field (if there is one), and the last level.
@@ -366,7 +366,7 @@ def _command(
     return found
 
 
-def _balance(request: Request, chain: Move, levels: Sequence[Level]) -> tuple[float, float]:
+def _balance(request: MoveRequest, chain: Move, levels: Sequence[Level]) -> tuple[float, float]:
     """Return field and amplifier output at arrival, from which they follow the branches."""
     material = request.material
     followed = arrival(request, replace(chain, levels=tuple(levels))).followed
@@ -377,7 +377,7 @@ def _balance(request: Request, chain: Move, levels: Sequence[Level]) -> tuple[fl
 
 
 def _settled(
-        request: Request, chain: Move, frame: _Frame, levels: Sequence[Level], wanted: float,
+        request: MoveRequest, chain: Move, frame: _Frame, levels: Sequence[Level], wanted: float,
         load: float) -> tuple[Level, ...]:
     """Return levels, the push after which the field has its final value, and the last level."""
     delivery = request.delivery
@@ -406,7 +406,7 @@ def _settled(
     return (*levels, Level(frame.times[-1], push), last) if kept and abs(now) < _NOTHING else ()
 
 
-def _starts(request: Request, chain: Move, frame: _Frame) -> list[Array]:
+def _starts(request: MoveRequest, chain: Move, frame: _Frame) -> list[Array]:
     """Return the mean levels of a chain between times, and the loads that its ramps reach."""
     times, ends = frame.times, [*(x.time for x in chain.levels[1:]), math.inf]
     found: list[Array] = [np.array([

@@ -7,14 +7,14 @@ from hmsa.model.moves import Move
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.shapers.free import free_levels
 from hmsa.planning.shapers.push_brake import push_brake
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.shapers.two_step import two_step
 
 # Work limit of the search for full push and full brake.
 _PUSHING = 400_000
 
 
-def minimum_time(request: Request) -> Move:
+def minimum_time(request: MoveRequest) -> Move:
     """
     Push with the load limit on one side, brake with the other, then hold.
 

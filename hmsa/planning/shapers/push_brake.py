@@ -13,16 +13,16 @@ from hmsa.model.moves import Level, Move, State
 from hmsa.model.simulation import paces, sampled
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.shapers.free import at_rest, free_levels
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.shooting import (
-    approach,
     Attempt,
+    continuation,
     first_kept,
     heights,
-    kept,
     on_time,
     solve,
     Template,
+    within_limits,
 )
 
 _RTOL = 1e-12
@@ -40,7 +40,7 @@ _STRIDE, _MOST_STEPS = 0.05, 8_000
 _SHORTEST_STRIDE = 0.03
 
 
-def push_brake(request: Request) -> Move:
+def push_brake(request: MoveRequest) -> Move:
     """
     Push with the load limit on one side, brake with the other, then hold.
 
@@ -71,7 +71,7 @@ def push_brake(request: Request) -> Move:
         f'rest at {request.target:g}')
 
 
-def _attempt(request: Request, low: float, high: float) -> Attempt:
+def _attempt(request: MoveRequest, low: float, high: float) -> Attempt:
     """Push and brake with given loads; None if this yields no command within the limits."""
     push, brake = (high, low) if _upwards(request, low, high) else (low, high)
     elastic = replace(request, material=request.material.elastic)
@@ -94,10 +94,10 @@ def _attempt(request: Request, low: float, high: float) -> Attempt:
         replace(delivery, lag=0.0))
     if found is not None and (request.material.creep or delivery.lag > 0.0):
         found = _carried(request, found[0])
-    return kept(on_time(found, request), request)
+    return within_limits(on_time(found, request), request)
 
 
-def _carried(request: Request, plain: tuple[Level, ...]) -> Attempt:
+def _carried(request: MoveRequest, plain: tuple[Level, ...]) -> Attempt:
     """
     Solve for the times of push, brake and, with a lag, second push.
 
@@ -128,13 +128,13 @@ def _carried(request: Request, plain: tuple[Level, ...]) -> Attempt:
             replace(delivery, lag=lag))
         return found if found is None or aim == 1.0 else (found[0][:len(guess)], found[1])
 
-    found = approach(plain, closer, _SHORTEST_STRIDE)
+    found = continuation(plain, closer, _SHORTEST_STRIDE)
     ordered = found and all(x.time < y.time for x, y in pairwise(found[0]))
     return found if ordered else None
 
 
 def _on_grid(
-        request: Request, push: tuple[float, float], brake: tuple[float, float], more: int,
+        request: MoveRequest, push: tuple[float, float], brake: tuple[float, float], more: int,
         longer: int) -> Template:
     """Return a guess of push and brake, (load, duration) each, on the grid; heights are free."""
     period, holding = request.delivery.period, request.holding_load()
@@ -146,7 +146,7 @@ def _on_grid(
         Level((first + second) * period, holding)))
 
 
-def _fastest_on_grid(request: Request, least: float, most: float) -> Attempt:
+def _fastest_on_grid(request: MoveRequest, least: float, most: float) -> Attempt:
     """Return the shortest three levels on the grid that keep the limits, else None."""
     period, lag, holding = request.delivery.period, request.delivery.lag, request.holding_load()
     longest = math.ceil((2.0 * math.pi / request.frequency + 3.0 * lag) / period) + 6
@@ -168,7 +168,7 @@ def _fastest_on_grid(request: Request, least: float, most: float) -> Attempt:
     return None
 
 
-def _bounds(request: Request, holding: float) -> tuple[float, float]:
+def _bounds(request: MoveRequest, holding: float) -> tuple[float, float]:
     """Return the loads for push and brake: the limits, or twice the change of the move."""
     state = request.state
     change = abs(holding - law.elastic_force(state.stretch, request.material.packed))
@@ -188,7 +188,7 @@ def _bounds(request: Request, holding: float) -> tuple[float, float]:
     return least, most
 
 
-def _turn(request: Request, state: State, load: float) -> tuple[float, float] | None:
+def _turn(request: MoveRequest, state: State, load: float) -> tuple[float, float] | None:
     """Return time and stretch of the turning point under a load, None if none is found."""
     status, time, stretch, _, _ = motion.turning_point(
         state.stretch, state.rate, math.copysign(1.0, state.rate), load, 1.0,
@@ -196,7 +196,7 @@ def _turn(request: Request, state: State, load: float) -> tuple[float, float] | 
     return (time, stretch) if status == motion.DONE else None
 
 
-def _upwards(request: Request, least: float, most: float) -> bool:
+def _upwards(request: MoveRequest, least: float, most: float) -> bool:
     """Return whether to push upwards: full braking would stop below the target."""
     state = request.state
     turned = None if state.rate == 0.0 else _turn(
@@ -204,7 +204,7 @@ def _upwards(request: Request, least: float, most: float) -> bool:
     return request.target > (state.stretch if turned is None else turned[1])
 
 
-def _durations(request: Request, push: float, brake: float) -> tuple[float, float]:
+def _durations(request: MoveRequest, push: float, brake: float) -> tuple[float, float]:
     """Return approximate durations of the push and of the brake that turns at the target."""
     material, target = request.material, request.target
     direction = math.copysign(1.0, push - brake)

@@ -17,7 +17,7 @@ from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.simulation import check_stretch, followed_by
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import Units
-from hmsa.planning.shapers.pace import PACE, Pace
+from hmsa.planning.shapers.smooth_limits import PACE, SmoothLimits
 
 #: Default relative errors of G, damping coefficient and J_lim.
 ERRORS = (0.1, 0.1, 0.1)
@@ -51,7 +51,7 @@ def as_errors(values: Sequence[float] | Ellipsoid) -> Uncertainty:
 
 
 @dataclass
-class Work:
+class StepBudget:
     """
     Remaining work of a request, in integration steps times the number of variables.
 
@@ -63,13 +63,13 @@ class Work:
     #: Whether it is for a search for advice, which shares this limit among all its attempts.
     advising: bool = False
 
-    def more(self, left: int) -> 'Work':
+    def more(self, left: int) -> 'StepBudget':
         """Return the work limit of another method for the same target."""
-        return self if self.advising else Work(left)
+        return self if self.advising else StepBudget(left)
 
 
 @dataclass(frozen=True)
-class Request:
+class MoveRequest:
     """One move to command, from a state in motion or at rest to rest at a target."""
 
     state: State
@@ -81,13 +81,13 @@ class Request:
     units: Units = field(default_factory=Units)  #: for the messages
     #: Relative errors of G, damping coefficient and J_lim from `as_errors`, for minimax.
     errors: Uncertainty = ERRORS
-    pace: Pace = PACE  #: of smooth; dimensionless rate
-    work: Work = field(default_factory=Work, compare=False)
+    pace: SmoothLimits = PACE  #: of smooth; dimensionless rate
+    work: StepBudget = field(default_factory=StepBudget, compare=False)
 
     @classmethod
     def of(
             cls, material: NondimensionalParameters, start: State | None = None,
-            **more: Any) -> 'Request':
+            **more: Any) -> 'MoveRequest':
         """Return a request to stay in a state, by default at rest without a field."""
         state = start or State(material.rest)
         return cls(state, state.stretch, material, **more)
@@ -172,4 +172,4 @@ class Request:
 
 
 #: Returns a move for a request, or raises `RefusedError` with a reason.
-Shaper = Callable[[Request], Move]
+Shaper = Callable[[MoveRequest], Move]

@@ -17,14 +17,14 @@ from hmsa.model.delivery import IDEAL
 from hmsa.model.moves import Level, Move, State
 from hmsa.model.status import Code
 from hmsa.planning.shapers.creeping import arrival
-from hmsa.planning.shapers.request import MOST_ORDER, Request
+from hmsa.planning.shapers.request import MOST_ORDER, MoveRequest
 from hmsa.planning.shapers.two_step import two_step
 
 # Relative rounding error of times.
 _ROUNDING = 1e-12
 
 
-def robust(request: Request) -> Move:
+def robust(request: MoveRequest) -> Move:
     """
     Command a move through ``request.order`` chained two-step commands.
 
@@ -54,7 +54,7 @@ def robust(request: Request) -> Move:
         'a single two-step command is used'))
 
 
-def _chain(request: Request, waypoints: list[float]) -> Move:
+def _chain(request: MoveRequest, waypoints: list[float]) -> Move:
     """Return the two-step commands through waypoints, without a hold at any of them."""
     levels: list[Level] = []
     begin = 0.0

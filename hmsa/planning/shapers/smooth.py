@@ -1,11 +1,11 @@
 """
 Moves without a step of the level: the level is computed from a smooth path of the stretch.
 
-The stretch is a flat output (`hmsa.planning.flat`): a path determines the load, and one more
-derivative determines the amplifier level if the field lags. The path is the motion as it would
-continue under the present level, faded into the target by a polynomial with three zero derivatives
-at either end. It therefore starts with the present motion, field and level, and ends at rest. The
-steps or ramps that commands use for the level are corrected to end exactly at rest.
+The stretch is a flat output (`hmsa.planning.inverse_dynamics`): a path determines the load, and
+one more derivative determines the amplifier level if the field lags. The path is the motion as it
+would continue under the present level, faded into the target by a polynomial with three zero
+derivatives at either end. It therefore starts with the present motion, field and level, and ends
+at rest. The steps or ramps that commands use for the level are corrected to end exactly at rest.
 """
 
 from dataclasses import replace
@@ -21,11 +21,11 @@ from hmsa.model.equations import acceleration, Array, elastic_force
 from hmsa.model.moves import Level, Move
 from hmsa.model.simulation import followed_by, sampled
 from hmsa.model.status import Code, RefusedError
-from hmsa.planning.flat import fade, held_along, loads_for
+from hmsa.planning.inverse_dynamics import fade, held_along, loads_for
 from hmsa.planning.shapers.free import at_rest
-from hmsa.planning.shapers.pace import MOST_PERIODS
-from hmsa.planning.shapers.request import Request
-from hmsa.planning.shooting import Attempt, kept, solve, Template
+from hmsa.planning.shapers.request import MoveRequest
+from hmsa.planning.shapers.smooth_limits import MOST_PERIODS
+from hmsa.planning.shooting import Attempt, solve, Template, within_limits
 
 # Points of a path, levels per natural period, and minimum and maximum number of levels.
 _POINTS = 129
@@ -41,7 +41,7 @@ _RETRY, _RETRIES = 1.08, 5
 _SLEW_SHARE, _SLACK = 0.95, 0.01
 
 
-def smooth(request: Request) -> Move:
+def smooth(request: MoveRequest) -> Move:
     """
     Command a move along a smooth path of the stretch, in the shortest time that limits allow.
 
@@ -59,7 +59,7 @@ def smooth(request: Request) -> Move:
     for _ in range(_RETRIES):
         if path is None:
             break
-        found = kept(_delivered(request, path, holding, period), request)
+        found = within_limits(_delivered(request, path, holding, period), request)
         if found is not None:
             return Move(Code.SMOOTH, *found)
         path = _path(request, holding, _RETRY * path.duration)
@@ -81,7 +81,7 @@ class _Path(NamedTuple):
     slopes: Array
 
 
-def _shortest(request: Request, holding: float, period: float) -> _Path | None:
+def _shortest(request: MoveRequest, holding: float, period: float) -> _Path | None:
     """Return the shortest path within the limits, else None."""
     shortest = short = duration = request.pace.periods * period
     longest = max(MOST_PERIODS * period, 2.0 * shortest)
@@ -99,7 +99,7 @@ def _shortest(request: Request, holding: float, period: float) -> _Path | None:
     return path
 
 
-def _path(request: Request, holding: float, duration: float) -> _Path | None:
+def _path(request: MoveRequest, holding: float, duration: float) -> _Path | None:
     """Return the levels of a path of a given duration, None if it does not keep the limits."""
     material, delivery, limits = request.material, request.delivery, request.limits
     packed = material.packed
@@ -132,7 +132,8 @@ def _path(request: Request, holding: float, duration: float) -> _Path | None:
 
 
 def _free(
-        request: Request, times: Array) -> tuple[Array, Array, Array, Array, tuple[float, ...]]:
+        request: MoveRequest, times: Array
+) -> tuple[Array, Array, Array, Array, tuple[float, ...]]:
     """
     Return the motion under the present level.
 
@@ -155,7 +156,7 @@ def _free(
     return stretch, rate, acceleration(stretch, rate, pull, material), loads, followed
 
 
-def _delivered(request: Request, path: _Path, holding: float, period: float) -> Attempt:
+def _delivered(request: MoveRequest, path: _Path, holding: float, period: float) -> Attempt:
     """Return the levels of a path as commands, corrected to end at rest."""
     delivery, limits = request.delivery, request.limits
     duration, along, slopes = path

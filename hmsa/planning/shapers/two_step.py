@@ -13,16 +13,16 @@ from hmsa.model.moves import Level, Move
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.shapers.free import at_rest, free_heights, free_levels, no_single
 from hmsa.planning.shapers.push_brake import push_brake
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.shooting import (
-    approach,
     Attempt,
+    continuation,
     first_kept,
     heights,
-    kept,
     solve,
     soonest_kept,
     Template,
+    within_limits,
 )
 from hmsa.planning.two_step import CODES, HOLD_TOLERANCE, plan_two_step, RTOL
 
@@ -45,7 +45,7 @@ _SLOW = 3.0
 _WITHOUT = (Code.HOLD, Code.TOO_DAMPED, Code.INDISTINGUISHABLE)
 
 
-def two_step(request: Request) -> Move:
+def two_step(request: MoveRequest) -> Move:
     """
     Apply beta_p for tau_p, then beta_1 (Eq. 13): rest at the target without residual vibration.
 
@@ -67,7 +67,7 @@ def two_step(request: Request) -> Move:
     if code in _WITHOUT and not (lags and code is Code.HOLD):
         return _without(request, code, holding)
     if code is Code.TWO_STEP:
-        found = kept((levels, levels[-1].time) if at_once else _delivered(
+        found = within_limits((levels, levels[-1].time) if at_once else _delivered(
             request, levels), request)
         if found is not None:
             sooner = _sooner(request, found[1]) if lags or creeps else None
@@ -85,7 +85,7 @@ def two_step(request: Request) -> Move:
         return Move(Code.TWO_STEP, *found)
 
 
-def _sooner(request: Request, duration: float) -> Move | None:
+def _sooner(request: MoveRequest, duration: float) -> Move | None:
     """Return levels of free heights that are at rest before a slow command, else None."""
     if duration <= _SLOW * request.delivery.lag or duration <= _SLOW * (
             math.pi / request.frequency + request.delivery.lag):
@@ -95,7 +95,7 @@ def _sooner(request: Request, duration: float) -> Move | None:
         if found is not None and found[1] < duration else None
 
 
-def _plain(request: Request) -> tuple[Code, tuple[Level, ...]]:
+def _plain(request: MoveRequest) -> tuple[Code, tuple[Level, ...]]:
     """Return code and levels for ideal hardware without branches."""
     state, limits = request.state, request.limits
     plan = plan_two_step(
@@ -104,7 +104,7 @@ def _plain(request: Request) -> tuple[Code, tuple[Level, ...]]:
     return plan.code, (Level(0.0, plan.beta_p), Level(plan.tau_p, plan.beta_1))
 
 
-def _late(request: Request, lag: float) -> tuple[Code, tuple[Level, ...]]:
+def _late(request: MoveRequest, lag: float) -> tuple[Code, tuple[Level, ...]]:
     """Return code and levels with branches or a lag, at any time and in steps."""
     state, material, limits = request.state, request.material, request.limits
     status, beta_p, tau_p, beta_1, push, until = motion.two_step_late(
@@ -121,7 +121,7 @@ def _late(request: Request, lag: float) -> tuple[Code, tuple[Level, ...]]:
         levels[0], Level(tau_p, push), Level(until, beta_1))
 
 
-def _without(request: Request, code: Code, holding: float) -> Move:
+def _without(request: MoveRequest, code: Code, holding: float) -> Move:
     """Return the move that replaces two levels where they do not exist."""
     if code is Code.HOLD:
         return Move(code, (Level(0.0, holding),), 0.0)
@@ -133,14 +133,14 @@ def _without(request: Request, code: Code, holding: float) -> Move:
         'rounding: the unshaped step is used'))
 
 
-def _delivered(request: Request, levels: tuple[Level, ...]) -> Attempt:
+def _delivered(request: MoveRequest, levels: tuple[Level, ...]) -> Attempt:
     """Return the command on a grid or with ramps for one at any time and in steps, else None."""
     if request.delivery.period > 0.0:
         return first_kept(_on_grid(request, *levels), request)
     return _ramped(request, levels)
 
 
-def _on_grid(request: Request, first: Level, last: Level) -> Iterator[Template]:
+def _on_grid(request: MoveRequest, first: Level, last: Level) -> Iterator[Template]:
     """
     Yield guesses on the grid: one level, another for a period, and one that settles the field.
 
@@ -161,7 +161,7 @@ def _on_grid(request: Request, first: Level, last: Level) -> Iterator[Template]:
         yield heights(levels + [Level(count * period, last.load)] * bool(push))
 
 
-def _ramped(request: Request, ideal: tuple[Level, ...]) -> Attempt:
+def _ramped(request: MoveRequest, ideal: tuple[Level, ...]) -> Attempt:
     """
     Solve for the level between two ramps and its duration, and the push that settles the field.
 
@@ -201,11 +201,12 @@ def _ramped(request: Request, ideal: tuple[Level, ...]) -> Attempt:
     if half_periods > 1:
         ideal = (Level(0.0, start + change / (1.0 + decay ** half_periods)),
                  Level(half_periods * last.time, last.load))
-    tried = [approach(ideal, slower, _SHORTEST_STRIDE)]
-    if request.still and (half_periods > 1 or kept(tried[0], request) is None):
+    tried = [continuation(ideal, slower, _SHORTEST_STRIDE)]
+    if request.still and (half_periods > 1 or within_limits(tried[0], request) is None):
         tried.append(soonest_kept(_held(bare), bare))
     for found in sorted(filter(None, tried), key=itemgetter(1)):
-        late = kept(approach(found[0], later, _SHORTEST_STRIDE) if lag > 0.0 else found, request)
+        late = within_limits(
+            continuation(found[0], later, _SHORTEST_STRIDE) if lag > 0.0 else found, request)
         if late is not None:
             return late
     return None
@@ -222,7 +223,7 @@ def _pushed(first: Level, push: Level, last: float, slew: float, lag: float) -> 
     return replace(template, d_times=d_times)
 
 
-def _held(request: Request) -> Iterator[tuple[float, Template]]:
+def _held(request: MoveRequest) -> Iterator[tuple[float, Template]]:
     """Yield guesses of a level between ramps and its hold, with their durations."""
     delivery, start, holding = request.delivery, request.load, request.holding_load()
     slew, eighth = delivery.slew, 0.25 * math.pi / request.frequency

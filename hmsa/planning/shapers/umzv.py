@@ -11,7 +11,7 @@ import math
 
 from hmsa.model.moves import Move
 from hmsa.planning.shapers.linear import shaped
-from hmsa.planning.shapers.request import Request
+from hmsa.planning.shapers.request import MoveRequest
 
 # Strides from no damping to full damping, and Newton iterations of each.
 _STRIDES, _PASSES = 16, 4
@@ -19,7 +19,7 @@ _STRIDES, _PASSES = 16, 4
 _STEEPEST = -6.0
 
 
-def umzv(request: Request) -> Move:
+def umzv(request: MoveRequest) -> Move:
     """Three impulses of unity magnitude, the second one negative, for the linearised motion."""
     return shaped(request, _impulses)
 

@@ -14,10 +14,10 @@ from rclpy.parameter import parameter_value_to_python
 
 from hmsa.errors import BadInputError, listed
 from hmsa.interfaces import topics
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.cdr import stamp_of
+from hmsa_ros.nodes.playback_publishers import NAMED_AT_MOST
 from hmsa_ros.nodes.selection import Selection
-from hmsa_ros.nodes.senders import NAMED_AT_MOST
 from hmsa_ros.nodes.service_call import ServiceCall
 
 
@@ -88,7 +88,7 @@ class Audience:
                 return [f'topics of {node}']
         return [
             x for x in sorted(names) if self._selects.wants(x)
-            and self._recorder not in endpoints.subscribers_of(self._node, x).values()]
+            and self._recorder not in ros_entities.subscribers_of(self._node, x).values()]
 
     def _subscribed(self, topic: str) -> bool:
         """Return whether a required node, or any node, subscribes to a topic."""
@@ -97,7 +97,7 @@ class Audience:
             return bool(sender.get_subscription_count() > 0)
         return any(
             x in self._nodes
-            for x in endpoints.subscribers_of(self._node, sender.topic_name).values())
+            for x in ros_entities.subscribers_of(self._node, sender.topic_name).values())
 
     def found(self, also: Any) -> bool:
         """Return whether all known subscribers are matched; ``also`` is one more publisher."""
@@ -118,7 +118,7 @@ class Followers:
 
     def __init__(self, node: Node, names: Sequence[str]) -> None:
         self._subscriptions = {
-            name: endpoints.listen(node, replace(topics.JOINT_STATES, name=name))
+            name: ros_entities.listen(node, replace(topics.JOINT_STATES, name=name))
             for name in names}
         # Timestamps in ns of the last two samples.
         self._stamps = dict.fromkeys(names, (0, 0))

@@ -7,21 +7,21 @@ import math
 
 from hmsa.errors import HmsaError
 from hmsa.identification.known import Known
-from hmsa.judge.holds import Hold
-from hmsa.judge.records import Sensor
+from hmsa.judge.records import SensorModel
+from hmsa.judge.setpoint_samples import SetpointSamples
 from hmsa.model.equations import equilibrium_stretch
 from hmsa.model.units import flux_text, NANOSECONDS
 from hmsa.offload import Awaited, Doing
 from hmsa.planning.planner import Believed, Planner
-from hmsa.planning.timeline import Model, Plan
+from hmsa.planning.timeline import JointModel, Timeline
 from hmsa_lab.adapt.choice import clearly_better
-from hmsa_lab.adapt.estimator import Estimate, Estimator, Options
-from hmsa_lab.adapt.learnt import as_of_path, believed, differs, learnt_model, sensor_of
-from hmsa_lab.adapt.ledger import Ledger, Moves
+from hmsa_lab.adapt.estimator import Estimator, EstimatorOptions, StateEstimate
+from hmsa_lab.adapt.learnt import as_of_path, differs, initial_state, learnt_model, sensor_of
+from hmsa_lab.adapt.messages import sentence
 from hmsa_lab.adapt.motion import held, rest
+from hmsa_lab.adapt.move_errors import MoveErrors, Moves
 from hmsa_lab.adapt.prior import Prior
 from hmsa_lab.adapt.trust import Trust
-from hmsa_lab.adapt.words import sentence
 from hmsa_ros.runtime.follower import as_held
 from hmsa_ros.runtime.records import Settings
 
@@ -51,27 +51,27 @@ _ROUNDED = 0.01
 
 
 @dataclass(eq=False)
-class Joint:
+class AdaptiveJoint:
     """State of one joint under feedback; times in ns."""
 
     name: str
     planner: Planner
-    given: Model
+    given: JointModel
     settings: Settings
     begun: InitVar[int]
     estimator: Estimator = field(init=False)
     trust: Trust = field(init=False)
     start: float = field(init=False)  # stretch before the setpoint under way
-    ledger: Ledger = field(default_factory=Ledger)
+    ledger: MoveErrors = field(default_factory=MoveErrors)
     moves: Moves = field(default_factory=Moves)  # those of the plan in force
-    latest: Estimate | None = None
+    latest: StateEstimate | None = None
     newest: int = 0  # time of the newest sample
     next_sample: int = 0  # time from which another sample is useful
     next_update: int = 0  # time of the next update
     not_before: int = 0  # earliest time of an update, which limits the CPU time
     next_report: int = 0  # when to publish the estimate
     next_choice: int = 0  # when to choose the parameters to plan with
-    used: Model | None = None  # chosen model; None for that of the planner
+    used: JointModel | None = None  # chosen model; None for that of the planner
     choosing: Iterator[None] | None = None  # the choice under way
     chosen: bool = False  # whether a choice was made since the latest estimate
     waits: int = 0  # arrival of a move slowed down to be corrected
@@ -82,7 +82,8 @@ class Joint:
     fresh: bool = False  # whether there are unprocessed samples
     looking: Iterator[None] | None = None  # the update under way
     spent: int = 0  # time spent on the update
-    audits: list[Hold] = field(default_factory=list)  # setpoints to be audited after an update
+    audits: list[SetpointSamples] = field(
+        default_factory=list)  # setpoints to be audited after an update
     ready: int = 0  # number of audits to do now
     auditing: Iterator[None] | None = None  # the audit under way
     lost: str = ''  # why the field is not as commanded; empty if it is
@@ -91,7 +92,7 @@ class Joint:
     # Samples that arrived during an update: timestamp, stretch, and time of arrival.
     _waiting: list[tuple[int, float, int]] = field(default_factory=list)
     _setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place under way
-    _sensor: tuple[Estimate, Sensor] | None = None  # estimate, and its sensor
+    _sensor: tuple[StateEstimate, SensorModel] | None = None  # estimate, and its sensor
     _measured: bool = False  # whether the field is measured
 
     def __post_init__(self, begun: int) -> None:
@@ -100,7 +101,8 @@ class Joint:
             given.actuator, settings.feedback_parameters, suspects=True, others=given.others)
         self.estimator = Estimator(
             prior.informed(settings.known.get(self.name, Known())),
-            Options(slew_limit=given.options.slew_limit, learn=not settings.feedback_frozen))
+            EstimatorOptions(
+                slew_limit=given.options.slew_limit, learn=not settings.feedback_frozen))
         self.trust = Trust(begun, at_once=settings.cautious)
         self.start = given.actuator.rest
 
@@ -120,7 +122,7 @@ class Joint:
         return self.settings.feedback_tolerance if self.settings.cautious else math.inf
 
     @property
-    def acting(self) -> Estimate | None:
+    def acting(self) -> StateEstimate | None:
         """The latest estimate if it is to be used: a whole move has shown that it fits."""
         latest = self.latest
         return latest if latest is not None and latest.trusted and self.trust.acts else None
@@ -249,7 +251,7 @@ class Joint:
             self._take(*sample)
         self._waiting.clear()
 
-    def _note_start(self, plan: Plan, now: int) -> None:
+    def _note_start(self, plan: Timeline, now: int) -> None:
         """Store the position of the joint before the setpoint that is under way at a time."""
         place, before = plan.under_way(now), self._setpoint
         self._setpoint = plan.number, place
@@ -260,7 +262,7 @@ class Joint:
         else:
             self.start = plan.levels[0].stretch if self.latest is None else self.latest.stretch
 
-    def _look_at_vibration(self, plan: Plan, found: Estimate) -> None:
+    def _look_at_vibration(self, plan: Timeline, found: StateEstimate) -> None:
         """Update the largest amplitude since the last arrival."""
         place = plan.under_way(found.time)
         segment = plan.segments[place] if place >= 0 else None
@@ -275,12 +277,12 @@ class Joint:
 
     # -- initial states of plans ---------------------------------------------------------------
 
-    def predicted(self, time: int) -> Estimate | None:
+    def predicted(self, time: int) -> StateEstimate | None:
         """Return the estimate for a time under the plan in force."""
         self._take_levels(time)
         return self.estimator.predict(time)
 
-    def state(self, time: int) -> Estimate | None:
+    def state(self, time: int) -> StateEstimate | None:
         """Return the initial state of plans at a time; None if the plan's prediction applies."""
         latest = self.acting
         if latest is None or not self.adapts or (
@@ -288,17 +290,17 @@ class Joint:
             return None
         return self.predicted(time)
 
-    def foreseen(self, time: int) -> Estimate | None:
+    def foreseen(self, time: int) -> StateEstimate | None:
         """Return the state for slowing down moves; a cautious joint has one before any sample."""
         if self.latest is not None or math.isinf(self.tolerance):
             return self.state(time)
         return self.predicted(time)
 
-    def adapted(self, model: Model | None = None) -> bool:
+    def adapted(self, model: JointModel | None = None) -> bool:
         """Return whether a model, by default that of the plans, uses learnt parameters."""
         return (model or self.planner.model) != self.given
 
-    def believed(self, time: int) -> Believed | None:
+    def initial_state(self, time: int) -> Believed | None:
         """Return the state for `hmsa.planning.planner.Planner` to plan from at a time."""
         try:
             found = self.state(time) if self.adapted() else None
@@ -313,30 +315,30 @@ class Joint:
         if at is None:
             return None
         shift = float(equilibrium_stretch(model.load(level), model.material)) - at[0]
-        stretch, rate, behind = believed(found, creeps=bool(model.material.creep))
+        stretch, rate, behind = initial_state(found, creeps=bool(model.material.creep))
         return stretch + shift, rate, behind
 
     @property
-    def sensor(self) -> Sensor:
+    def sensor(self) -> SensorModel:
         """The sensor as estimated; as given where there is no estimate."""
         found = self.acting
         if found is None:
-            return Sensor()
+            return SensorModel()
         if self._sensor is None or self._sensor[0] is not found:
             self._sensor = found, sensor_of(found, self.estimator.prior)
         return self._sensor[1]
 
     # -- models of plans -----------------------------------------------------------------------
 
-    def learnt(self, model: Model) -> Model:
+    def learnt(self, model: JointModel) -> JointModel:
         """Return a model updated by the estimate, or by the last confirmed parameters."""
         if self.acting is not None:
             return learnt_model(model, self.acting, self.planner.plan.levels[-1].stretch)
         confirmed = self.trust.confirmed
-        return model if confirmed is None else Model(
+        return model if confirmed is None else JointModel(
             confirmed.actuator, replace(model.options, **confirmed.others))
 
-    def may_choose(self, latest: Estimate) -> bool:
+    def may_choose(self, latest: StateEstimate) -> bool:
         """Return whether an estimate may be used to choose the parameters to plan with."""
         # A plan with changed parameters begins from an unknown state, so moves are not
         # interrupted.
@@ -351,7 +353,7 @@ class Joint:
         look = round(_LOOK * self.unit * NANOSECONDS)
         return place >= 0 and time >= (plan.segments[place].arrival or 0) + look
 
-    def choose(self, latest: Estimate, doing: Doing) -> Awaited[None]:
+    def choose(self, latest: StateEstimate, doing: Doing) -> Awaited[None]:
         """Adopt learnt parameters once clearly better, or while a move waits for them."""
         used, segments = self.used or self.planner.model, self.planner.plan.segments
         model, waits = used, latest.time < self.waits
@@ -416,6 +418,6 @@ class Joint:
             **self.sensor.to_dict()}
 
 
-def _updated(estimator: Estimator, now: int) -> tuple[Estimator, Estimate | None]:
+def _updated(estimator: Estimator, now: int) -> tuple[Estimator, StateEstimate | None]:
     """Return an estimator updated with its samples, and its estimate for a time."""
     return estimator, estimator.update(now)

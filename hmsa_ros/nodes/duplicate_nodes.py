@@ -20,7 +20,7 @@ from rclpy.node import Node
 from hmsa.errors import BadInputError
 from hmsa.interfaces import topics
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.capture import RawSubscription, Taken
 from hmsa_ros.nodes.conversions import from_samples
 
@@ -70,7 +70,7 @@ class Presence:
 
     def __init__(self, node: Node, *, samples: bool = True) -> None:
         self._node, self._of_samples = node, samples
-        self._diagnostics = endpoints.listen(node, topics.DIAGNOSTICS)
+        self._diagnostics = ros_entities.listen(node, topics.DIAGNOSTICS)
         self._samples: RawSubscription | None = None
         # Processes, and publishers of samples of a joint.
         self._processes, self._sampling = Active(), Active()
@@ -82,7 +82,7 @@ class Presence:
         if not self._of_samples:
             return
         if self._samples is None and len(self._publishers(states)) > 1:
-            self._samples = endpoints.listen(self._node, _SAMPLES)
+            self._samples = ros_entities.listen(self._node, _SAMPLES)
         elif self._samples is not None:
             self._note(taken := self._samples.take())
             # Only the newest message of each publisher, since reading all would take long.
@@ -133,7 +133,7 @@ class Presence:
 
     def _publishers(self, topic: str) -> dict[bytes, str]:
         try:
-            return endpoints.publishers_of(self._node, topic)
+            return ros_entities.publishers_of(self._node, topic)
         except rclpy_implementation.RCLError:
             # Joint names in messages are arbitrary and may not be valid in a topic.
             return {}

@@ -6,11 +6,11 @@ from typing import Any
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 
-from hmsa.bag.reader import BagReader, Topic
+from hmsa.bag.reader import BagReader, BagTopic
 from hmsa.errors import BadInputError, BagError, listed, printable
 from hmsa.interfaces import topics
-from hmsa_ros.nodes.endpoints import interface_class
 from hmsa_ros.nodes.qos import publisher
+from hmsa_ros.nodes.ros_entities import interface_class
 from hmsa_ros.nodes.selection import Filter, is_full_name
 
 #: Limit on the number of publishers, each of which takes 1.5 ms and 35 kB.
@@ -73,7 +73,7 @@ def full_name(node: Node, name: str) -> str:
 
 
 def _left_out(
-        node: Node, selection: Filter, name: str, info: Topic, own_clock: bool) -> str:
+        node: Node, selection: Filter, name: str, info: BagTopic, own_clock: bool) -> str:
     """Return why a topic that passes the filter is not played; empty if it is."""
     if not is_full_name(name):
         return 'it cannot be published, its name is not a valid ROS name'

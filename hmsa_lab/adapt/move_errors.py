@@ -3,11 +3,11 @@
 from dataclasses import dataclass, field, replace
 import math
 
-from hmsa.judge.holds import Hold
-from hmsa.judge.records import Finding, Sensor, Setpoint
+from hmsa.judge.records import Finding, RequestedSetpoint, SensorModel
+from hmsa.judge.setpoint_samples import SetpointSamples
 from hmsa.model.equations import equilibrium_stretch
 from hmsa.offload import Awaited
-from hmsa.planning.timeline import Model, Plan
+from hmsa.planning.timeline import JointModel, Timeline
 
 # A move is worse if its error exceeds the open-loop error by more than this fraction of the step
 # plus this many standard deviations.
@@ -28,7 +28,7 @@ class Moves:
     corrected: list[int] = field(default_factory=list)  # times from which plans were corrected
 
 
-class Ledger:
+class MoveErrors:
     """
     Compare the errors that moves leave, as judged from samples.
 
@@ -42,8 +42,8 @@ class Ledger:
         self._without = math.nan  # largest open-loop vibration, as a fraction of the step
 
     def take(
-            self, hold: Hold, plan: Plan, given: Model, moves: Moves,
-            sensor: Sensor) -> Awaited[str]:
+            self, hold: SetpointSamples, plan: Timeline, given: JointModel, moves: Moves,
+            sensor: SensorModel) -> Awaited[str]:
         """
         Process the samples of a setpoint; return why feedback made it worse, empty if it did not.
 
@@ -78,7 +78,7 @@ class Ledger:
         return self._worse(found, setpoint, given, level.flux_density, moves.expected)
 
     def _worse(
-            self, found: Finding, setpoint: Setpoint, given: Model, level: float,
+            self, found: Finding, setpoint: RequestedSetpoint, given: JointModel, level: float,
             expected: float) -> str:
         """Return a message if open loop would have left a smaller error; empty if not."""
         rest = float(equilibrium_stretch(given.load(level), given.material))

@@ -1,5 +1,5 @@
 """
-Suspects: further parameters that may be in error, and the evidence for them.
+Hypotheses: further parameters that may be in error, and the evidence for them.
 
 A suspect keeps its given value unless the evidence supports a change. The estimate is a mixture
 over all possible sets of suspects.
@@ -31,7 +31,7 @@ _UNLIKELY = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class Suspects:
+class Hypotheses:
     """The suspects of an estimator."""
 
     names: tuple[str, ...]  # of all coordinates, except stretch and rate
@@ -138,10 +138,10 @@ class Explained(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class Evidence:
     """Quadratic approximation of the cost about some coordinates."""
 
-    suspects: Suspects
+    suspects: Hypotheses
     z: Array  # the coordinates, shape (q,)
     matrix: Array  # second derivatives
     gradient: Array  # negative first derivatives

@@ -12,7 +12,7 @@ class PlayingInterruptedError(Exception):
     """Playback was stopped, or is to continue from another time of the bag."""
 
 
-class Transport:
+class PlaybackClock:
     """
     The schedule of one playback, initially paused: when each time of the bag (ns) is due.
 

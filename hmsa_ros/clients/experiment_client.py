@@ -14,7 +14,7 @@ from hmsa.interfaces.status import whole
 from hmsa_ros.clients.client import newest_time, PlannerClient
 from hmsa_ros.clients.experiment import Experiment, START_SECONDS
 from hmsa_ros.clients.remote import parameters_of
-from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes import ros_entities
 
 # Time limit in s for a sequence to be completed after its duration.
 _GRACE_SECONDS = 20.0
@@ -25,7 +25,7 @@ _LOOK_SECONDS = 0.5
 _SAME = 1e-9
 
 
-class Watch(PlannerClient):
+class ExperimentClient(PlannerClient):
     """
     A client of the planner that also monitors the nodes of an experiment.
 
@@ -47,9 +47,9 @@ class Watch(PlannerClient):
         self._seen = 0.0, monotonic()
         self._over: float | None = None
         self._parameters: dict[str, Any] = {}
-        endpoints.subscribe(self.node, topics.DIAGNOSTICS, self._on_diagnostics)
+        ros_entities.subscribe(self.node, topics.DIAGNOSTICS, self._on_diagnostics)
         # Only the newest message is read, since a callback for thousands a second is too slow.
-        self._clock = endpoints.listen(self.node, topics.CLOCK_TOPIC)
+        self._clock = ros_entities.listen(self.node, topics.CLOCK_TOPIC)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -183,7 +183,7 @@ class Watch(PlannerClient):
 
     def unpause(self) -> None:
         """Resume simulated time."""
-        call = endpoints.call(
+        call = ros_entities.call(
             self.node, topics.SET_PAUSED, topics.PLANT, SetBool.Request(data=False))
         for condition, failure in (
                 (lambda: call.ready, 'the plant offers no service to unpause it'),

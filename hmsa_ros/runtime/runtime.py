@@ -1,8 +1,8 @@
 """
 A planner at work: takes requests, receipts and samples, and returns commands and verdicts.
 
-Does not depend on ROS. The caller calls `PlannerRuntime.tick` with the time of its clock, at the
-latest at `PlannerRuntime.wake`, and delivers the returned outputs: a node to topics, a loop
+Does not depend on ROS. The caller calls `Runtime.tick` with the time of its clock, at the
+latest at `Runtime.wake`, and delivers the returned outputs: a node to topics, a loop
 directly to the coil.
 """
 
@@ -15,13 +15,14 @@ from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning import path
 from hmsa.planning.group import PlannerGroup
-from hmsa.planning.timeline import Model
+from hmsa.planning.timeline import JointModel
+from hmsa_ros.runtime.arrival_monitor import ArrivalMonitor
 from hmsa_ros.runtime.checks import check_joints, check_ready
-from hmsa_ros.runtime.devices import Devices
-from hmsa_ros.runtime.environment import Environment, Seen
+from hmsa_ros.runtime.command_link import CommandLink
+from hmsa_ros.runtime.deviations import Deviations
+from hmsa_ros.runtime.environment import Environment, ObservedSample
 from hmsa_ros.runtime.follower import feedback, Follower
-from hmsa_ros.runtime.following import Following
-from hmsa_ros.runtime.planning import Planning
+from hmsa_ros.runtime.planning_task import SLICE
 from hmsa_ros.runtime.receipts import Receipts
 from hmsa_ros.runtime.records import (
     Note,
@@ -34,12 +35,11 @@ from hmsa_ros.runtime.records import (
     Verdict,
 )
 from hmsa_ros.runtime.reporting import LOOK, Reporting
-from hmsa_ros.runtime.silence import Silence
-from hmsa_ros.runtime.slices import SLICE
+from hmsa_ros.runtime.request_queue import RequestQueue
+from hmsa_ros.runtime.sample_timeout import SampleTimeout
 from hmsa_ros.runtime.stops import Stops
 from hmsa_ros.runtime.takeover import Takeover
 from hmsa_ros.runtime.throttle import Throttle
-from hmsa_ros.runtime.watching import Watch
 from hmsa_ros.timekeeping import clock_set_words
 
 # In ns by the steady clock: delay of a service that is a stall of this process; time that the
@@ -56,7 +56,7 @@ _WAITING = Verdict(
     Severity.OK, Code.WAITING, 'accepted: starts as soon as the current state is known')
 
 
-class PlannerRuntime:
+class Runtime:
     """Plan requests in slices, send commands in time and track their effects."""
 
     def __init__(
@@ -78,15 +78,15 @@ class PlannerRuntime:
         self._clock, self._steady = clock, around.steady
         self._outputs: list[Output] = []
         receipts = Receipts(around.steady)
-        self.following = Following(group, receipts, self._note)
+        self.following = Deviations(group, receipts, self._note)
         self.follower = Follower(group, settings)
         self._follow()
         self._takeover = Takeover(
             group.planners, around, receipts, self.following.newest,
             self._follows, self._note)
-        self._silence = Silence(around)
-        self._watch = Watch(group, around, lambda: self.follower)
-        self.devices = Devices(
+        self._silence = SampleTimeout(around)
+        self._watch = ArrivalMonitor(group, around, lambda: self.follower)
+        self.devices = CommandLink(
             group.planners, receipts, self.following, self._takeover, around, self._outputs)
         self._reporting = Reporting(
             group, self.following, self._watch, around, self._outputs, self._note,
@@ -94,7 +94,7 @@ class PlannerRuntime:
         self._stops = Stops(
             group, self.devices, self.following.newest, self._watch, around, around.unheard,
             lambda: self.settings.tolerances)
-        self.planning = Planning(
+        self.planning = RequestQueue(
             group, self.following, lambda: self.follower, self._reporting,
             around, lambda: self.devices.send(clock()), self._stops.begin)
         self._next_beat = 0  # time in ns of the next heartbeat
@@ -278,7 +278,7 @@ class PlannerRuntime:
         """
         came = self._clock() if came is None else came - self._stepped
         if self._takeover.waiting or not self._takeover.engaged:
-            self._takeover.observe(joint, Seen(
+            self._takeover.observe(joint, ObservedSample(
                 stamp, stretch, rate, flux_density,
                 None if self.environment.one_clock() else came - stamp))
         if joint in self.devices.apart:
@@ -360,7 +360,7 @@ class PlannerRuntime:
         self._takeover.engaged = False
 
     def change(
-            self, settings: Settings, models: Mapping[str, Model], *,
+            self, settings: Settings, models: Mapping[str, JointModel], *,
             simultaneous: bool) -> None:
         """Adopt new settings now, and new models by joint from the next request on."""
         if settings.heartbeat_period != self.settings.heartbeat_period:

@@ -10,8 +10,8 @@ from hmsa.judge.records import (
     Finding,
     GoalTolerances,
     missed,
-    Sensor,
-    Setpoint,
+    RequestedSetpoint,
+    SensorModel,
     Tolerances,
     unobserved,
 )
@@ -30,7 +30,7 @@ _TOLERANCES = Tolerances()
 AHEAD = NANOSECONDS // 20
 
 
-class Hold:
+class SetpointSamples:
     """
     Gather the relevant samples of a setpoint, and judge it once there are enough.
 
@@ -39,7 +39,7 @@ class Hold:
     """
 
     def __init__(
-            self, setpoint: Setpoint, goal: GoalTolerances | None = None,
+            self, setpoint: RequestedSetpoint, goal: GoalTolerances | None = None,
             doing: Doing = here) -> None:
         self.setpoint = setpoint
         self.found: Finding | None = None
@@ -47,7 +47,7 @@ class Hold:
         self.unreported = False  # whether it is missed and this is not reported yet
         self.news = False  # whether judged samples await an audit
         # The setpoint judged last, and its finding.
-        self._answer: tuple[Setpoint, Finding] | None = None
+        self._answer: tuple[RequestedSetpoint, Finding] | None = None
         self._doing = doing
         self._judging: Awaited[Finding | None] | None = None
         self._end, self._goal = setpoint.end, goal
@@ -154,7 +154,7 @@ class Hold:
     # -- judging -------------------------------------------------------------------------------
 
     def judge(
-            self, now: int, steady: int, tolerances: Tolerances, sensor: Sensor, *,
+            self, now: int, steady: int, tolerances: Tolerances, sensor: SensorModel, *,
             observable: bool) -> Finding | None:
         """Judge if due at a time in ns; None if not due or if the finding does not change."""
         if self.unreported:
@@ -172,7 +172,7 @@ class Hold:
             return found
         return None
 
-    def _judge(self, tolerances: Tolerances, sensor: Sensor) -> Awaited[Finding | None]:
+    def _judge(self, tolerances: Tolerances, sensor: SensorModel) -> Awaited[Finding | None]:
         """Judge the samples up to the due time; return the finding if it changed."""
         # Only samples up to the due time count, whenever the judging runs.
         after, setpoint = self.due - self._begin, self.setpoint
@@ -226,15 +226,15 @@ class Hold:
         self.due = self._closes
         return True
 
-    def shown(self, setpoint: Setpoint, *, sensor: Sensor) -> Awaited[Finding]:
+    def shown(self, setpoint: RequestedSetpoint, *, sensor: SensorModel) -> Awaited[Finding]:
         """Return the last finding of a setpoint, or judge it."""
         if self._answer is not None and self._answer[0] == setpoint:
             return self._answer[1]
         return (yield from self.judged(setpoint, sensor=sensor))
 
     def judged(
-            self, setpoint: Setpoint, tolerances: Tolerances = _TOLERANCES, *,
-            sensor: Sensor, until: int | None = None) -> Awaited[Finding]:
+            self, setpoint: RequestedSetpoint, tolerances: Tolerances = _TOLERANCES, *,
+            sensor: SensorModel, until: int | None = None) -> Awaited[Finding]:
         """Judge the samples up to a time in ns as those of a setpoint."""
         samples = self._samples if until is None else {
             x: y for x, y in self._samples.items() if x <= until}

@@ -1,7 +1,7 @@
 """Simulated time relative to a steady clock: real-time factor, pause and resume."""
 
 
-class Pacer:
+class RealTimeFactor:
     """
     Time that a simulation should have reached, in ns.
 

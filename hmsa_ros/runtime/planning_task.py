@@ -11,7 +11,7 @@ from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Planner
 from hmsa.planning.timeline import Draft
 from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.records import Request, Stop, Target, Trajectory
+from hmsa_ros.runtime.records import Request, Stop, StretchRequest, Trajectory
 from hmsa_ros.runtime.worker import Inline, Job
 
 _INLINE = Inline()
@@ -45,7 +45,7 @@ class Drafting(NamedTuple):
 
 
 @dataclass(eq=False)
-class Work:
+class PlanningTask:
     """A request or a replanning in progress."""
 
     joints: frozenset[str]  # joints whose plans it changes
@@ -70,7 +70,7 @@ class Work:
         """Whether the present plan continues until a timestamp at which this one begins."""
         return isinstance(self.request, Trajectory) and self.request.stamp is not None
 
-    def replaces(self, others: Iterable['Work']) -> bool:
+    def replaces(self, others: Iterable['PlanningTask']) -> bool:
         """Return whether its plans do not depend on others being planned before."""
         return not self.postponed and all(
             x.joints <= self.joints or x.joints.isdisjoint(self.joints) for x in others)
@@ -147,7 +147,8 @@ class Work:
 
 
 def work_on(
-        request: Request, group: PlannerGroup, complete: Callable[[Drafts], Drafts]) -> Work:
+        request: Request, group: PlannerGroup,
+        complete: Callable[[Drafts], Drafts]) -> PlanningTask:
     """Return the work of planning a request for joints of a group."""
     names = frozenset(group.planners if isinstance(request, Stop) else request.joints)
 
@@ -156,15 +157,16 @@ def work_on(
 
     def prepare(now: int) -> Drafting:
         plans = group.snapshot(lambda x: x.start(None, now))
-        if isinstance(request, Target):
+        if isinstance(request, StretchRequest):
             return Drafting(lambda check: plans.checked(check).draft_setpoint(
                 request.joint, request.stretch, now), complete)
         return Drafting(lambda check: plans.checked(check).draft_stop(now))
-    return Work(names, prepare, request)
+    return PlanningTask(names, prepare, request)
 
 
 def _of_trajectory(
-        request: Trajectory, group: PlannerGroup, complete: Callable[[Drafts], Drafts]) -> Work:
+        request: Trajectory, group: PlannerGroup,
+        complete: Callable[[Drafts], Drafts]) -> PlanningTask:
     points: dict[str, list[tuple[Any, int]]] = {name: [] for name in request.joints}
     path = request.path is not None
 
@@ -187,7 +189,7 @@ def _of_trajectory(
 
     # The work of a path is not proportional to its number of points.
     size = 1 if path else request.count * len(request.joints)
-    return Work(
+    return PlanningTask(
         frozenset(request.joints), prepare, request, not path and size <= _FEW, size, read)
 
 
@@ -201,7 +203,7 @@ class Replanning(NamedTuple):
 
 def replanning(
         name: str, planner: Planner, make: Callable[[int], Replanning | None], *,
-        corrects: bool = False) -> Work:
+        corrects: bool = False) -> PlanningTask:
     """Return the work of replanning a joint; ``make`` returns None to keep its plan."""
     def prepare(now: int) -> Drafting | None:
         anew = make(now)
@@ -218,4 +220,4 @@ def replanning(
         return Drafting(draft, complete)
     segments = planner.plan.segments
     brief = len(segments) <= _FEW and all(x.path is None for x in segments)
-    return Work(frozenset([name]), prepare, brief=brief, corrects=corrects)
+    return PlanningTask(frozenset([name]), prepare, brief=brief, corrects=corrects)

@@ -12,7 +12,7 @@ from hmsa_ros.clients.experiment import Experiment, prepare, recorder_of
 from hmsa_ros.clients.processes import dated, Session
 
 
-class Recording:
+class PanelRecorder:
     """
     Record to new folders in ``base``, in a separate process; another one makes the report.
 

@@ -10,7 +10,7 @@ LEAST_PERIODS, MOST_PERIODS = 0.2, 50.0
 
 
 @dataclass(frozen=True)
-class Pace:
+class SmoothLimits:
     """Minimum duration and maximum rate of the shaper smooth."""
 
     #: Minimum duration of a move, in natural periods about the target, 0.2 to 50.
@@ -28,4 +28,4 @@ class Pace:
 
 
 #: One natural period, at any rate.
-PACE = Pace()
+PACE = SmoothLimits()

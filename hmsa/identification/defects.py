@@ -21,7 +21,7 @@ from hmsa.identification.fit import Fit
 from hmsa.identification.noise import inflation, Whiteness, whiteness
 from hmsa.identification.quantities import BRANCHES, quantity_of
 from hmsa.identification.response import respond
-from hmsa.identification.result import Signature
+from hmsa.identification.result import Defect
 from hmsa.model.equations import Array
 from hmsa.motion import theta as places
 
@@ -93,7 +93,7 @@ def _columns(fit: Fit) -> Iterator[Departure]:
 class Departures:
     """All departures, tested on the residuals of a fit."""
 
-    signatures: tuple[Signature, ...]  # the largest first
+    signatures: tuple[Defect, ...]  # the largest first
     hint: Array  # variance of the coordinates due to likely departures, shape (p,)
     # Change of the coordinates by one standard deviation of each undetectable error, by name.
     considered: dict[str, Array]
@@ -129,7 +129,7 @@ def departures(
     norms, lengths = (np.linalg.norm(x, axis=0) for x in (directions, columns))
     directions = directions / np.maximum(norms, 1e-300)
     ways = (inverse @ (own.T @ columns)).T
-    signatures, considered = list[Signature](), dict[str, Array]()
+    signatures, considered = list[Defect](), dict[str, Array]()
     hint: Array = np.zeros(len(fit.free))
     late = None
     for one, direction, norm, length, way in zip(
@@ -146,7 +146,7 @@ def departures(
             spread *= inflation(direction, whiteness(residual - size * direction))
         deviations, share = abs(size) / max(spread, 1e-300), size * size / total
         moves = abs(size) / norm * np.abs(way)
-        signatures.append(Signature(one.name, share, deviations, bool(
+        signatures.append(Defect(one.name, share, deviations, bool(
             deviations > _DEVIATIONS and abs(size) / math.sqrt(len(residual)) > floor
             and (share > _SHARE or np.max(moves / single) > _MOVES)), one.remedy))
         if one.remedy == 'sensor_latency' and one.remedy not in given and not (

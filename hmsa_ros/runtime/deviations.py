@@ -14,17 +14,17 @@ from hmsa.planning.group import PlannerGroup, resumed, Resumption
 from hmsa.planning.planner import Planner
 from hmsa.planning.timeline import Draft, Options
 from hmsa_ros.runtime.lateness import Lateness
+from hmsa_ros.runtime.planning_task import PlanningTask, Replanning, replanning
 from hmsa_ros.runtime.receipts import Receipts
 from hmsa_ros.runtime.records import Settings, Severity, Verdict
-from hmsa_ros.runtime.slices import Replanning, replanning, Work
 from hmsa_ros.runtime.throttle import Throttle
 from hmsa_ros.runtime.weighing import (
     aims,
+    better_than_keeping,
     compared,
     expected,
     SHARE,
     step_of,
-    worthwhile,
 )
 
 # Fraction of a period by which commands may be late and are still sent.
@@ -37,7 +37,7 @@ _PAUSE = 20_000_000
 _CAUSE = 400_000_000
 
 
-class Following:
+class Deviations:
     """Compare levels that took effect with the plans."""
 
     def __init__(
@@ -273,7 +273,7 @@ class Following:
             self._report_kept()
         return sorted(self.astray)
 
-    def resumption(self, name: str) -> Work:
+    def resumption(self, name: str) -> PlanningTask:
         """Return the work of replanning the rest for a joint if that reduces the error."""
         return replanning(name, self._group.planners[name], partial(self._resumed, name))
 
@@ -306,7 +306,7 @@ class Following:
             before, after = compared(plan, start, levels, draft, self.lateness)
             # A plan without its lost levels is no alternative: kept, it left 1.3 of the step after
             # a stall of 1 s (row planner_stopped of the fault table).
-            if name not in self._unsent and not worthwhile(
+            if name not in self._unsent and not better_than_keeping(
                     before, after, news=news, unsure=unsure):
                 self._found[name] = Resumption(None, left=float(before.mean()))
                 self._again[name] = 0 if unsure else now + max(_PAUSE, planner.model.ns(1.0))
@@ -316,7 +316,7 @@ class Following:
 
         return Replanning(draft, adopt)
 
-    def take(self, work: Work, drafts: Mapping[str, Draft], now: int) -> Verdict | None:
+    def take(self, work: PlanningTask, drafts: Mapping[str, Draft], now: int) -> Verdict | None:
         """Adopt a new plan made for a time in ns; None if there is nothing to report."""
         name, = work.joints
         found = self._found.pop(name, None)
@@ -344,7 +344,7 @@ class Following:
             (why or 'commands did not take effect as planned') + ': the rest is replanned' + (
                 f', without {missed} setpoints whose time has passed' if missed else ''))
 
-    def abandon(self, work: Work, error: HmsaError) -> Verdict:
+    def abandon(self, work: PlanningTask, error: HmsaError) -> Verdict:
         """Keep a plan that cannot even be stopped."""
         name, = work.joints
         self.dropped([name])

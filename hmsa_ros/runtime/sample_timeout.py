@@ -20,7 +20,7 @@ class _Joint:
     silent: bool = False
 
 
-class Silence:
+class SampleTimeout:
     """
     Detect that samples stop while their publisher still exists.
 

@@ -7,29 +7,29 @@ from hmsa.errors import BadInputError, HmsaError
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.timeline import Draft
+from hmsa_ros.runtime.deviations import Deviations
 from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.follower import Follower
-from hmsa_ros.runtime.following import Following
+from hmsa_ros.runtime.planning_task import Drafts, PlanningTask, SLICE, work_on
 from hmsa_ros.runtime.records import Note, Request, Severity, Stop, Verdict
 from hmsa_ros.runtime.reporting import Reporting
-from hmsa_ros.runtime.slices import Drafts, SLICE, Work, work_on
 
 # Number of levels and setpoints of replaced plans that are freed at a time.
 _FREED = 2_000
 
 
-class Planning:
+class RequestQueue:
     """Have waiting requests planned, and report the results."""
 
     def __init__(
-            self, group: PlannerGroup, following: Following, follower: Callable[[], Follower],
+            self, group: PlannerGroup, following: Deviations, follower: Callable[[], Follower],
             reporting: Reporting, environment: Environment, send: Callable[[], None],
             stopping: Callable[[str], None]) -> None:
         """Begin without requests; ``stopping`` is called with the name of an adopted stop."""
         self._group, self._following, self._reporting = group, following, reporting
         self._follower = follower
         self._around, self._send, self._stopping = environment, send, stopping
-        self._queue: deque[Work] = deque()
+        self._queue: deque[PlanningTask] = deque()
         # Parts of replaced plans: freeing all at once takes tens of ms.
         self._leftovers: list[object] = []
         self.refused = 0
@@ -50,7 +50,7 @@ class Planning:
                 self._queue.remove(work)
                 self.refuse(error, work.request)
 
-    def __contains__(self, work: Work) -> bool:
+    def __contains__(self, work: PlanningTask) -> bool:
         return work in self._queue
 
     def clear(self) -> None:
@@ -60,7 +60,7 @@ class Planning:
         self._queue.clear()
         self._leftovers.clear()
 
-    def add(self, request: Request, *, engaged: bool) -> Work:
+    def add(self, request: Request, *, engaged: bool) -> PlanningTask:
         """Add a checked request; once ``engaged``, one that replaces all others comes first."""
         work = work_on(request, self._group, lambda drafts: self._follower().cautious(drafts))
         if engaged and work.replaces(self._queue):
@@ -69,7 +69,7 @@ class Planning:
             self._queue.append(work)
         return work
 
-    def _supersede(self, work: Work) -> None:
+    def _supersede(self, work: PlanningTask) -> None:
         """Drop earlier requests that this one would replace as soon as they are planned."""
         for old in list(self._queue):
             if old.number < work.number and old.joints <= work.joints and not work.postponed:
@@ -96,7 +96,7 @@ class Planning:
         while self._following.verdicts:
             self._reporting.go_on(self._following.verdicts.pop(0))
 
-    def advance(self, work: Work, wait: int = SLICE) -> bool:
+    def advance(self, work: PlanningTask, wait: int = SLICE) -> bool:
         """Continue work for some ns; return whether it is done."""
         begun = self._around.clock() if work.corrects else 0
         found: tuple[Drafts, int] | None = None
@@ -159,7 +159,7 @@ class Planning:
         self._reporting.outputs.append(Note(Severity.ERROR, f'request refused ({code}): {error}'))
         return self._reporting.verdict
 
-    def _go_on(self, work: Work, drafts: Mapping[str, Draft], now: int) -> None:
+    def _go_on(self, work: PlanningTask, drafts: Mapping[str, Draft], now: int) -> None:
         """Adopt a plan that was replanned, or corrected from samples."""
         by = self._follower() if work.corrects else self._following
         verdict = by.take(work, drafts, now)

@@ -12,9 +12,9 @@ import math
 from hmsa.model.equations import equilibrium_stretch, stretch_limits
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
-from hmsa.planning.drafting import check_times, draft_moves, Outset
+from hmsa.planning.drafting import check_times, draft_moves, PlanStart
 from hmsa.planning.setpoint import Setpoint
-from hmsa.planning.timeline import Draft, Model, PlannedLevel, PlannedSegment
+from hmsa.planning.timeline import Draft, JointModel, PlannedLevel, PlannedSegment
 
 # Fraction of the range from rest to the limits of the model that a motion may use.
 _MARGIN = 0.98
@@ -24,7 +24,7 @@ _PERIODS, _SAMPLES = 2.0, 40
 _REST = 5e-4
 
 
-def check_levels(points: Sequence[tuple[float, int]], model: Model) -> None:
+def check_levels(points: Sequence[tuple[float, int]], model: JointModel) -> None:
     """
     Check flux densities in T and their start times in ns.
 
@@ -44,7 +44,7 @@ def check_levels(points: Sequence[tuple[float, int]], model: Model) -> None:
     check_times(points, 'level')
 
 
-def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Draft:
+def draft_levels(outset: PlanStart, points: Sequence[tuple[float, int]]) -> Draft:
     """
     Draft checked levels (T, ns); their one setpoint is the equilibrium stretch of the last one.
 
@@ -92,7 +92,7 @@ def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Draft:
         rest, outset.begin, arrival, Code.LEVELS, '', outset.begin),))
 
 
-def _period(model: Model, stretch: float) -> float:
+def _period(model: JointModel, stretch: float) -> float:
     """Return the shorter period, in ns, of vibration about a stretch and about rest."""
     return min(
         2.0 * math.pi / model.frequency(x) * model.units.time * NANOSECONDS

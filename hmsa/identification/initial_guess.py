@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from hmsa.errors import BadInputError
 from hmsa.identification import quantities
-from hmsa.identification.recording import Recording
+from hmsa.identification.measurement import Measurement
 from hmsa.identification.response import respond
 from hmsa.model import equations
 from hmsa.model.equations import Array
@@ -53,7 +53,7 @@ class Static:
 
 
 def segments(
-        recording: Recording, fewest: int = _FEWEST) -> list[tuple[int, int, float, float]]:
+        recording: Measurement, fewest: int = _FEWEST) -> list[tuple[int, int, float, float]]:
     """Return begin and end index, start in s and flux density of each level with samples."""
     times, levels = recording.level_times, recording.levels
     changed = np.flatnonzero(np.append(True, np.diff(levels) != 0.0))
@@ -77,7 +77,7 @@ def deviations(values: Array, parts: NDArray[np.int64]) -> Array:
     return found
 
 
-def begins_at_rest(recording: Recording) -> bool:
+def begins_at_rest(recording: Measurement) -> bool:
     """Return whether the samples before the first change of level show no motion."""
     # Slow to import, and not needed by a planner that estimates.
     from scipy.special import fdtri
@@ -107,7 +107,7 @@ def _evaluated(what: int, values: Array, material: Array) -> Array:
 
 
 def static(
-        recording: Recording, values: Mapping[str, float], free: Sequence[str]) -> Static:
+        recording: Measurement, values: Mapping[str, float], free: Sequence[str]) -> Static:
     """Return properties of the levels at rest; the model, and J_lim unless free, are kept."""
     limits = _CHAIN_LIMITS if 'chain_limit' in free else (values['chain_limit'],)
     usual = 5.0 if 'chain_limit' in free else values['chain_limit']
@@ -140,7 +140,7 @@ def static(
     return Static(best[1], best[2], tuple(rests))
 
 
-def ringing(recording: Recording, rests: Sequence[tuple[float, float, float]]) -> list[
+def ringing(recording: Measurement, rests: Sequence[tuple[float, float, float]]) -> list[
         tuple[float, float, float]]:
     """
     Return candidates of frequency (rad/s), decay (1/s) and the stretch of equilibrium.
@@ -190,7 +190,7 @@ def _oscillations(t: Array, y: Array) -> list[tuple[float, float, float]]:
 
 
 def starts(
-        recording: Recording, values: Mapping[str, float], free: Sequence[str]
+        recording: Measurement, values: Mapping[str, float], free: Sequence[str]
 ) -> list[dict[str, float]]:
     """Return start values, the most likely first; the given values come last."""
     given = dict(values)
@@ -217,7 +217,7 @@ def starts(
 
 
 def scan(
-        recording: Recording, values: Mapping[str, float], free: Sequence[str]
+        recording: Measurement, values: Mapping[str, float], free: Sequence[str]
 ) -> list[dict[str, float]]:
     """
     Return start values from trials of time units and damping ratios on the first part of the data.

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from hmsa.identification.quantities import modulus_of
-from hmsa_lab.adapt.estimator import Estimate
+from hmsa_lab.adapt.estimator import StateEstimate
 from hmsa_lab.adapt.motion import held
 
 # Standard deviations and relative change above which a parameter differs from the nominal one.
@@ -35,7 +35,7 @@ _ABSOLUTE = {
     'stretch_bias': ('bias of the sensor', '', 1.0)}
 
 
-def confounded(estimate: Estimate, least: float = _UNKNOWN) -> bool:
+def confounded(estimate: StateEstimate, least: float = _UNKNOWN) -> bool:
     """
     Return whether a tracked sensor bias and a constant force are still indistinguishable.
 
@@ -53,7 +53,7 @@ def confounded(estimate: Estimate, least: float = _UNKNOWN) -> bool:
     return abs(together) > _HIDDEN and math.sqrt(covariance[i, i]) > least
 
 
-def differences(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
+def differences(estimate: StateEstimate, nominal: Mapping[str, Any]) -> list[str]:
     """Return the parameters that differ from nominal values, such as ``G about +20 %``."""
     found = []
     hidden = _PAIR if confounded(estimate) else ()
@@ -74,7 +74,7 @@ def differences(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
     return found + _later(estimate, nominal)
 
 
-def _later(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
+def _later(estimate: StateEstimate, nominal: Mapping[str, Any]) -> list[str]:
     """Return the sum of latency and lag if they are known only together."""
     apart = {x: estimate.values[x] - nominal[x] for x in _LATER if x in estimate.free}
     if any(abs(y) > _SURE * estimate.deviations[x] for x, y in apart.items()):
@@ -88,7 +88,7 @@ def _later(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
 
 
 def sentence(
-        estimate: Estimate, nominal: Mapping[str, Any], holding: float, target: float,
+        estimate: StateEstimate, nominal: Mapping[str, Any], holding: float, target: float,
         start: float, amplitude: float, use: str) -> str:
     """
     Return the errors and their treatment, as a sentence without a full stop.

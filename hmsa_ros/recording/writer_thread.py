@@ -15,7 +15,7 @@ import threading
 import time
 from typing import NamedTuple
 
-from hmsa.bag.metadata import Topic
+from hmsa.bag.metadata import BagTopic
 from hmsa.bag.output import Entry
 from hmsa.bag.topics import number_of
 from hmsa.bag.writer import BagWriter, MIN_FILE_SIZE
@@ -39,7 +39,7 @@ FILE_SECONDS = 1.0
 
 
 @dataclass(frozen=True)
-class Limits:
+class RecordingLimits:
     """Limits on flushing, splitting, and memory."""
 
     flush_period: float = 0.5  #: maximum time in s until the operating system has a message
@@ -96,7 +96,7 @@ class _Batch:
     since: float
 
 
-class Recording:
+class WriterThread:
     """
     Write to a bag in a separate thread.
 
@@ -105,7 +105,7 @@ class Recording:
     """
 
     def __init__(
-            self, writer: BagWriter, limits: Limits,
+            self, writer: BagWriter, limits: RecordingLimits,
             report: Callable[[str, bool], None] = lambda sentence, failure: None) -> None:
         self._writer = writer
         self._limits = limits
@@ -116,7 +116,7 @@ class Recording:
         self._queued = 0
         self._used = 0  # bytes of messages since memory was given back
         self._next_trim = 0.0
-        self._topics: list[Topic] = []
+        self._topics: list[BagTopic] = []
         self._overflowed = Counter[int]()
         self._closing = False
         self._error = ''
@@ -130,7 +130,7 @@ class Recording:
 
     # From any thread -------------------------------------------------------------------------
 
-    def add_topic(self, topic: Topic) -> int:
+    def add_topic(self, topic: BagTopic) -> int:
         """Add a topic, or new profiles of a known one; return its number for the messages."""
         topic.check()
         with self._condition:

@@ -5,20 +5,20 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from hmsa.judge.holds import AHEAD, Hold
 from hmsa.judge.records import (
     Finding,
     GoalTolerances,
     missed,
-    Setpoint,
+    RequestedSetpoint,
     Tolerances,
     worst,
 )
+from hmsa.judge.setpoint_samples import AHEAD, SetpointSamples
 from hmsa.model.equations import stretch_limits
 from hmsa.model.law import critical_zeta
 from hmsa.offload import Awaited, Doing
 from hmsa.planning.group import PlannerGroup
-from hmsa.planning.timeline import Plan, PlannedSegment
+from hmsa.planning.timeline import PlannedSegment, Timeline
 from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.follower import Follower
 
@@ -35,13 +35,14 @@ class _Joint:
 
     name: str  # empty if there is only one
     doing: Doing  # executes the judging
-    asked: Plan  # plan as accepted
-    plan: Plan  # plan now
+    asked: Timeline  # plan as accepted
+    plan: Timeline  # plan now
     request: int  # number of the request in the group
     goal: GoalTolerances | None = None  # tolerances at the last setpoint
     following: int = 0  # number, from 0, of the next setpoint to watch
     left: Sequence[int] = field(init=False)  # numbers of setpoints that are still planned
-    holds: list[Hold] = field(default_factory=list)  # the last one stays after it is over
+    holds: list[SetpointSamples] = field(
+        default_factory=list)  # the last one stays after it is over
     news: list[Finding] = field(default_factory=list)  # findings that need no samples
     corrected: bool = False  # whether the next plan is a correction from samples
     needed: bool = False  # whether the plan was replanned after a deviation
@@ -85,7 +86,7 @@ class _Joint:
         back = len(self.left) - place
         return self.plan.segments[-back] if back <= len(self.plan.segments) else None
 
-    def leave_out(self, plan: Plan, now: int) -> Sequence[int]:
+    def leave_out(self, plan: Timeline, now: int) -> Sequence[int]:
         """Adopt a new plan, and return the numbers of the setpoints that it leaves out."""
         before, after = self.plan.segments, plan.segments
         # Finished setpoints stay as they are.
@@ -104,7 +105,7 @@ class _Joint:
         return {x for x in range(self.following)
                 if (one := self.segment(x)) is not None and not one.carried_out}
 
-    def stop(self, plan: Plan) -> None:
+    def stop(self, plan: Timeline) -> None:
         """Record that a joint came to rest instead of completing a request."""
         self.plan = plan
         for hold in self.holds:
@@ -112,7 +113,7 @@ class _Joint:
         self._miss((x for x in self.left if x >= self.following), _STOPPED)
         self.following = self.count
 
-    def change(self, plan: Plan, now: int) -> None:
+    def change(self, plan: Timeline, now: int) -> None:
         """Adopt a new plan; the setpoints that it leaves out are missed."""
         self.needed |= not self.corrected
         self.corrected = False
@@ -146,14 +147,14 @@ class _Joint:
         self.holds = [
             x if x.over else self._hold(x.setpoint.number - 1) for x in self.holds]
 
-    def _hold(self, number: int) -> Hold:
+    def _hold(self, number: int) -> SetpointSamples:
         """Return a new hold for a setpoint."""
         setpoint = self._setpoint(number)
-        hold = Hold(setpoint, self.goal if setpoint.held else None, self.doing)
+        hold = SetpointSamples(setpoint, self.goal if setpoint.held else None, self.doing)
         self._keep_up(hold)
         return hold
 
-    def _keep_up(self, hold: Hold) -> None:
+    def _keep_up(self, hold: SetpointSamples) -> None:
         """Have a setpoint judged from its arrival in the plan in force."""
         segment = self.segment(hold.setpoint.number - 1)
         if segment is None:
@@ -165,7 +166,7 @@ class _Joint:
         elif hold.setpoint.arrival is not None:
             hold.miss('its time ended before the move to it')
 
-    def _setpoint(self, number: int) -> Setpoint:
+    def _setpoint(self, number: int) -> RequestedSetpoint:
         """Return a setpoint as requested."""
         asked, place, last = self.asked, self.asked.kept + number, number + 1 == self.count
         segment = asked.segments[place]
@@ -173,7 +174,7 @@ class _Joint:
         model = level.model
         omega = model.frequency(segment.stretch) / model.units.time
         ratio = model.material.zeta / critical_zeta(segment.stretch, model.material.packed)
-        return Setpoint(
+        return RequestedSetpoint(
             segment.stretch, asked.segments[place - 1].stretch if number
             else asked.level(segment.begin).stretch,
             segment.since, segment.arrival, segment.until if last
@@ -181,7 +182,7 @@ class _Joint:
             self.count, possible=stretch_limits(model.material), held=last)
 
 
-class Watch:
+class ArrivalMonitor:
     """Gather samples of each setpoint as requested, and judge them."""
 
     def __init__(
@@ -205,7 +206,7 @@ class Watch:
             plan = planner.plan
             self._begin(name, replace(plan, kept=len(plan.segments)), plan)
 
-    def _begin(self, name: str, asked: Plan, plan: Plan) -> None:
+    def _begin(self, name: str, asked: Timeline, plan: Timeline) -> None:
         """Watch the requested setpoints of a joint."""
         self._joints[name] = _Joint(
             name if len(self._group.planners) > 1 else '', self._do, asked, plan,

@@ -6,9 +6,9 @@ import math
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Planner
+from hmsa_ros.runtime.deviations import Deviations
 from hmsa_ros.runtime.device_clock import Offset
 from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.following import Following
 from hmsa_ros.runtime.receipts import Receipts
 from hmsa_ros.runtime.records import Output, Send, Settings, Severity, Verdict
 from hmsa_ros.runtime.takeover import Takeover
@@ -26,7 +26,7 @@ _SHARE = 0.1
 _FAR = 2**62
 
 
-class Devices:
+class CommandLink:
     """
     Send commands, track the reports of devices, and adapt the plans to them.
 
@@ -38,7 +38,7 @@ class Devices:
     """
 
     def __init__(
-            self, planners: Mapping[str, Planner], receipts: Receipts, following: Following,
+            self, planners: Mapping[str, Planner], receipts: Receipts, following: Deviations,
             takeover: Takeover, environment: Environment, outputs: list[Output]) -> None:
         self._planners, self._following, self._takeover = planners, following, takeover
         self.receipts, self._around = receipts, environment

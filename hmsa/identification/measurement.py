@@ -30,7 +30,7 @@ _FEW, _STRONGEST = 0.02, 5.0
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class Measurement:
     """
     A measured motion.
 
@@ -242,11 +242,11 @@ class Recording:
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class UncheckedMeasurement:
     """
     A recording to simulate, without checks, as a search creates thousands.
 
-    The fields are those of a `Recording`.
+    The fields are those of a `Measurement`.
     """
 
     time: Array
