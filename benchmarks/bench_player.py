@@ -28,11 +28,11 @@ def write(folder, rate, seconds):
 
     from hmsa.bag.definitions import message_definition, type_hash
     from hmsa.bag.qos import Qos
-    from hmsa.bag.writer import BagWriter, Topic
+    from hmsa.bag.writer import BagTopic, BagWriter
     name = 'std_msgs/msg/Float64'
     encoding, text = message_definition(name)
     with BagWriter(folder, preset='zstd_fast') as writer:
-        number = writer.add_topic(Topic(
+        number = writer.add_topic(BagTopic(
             '/load', name, text, encoding, (Qos(),), type_hash(name)))
         writer.write((number, START + round(i * 1e9 / rate), 0, i,
                       b'\0\1\0\0' + struct.pack('<d', i)) for i in range(round(rate * seconds)))

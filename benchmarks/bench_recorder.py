@@ -105,9 +105,9 @@ def receive(kind, folder):
             count += 1
         executor = EventsExecutor()
     else:
-        from hmsa.bag.writer import BagWriter, Topic
+        from hmsa.bag.writer import BagTopic, BagWriter
         writer = BagWriter(folder)
-        number = writer.add_topic(Topic(TOPIC, 'std_msgs/msg/UInt8MultiArray'))
+        number = writer.add_topic(BagTopic(TOPIC, 'std_msgs/msg/UInt8MultiArray'))
         flushed = time.monotonic()
 
         def callback(message, info):

@@ -19,7 +19,7 @@ from mcap.opcode import Opcode
 from hmsa.bag.info import summarize
 from hmsa.bag.reader import BagReader
 from hmsa.bag.records import MAGIC, PREFIX
-from hmsa.bag.writer import BagWriter, Topic
+from hmsa.bag.writer import BagTopic, BagWriter
 from hmsa.errors import HmsaError
 
 _FLOAT = 'std_msgs/msg/Float64'
@@ -41,7 +41,7 @@ class Count:
 def make_bag(folder: Path, *, preset: str = 'none', killed: bool = False) -> Path:
     """Write a bag of two topics in several chunks."""
     writer = BagWriter(folder, preset=preset, chunk_size=1000, custom_data={'actuator': 'A3'})
-    numbers = [writer.add_topic(Topic(name, _FLOAT, 'float64 data\n')) for name in ('/a', '/b')]
+    numbers = [writer.add_topic(BagTopic(name, _FLOAT, 'float64 data\n')) for name in ('/a', '/b')]
     writer.write((
         numbers[i % 3 == 0], 10**18 + i * 10**6, 10**18 + i * 10**6, i,
         bytes((0, 1, 0, 0)) + struct.pack('<d', i)) for i in range(300))

@@ -24,7 +24,7 @@ from hmsa.bag.info import summarize, to_json, to_text
 from hmsa.bag.reader import BagReader, read_messages
 from hmsa.bag.records import MAGIC, MessageBlock, PREFIX
 from hmsa.bag.recover import recover
-from hmsa.bag.writer import BagWriter, Topic
+from hmsa.bag.writer import BagTopic, BagWriter
 from hmsa.cli import main
 from hmsa.errors import BadInputError, BagError
 
@@ -38,7 +38,7 @@ def payload(value):
 def write_bag(folder, count=400, preset='none'):
     encoding, text = message_definition(FLOAT)
     with BagWriter(folder, preset=preset, chunk_size=1000) as writer:
-        number = writer.add_topic(Topic(
+        number = writer.add_topic(BagTopic(
             '/a', FLOAT, text, encoding, (qos.Qos(),), type_hash(FLOAT)))
         writer.write((number, i, i, i, payload(i)) for i in range(count))
     return folder / f'{folder.name}_0.mcap'
@@ -316,7 +316,7 @@ def test_empty_definitions_are_those_of_the_installed_types(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
         for i, (kind, hash_of) in enumerate((
                 (FLOAT, type_hash(FLOAT)), (FLOAT, 'RIHS01_' + '0' * 64), ('x/msg/Y', ''))):
-            number = writer.add_topic(Topic(f'/t{i}', kind, '', 'ros2msg', (), hash_of))
+            number = writer.add_topic(BagTopic(f'/t{i}', kind, '', 'ros2msg', (), hash_of))
             writer.write([(number, i, i, i, payload(i))])
     reader = BagReader(tmp_path / 'bag')
     read, = read_messages(tmp_path / 'bag', ['/t0'])
@@ -390,7 +390,7 @@ def test_two_bags_under_one_name_are_told_apart(tmp_path):
 
 def test_a_file_named_in_the_metadata_that_is_missing_is_told(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
-        number = writer.add_topic(Topic('/a', FLOAT))
+        number = writer.add_topic(BagTopic('/a', FLOAT))
         writer.write([(number, 1, 1, 1, payload(1))])
         writer.split()
         writer.write([(number, 2, 2, 2, payload(2))])
@@ -443,7 +443,7 @@ def test_a_missing_schema_leaves_the_messages_raw(tmp_path, encoding):
 
 def test_a_definition_that_cannot_be_read_is_named(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
-        number = writer.add_topic(Topic('/a', 'x/msg/Y', 'nonsense ::: here\n'))
+        number = writer.add_topic(BagTopic('/a', 'x/msg/Y', 'nonsense ::: here\n'))
         writer.write([(number, 1, 1, 1, payload(1))])
     with pytest.raises(BagError, match='definition of x/msg/Y in the bag cannot be read'):
         list(read_messages(tmp_path / 'bag', ['/a']))
@@ -452,7 +452,7 @@ def test_a_definition_that_cannot_be_read_is_named(tmp_path):
 def test_a_payload_that_does_not_fit_is_named(tmp_path):
     encoding, text = message_definition(FLOAT)
     with BagWriter(tmp_path / 'bag') as writer:
-        number = writer.add_topic(Topic('/a', FLOAT, text, encoding))
+        number = writer.add_topic(BagTopic('/a', FLOAT, text, encoding))
         writer.write([(number, 1, 1, 1, bytes((0, 1, 0, 0, 1)))])
     with pytest.raises(BagError, match='does not decode as std_msgs/msg/Float64'):
         list(read_messages(tmp_path / 'bag'))
@@ -551,7 +551,7 @@ def interrupted(self):
     '[1]', '{"/a": "1"}'])
 def test_counts_of_losses_that_make_no_sense_are_left_aside(tmp_path, lost):
     with BagWriter(tmp_path / 'bag', custom_data={'lost': lost}) as writer:
-        writer.add_topic(Topic('/a', FLOAT))
+        writer.add_topic(BagTopic('/a', FLOAT))
     summary = summarize(tmp_path / 'bag')
     assert summary.lost is None
     json.loads(to_json(summary), parse_constant=pytest.fail)

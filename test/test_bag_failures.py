@@ -18,12 +18,12 @@ from hmsa.bag import metadata
 from hmsa.bag.output import OutputFile
 from hmsa.bag.reader import BagReader
 from hmsa.bag.recover import recover
-from hmsa.bag.writer import BagWriter, Topic
+from hmsa.bag.writer import BagTopic, BagWriter
 from hmsa.errors import BadInputError, BagError
 from hmsa_ros.recording.reception import judge, WARN
 from hmsa_ros.recording.writer_thread import lost_by_topic, RecordingLimits, WriterThread
 
-TOPIC = Topic('/a', 'std_msgs/msg/UInt8', 'uint8 data\n')
+TOPIC = BagTopic('/a', 'std_msgs/msg/UInt8', 'uint8 data\n')
 PAYLOAD = bytes((0, 1, 0, 0, 7))
 
 
@@ -222,9 +222,9 @@ def test_messages_that_a_snapshot_has_no_room_for_are_counted(tmp_path):
 # A writer that is killed: it says after each flush what is safe.
 WRITER = """
 import sys
-from hmsa.bag.writer import BagWriter, Topic
+from hmsa.bag.writer import BagWriter, BagTopic
 writer = BagWriter(sys.argv[1], preset=sys.argv[2])
-number = writer.add_topic(Topic('/a', 'std_msgs/msg/UInt8', 'uint8 data\\n'))
+number = writer.add_topic(BagTopic('/a', 'std_msgs/msg/UInt8', 'uint8 data\\n'))
 i = 0
 while True:
     writer.write([(number, i + j, 0, i + j, bytes((0, 1, 0, 0, 7))) for j in range(50)])
@@ -261,7 +261,7 @@ def test_files_that_are_full_at_once_do_not_hold_up_the_writing(tmp_path):
     definition = 'uint8 data\n' * 2000
     recording = WriterThread(
         BagWriter(tmp_path / 'bag'), RecordingLimits(flush_period=0.05, max_size=1024))
-    recording.add_topic(Topic('/a', 'std_msgs/msg/UInt8', definition))
+    recording.add_topic(BagTopic('/a', 'std_msgs/msg/UInt8', definition))
     recording.put([message(i) for i in range(20_000)], 100_000)
     status = recording.close()
     assert status.written == {'/a': 20_000}
@@ -273,7 +273,7 @@ def test_files_that_are_full_at_once_do_not_hold_up_the_writing(tmp_path):
 
 def test_what_is_declared_is_no_part_of_the_size_of_a_file(tmp_path):
     recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits(max_size=1024))
-    recording.add_topic(Topic('/a', 'std_msgs/msg/UInt8', 'uint8 data\n' * 2000))
+    recording.add_topic(BagTopic('/a', 'std_msgs/msg/UInt8', 'uint8 data\n' * 2000))
     recording.put([message(i) for i in range(100)], 500)
     recording.close()
     assert [file.message_count for file in metadata.read(

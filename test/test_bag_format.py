@@ -12,7 +12,7 @@ from hmsa.bag import limits, metadata, qos
 from hmsa.bag.definitions import message_definition, type_hash
 from hmsa.bag.info import summarize
 from hmsa.bag.reader import BagReader, read_messages
-from hmsa.bag.writer import BagWriter, parse_custom_data, PRESETS, Topic
+from hmsa.bag.writer import BagTopic, BagWriter, parse_custom_data, PRESETS
 from hmsa.errors import BadInputError, BagError
 
 AnyReader = needs('rosbags.highlevel').AnyReader
@@ -32,7 +32,7 @@ def payload(value):
 
 def topic(name='/a', type_name=FLOAT, profiles=PROFILES[:1]):
     encoding, text = message_definition(type_name)
-    return Topic(name, type_name, text, encoding, tuple(profiles), type_hash(type_name))
+    return BagTopic(name, type_name, text, encoding, tuple(profiles), type_hash(type_name))
 
 
 def write_bag(folder, stamps=range(10), **options):

@@ -19,7 +19,7 @@ from hmsa.bag import limits, metadata
 from hmsa.bag.definitions import message_definition
 from hmsa.bag.reader import BagReader, read_messages
 from hmsa.bag.recover import recover
-from hmsa.bag.writer import BagWriter, Topic
+from hmsa.bag.writer import BagTopic, BagWriter
 from hmsa.cli import main
 from hmsa.errors import BadInputError, BagError
 
@@ -175,7 +175,7 @@ def test_a_large_chunk_is_read_when_it_is_allowed(tmp_path):
 def good_bag(folder):
     encoding, text = message_definition(FLOAT)
     with BagWriter(folder) as writer:
-        number = writer.add_topic(Topic('/a', FLOAT, text, encoding))
+        number = writer.add_topic(BagTopic('/a', FLOAT, text, encoding))
         writer.write([(number, 1, 1, 1, PAYLOAD)])
     return folder
 

@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 import hmsa
 from hmsa.bag.definitions import message_definition
 from hmsa.bag.reader import read_messages
-from hmsa.bag.writer import BagWriter, Topic
+from hmsa.bag.writer import BagTopic, BagWriter
 from hmsa.cli import main
 from hmsa.errors import BadInputError, MissingWarning
 from hmsa.model.parameters import paper_actuator
@@ -146,7 +146,7 @@ def write_joints(
     with BagWriter(folder, custom_data=custom_data, **options) as writer:
         def topic(name, kind):
             encoding, text = message_definition(kind)
-            return writer.add_topic(Topic(f'{space}/{name}', kind, text, encoding))
+            return writer.add_topic(BagTopic(f'{space}/{name}', kind, text, encoding))
 
         states = topic('joint_states', 'sensor_msgs/msg/JointState')
         for i, (joint, simulation) in enumerate(simulations.items()):
@@ -268,7 +268,7 @@ def test_several_rounds_in_one_bag_are_refused_with_a_way_out(tmp_path):
     encoding, text = message_definition('sensor_msgs/msg/JointState')
     with BagWriter(tmp_path / 'bag', custom_data={'time_jumps': '1'}) as writer:
         states = writer.add_topic(
-            Topic('/joint_states', 'sensor_msgs/msg/JointState', text, encoding))
+            BagTopic('/joint_states', 'sensor_msgs/msg/JointState', text, encoding))
         for _ in range(2):
             writer.write([(states, BEGIN, 0, 0, sample())])
             writer.split()
@@ -280,7 +280,7 @@ def test_topics_that_are_no_run_are_refused(tmp_path):
     encoding, text = message_definition('std_msgs/msg/Float64')
     with BagWriter(tmp_path / 'bag') as writer:
         for name in ('/joint_states', '/flux_density_command'):
-            number = writer.add_topic(Topic(name, 'std_msgs/msg/Float64', text, encoding))
+            number = writer.add_topic(BagTopic(name, 'std_msgs/msg/Float64', text, encoding))
             writer.write([(number, 1, 1, 1, serialize_message(Float64(data=1.0)))])
     with pytest.raises(BadInputError, match='has no topic .../joint_states'):
         verify(tmp_path / 'bag')

@@ -15,7 +15,7 @@ from benchmarks import bench_soak
 from benchmarks.faults import memory, rows
 from benchmarks.faults.rig import Rig, settled
 from benchmarks.faults.table import inject, markdown, Outcome, Seen
-from hmsa.bag.writer import BagWriter, Topic
+from hmsa.bag.writer import BagTopic, BagWriter
 
 MIB = 2**20
 
@@ -136,7 +136,7 @@ def test_planner_and_plant_agree_over_minutes_without_drift():
 
 def test_garbage_among_the_samples_of_a_rough_bag_is_counted_and_not_read(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
-        number = writer.add_topic(Topic('/joint_states', 'sensor_msgs/msg/JointState'))
+        number = writer.add_topic(BagTopic('/joint_states', 'sensor_msgs/msg/JointState'))
         writer.write([(number, 1, 1, 1, bytes(8)), (number, 2, 2, 2, bytes(100))])
     found = bench_soak.check_bag(tmp_path / 'bag', 'rough', '')
     assert (found.samples, found.missing, found.failure) == (2, 0, '')

@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 from hmsa.bag.definitions import message_definition, type_hash
 from hmsa.bag.info import summarize
 from hmsa.bag.qos import Qos
-from hmsa.bag.writer import BagWriter, Topic
+from hmsa.bag.writer import BagTopic, BagWriter
 from hmsa.cli import main
 from hmsa.interfaces import topics
 from hmsa_ros.clients.launching import REPLAY
@@ -42,7 +42,7 @@ def write_bag(folder, entries, profiles=RELIABLE):
             if name not in numbers:
                 type_name = FIELD if 'command' in name else FLOAT
                 encoding, text = message_definition(type_name)
-                numbers[name] = writer.add_topic(Topic(
+                numbers[name] = writer.add_topic(BagTopic(
                     name, type_name, text, encoding, profiles, type_hash(type_name)))
             if 'command' in name:
                 message = MagneticField()

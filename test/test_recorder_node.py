@@ -23,7 +23,7 @@ from hmsa.bag.info import missing_messages, summarize, to_text
 from hmsa.bag.qos import Qos
 from hmsa.bag.reader import BagReader, read_messages
 from hmsa.bag.recover import recover
-from hmsa.bag.writer import BagWriter, Topic
+from hmsa.bag.writer import BagTopic, BagWriter
 from hmsa.cli import main
 from hmsa_ros.nodes.capture import RawSubscription
 from hmsa_ros.nodes.recorder import Recorder as Recording
@@ -441,7 +441,7 @@ def test_a_bag_played_in_a_loop_is_recorded_round_by_round(record, start, ros, t
     bag = tmp_path / 'played'
     encoding, text = message_definition('std_msgs/msg/Float64')
     with BagWriter(bag) as writer:
-        number = writer.add_topic(Topic('/a', 'std_msgs/msg/Float64', text, encoding, (Qos(),)))
+        number = writer.add_topic(BagTopic('/a', 'std_msgs/msg/Float64', text, encoding, (Qos(),)))
         writer.write((number, 10**12 + i * 10**6, 1, i, serialize_message(Float64(data=float(i))))
                      for i in range(200))
     recorder = record('use_sim_time:=true')

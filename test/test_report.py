@@ -20,7 +20,7 @@ from scipy.io import loadmat
 
 import hmsa
 from hmsa.bag.definitions import message_definition
-from hmsa.bag.writer import BagWriter, Topic
+from hmsa.bag.writer import BagTopic, BagWriter
 from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.identification.runs import recording_of
@@ -193,7 +193,7 @@ def write(
             if topic not in numbers:
                 encoding, text = message_definition(kind)
                 text = dict(definitions).get(kind, text)
-                numbers[topic] = writer.add_topic(Topic(topic, kind, text, encoding))
+                numbers[topic] = writer.add_topic(BagTopic(topic, kind, text, encoding))
         writer.write(
             (numbers[topic], time, published.get(time, time), i, payload(message, kind))
             for i, (time, topic, kind, message) in enumerate(
@@ -1452,7 +1452,7 @@ def _bad(tmp_path, case):
         with BagWriter(tmp_path / 'bag') as writer:
             for role in (JOINT_STATES, COMMAND):
                 encoding, text = message_definition(TYPES[role])
-                writer.add_topic(Topic(f'/{role}', TYPES[role], text, encoding))
+                writer.add_topic(BagTopic(f'/{role}', TYPES[role], text, encoding))
         return [str(tmp_path / 'bag')], 'no message'
     if case == 'no folder to write to':
         return [str(good), '--out', str(tmp_path / 'no' / 'x.html')], 'is no folder'
