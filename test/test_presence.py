@@ -5,6 +5,7 @@ import json
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import pytest
 from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
 
 from hmsa.cli import main
 from hmsa.interfaces import topics
@@ -69,6 +70,23 @@ def test_second_plant_of_a_joint_is_refused_until_it_is_gone(ros, serve, start):
     asking.until(refused=False)
     # The middleware believes for some 20 s that it runs.
     assert ros.node.count_publishers(topics.FLUX_DENSITY_APPLIED.name) == 2
+
+
+def test_a_recorder_of_the_commands_does_not_carry_them_out(ros, serve, start):
+    ros.node.create_service(Trigger, '~/split_bagfile', lambda _, response: response)
+    ros.collect(topics.FLUX_DENSITY_COMMAND.type, topics.FLUX_DENSITY_COMMAND.name)
+    states = ros_entities.publisher(ros.node, topics.JOINT_STATES)
+    serve(PlannerNode)
+    asking = Asking(ros)
+    states.publish(JointState(name=['actuator'], position=[1.0]))
+    asking.until(refused=False)
+    status = ros.collect(topics.STATUS.type, '/planner/status', topics.STATUS.qos)
+    ros.spin_until(lambda: status and any(
+        x.value.startswith('no node subscribes to /flux_density_command')
+        for x in status[-1].values if x.key == 'unheard'), 'the planner says so')
+    start.hmsa('plant')
+    ros.spin_until(lambda: not any(
+        x.key == 'unheard' for x in status[-1].values), 'the plant carries them out')
 
 
 @pytest.mark.parametrize(('messages', 'active'), [

@@ -4,8 +4,9 @@ import signal
 
 import pytest
 from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, HmsaError
 from hmsa.interfaces import topics
 from hmsa_ros.device.hardware import load
 from hmsa_ros.nodes.conversions import from_time, to_command
@@ -100,6 +101,24 @@ def test_a_coil_whose_node_has_gone_may_be_on_until_it_is_back(start, ros, make_
     assert again[0].data == 0.0
     assert driver.wait() == 1
     assert 'the coil is switched off at last' in driver.output
+
+
+@pytest.mark.ros
+def test_a_recorder_of_the_topic_is_no_node_that_serves_the_coil(ros, make_ros, monkeypatch):
+    ros.node.create_service(Trigger, '~/split_bagfile', lambda _, response: response)
+    ros.collect(FIELD, '/field')
+    with monkeypatch.context() as patched:
+        patched.setattr('hmsa_lab.nodes.topic_coil._PATIENCE', 0.5)
+        with pytest.raises(BadInputError, match='no node subscribes to /field'):
+            load('topic', 'left', {'topic': '/field'})
+    server = make_ros(namespace='/bench')
+    server.collect(FIELD, '/field')
+    coil = load('topic', 'left', {'topic': '/field'})
+    coil.write(0.1, 0)
+    server.node.destroy_subscription([*server.node.subscriptions][0])
+    with pytest.raises(HmsaError, match='no node subscribes to /field'):
+        ros.spin_until(lambda: coil.write(0.1, 0) and None, 'the loss')
+    coil.close()
 
 
 BAD = (

@@ -22,8 +22,9 @@ from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import to_time
 from hmsa_ros.nodes.temporary_node import leave, visit
 
-# In s: wait for a subscriber at the start, interval of checks, wait for the last acknowledgement.
-_PATIENCE, _LOOK, _LAST = 8.0, 0.02, 0.3
+# In s: wait for a subscriber at the start, interval of checks then and later (each takes 0.1 ms),
+# wait for the last acknowledgement.
+_PATIENCE, _LOOK, _AGAIN, _LAST = 8.0, 0.02, 0.25, 0.3
 # Tolerance of the length of a direction, and maximum length of an array.
 _ROUNDED, _LONGEST = 1e-3, 4096
 
@@ -43,6 +44,7 @@ class _Topic:
             cli_args=['--ros-args', '-r', f'__node:={own}'])
         self.fields: dict[str, Field] = {}
         self._publisher: Any = None
+        self._count, self._looked = 0, -math.inf  # subscribers, and time in s, at the last check
         try:
             self.name = self._node.resolve_topic_name(name)
             until = monotonic() + _PATIENCE
@@ -63,8 +65,8 @@ class _Topic:
 
     @property
     def matched(self) -> bool:
-        """Whether there is a subscriber."""
-        return self._publisher is not None and bool(self._publisher.get_subscription_count())
+        """Whether there is a subscriber other than recorders."""
+        return self._publisher is not None and ros_entities.heard(self._node, self._publisher)
 
     def _require_subscriber(self) -> None:
         if not self.matched:
@@ -75,17 +77,21 @@ class _Topic:
 
     def publish(self, now: int) -> None:
         """Publish the levels of all joints at a time in ns."""
-        self._require_subscriber()
         message = self.kind()
         for field in self.fields.values():
             field.put(message)
         if hasattr(message, 'header'):
             message.header.stamp = to_time(now)
         self._publisher.publish(message)
+        # After the level, which this would delay.
+        count, time = self._publisher.get_subscription_count(), monotonic()
+        if count != self._count or time - self._looked >= _AGAIN:
+            self._require_subscriber()
+            self._count, self._looked = count, time
 
     def close(self) -> None:
         """Close after the last message is acknowledged."""
-        if self.matched:
+        if self._publisher.get_subscription_count():
             self._publisher.wait_for_all_acked(Duration(seconds=_LAST))
         leave(self._node)
 

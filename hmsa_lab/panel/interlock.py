@@ -21,14 +21,14 @@ class InterlockSwitch:
     """
 
     def __init__(self, node: Node) -> None:
-        self._publisher = ros_entities.publisher(node, INTERLOCK, DRIVER)
+        self._node, self._publisher = node, ros_entities.publisher(node, INTERLOCK, DRIVER)
         self.closed: bool | None = None  #: as last requested; None before the first request
         self._next = math.inf
 
     @property
     def present(self) -> bool:
         """Whether a driver listens."""
-        return bool(self._publisher.get_subscription_count())
+        return ros_entities.heard(self._node, self._publisher)
 
     def turn(self, now: float, *, closed: bool) -> None:
         """Open or close it, from a time in s on."""

@@ -181,7 +181,7 @@ class PlannerClient(Link):
 
         def subscribed() -> bool:
             heard = ros_entities.subscribers_of(self.node, self._publisher.topic_name).values()
-            return not graph.recorders(self.node).isdisjoint(heard) and (
+            return not ros_entities.recorders(self.node).isdisjoint(heard) and (
                 self._publisher.get_subscription_count() >= len(heard))
 
         self.spin_until(

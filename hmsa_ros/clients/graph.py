@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from rclpy.node import Node
 
 from hmsa.interfaces import topics
-from hmsa_ros.nodes.ros_entities import publishers_of, subscribers_of
+from hmsa_ros.nodes.ros_entities import publishers_of, recorders, subscribers_of
 
 
 def unheard(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
@@ -13,13 +13,6 @@ def unheard(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
     leave_out = recorders(node)
     return [x for x in _commands(node, namespace, joints)
             if leave_out.issuperset(subscribers_of(node, x).values())]
-
-
-def recorders(node: Node) -> set[str]:
-    """Return the full names of recorders, including those of rosbag2, which also split bags."""
-    return {
-        service.rpartition('/')[0] for service, _ in node.get_service_names_and_types()
-        if service.endswith('/split_bagfile')}
 
 
 def _commands(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:

@@ -51,7 +51,7 @@ class JointChannel:
     def found(self) -> bool:
         """Whether a device subscribes to the commands and reports applied levels."""
         return not self._applied or bool(
-            self._command.get_subscription_count() and (
+            ros_entities.heard(self._node, self._command) and (
                 self._node.count_publishers(self._applied)
                 or self._node.count_publishers(topics.JOINT_STATES.name)))
 
@@ -72,7 +72,7 @@ class JointChannel:
         """Return why commands are not carried out; empty if they are."""
         if not self._applied:
             return ''
-        if not self._command.get_subscription_count():
+        if not ros_entities.heard(self._node, self._command):
             return f'no node subscribes to {self._command.topic_name}: start a plant or a driver'
         if not self._node.count_publishers(self._received):
             # The present subscriber gives no receipts.

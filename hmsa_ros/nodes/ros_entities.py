@@ -74,6 +74,19 @@ def subscribers_of(node: Node, topic: str) -> dict[bytes, str]:
     return _names(node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic)))
 
 
+def recorders(node: Node) -> set[str]:
+    """Return the full names of recorders, including those of rosbag2, which also split bags."""
+    return {
+        service.rpartition('/')[0] for service, _ in node.get_service_names_and_types()
+        if service.endswith('/split_bagfile')}
+
+
+def heard(node: Node, publisher: Publisher) -> bool:
+    """Return whether a publisher has a subscriber other than recorders."""
+    return publisher.get_subscription_count() > 0 and not recorders(node).issuperset(
+        subscribers_of(node, publisher.topic_name).values())
+
+
 def matched(node: Node, publisher: Publisher, *owners: str) -> bool:
     """
     Return whether a publisher reaches all its subscribers in the graph, those of the owners too.
