@@ -34,6 +34,7 @@ INSTALL_REQUIRES = [
     'numpy>=1.26',
     'plotly>=5.15',
     'rich>=13.0',
+    'rosbags>=0.11',
     'scipy>=1.11',
     'zstandard>=0.18',
 ]
@@ -52,7 +53,6 @@ EXTRAS_REQUIRE = {
         'pytest>=7.4,<9.2',
         'pytest-timeout>=2.2',
         'pytest-xdist>=3.7',
-        'rosbags>=0.10',
         'sympy>=1.12',
     ],
     # Style and types, which no test depends on.

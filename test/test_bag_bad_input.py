@@ -280,20 +280,20 @@ def test_a_file_that_is_no_mcap_is_named(tmp_path, capsys):
 def test_what_is_not_there_is_said(tmp_path, capsys):
     (tmp_path / 'empty').mkdir()
     for name, expected in (
-            ('none', 'does not exist'), ('empty', 'holds no .mcap file')):
+            ('none', 'does not exist'), ('empty', 'holds no .mcap or .db3 file')):
         assert main(['bag', 'info', str(tmp_path / name)]) == 2
         assert expected in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('in_folder', [True, False])
 @pytest.mark.parametrize(('name', 'content', 'advice'), [
-    ('a.db3', b'', '"ros2 bag convert"'),
-    ('a.db3', b'SQLite format 3\0 ...', 'is an SQLite bag: expected MCAP; convert it with "ros2'),
+    ('a.db3', b'', 'or database missing tables.): expected a bag of MCAP, SQLite or ROS 1'),
+    ('a.db3', b'SQLite format 3\0 ...', 'a.db3 cannot be read ('),
     ('a.mcap.zstd', zstandard.compress(MAGIC), 'decompress it with "zstd -d FILE"'),
-    ('a.bag', b'#ROSBAG V2.0\n', 'is a bag of ROS 1: expected MCAP; convert it with "rosbags-con'),
+    ('a.bag', b'#ROSBAG V2.0\n', 'a.bag'),
     ('a.mcap', b'version https://git-lfs.github.com/spec/v1\n', 'the file with "git lfs pull"'),
 ])
-def test_a_bag_of_another_format_is_refused_with_a_way_on(
+def test_a_file_that_is_no_bag_is_refused_with_a_way_on(
         tmp_path, capsys, name, content, advice, in_folder):
     (tmp_path / 'bag').mkdir()
     path = tmp_path / 'bag' / name

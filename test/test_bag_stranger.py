@@ -230,7 +230,7 @@ def test_files_outside_the_folder_are_not_read(tmp_path):
         assert reader.files == (bag / 'bag_0.mcap',)
     (bag / 'bag_0.mcap').unlink()
     (bag / 'bag_0.mcap').symlink_to(other / 'other_0.mcap')
-    with pytest.raises(BadInputError, match='holds no .mcap file: .*; name .*/bag_0.mcap'):
+    with pytest.raises(BadInputError, match='holds no .mcap or .db3 file: .*; name .*/bag_0.mcap'):
         BagReader(bag)
     # A link that stays inside, and one that is named itself, are what they seem.
     (other / 'other_1.mcap').symlink_to('other_0.mcap')

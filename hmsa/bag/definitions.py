@@ -8,7 +8,7 @@ need ROS. Definitions are read from the ``share`` folders of the environment, wi
 from collections.abc import Callable
 import contextlib
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 import io
 import json
 import os
@@ -28,6 +28,8 @@ _BUILTIN = frozenset((
     'bool', 'byte', 'char', 'float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32',
     'uint32', 'int64', 'uint64', 'string', 'wstring'))
 _FIELD = re.compile(r'^([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]\w*')
+#: Encoding of the messages of ROS 1, and of their definitions.
+ROS1 = 'ros1'
 #: The one usual type whose definition is empty.
 EMPTY = 'std_msgs/msg/Empty'
 _SEPARATOR = '\n' + '=' * 80 + '\nMSG: '
@@ -127,6 +129,14 @@ def installed(topic: 'BagTopic') -> 'BagTopic':
     return replace(topic, definition=definition, definition_encoding=encoding)
 
 
+def _ros1_decoder(info: 'BagTopic') -> Callable[[bytes], Any]:
+    """Return the decoder of a topic of ROS 1: times have the fields of ROS 2."""
+    from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(info.definition, info.type))
+    return partial(store.deserialize_ros1, typename=info.type)
+
+
 def make_decoder(info: 'BagTopic') -> Callable[[bytes], Any]:
     """Return the decoder of a topic's payloads; both raise `BagError` if they cannot decode."""
     from mcap.records import Schema
@@ -140,9 +150,10 @@ def make_decoder(info: 'BagTopic') -> Callable[[bytes], Any]:
         # Its parser prints before it raises.
         with contextlib.redirect_stderr(io.StringIO()), \
                 contextlib.redirect_stdout(io.StringIO()):
-            decode = DecoderFactory().decoder_for(info.encoding, Schema(
-                id=1, name=info.type, encoding=info.definition_encoding,
-                data=info.definition.encode()))
+            decode = _ros1_decoder(info) if info.encoding == ROS1 else (
+                DecoderFactory().decoder_for(info.encoding, Schema(
+                    id=1, name=info.type, encoding=info.definition_encoding,
+                    data=info.definition.encode())))
     except Exception as error:  # the parser raises errors of many unrelated classes
         raise BagError(f'the definition of {info.type} in the bag cannot be read: '
                        f'{error}') from error

@@ -9,27 +9,22 @@ from hmsa.errors import BadInputError, BagError
 _Problem = Callable[[str], None]
 
 
-_CONVERT = 'convert it with "ros2 bag convert"'
-# Files that are often given in place of an MCAP file: how they begin, and what to do.
-_FOREIGN = (
-    (b'SQLite format 3\0', f'is an SQLite bag: expected MCAP; {_CONVERT}'),
-    (b'#ROSBAG V', 'is a bag of ROS 1: expected MCAP; convert it with "rosbags-convert --src FILE '
-     '--dst FOLDER --dst-storage mcap" (pip install rosbags)'),
+_SUFFIXES = '.mcap', '.db3'
+# Files that are often given in place of a bag: how they begin, and what to do.
+_MISTAKEN = (
     (b'version https://git-lfs.github.com/', 'is a pointer of Git LFS in place of the file: '
-     'expected MCAP; fetch the file with "git lfs pull"'),
-    (b'\x28\xb5\x2f\xfd', 'is compressed as a whole by zstd: expected MCAP with compressed '
-     f'chunks; decompress it with "zstd -d FILE" and name the .mcap file, or {_CONVERT}'))
+     'expected a bag; fetch the file with "git lfs pull"'),
+    (b'\x28\xb5\x2f\xfd', 'is compressed as a whole by zstd: expected the folder of the bag '
+     f'with its {metadata.FILE_NAME}; or decompress it with "zstd -d FILE" and name the result'))
 
 
-def foreign(path: Path) -> str:
-    """Return what a file is in place of an MCAP file and what to do; empty if it may be one."""
+def advice_on(path: Path) -> str:
+    """Return what a file is in place of a bag and what to do; empty if it may be one."""
     if not path.is_file():
         return ''
     with path.open('rb') as file:
-        begin = file.read(max(len(magic) for magic, _ in _FOREIGN))
-    if path.suffix == '.db3' and not begin:
-        begin = _FOREIGN[0][0]
-    return next((advice for magic, advice in _FOREIGN if begin.startswith(magic)), '')
+        begin = file.read(max(len(magic) for magic, _ in _MISTAKEN))
+    return next((advice for magic, advice in _MISTAKEN if begin.startswith(magic)), '')
 
 
 def find(path: Path, problem: _Problem) -> tuple[list[Path], metadata.BagMetadata | None]:
@@ -46,10 +41,17 @@ def find(path: Path, problem: _Problem) -> tuple[list[Path], metadata.BagMetadat
             return [path], None
         if not path.is_dir():
             what = 'is neither' if path.exists() else 'does not exist'
-            raise BadInputError(f'{path} {what}: expected the folder of a bag or an .mcap file')
+            raise BadInputError(
+                f'{path} {what}: expected the folder of a bag or an .mcap or .db3 file')
         entries = sorted(path.iterdir(), key=_order)
-        present = [x for x in entries if x.suffix == '.mcap' and _is_own(x, problem)]
+        present = [x for x in entries if x.suffix in _SUFFIXES and _is_own(x, problem)]
         stored = _metadata(path, problem)
+        if stored is not None and stored.compression_mode.upper() not in ('', 'NONE'):
+            # As a whole by rosbags, which follows links.
+            if links := [x for x in entries if x.is_symlink()]:
+                raise BadInputError(f'{path} is compressed and holds the link {links[0].name}: '
+                                    'expected files')
+            return [path], stored
         listed = [] if stored is None else _listed(path, stored, problem)
     except OSError as error:
         raise BadInputError(
@@ -69,18 +71,19 @@ def find(path: Path, problem: _Problem) -> tuple[list[Path], metadata.BagMetadat
         return listed, stored
     if not present:
         for entry in entries:
-            if advice := foreign(entry):
+            if advice := advice_on(entry):
                 raise BadInputError(f'{entry} {advice}')
-        inside = sorted(x.parent for x in path.glob('*/*.mcap'))
-        links = [x for x in entries if x.suffix == '.mcap' and x.is_file()]
-        raise BadInputError(f'{path} holds no .mcap file: expected a bag' + (
+        inside = sorted({x.parent for suffix in _SUFFIXES for x in path.glob(f'*/*{suffix}')}
+                        | set(path.glob('*.bag')))
+        links = [x for x in entries if x.suffix in _SUFFIXES and x.is_file()]
+        raise BadInputError(f'{path} holds no .mcap or .db3 file: expected a bag' + (
             f', such as {inside[0]}' if inside else
             f'; name {links[0]}, a link out of the folder, to read it' if links else ''))
     stems = dict.fromkeys(_order(x)[0] for x in present)
     if len(stems) > 1:
         raise BadInputError(
             f'{path} has no usable {metadata.FILE_NAME} and holds files of several bags '
-            f'({", ".join(stems)}): expected one bag; name one .mcap file')
+            f'({", ".join(stems)}): expected one bag; name one of its files')
     return present, stored
 
 
@@ -109,13 +112,10 @@ def _metadata(folder: Path, problem: _Problem) -> metadata.BagMetadata | None:
         problem(f'{error}; the files themselves are read')
         return None
     # "ros2 bag reindex" leaves no storage.
-    if stored.storage not in ('', 'mcap'):
+    if stored.storage not in ('', 'mcap', 'sqlite3'):
         raise BadInputError(
-            f'{folder} is stored as {stored.storage!r}: expected mcap; {_CONVERT}')
-    if stored.compression_mode.upper() not in ('', 'NONE'):
-        raise BadInputError(
-            f'{folder} is compressed by rosbag2 in mode {stored.compression_mode}: expected MCAP '
-            f'with compressed chunks; {_CONVERT}')
+            f'{folder} is stored as {stored.storage!r}: expected mcap or sqlite3; convert it with '
+            '"ros2 bag convert"')
     return stored
 
 
@@ -138,6 +138,6 @@ def _listed(
 
 def _order(path: Path) -> tuple[str, int]:
     """Return a file's name without number and ending, and its number, by which files are read."""
-    name = path.name.removesuffix('.mcap')
+    name = path.stem if path.suffix in _SUFFIXES else path.name
     stem, _, number = name.rpartition('_')
     return (stem, int(number)) if stem and number.isdecimal() else (name, -1)

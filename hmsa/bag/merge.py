@@ -4,7 +4,7 @@ from array import array
 from collections.abc import Callable, Iterator
 import heapq
 from itertools import islice
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from hmsa.bag import records
 from hmsa.errors import BagError
@@ -20,6 +20,27 @@ class Message(NamedTuple):
     data: bytes
 
 
+class AnyCursor(Protocol):
+    """A position in messages; among equal log times, the smaller ``key`` comes first."""
+
+    key: tuple[int, int]
+    size: int  #: in memory
+
+    def sort(self) -> None:
+        """Sort the messages by log time; the sort is stable."""
+
+    @property
+    def left(self) -> bool:
+        """Return whether there is a next message."""
+
+    @property
+    def time(self) -> int:
+        """Return the log time of the next message."""
+
+    def take(self, limit: int) -> Iterator[Message]:
+        """Yield the next messages before a log time; the messages must be sorted."""
+
+
 class Cursor:
     """
     A position in the messages of a chunk or run, initially in stored order.
@@ -33,6 +54,7 @@ class Cursor:
             topic_of: Callable[[int], str | None], start: int, end: int) -> None:
         self.key = key
         self.content = content
+        self.size = len(content)
         self.problem = ''
         self._names: dict[int, str | None] = {}
         self._times, self._places = array('Q'), array('Q')
@@ -85,7 +107,7 @@ class Cursor:
                 content[place + head_size:place + prefix_size + length])
 
 
-def merge(cursors: list[Cursor], limit: int) -> Iterator[Message]:
+def merge(cursors: list[AnyCursor], limit: int) -> Iterator[Message]:
     """Yield the messages of sorted chunks before a log time; equal times in written order."""
     heap = [(cursor.time, cursor.key, cursor) for cursor in cursors
             if cursor.left and cursor.time < limit]

@@ -1,5 +1,5 @@
 """
-Read a bag, a folder or a single ``.mcap`` file, of this package or of rosbag2.
+Read a bag, a folder or a single file, of this package, of rosbag2 or of ROS 1.
 
 For analysis without ROS, use one function::
 
@@ -13,8 +13,8 @@ raw payloads use `BagReader`.
 Unreadable parts are skipped and reported in `BagReader.problems`, one sentence each: a truncated
 file is read up to its end, a damaged chunk is skipped.
 
-Bags can come from untrusted sources: sizes are checked against `hmsa.bag.limits` before memory
-is allocated, only files in the bag's folder are read, and no content is executed.
+Bags can come from untrusted sources: sizes in MCAP files are checked against `hmsa.bag.limits`
+before memory is allocated, only files in the bag's folder are read, and no content is executed.
 """
 
 from collections.abc import Callable, Collection, Iterator
@@ -25,7 +25,8 @@ from typing import Any, NamedTuple
 from hmsa.bag import limits, metadata
 from hmsa.bag.definitions import make_decoder
 from hmsa.bag.folder import find
-from hmsa.bag.merge import Cursor, merge, Message
+from hmsa.bag.foreign import ForeignFile, is_foreign
+from hmsa.bag.merge import AnyCursor, merge, Message
 from hmsa.bag.metadata import BagTopic
 from hmsa.bag.output import EXPERIMENT
 from hmsa.bag.records import MessageBlock
@@ -54,7 +55,7 @@ class BagReader:
     Parameters
     ----------
     path : path
-        Folder of a bag, or one ``.mcap`` file.
+        Folder of a bag, or one of its files (``.mcap``, ``.db3``, ``.bag``).
     max_chunk_size : int
         Largest content of a chunk, and largest message, in bytes; larger ones are skipped. Reading
         takes at most a few times as much memory.
@@ -95,17 +96,20 @@ class BagReader:
         intake = ReadLimits(max_chunk_size)
         self.problems = intake.problems
         paths, self.metadata = find(self.path, intake.problem)
-        self._files: list[ScannedFile] = []
+        self._files: list[ScannedFile | ForeignFile] = []
         for file_path in paths:
             try:
-                self._files.append(ScannedFile(intake, file_path, len(self._files)))
+                number = len(self._files)
+                self._files.append(
+                    ForeignFile(intake, file_path, number, self.metadata)
+                    if is_foreign(file_path) else ScannedFile(intake, file_path, number))
             except HmsaError as error:
                 if len(paths) == 1 and isinstance(error, BadInputError):
                     raise
                 intake.problem(str(error))
         if not self._files:
             raise BadInputError(f'no file of {self.path} can be read: ' + self.problems[0])
-        self.files = tuple(file.path for file in self._files)
+        self.files = tuple(path for file in self._files for path in file.paths)
         self.records: dict[str, dict[str, str]] = {}
         for file in self._files:
             for name, values in file.metadata.items():
@@ -120,7 +124,7 @@ class BagReader:
             key: value for key, value in self.records.get(EXPERIMENT, {}).items()
             if key != 'version'}
         # Messages by file; of old versions of the metadata, 0.
-        self._listed = {} if self.metadata is None else {
+        self._listed = {} if self.metadata is None or paths == [self.path] else {
             Path(x.path).name: x.message_count for x in self.metadata.files}
         read = {x.name for x in self.files}
         self._missing = sum(
@@ -198,11 +202,11 @@ class BagReader:
             key=lambda block: (block.start, block.file, block.offset))
         wanted = None if topics is None else frozenset(topics)
         most = limits.CHUNKS_AT_ONCE * self._max_chunk_size
-        active: list[Cursor] = []
+        active: list[AnyCursor] = []
         for i, block in enumerate(blocks):
             if cancelled():
                 return
-            if sum(len(cursor.content) for cursor in active) + block.size > most:
+            if sum(cursor.size for cursor in active) + block.size > most:
                 # All active chunks overlap with this one.
                 self._files[block.file].problem(
                     f': more than {most} bytes of chunks overlap in time, at byte '
@@ -236,26 +240,17 @@ class BagReader:
 
     def _cursor(
             self, block: MessageBlock, topics: Collection[str] | None = None, start: int = 0,
-            end: int = _NEVER) -> Cursor | None:
-        """Return the messages of a chunk or run in the order stored; report damage."""
+            end: int = _NEVER) -> AnyCursor | None:
+        """Return the messages of a block in the order stored; report damage."""
         file = self._files[block.file]
 
         def topic_of(channel: int) -> str | None:
             name = self._topic_of(file, channel)
             return name if topics is None or name in topics else None
 
-        try:
-            with file.path.open('rb') as stream:
-                content = block.content(stream.fileno())
-        except (BagError, OSError) as error:
-            file.problem(f': {error}, at byte {block.offset}: skipped')
-            return None
-        cursor = Cursor((block.file, block.offset), content, topic_of, start, end)
-        if cursor.problem:
-            file.problem(f': {cursor.problem}, at byte {block.offset}: skipped')
-        return cursor
+        return file.cursor(block, topic_of, start, end)
 
-    def _topic_of(self, file: ScannedFile, number: int) -> str | None:
+    def _topic_of(self, file: ScannedFile | ForeignFile, number: int) -> str | None:
         """Return the topic of a channel, None if its messages are skipped."""
         channel = file.channels.get(number)
         if channel is None:

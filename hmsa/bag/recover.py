@@ -4,9 +4,10 @@ from dataclasses import dataclass, replace
 import os
 
 from hmsa.bag import limits
+from hmsa.bag.definitions import ROS1
 from hmsa.bag.reader import BagReader
 from hmsa.bag.writer import BagWriter
-from hmsa.errors import BagError
+from hmsa.errors import BadInputError, BagError
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,10 @@ def recover(
         max_chunk_size: int = limits.CHUNK_SIZE) -> Recovered:
     """Write all that can be read of a bag to a new one; raise `BagError` unless it reads back."""
     reader = BagReader(path, max_chunk_size=max_chunk_size)
+    if any(topic.encoding == ROS1 for topic in reader.topics.values()):
+        raise BadInputError(
+            f'{path} is a bag of ROS 1, whose messages are encoded otherwise: expected one of ROS '
+            f'2; convert it with "rosbags-convert --src {path} --dst {out} --dst-storage mcap"')
     try:
         with BagWriter(out, custom_data=reader.custom_data) as writer:
             numbers = {name: writer.add_topic(replace(topic, type=topic.type or 'unknown'))

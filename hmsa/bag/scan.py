@@ -2,7 +2,7 @@
 
 from array import array
 from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 import os
 from pathlib import Path
@@ -24,7 +24,8 @@ from mcap.records import (
 )
 
 from hmsa.bag import limits, records
-from hmsa.bag.folder import foreign
+from hmsa.bag.folder import advice_on
+from hmsa.bag.merge import Cursor
 from hmsa.bag.records import MAGIC, MessageBlock, PREFIX
 from hmsa.errors import BadInputError, BagError, printable
 
@@ -89,6 +90,7 @@ class ScannedFile:
 
     def __init__(self, intake: ReadLimits, path: Path, number: int) -> None:
         self.path = path
+        self.paths = [path]
         self.closed = False
         self.said: int | None = None
         self._intake = intake
@@ -102,7 +104,7 @@ class ScannedFile:
                 self._size = os.fstat(self._descriptor).st_size
                 magic = stream.read(len(MAGIC))
                 if magic != MAGIC:
-                    what = foreign(path) or ('is empty' if not magic else (
+                    what = advice_on(path) or ('is empty' if not magic else (
                         f'was cut off after {self._size} bytes' if MAGIC.startswith(magic) else
                         f'is not an MCAP file, as it begins with {magic!r}')
                         ) + ': expected an MCAP file'
@@ -135,6 +137,21 @@ class ScannedFile:
         except OSError as error:
             self.problem(f' cannot be read any more: {error.strerror}')
         return self._counts
+
+    def cursor(
+            self, block: MessageBlock, topic_of: Callable[[int], str | None], start: int,
+            end: int) -> Cursor | None:
+        """Return the messages of a block in the order stored; report damage."""
+        try:
+            with self.path.open('rb') as stream:
+                content = block.content(stream.fileno())
+        except (BagError, OSError) as error:
+            self.problem(f': {error}, at byte {block.offset}: skipped')
+            return None
+        cursor = Cursor((block.file, block.offset), content, topic_of, start, end)
+        if cursor.problem:
+            self.problem(f': {cursor.problem}, at byte {block.offset}: skipped')
+        return cursor
 
     def _clear(self) -> None:
         """Reset the content."""

@@ -7,6 +7,7 @@ from mcap.records import Schema
 
 from hmsa.bag import limits, qos
 from hmsa.bag.definitions import EMPTY, installed
+from hmsa.bag.foreign import ForeignFile
 from hmsa.bag.metadata import BagTopic
 from hmsa.bag.scan import ScannedFile
 from hmsa.errors import BagError
@@ -20,7 +21,7 @@ def number_of(topic: BagTopic, known: Sequence[BagTopic]) -> int:
 
 
 def topics_of(
-        files: Iterable[ScannedFile], described: Mapping[str, BagTopic],
+        files: Iterable[ScannedFile | ForeignFile], described: Mapping[str, BagTopic],
         custom_data: Mapping[str, str], problem: Callable[[str], None]) -> dict[str, BagTopic]:
     """Return the topics of files, with the profiles of their metadata, in order of appearance."""
     topics: dict[str, BagTopic] = {}

@@ -42,7 +42,7 @@ def add_parser(subparsers: Any) -> None:
             (_recover, [out]), (_verify, [tolerance, params_file, JSON])):
         add_command(
             actions, function.__name__.strip('_'), function.__doc__,
-            ('bag', 'BAG', str, 'folder of a bag, or an .mcap file'), *options, max_chunk,
+            ('bag', 'BAG', str, 'folder of a bag, or one of its files'), *options, max_chunk,
             run=function)
 
 
@@ -121,7 +121,8 @@ def _recover(arguments: argparse.Namespace) -> int:
     """
     Copy the readable messages of a damaged bag to a new bag.
 
-    Copy everything readable in a bag to a new bag.
+    Copy everything readable in a bag to a new bag. A bag of SQLite, or compressed as a whole,
+    becomes MCAP.
 
     example: hmsa bag recover cut_off_run --out saved_run
     """
