@@ -192,13 +192,13 @@ from hmsa.model.parameters import paper_actuator
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa_ros.runtime.loop import Loop
-from hmsa_ros.runtime.records import Settings, Target
+from hmsa_ros.runtime.records import Settings, StretchRequest
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 import hmsa_ros.nodes.planner
 group = PlannerGroup({'a': Planner(paper_actuator(), Options())})
 loop = Loop(group, Settings(takeover_timeout=0), SimulatedDevice(
     [SimulatedJoint(Setup(paper_actuator()))], period=10**6, time=10**9))
-assert loop.runtime.request(Target('a', 1.2)).code == 'accepted'
+assert loop.runtime.request(StretchRequest('a', 1.2)).code == 'accepted'
 loop.run(11 * 10**8)
 assert abs(loop.device.stretch[0] - 1.2) < 1e-6
 """)
