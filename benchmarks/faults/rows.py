@@ -2,7 +2,6 @@
 
 from benchmarks.faults import (
     apart,
-    bags,
     delivery,
     hardware,
     inputs,
@@ -14,7 +13,7 @@ from benchmarks.faults import (
 
 FAULTS = (
     *delivery.FAULTS, *processes.FAULTS, *timing.FAULTS, *inputs.FAULTS, *model.FAULTS,
-    *samples.FAULTS, *hardware.FAULTS, *bags.FAULTS, *apart.FAULTS)
+    *samples.FAULTS, *hardware.FAULTS, *apart.FAULTS)
 
 #: Faults injected by the tests: one of each kind.
 QUICK = (
