@@ -8,7 +8,7 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 import pytest
 
-from hmsa.bag import limits, metadata, qos
+from hmsa.bag import metadata, qos
 from hmsa.bag.definitions import message_definition, type_hash
 from hmsa.bag.info import summarize
 from hmsa.bag.reader import BagReader, read_messages
@@ -203,8 +203,6 @@ def test_notes_survive_without_a_clean_end(tmp_path):
 
 def test_notes_that_change_for_hours_take_a_bounded_part_of_a_file(tmp_path, monkeypatch):
     monkeypatch.setattr('hmsa.bag.writer._NOTES_SIZE', 30_000)
-    # Less than all values that there were, and more than the last ones.
-    monkeypatch.setattr(limits, 'KEPT_SIZE', 12_000)
     writer = BagWriter(tmp_path / 'bag')
     writer.add_topic(topic())
     writer.write([(0, 1, 1, 0, bytes(1_000_000))])

@@ -96,7 +96,7 @@ def hostile_files():
     zeros = zstd_of_zeros(512 * MEGA)
     small = many_small_messages(4 * MEGA)
     overlapping = chunk(zstandard.ZstdCompressor().compress(small), len(small), end=10**9)
-    large_schema = schema(2, 'x/msg/Y', b'#' * 3 * MEGA)
+    large_schema = schema(2, 'x/msg/Y', b'#' * 5 * MEGA)
     packed_schema = zstandard.ZstdCompressor().compress(large_schema)
     nested = b'A[] a\n' + b'=' * 80 + b'\nMSG: x/A\n'
     many = struct.pack('<I', 10 * MEGA) + bytes(10 * MEGA)
@@ -110,11 +110,11 @@ def hostile_files():
         3 * MEGA), 'does not decompress'
     yield 'many chunks at once', overlapping * 20, 'overlap in time'
     yield 'large record', struct.pack('<BQ', Opcode.METADATA, 2**40), 'is not complete'
-    yield 'large definition', large_schema, 'bytes, more than'
+    yield 'large definition', large_schema, 'schema record is larger than 4194304 bytes'
     yield 'large definitions in chunks', chunk(
-        packed_schema, len(large_schema)), 'bytes, more than'
+        packed_schema, len(large_schema)), 'larger than the 4194304 bytes allowed'
     yield 'metadata of many entries', metadata_record(
-        'hmsa_ros', {str(i): '' for i in range(150_000)}), 'more than 100000 entries'
+        'hmsa_ros', {str(i): '' for i in range(100_000)}) * 10, 'metadata are larger than'
     yield 'statistics that lie', record(Opcode.STATISTICS, struct.pack(
         '<QHIIIIQQI', 2**63, 1, 1, 0, 0, 1, 0, 0, 2**32 - 1)), 'statistics record ends early'
     yield 'many channels', b''.join(

@@ -17,24 +17,14 @@ MEBIBYTE = 2**20
 CHUNK_SIZE = 128 * MEBIBYTE
 #: Content of chunks that overlap in time, as a multiple of the largest chunk.
 CHUNKS_AT_ONCE = 4
-#: Chunks of a file; with rosbag2's usual chunks that is more than a terabyte.
-CHUNKS = 2_000_000
-#: Channels of a file, and schemas; each topic costs a player a publisher.
-CHANNELS = 8192
-#: Topics of a bag.
-TOPICS = 4096
 #: Summary of a file, that of half a terabyte in usual chunks.
 SUMMARY_SIZE = 128 * MEBIBYTE
 #: Largest data section whose CRC is checked when a bag is summarized, which takes seconds.
 CHECKED_SIZE = 1024 * MEBIBYTE
 #: Record of a schema, a channel, statistics or metadata.
-RECORD_SIZE = 16 * MEBIBYTE
-#: All schemas, channels and metadata that are kept of a bag.
+RECORD_SIZE = 4 * MEBIBYTE
+#: All schemas, channels and metadata that are kept of a file.
 KEPT_SIZE = 64 * MEBIBYTE
-#: Definition of a message type with all it depends on.
-DEFINITION_SIZE = 2 * MEBIBYTE
-#: Entries of a map in a record.
-MAP_ENTRIES = 100_000
 #: Largest message of a type with arrays of messages that is decoded: in Python it may take a
 #: hundred times its size.
 DECODED_SIZE = 8 * MEBIBYTE
@@ -42,7 +32,7 @@ DECODED_SIZE = 8 * MEBIBYTE
 YAML_SIZE = 16 * MEBIBYTE
 #: Values, lists and maps in a YAML text.
 YAML_NODES = 300_000
-#: Lists and maps inside each other.
+#: Lists and maps inside each other; a hundred thousand crash the C parser.
 YAML_DEPTH = 30
 #: Sentences about unreadable parts.
 PROBLEMS = 200

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import zlib
 
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
+from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.records import (
     Channel,
@@ -55,7 +55,7 @@ _CLASSES: dict[int, type[Any]] = {
     Opcode.SUMMARY_OFFSET: SummaryOffset}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class MessageBlock:
     """A chunk, or a run of messages outside chunks, and its position in the file."""
 
@@ -93,22 +93,15 @@ class MessageBlock:
 
 
 class _Content(ReadDataStream):
-    """The content of a record: reads to its end only, and limits the number of fields."""
+    """The content of a record, read to its end only, with invalid UTF-8 escaped."""
 
-    def __init__(self, data: bytes, what: str) -> None:
+    def __init__(self, data: bytes) -> None:
         super().__init__(io.BytesIO(data))
         self._size = len(data)
-        self._what = what
-        self._fields = 0
 
     def read(self, length: int) -> bytes:
-        """Return the next bytes; raise `BagError` beyond the end, or for too many fields."""
-        self._fields += 1
-        if self._fields > 4 * limits.MAP_ENTRIES:
-            raise BagError(
-                f'a {self._what} record has more than {limits.MAP_ENTRIES} entries')
         if self.count + length > self._size:
-            raise BagError(f'a {self._what} record ends early')
+            raise EndOfFile
         return super().read(length)
 
     def read_prefixed_string(self) -> str:
@@ -116,9 +109,11 @@ class _Content(ReadDataStream):
 
 
 def parse(kind: type[_Record], content: bytes) -> _Record:
-    """Parse a record by the mcap package, escaping invalid UTF-8; raise `BagError` if damaged."""
+    """Parse a record by the mcap package; raise `BagError` if it is damaged or too large."""
     what = kind.__name__.lower()
-    stream = _Content(content, what)
+    if len(content) > limits.RECORD_SIZE:
+        raise BagError(f'a {what} record is larger than {limits.RECORD_SIZE} bytes')
+    stream = _Content(content)
     try:
         record: _Record = kind.read(stream)  # type: ignore[attr-defined]
     except (McapError, struct.error) as error:

@@ -1,13 +1,12 @@
 """Scan a file of a bag: by its summary, or else record by record."""
 
 from array import array
-from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 import os
 from pathlib import Path
 import struct
-from typing import Any, TypeVar
 import zlib
 
 from mcap.opcode import Opcode
@@ -39,7 +38,6 @@ _TAIL_SIZE = _FOOTER_SIZE + len(MAGIC)
 _DATA_END_SIZE = PREFIX.size + 4
 # Valid records that are not used here.
 _PASSED_OVER = frozenset((Opcode.ATTACHMENT, Opcode.ATTACHMENT_INDEX))
-_Declared = TypeVar('_Declared', Schema, Channel)
 
 
 class ReadLimits:
@@ -52,7 +50,6 @@ class ReadLimits:
 
     def __init__(self, max_chunk_size: int) -> None:
         self._max_chunk_size = max_chunk_size
-        self._kept = 0
         self._known: set[str] = set()
         self.problems: list[str] = []
 
@@ -70,13 +67,6 @@ class ReadLimits:
         if size > self._max_chunk_size:
             raise BagError(f'a {what} of {size} bytes is larger than the {self._max_chunk_size} '
                            'bytes allowed')
-
-    def keep(self, size: int) -> None:
-        """Count the size of records kept in memory; raise `BagError` above the limit."""
-        if self._kept + size > limits.KEPT_SIZE:
-            raise BagError(f'schemas, channels and metadata are larger than '
-                           f'{limits.KEPT_SIZE} bytes')
-        self._kept += size
 
 
 class ScannedFile:
@@ -155,48 +145,37 @@ class ScannedFile:
 
     def _clear(self) -> None:
         """Reset the content."""
+        self._kept = 0  # bytes of records in memory
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.blocks: list[MessageBlock] = []
         self.metadata: dict[str, dict[str, str]] = {}
         self._counts = Counter[int]()
 
-    def _take(self, record: McapRecord) -> None:
-        """Add a schema, channel or metadata record; raise `BagError` if it is too large."""
-        if isinstance(record, Schema):
-            if self._is_new(self.schemas, record):
-                self._intake.keep(len(record.data))
-                if len(record.data) > limits.DEFINITION_SIZE:
-                    raise BagError(
-                        f'the definition of {record.name} has {len(record.data)} bytes, more '
-                        f'than {limits.DEFINITION_SIZE}')
-                self.schemas[record.id] = record
-        elif isinstance(record, Channel):
-            if self._is_new(self.channels, record):
-                self._intake.keep(sum(map(len, record.metadata.values())) + len(record.topic))
-                self.channels[record.id] = record
+    def _take(self, record: McapRecord, size: int) -> None:
+        """Keep a schema, channel or metadata record of a size; raise `BagError` if too many."""
+        known: dict[int, Schema] | dict[int, Channel]
+        if isinstance(record, (Schema, Channel)):
+            known = self.schemas if isinstance(record, Schema) else self.channels
+            if record.id in known:
+                if known[record.id] != record:
+                    self.problem(f': {type(record).__name__.lower()} {record.id} is declared in '
+                                 'two ways')
+                return
         elif isinstance(record, Metadata):
-            if record.name not in self.metadata:
-                self._intake.keep(len(record.name) + _ENTRY_BYTES)
-            values = self.metadata.setdefault(record.name, {})
-            # A new value replaces the old one in memory.
-            self._intake.keep(sum(
-                len(value) - len(values[key]) if key in values
-                else len(value) + len(key) + _ENTRY_BYTES
-                for key, value in record.metadata.items()))
-            values.update(record.metadata)
-
-    def _is_new(self, known: Mapping[int, _Declared], record: _Declared) -> bool:
-        """Return whether a declaration is new and within limits."""
-        what = type(record).__name__.lower()
-        if record.id in known:
-            if known[record.id] != record:
-                self.problem(f': {what} {record.id} is declared in two ways')
-            return False
-        if len(known) >= limits.CHANNELS:
-            self.problem(f' declares more than {limits.CHANNELS} of {what}: the rest is skipped')
-            return False
-        return True
+            size += len(record.metadata) * _ENTRY_BYTES
+        else:
+            return
+        if self._kept + size > limits.KEPT_SIZE:
+            raise BagError(
+                f'schemas, channels and metadata are larger than {limits.KEPT_SIZE} bytes')
+        self._kept += size
+        if isinstance(record, Metadata):
+            self.metadata.setdefault(record.name, {}).update(record.metadata)
+        elif isinstance(record, Schema):
+            self.schemas[record.id] = record
+        else:
+            self.channels[record.id] = record
 
     def _add_block(self, block: MessageBlock, offset: int) -> None:
         """Add a chunk unless it is too large."""
@@ -220,9 +199,6 @@ class ScannedFile:
             end = offset + PREFIX.size + length
             if end > self._size or opcode == 0:
                 break
-            if len(self.blocks) > limits.CHUNKS:
-                self.problem(f' has more than {limits.CHUNKS} chunks: the rest is skipped')
-                break
             try:
                 if opcode != Opcode.MESSAGE or run is not None and offset - run >= _RUN_BYTES:
                     self._end_run(run, offset)
@@ -236,11 +212,7 @@ class ScannedFile:
                     run = offset if run is None else run
                 else:
                     chunked = chunked or opcode == Opcode.CHUNK
-                    record = self._read_record(offset, head)
-                    if isinstance(record, Statistics):
-                        self.said = record.message_count
-                    self.closed = isinstance(record, Footer) and os.pread(
-                        self._descriptor, len(MAGIC), end) == MAGIC
+                    self._read_record(offset, head)
             except BagError as error:
                 self._end_run(run, offset)
                 run = None
@@ -257,26 +229,27 @@ class ScannedFile:
         if begin is not None:
             self.blocks.append(MessageBlock(self._number, begin, end - begin, end - begin, -1, -1))
 
-    def _read_record(self, offset: int, head: bytes) -> McapRecord | None:
+    def _read_record(self, offset: int, head: bytes) -> None:
         """Read one record that is not a message."""
         opcode, length = PREFIX.unpack_from(head)
-        content = head[PREFIX.size:]
+        start = offset + PREFIX.size
         if opcode == Opcode.CHUNK:
-            self._add_block(MessageBlock.of_chunk(self._number, offset, content, length), offset)
+            self._add_block(
+                MessageBlock.of_chunk(self._number, offset, head[PREFIX.size:], length), offset)
         elif opcode == Opcode.MESSAGE_INDEX:
-            if length < 6 or struct.unpack_from('<I', content, 2)[0] != length - 6:
+            # A chunk with a wrong bit would be passed over in silence.
+            if length < 6 or struct.unpack_from('<I', head, PREFIX.size + 2)[0] != length - 6:
                 raise BagError('a message index record ends early')
         elif opcode not in _PASSED_OVER:
-            if length > limits.RECORD_SIZE:
-                raise BagError(f'a record of {length} bytes is larger than '
-                               f'{limits.RECORD_SIZE} bytes')
-            record = records.parse_any(
-                opcode, records.read_exactly(self._descriptor, length, offset + PREFIX.size))
+            record = records.parse_any(opcode, records.read_exactly(
+                self._descriptor, min(length, limits.RECORD_SIZE + 1), start))
             if record is None:
                 raise BagError(f'a record is of the unknown kind {opcode:#x}')
-            self._take(record)
-            return record
-        return None
+            if isinstance(record, Statistics):
+                self.said = record.message_count
+            self.closed = isinstance(record, Footer) and os.pread(
+                self._descriptor, len(MAGIC), start + length) == MAGIC
+            self._take(record, length)
 
     def _count(self) -> None:
         """Read all blocks for their declarations, counts and times."""
@@ -297,7 +270,7 @@ class ScannedFile:
                         record = records.parse_any(opcode, content[begin:until])
                         if not isinstance(record, (Schema, Channel)):
                             raise BagError(f'a chunk holds a record of the kind {opcode:#x}')
-                        self._take(record)
+                        self._take(record, until - begin)
                     except BagError as error:
                         self.problem(f': {error}: skipped')
             except BagError as error:
@@ -328,49 +301,44 @@ class ScannedFile:
             summary = records.read_exactly(self._descriptor, end - start, start)
             if footer.summary_crc not in (0, zlib.crc32(tail[:25], zlib.crc32(summary))):
                 raise BagError('its CRC differs')
-            return self._take_summary(summary, start - _DATA_END_SIZE)
+            self._data_end = start - _DATA_END_SIZE
+            data_end = records.read_exactly(self._descriptor, _DATA_END_SIZE, self._data_end)
+            self._data_crc = records.parse(DataEnd, data_end[PREFIX.size:]).data_section_crc
+            return self._take_summary(summary)
         except BagError as error:
             self.problem(
                 f': the summary cannot be used ({error}): the file is read record by record')
             return False
 
-    def _take_summary(self, summary: bytes, data_end: int) -> bool:
+    def _take_summary(self, summary: bytes) -> bool:
         """Add the records of a summary; return False if it is incomplete."""
-        found: defaultdict[type[McapRecord] | None, list[Any]] = defaultdict(list)
+        statistics = None
         for opcode, begin, end in records.split(summary):
             record = records.parse_any(opcode, summary[begin:end])
-            found[None if record is None else type(record)].append(record)
-        chunks: list[ChunkIndex] = found[ChunkIndex]
-        if not found[Statistics]:
+            if isinstance(record, ChunkIndex):
+                self._find_chunk(record)
+            elif isinstance(record, MetadataIndex):
+                self._find_metadata(record)
+            elif isinstance(record, Statistics):
+                statistics = record
+            elif record is not None:
+                self._take(record, end - begin)
+        if statistics is None or statistics.channel_count != len(self.channels) or (
+                statistics.message_count and not self.blocks):
             return False
-        statistics: Statistics = found[Statistics][-1]
-        if statistics.message_count and not chunks or (
-                statistics.channel_count and not found[Channel]):
-            return False
-        _check(statistics, chunks, len(found[Channel]))
-        for record in (*found[Schema], *found[Channel]):
-            self._take(record)
+        if statistics.chunk_count != len(self.blocks) and not self._damaged:
+            raise BagError(
+                f'it says {statistics.chunk_count} chunks and has {len(self.blocks)}')
+        self.blocks.sort(key=lambda block: block.offset)
         self._counts = Counter(statistics.channel_message_counts)
         self.said = statistics.message_count
-        end_record = records.read_exactly(self._descriptor, _DATA_END_SIZE, data_end)
-        if not end_record.startswith(PREFIX.pack(Opcode.DATA_END, 4)):
-            self.problem(f' is damaged at byte {data_end}: no end of data')
-        self._data_end = data_end
-        self._data_crc = records.parse(DataEnd, end_record[PREFIX.size:]).data_section_crc
-        before = len(MAGIC)
-        for index in sorted(chunks, key=lambda index: index.chunk_start_offset):
-            offset = index.chunk_start_offset
-            if offset < before or offset + index.chunk_length > data_end:
-                raise BagError(f'a chunk at byte {offset} overlaps with something else')
-            before = offset + index.chunk_length
-            self._find_chunk(index)
-        for entry in found[MetadataIndex]:
-            self._find_metadata(entry)
         return True
 
     def _find_chunk(self, index: ChunkIndex) -> None:
         """Take in a chunk as the summary describes it."""
         offset = index.chunk_start_offset
+        if offset + index.chunk_length > self._data_end:
+            raise BagError(f'a chunk at byte {offset} overlaps with something else')
         # The index has no checksum.
         crc, = struct.unpack('<I', records.read_exactly(
             self._descriptor, 4, offset + PREFIX.size + 24))
@@ -382,12 +350,11 @@ class ScannedFile:
     def _find_metadata(self, index: MetadataIndex) -> None:
         """Take in a metadata record that the summary names."""
         try:
-            if not PREFIX.size <= index.length <= limits.RECORD_SIZE:
-                raise BagError(f'a metadata record has {index.length} bytes')
-            data = records.read_exactly(self._descriptor, index.length, index.offset)
-            if PREFIX.unpack_from(data) != (Opcode.METADATA, index.length - PREFIX.size):
+            data = records.read_exactly(self._descriptor, min(
+                index.length, PREFIX.size + limits.RECORD_SIZE + 1), index.offset)
+            if data[:1] != bytes((Opcode.METADATA,)):
                 raise BagError('a metadata record is not where the index says')
-            self._take(records.parse(Metadata, data[PREFIX.size:]))
+            self._take(records.parse(Metadata, data[PREFIX.size:]), index.length)
         except (BagError, OverflowError) as error:
             self.problem(f': {error}, at byte {index.offset}: skipped')
 
@@ -401,19 +368,3 @@ class ScannedFile:
             crc = zlib.crc32(os.pread(self._descriptor, size, offset), crc)
         if crc != self._data_crc:
             self.problem(' is damaged: the CRC of its data differs')
-
-
-def _check(statistics: Statistics, chunks: list[ChunkIndex], declared: int) -> None:
-    """Hold the statistics of a file against the rest of its summary."""
-    filled = [index for index in chunks if index.uncompressed_size]
-    for what, said, found in (
-            ('chunks', statistics.chunk_count, len(chunks)),
-            ('channels', statistics.channel_count, declared),
-            ('messages', statistics.message_count,
-             sum(statistics.channel_message_counts.values())),
-            ('ns to begin with', statistics.message_start_time, min(
-                (x.message_start_time for x in filled), default=statistics.message_start_time)),
-            ('ns to end with', statistics.message_end_time, max(
-                (x.message_end_time for x in filled), default=statistics.message_end_time))):
-        if said != found:
-            raise BagError(f'it says {said} {what} and has {found}')

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from mcap.records import Schema
 
-from hmsa.bag import limits, qos
+from hmsa.bag import qos
 from hmsa.bag.definitions import EMPTY, installed
 from hmsa.bag.foreign import ForeignFile
 from hmsa.bag.metadata import BagTopic
@@ -28,9 +28,6 @@ def topics_of(
     for file in files:
         for channel in file.channels.values():
             name, known = channel.topic, topics.get(channel.topic)
-            if known is None and len(topics) >= limits.TOPICS:
-                problem(f'the bag has more than {limits.TOPICS} topics: the rest is skipped')
-                continue
             schema, stored = file.schemas.get(channel.schema_id), described.get(name)
             if schema is None:
                 schema = Schema(
