@@ -1,5 +1,6 @@
 """A steady clock, and detection of wall clock steps with it."""
 
+from collections.abc import Callable
 from functools import partial
 import time
 
@@ -7,6 +8,8 @@ from hmsa.model.units import NANOSECONDS
 
 # Smaller differences may be due to the time between two readings.
 _STEP_NS = 5_000_000
+# Number of readings after each of which the process may be interrupted.
+_ATTEMPTS = 5
 
 #: Returns the time in ns of a clock that is never set, and that counts the time for which the
 #: computer is suspended: that time is a stall, and no step of the wall clock.
@@ -15,22 +18,35 @@ steady_ns = partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME) if hasattr(
 
 
 class StepWatch:
-    """Detect that a clock has been set."""
+    """
+    Read a clock, and detect that it has been set.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    clock, steady : callable
+        Return the time of the clock, and of a steady one, in ns.
+
+    """
+
+    def __init__(
+            self, clock: Callable[[], int] = time.time_ns,
+            steady: Callable[[], int] = steady_ns) -> None:
+        self._clock, self._steady = clock, steady
         self._offset: int | None = None
 
-    def step(self, before: int, now: int, after: int) -> int:
-        """Return the ns by which the clock was set ahead since the last reading; 0 if not."""
-        # ``before`` and ``after`` are steady times in ns around the reading ``now``.
-        if after - before > _STEP_NS:
-            # The process was interrupted between the readings, so they cannot be compared.
-            return 0
+    def read(self) -> tuple[int, int]:
+        """Return the time in ns, and by how many ns the clock was set ahead since the last one."""
+        for _ in range(_ATTEMPTS):
+            before, now, after = self._steady(), self._clock(), self._steady()
+            # If the process was interrupted between the readings, they cannot be compared.
+            if after - before <= _STEP_NS:
+                break
+        else:
+            # A clock that was set is found next time. Until then, its time is the former one.
+            return now if self._offset is None else after + self._offset, 0
         offset = now - after
         last, self._offset = self._offset, offset
-        if last is None or abs(offset - last) < _STEP_NS:
-            return 0
-        return offset - last
+        return now, 0 if last is None or abs(offset - last) < _STEP_NS else offset - last
 
 
 def clock_set_words(by: int, what: str) -> str:

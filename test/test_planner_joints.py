@@ -532,19 +532,30 @@ def test_two_clocks_are_told_of_and_their_quarrel_makes_no_storm(rig, make_ros):
 
 
 def test_step_of_the_wall_clock_is_noticed():
-    watch = StepWatch()
-    steady = 10**12
-    now = 10**18
-    assert watch.step(steady, now, steady) == 0
-    # Slewed, or interrupted between the readings: no step.
-    for ahead, later in ((10**9, 10**9 - 10**5), (10**9, 10**9)):
-        steady += ahead
-        now += later
-        assert watch.step(steady, now, steady) == 0
-    assert watch.step(steady, now, steady + 10**9) == 0
-    assert watch.step(steady + 10**9, now - 10**9, steady + 10**9) == -2 * 10**9
-    assert watch.step(steady + 2 * 10**9, now, steady + 2 * 10**9) == 0
-    assert watch.step(steady + 3 * 10**9, now + 4 * 10**9, steady + 3 * 10**9) == 3 * 10**9
+    steady, offset, pauses = 10**12, 10**18, []
+
+    def reading() -> int:
+        nonlocal steady
+        steady += pauses.pop() if pauses else 0
+        return steady
+
+    watch = StepWatch(lambda: steady + offset, reading)
+    assert watch.read() == (steady + offset, 0)
+    steady += 10**9
+    # It is slewed.
+    offset -= 10**5
+    assert watch.read() == (steady + offset, 0)
+    for by in (-2 * 10**9, 3 * 10**9):
+        offset += by
+        # The process is interrupted between the readings.
+        pauses += [10**9, 0]
+        assert watch.read() == (steady + offset, by)
+        assert watch.read() == (steady + offset, 0)
+    # As often as it is read: the time goes on as if the clock had not been set.
+    offset += 10**10
+    pauses += [10**9, 0] * 5
+    assert watch.read() == (steady + offset - 10**10, 0)
+    assert watch.read() == (steady + offset, 10**10)
 
 
 def test_the_plan_goes_on_when_the_wall_clock_is_set_back(ros, serve):

@@ -62,7 +62,7 @@ class HardwareWorker:
         self._reconnect = reconnect
         self._away = ''  # reason of a failure, until it continues
         self._resumes = 0.0  # end of the refusal after a failure, by the monotonic clock
-        self._steps = StepWatch()
+        self._steps = StepWatch(clock, steady)
         # Steady times in ns by which this thread is to wake up, and of the last `look_after`.
         self._wakes = steady()
         self._looked: int | None = None
@@ -120,7 +120,7 @@ class HardwareWorker:
         """Keep coils off and refuse commands while there is a reason; an empty one ends that."""
         if why != self.locked:
             self.locked = why
-            self._put(lambda: self.device.lock(why, self._clock()))
+            self._put(lambda: self.device.lock(why, self._now()))
 
     def _put(self, command: Callable[[], None]) -> None:
         self._commands.append(command)
@@ -132,7 +132,7 @@ class HardwareWorker:
         self._put(lambda: self._stand_still(span))
 
     def _stand_still(self, span: int) -> None:
-        self.device.advance_to(self._clock())
+        self.device.advance_to(self._now())
         self.device.stood_still(span)
 
     def look_after(self) -> None:
@@ -164,7 +164,7 @@ class HardwareWorker:
         """Serve the hardware whenever work is due, and sleep until then."""
         try:
             self.device = self._make()
-            if left := self.device.switch_off(self._clock()):
+            if left := self.device.switch_off(self._now()):
                 raise HmsaError(
                     f'{left}: the coil could NOT be switched off at the start; {_MEND}')
         except BaseException as error:  # any error, which would be lost otherwise
@@ -184,13 +184,12 @@ class HardwareWorker:
             while not self._ended:
                 if self._resumes and monotonic() >= self._resumes:
                     self._resumes = 0.0
-                    self.device.lock(self.locked, self._clock())
+                    self.device.lock(self.locked, self._now())
                     self.trouble = ''
-                self._check_clock_step()
                 self._let_main_thread_read()
                 while self._commands:
                     self._commands.popleft()()
-                self.device.advance(self._clock())
+                self.device.advance(self._now())
                 self._wait()
         except BaseException as error:
             return self._end(
@@ -203,13 +202,15 @@ class HardwareWorker:
         """Prepare to continue: all coils are off and locked for a while."""
         self.trouble, self._away = (
             f'{self._away}: the coil is switched off, and what was commanded is forgotten', '')
-        self.device.lock(self.trouble, self._clock())
+        self.device.lock(self.trouble, self._now())
         self._resumes = monotonic() + _AWAY
 
-    def _check_clock_step(self) -> None:
-        """Detect a clock that was set, which must not count as silence."""
-        if by := self._steps.step(self._steady(), self._clock(), self._steady()):
+    def _now(self) -> int:
+        """Return the time in ns; a clock that was set must not count as silence."""
+        now, by = self._steps.read()
+        if by:
             self.device.clock_set(by)
+        return now
 
     def _let_main_thread_read(self) -> None:
         """After a stall, wait for the commands that arrived meanwhile, for a short time."""
@@ -224,19 +225,19 @@ class HardwareWorker:
     def _obey(self, joint: int, stamp: int, level: float, came: int) -> None:
         """Accept a level that arrived at a steady time in ns, perhaps during a blocked call."""
         try:
-            self.device.receive_at(joint, stamp, level, self._clock() - self._steady() + came)
+            self.device.receive_at(joint, stamp, level, self._now() - self._steady() + came)
         except BadInputError as error:
             self.device.coils[joint].note(Kind.REFUSED, str(error))
 
     def _switch_off(self) -> None:
-        if left := self.device.switch_off(self._clock()):
+        if left := self.device.switch_off(self._now()):
             raise HardwareError(left)
 
     def _wait(self) -> None:
         """Sleep until work is due, but busy-wait shortly before a level."""
-        device = self.device
+        device, now = self.device, self._now()
         due, level = device.due, device.next_level
-        left = math.inf if due is None else due - self._clock()
+        left = math.inf if due is None else due - now
         self._wakes = self._steady() + round(min(max(left, 0), _LONG))
         if due == level and left <= _WATCHED:
             device.calls.make_ready()
@@ -264,7 +265,7 @@ class HardwareWorker:
         begun, pause = monotonic(), _PAUSE
         last, reported = None, False
         self._resumes = 0.0
-        while left := self.device.switch_off(self._clock()):
+        while left := self.device.switch_off(self._now()):
             if not reported:
                 reported = True
                 self.trouble = (

@@ -267,10 +267,9 @@ class PlannerNode(ManagedNode):
                     self.get_logger().error(
                         f'message on /clock skipped: {error}', throttle_duration_sec=1.0)
             return super().now()
-        before = steady_ns()
         # Equal to the time of rclpy's clock, without creating objects.
-        now = time_ns()
-        if by := self._steps.step(before, now, steady_ns()):
+        now, by = self._steps.read()
+        if by:
             self._runtime.clock_set(by)
         return now
 

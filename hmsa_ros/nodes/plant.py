@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from functools import partial
 import math
-from time import monotonic_ns, time_ns
+from time import monotonic_ns
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -32,7 +32,7 @@ from hmsa_ros.nodes.markers import (
 )
 from hmsa_ros.nodes.parameters import declare_joints, JointParameters
 from hmsa_ros.nodes.runner import run
-from hmsa_ros.timekeeping import steady_ns, StepWatch
+from hmsa_ros.timekeeping import StepWatch
 
 #: Parameters that may have a separate value for each joint.
 OWN = (
@@ -256,12 +256,11 @@ class PlantNode(DeviceNode):
 
     def _follow(self) -> None:
         """Advance to the node's clock: the wall clock, or a /clock of another node."""
-        # Equal to the wall clock of rclpy, without creating objects.
-        before = steady_ns()
-        now = self.now() if self.simulated else time_ns()
+        # Without simulated time, the wall clock of rclpy, without creating objects.
+        now, by = (self.now(), 0) if self.simulated else self._steps.read()
         if now == 0:
             return
-        if not self.simulated and (by := self._steps.step(before, now, steady_ns())):
+        if by:
             self._clock_seen += by
             self.device.clock_set(by)
         behind = now - self._clock_seen < 1_000_000_000
