@@ -176,7 +176,8 @@ def _policies(kind, seed, monkeypatch, case=None):
         with monkeypatch.context() as patch:
             if policy == 'always':
                 patch.setattr('hmsa_ros.runtime.deviations.expected', lambda *_: np.ones(1))
-                patch.setattr('hmsa_ros.runtime.deviations.worthwhile', lambda *_, **__: True)
+                patch.setattr(
+                    'hmsa_ros.runtime.deviations.better_than_keeping', lambda *_, **__: True)
                 patch.setattr('hmsa_ros.runtime.lateness.Lateness.expected', 0)
                 patch.setattr('hmsa_ros.runtime.lateness.Lateness.unsure', False)
             left[policy] = sequence(
