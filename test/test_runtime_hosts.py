@@ -177,6 +177,32 @@ def test_a_device_in_slow_motion_is_heard_again_after_a_silence():
     assert rig.status.unheard == ''
 
 
+@pytest.mark.parametrize('sampled', [False, True])
+def test_a_level_whose_report_is_late_is_not_taken_back_by_a_heartbeat(sampled):
+    rig = Bench()
+    rig.runtime.request(StretchRequest('a', 1.2))
+    rig.run(START + 1000 * MS)
+    applied, reports = rig.runtime.applied, []
+    rig.runtime.applied = lambda *report: reports.append(report)
+    # As of a plant that has stood still: its receipts come at once, its samples when they are due.
+    seen = rig.now if sampled else None
+    rig.runtime.request(StretchRequest('a', 1.4))
+    first = len(rig.sent)
+    planned = {x.flux_density for x in rig.planner.plan.levels}
+    for _ in range(150 if sampled else 70):
+        rig.run(rig.now + 4 * MS)
+        if seen is not None:
+            seen += MS
+            rig.runtime.looks_at(seen)
+    assert len(reports) == 2
+    rig.runtime.applied = applied
+    for report in reports:
+        applied(*report)
+    rig.run(rig.now + 1000 * MS)
+    assert {x.flux_density for _, x in rig.sent[first:]} <= planned
+    assert rig.residual(1.4) < 1e-9
+
+
 def test_a_device_without_receipts_is_sent_everything():
     rig = Rig(settings=BEATING)
     rig.runtime.request(trajectory((1.2, HOLD)))

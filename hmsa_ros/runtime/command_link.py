@@ -96,11 +96,14 @@ class CommandLink:
         Send the levels in force again, as a heartbeat of the planner.
 
         A level that was sent and took no effect in time is not among them: by now it would leave
-        vibration, and the rest is planned anew instead.
+        vibration, and the rest is planned anew instead. While it may be lost, nothing is sent: if
+        only the report is late, the level before it would leave vibration, too.
         """
         for name, planner in self._planners.items():
             if name in self.receipts.silent | self.cut | self.fresh | self.apart:
                 # The last level is not meant for this device.
+                continue
+            if self._following.doubts(name):
                 continue
             stamp, following = planner.beat_stamp(now), planner.next_stamp
             level = planner.last_sent.flux_density

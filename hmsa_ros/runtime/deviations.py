@@ -1,7 +1,7 @@
 """Late, lost and foreign commands, and the new plans that they require."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 import math
 
@@ -29,12 +29,27 @@ from hmsa_ros.runtime.weighing import (
 
 # Fraction of a period by which commands may be late and are still sent.
 _PART = 0.25
-# Longest gap between samples, in ns, for their times to be used.
-_SILENT = 10 * NANOSECONDS
+# Longest gap between samples, and between receipts, in ns, for their times to be used.
+_UNSEEN, _SILENT = 2 * NANOSECONDS, 10 * NANOSECONDS
 # Shortest time in ns between two evaluations of a plan that is kept.
 _PAUSE = 20_000_000
 # Time in ns until receipts show why commands are late; there are five a second.
 _CAUSE = 400_000_000
+
+
+@dataclass
+class _Newest:
+    """The newest report of a kind; times in ns."""
+
+    stamp: int = 0  # its timestamp; 0 for none
+    _looked: int = 0  # that at the last look
+    _since: int = 0  # time of the look that found it changed
+
+    def is_recent(self, now: int, silence: int) -> bool:
+        """Return whether there was a new one within a time; to be called at each look."""
+        if self.stamp != self._looked:
+            self._looked, self._since = self.stamp, now
+        return self.stamp != 0 and now - self._since < silence
 
 
 class Deviations:
@@ -57,10 +72,8 @@ class Deviations:
         self._saturated: dict[str, tuple[str, Options]] = {}
         # Joints that may deviate, and the timestamp of the unconfirmed command.
         self._suspected: dict[str, int] = {}
-        # Timestamp in ns of the newest report; its value at the last look, and when that changed;
-        # age in ns of each joint's newest change when it was reported.
-        self._newest_seen = 0
-        self._looked = 0, 0
+        self._sampled, self._received = _Newest(), _Newest()  # sample and receipt
+        # Age in ns of each joint's newest change when it was reported.
         self._ages: dict[str, int] = {}
         self._found: dict[str, Resumption] = {}
         self._advise_at: int | None = None  # steady time in ns at which to advise on lateness
@@ -74,7 +87,7 @@ class Deviations:
         self.newest.update(kept)
         self._suspected.clear()
         self._ages.clear()
-        self._newest_seen = 0
+        self._sampled, self._received = _Newest(), _Newest()
         self.dropped(list(self._group.planners))
 
     def forget_times(self, joint: str) -> None:
@@ -83,7 +96,7 @@ class Deviations:
             self.newest[joint] = 0, self.newest[joint][1]
         self._suspected.pop(joint, None)
         self._ages.pop(joint, None)
-        self._newest_seen = 0
+        self._sampled, self._received = _Newest(), _Newest()
         self.dropped([joint])
 
     def dropped(self, joints: Iterable[str]) -> None:
@@ -188,18 +201,23 @@ class Deviations:
         model = planner.model
         return model.ns(_PART * 2.0 * math.pi / model.frequency(planner.last_sent.stretch))
 
+    def doubts(self, name: str) -> bool:
+        """Return whether a level of a joint may be lost, as the next look will show."""
+        return name in self._suspected
+
     def lost(self, name: str) -> bool:
-        """Return whether levels of a joint seem to be lost, until the rest is planned anew."""
-        return name in self._suspected or name in self._unsent and name in self.astray
+        """Return whether levels of a joint are lost, until the rest is planned anew."""
+        return name in self._unsent and name in self.astray
 
     def replan(self, name: str) -> None:
         """Have the rest planned anew for a joint, since its levels do not take effect."""
         self._leaves(name)
         self._unsent.add(name)
 
-    def seen(self, stamp: int) -> None:
-        """Record that plant or driver has reported the state at a timestamp in ns."""
-        self._newest_seen = max(self._newest_seen, stamp)
+    def seen(self, stamp: int, *, sampled: bool = False) -> None:
+        """Record a receipt, or a sample, of a timestamp in ns."""
+        newest = self._sampled if sampled else self._received
+        newest.stamp = max(newest.stamp, stamp)
 
     def look_for_unheard(self, now: int) -> None:
         """Find commands that took no effect; reports may be as late as commands."""
@@ -222,11 +240,13 @@ class Deviations:
 
     def _reported(self, name: str, now: int) -> int:
         """Return the time in ns up to which a joint's reports have arrived."""
-        # Reports of a busy plant are delayed, and simulated time may run slower.
-        if self._newest_seen != self._looked[0]:
-            self._looked = self._newest_seen, now
-        sampled = self._newest_seen and now - self._looked[1] < _SILENT
-        return min(now, self._newest_seen) if sampled else now - self._ages.get(name, 0)
+        # Reports of a busy plant are delayed, and simulated time may run slower. A plant that
+        # stood still gives receipts at once, but its samples show the time it has reached.
+        recent = [
+            newest.stamp for newest, silence in (
+                (self._sampled, _UNSEEN), (self._received, _SILENT))
+            if newest.is_recent(now, silence)]
+        return min(now, recent[0]) if recent else now - self._ages.get(name, 0)
 
     def _report_advice(self) -> None:
         if self._late_due():

@@ -386,7 +386,7 @@ class Runtime:
 
     def looks_at(self, stamp: int) -> bool:
         """Return whether a sample with a timestamp in ns is needed; most are not."""
-        self.following.seen(stamp)
+        self.following.seen(stamp, sampled=True)
         return (self._takeover.waiting or self._watch.wants(stamp)
                 or self.follower.wants(stamp))
 
