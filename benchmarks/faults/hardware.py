@@ -12,7 +12,7 @@ from typing import Any
 from sensor_msgs.msg import TimeReference
 
 from benchmarks.faults.board import Board
-from benchmarks.faults.common import Register
+from benchmarks.faults.common import PATIENT_LEAD, Register
 from benchmarks.faults.rig import Child, Rig
 from benchmarks.faults.table import Seen
 from hmsa.interfaces import topics
@@ -26,6 +26,7 @@ _BEAT = 0.05
 _LEAD = 200_000_000
 # Timeouts in s: the driver's watchdog, a call, and the firmware's watchdog.
 _TIMEOUT, _CALL, _FIRMWARE = 0.5, 0.5, 0.4
+_STALL = 1.2  # time in s for which a process is stopped
 # Allowed time in s for a driver to end on request, and for one whose call hangs.
 _PROMPT, _SOON = 3.0, 5.0
 # Text around a driver's message, in its log and in its last line.
@@ -305,6 +306,43 @@ def _planner_killed(rig: Rig) -> Seen:
         off = bench.board.off_since(begin)
         rig.spin_until(lambda: 'no heartbeat' in bench.driver.said, 'that it is said')
         return Seen('reported', f'off after {off:.2f} s', off < _TIMEOUT + 0.1)
+
+
+def _stalled(rig: Rig, who: str, latest: float) -> Seen:
+    """Stop a process for longer than the watchdog waits; ``latest`` is when the coil is off."""
+    with _bench(rig) as bench:
+        processes = {'driver': bench.driver, 'planner': rig.start('planner', {
+            'lead_time': PATIENT_LEAD})}
+        bench.ready()
+        rig.ready('planner')
+        rig.sequence([(x, 0.3) for x in (1.1, 1.2, 1.3) * 4])
+        rig.spin_until(lambda: bench.board.level, 'a level')
+        rig.spin(0.5)
+        begin = monotonic()
+        processes[who].send(signal.SIGSTOP)
+        rig.spin(_STALL)
+        processes[who].send(signal.SIGCONT)
+        rig.spin_until(lambda: any(x['code'] == CUT_OFF for x in rig.verdicts), 'the status')
+        off = next(x for x, level in bench.board.record if x > begin and not level)
+        rig.spin(1.0)
+        again = bench.board.largest_since(off)
+        rig.setpoint(1.1)
+        rig.spin_until(lambda: bench.board.level, 'the level of a request')
+        return Seen(
+            f'{again:g} T before the next request', f'off after {off - begin:.2f} s',
+            not again and off - begin < latest)
+
+
+FAULTS.fault(
+    'driver_planner_stalled', 'planner stopped for longer than command_timeout',
+    f'SIGSTOP for {_STALL:g} s in mid-sequence, SIGCONT; a board on a serial line',
+    'off within command_timeout of the last heartbeat, and until a request; status `cut_off`')(
+        lambda rig: _stalled(rig, 'planner', _TIMEOUT + 0.1))
+FAULTS.fault(
+    'driver_stalled', 'driver stopped for longer than command_timeout',
+    f'SIGSTOP for {_STALL:g} s in mid-sequence, SIGCONT; a board on a serial line',
+    'off as soon as it continues, and until a request; status `cut_off`')(
+        lambda rig: _stalled(rig, 'driver', _STALL + 0.3))
 
 
 @FAULTS.fault(

@@ -106,6 +106,51 @@ def _planner_stopped(rig: Rig) -> Seen:
 
 
 @FAULTS.fault(
+    'planner_stalled', 'planner stopped for longer than command_timeout',
+    'SIGSTOP for 1.2 s in mid-sequence, SIGCONT; command_timeout 0.5 s, safe_flux zero',
+    'no field until a request; status `cut_off`; the next move starts from the actual state')
+def _planner_stalled(rig: Rig) -> Seen:
+    rig.start('plant', {'command_timeout': _TIMEOUT, 'safe_flux': 'zero'})
+    planner = rig.start('planner', {'lead_time': PATIENT_LEAD})
+    rig.ready('plant', 'planner')
+    rig.sequence([(1.1, 0.4), (1.3, 0.4), (1.2, 0.4)] * 4)
+    rig.let_pass(0.5)
+    planner.send(signal.SIGSTOP)
+    rig.let_pass(1.2)
+    planner.send(signal.SIGCONT)
+    mark = rig.count()
+    rig.spin_until(lambda: rig.verdicts[-1]['code'] == 'cut_off', 'the status')
+    rig.let_pass(1.0)
+    field = float(np.abs(rig.samples(mark)[1][:, 2]).max())
+    residual, error = move(rig, 1.2, start=float(rig.samples()[1][-1, 0]))
+    return Seen(
+        f'{field:g} T before the request, error {error:.0e}', share(residual),
+        not field and max(residual, error) < LIMIT)
+
+
+@FAULTS.fault(
+    'plant_stalled', 'plant stopped for longer than command_timeout',
+    'SIGSTOP for 1.2 s in mid-sequence, SIGCONT; command_timeout 0.5 s, safe_flux zero',
+    'no alarm of the watchdog: the simulation catches up; at the last target in the end')
+def _plant_stalled(rig: Rig) -> Seen:
+    plant = rig.start('plant', {'command_timeout': _TIMEOUT, 'safe_flux': 'zero'})
+    rig.start('planner', {'lead_time': PATIENT_LEAD})
+    rig.ready('plant', 'planner')
+    rig.sequence([(1.1, 0.4), (1.2, 0.4), (1.3, 0.4), (1.2, 0.4), (1.4, 0.4), (1.1, 1.0)])
+    rig.let_pass(0.5)
+    plant.send(signal.SIGSTOP)
+    rig.spin(1.2)
+    plant.send(signal.SIGCONT)
+    rig.let_pass(2.5)
+    rig.fresh('plant')
+    residual, error = settled(*rig.samples(), rig.applied, 1.1, 0.3)
+    trips = rig.value('plant', 'timeouts')
+    return Seen(
+        f'{trips:g} alarms of the watchdog, error {error:.0e}', share(residual),
+        trips == 0 and max(residual, error) < LIMIT)
+
+
+@FAULTS.fault(
     'plant_restarted', 'plant killed in mid-sequence, restarted',
     'while 1.2 is held; a new plant at rest without field',
     'status `missed`; no field before the next request')
