@@ -278,7 +278,7 @@ def _last(moves: Sequence[Left]) -> float:
     return max(x.size for x in moves[2:])
 
 
-class SequenceRepeat:
+class Trial:
     """A laboratory, its driver and a planner in one loop."""
 
     def __init__(self, driver: Driver, planner: Planner) -> None:
@@ -397,10 +397,10 @@ def run(lab: Laboratory) -> Outcome:
         Path(), tuple(((x,), hold) for x in lab.bench.targets), Path(), entries,
         accept=True)
     belief = read_belief(None, entries)
-    trial = SequenceRepeat(Driver(Board(lab), sheet), planner_of(belief.actuator))
+    trial = Trial(Driver(Board(lab), sheet), planner_of(belief.actuator))
     before = trial.moves(hold)
     if lab.hysteresis:
-        trial = SequenceRepeat(Driver(Board(lab), calibrated(lab)), planner_of(belief.actuator))
+        trial = Trial(Driver(Board(lab), calibrated(lab)), planner_of(belief.actuator))
     trial.request([(1.0, hold)], raw=False)
     begin = trial.request(
         [(y, x) for x, y in excitation(tuning, belief, 1e9 / _PERIOD)], raw=True)
@@ -410,7 +410,7 @@ def run(lab: Laboratory) -> Outcome:
         return Outcome(lab, found.verdict, found.reason, '', before, [], [])
     _, settings = chosen(tuning, belief, found)
     actuator = planned_from(settings)
-    trial = SequenceRepeat(trial.driver, planner_of(
+    trial = Trial(trial.driver, planner_of(
         actuator, shaper=settings['shaper'],
         coil_time_constant=settings.get('coil_time_constant', 0.0)))
     after = trial.moves(hold)
