@@ -12,6 +12,9 @@ import uuid
 
 from hmsa.errors import BadInputError
 
+#: Endings of the files of bags: MCAP, SQLite, ROS 1.
+BAG_SUFFIXES = '.mcap', '.db3', '.bag'
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
@@ -59,12 +62,17 @@ def check_targets(*targets: Path | None, sources: Iterable[Path | None] = ()) ->
                if not place.parent.is_dir() else
                'the command reads it; expected another name' if place in read else
                'it may be part of a bag; expected another name'
-               if target.suffix == '.mcap' or target.name == 'metadata.yaml' else
+               if target.suffix in BAG_SUFFIXES or target.name == 'metadata.yaml' else
                'two outputs name the same file; expected different files'
                if place in written else '')
         if why:
             raise BadInputError(f'cannot write {target}: {why}')
         written.add(place)
+
+
+def may_be_bag(path: Path) -> bool:
+    """Return whether a path is given as a bag, not as a table."""
+    return path.is_dir() or path.suffix in BAG_SUFFIXES
 
 
 def make_folder(folder: Path) -> None:

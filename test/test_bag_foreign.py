@@ -2,6 +2,7 @@
 
 import json
 import sqlite3
+import struct
 import subprocess
 import sys
 
@@ -11,6 +12,7 @@ import pytest
 
 from hmsa.bag.info import summarize
 from hmsa.bag.reader import BagReader, read_messages
+from hmsa.bag.writer import BagTopic, BagWriter
 from hmsa.cli import main
 from hmsa.errors import BadInputError
 
@@ -138,6 +140,23 @@ def test_links_in_a_compressed_bag_are_not_followed(tmp_path):
     path.symlink_to(tmp_path / 'elsewhere')
     with pytest.raises(BadInputError, match='holds the link bag.db3.zstd'):
         BagReader(folder)
+
+
+IDL = """================================================================================
+IDL: made/msg/Pair
+module made { module msg { struct Pair { made::msg::Number first; double second; }; }; };
+================================================================================
+IDL: made/msg/Number
+module made { module msg { struct Number { double data; }; }; };
+"""
+
+
+def test_a_type_defined_in_idl_is_decoded(tmp_path):
+    with BagWriter(tmp_path / 'bag') as writer:
+        number = writer.add_topic(BagTopic('/a', 'made/msg/Pair', IDL, 'ros2idl'))
+        writer.write([(number, 1, 1, 1, bytes((0, 1, 0, 0)) + struct.pack('<dd', 1.5, 2.5))])
+    read, = read_messages(tmp_path / 'bag')
+    assert (read.message.first.data, read.message.second) == (1.5, 2.5)
 
 
 def test_an_mcap_bag_is_read_without_rosbags(tmp_path):

@@ -412,17 +412,17 @@ def test_topics_without_end_are_refused_and_those_named_are_played(ros, play, tm
     finish(ros, play(path, 'play.topics_to_filter:=[/t7]'), got, 1)
 
 
-def test_a_bag_of_rosbags_is_played(ros, play, tmp_path):
+def test_a_database_is_played(ros, play, tmp_path):
     rosbag2, typesys = needs('rosbags.rosbag2'), needs('rosbags.typesys')
     store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
     with rosbag2.Writer(
-            tmp_path / 'bag', version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+            tmp_path / 'bag', version=9, storage_plugin=rosbag2.StoragePlugin.SQLITE3) as writer:
         connection = writer.add_connection('/a', FLOAT, typestore=store)
         for i in range(50):
             writer.write(connection, START + i * MS, store.serialize_cdr(
                 store.types[FLOAT](data=float(i)), FLOAT))
     got = ros.collect(Float64, '/a')
-    finish(ros, play(tmp_path / 'bag' / 'bag.mcap'), got, 50)
+    finish(ros, play(tmp_path / 'bag' / 'bag.db3'), got, 50)
     assert [message.data for message in got] == list(range(50))
 
 

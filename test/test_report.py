@@ -710,10 +710,10 @@ def test_each_joint_of_a_planner_of_several_is_a_run(tmp_path, bag):
 
 # Bags of all kinds ---------------------------------------------------------------------------
 
-def write_with_rosbags(folder, messages):
+def write_with_rosbags(folder, messages, storage='MCAP'):
     """Write a bag as another program does, without node parameters."""
     with rosbag2.Writer(
-            folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+            folder, version=9, storage_plugin=rosbag2.StoragePlugin[storage]) as writer:
         connections = {}
         for time, topic, kind, message in sorted(messages, key=lambda x: x[0]):
             if topic not in connections:
@@ -749,8 +749,9 @@ def test_a_bag_without_parameters_is_verified_and_exported_with_a_parameter_file
     assert levels['flux_density'].tolist() == [x.flux_density for x in run.commands]
 
 
-def test_a_bag_that_rosbags_wrote_will_do(tmp_path, bag):
-    write_with_rosbags(tmp_path / 'bag', simulated())
+@pytest.mark.parametrize('storage', ['MCAP', 'SQLITE3'])
+def test_a_bag_that_rosbags_wrote_will_do(tmp_path, bag, storage):
+    write_with_rosbags(tmp_path / 'bag', simulated(), storage)
     part, = parts_of(tmp_path / 'bag')
     expected, = parts_of(bag)
     assert part.evaluation.results == expected.evaluation.results

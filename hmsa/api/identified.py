@@ -13,7 +13,7 @@ from hmsa.api.actuator import Actuator
 from hmsa.api.arguments import columns_of, file_of, mapping_of, names_of, number
 from hmsa.api.motion import Motion
 from hmsa.errors import BadInputError, excerpt
-from hmsa.files import write_text
+from hmsa.files import may_be_bag, write_text
 from hmsa.identification.files import Belief, belief_in, file_text
 from hmsa.identification.identify import identify as find
 from hmsa.identification.known import Known
@@ -157,7 +157,7 @@ def identify(
         'coil_time_constant': options.coil_time_constant}
     if isinstance(samples, (str, os.PathLike)):
         samples = file_of(samples)
-        if os.path.isdir(samples) or samples.suffix == '.mcap':
+        if may_be_bag(samples):
             samples = Motion(read_run(samples))
     if isinstance(samples, Motion):
         if commands is not None:

@@ -32,6 +32,8 @@ _FIELD = re.compile(r'^([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]\w*')
 ROS1 = 'ros1'
 #: The one usual type whose definition is empty.
 EMPTY = 'std_msgs/msg/Empty'
+# Before each definition of a bag in IDL.
+_IDL = re.compile(r'^={80}\nIDL: .*\n', re.MULTILINE)
 _SEPARATOR = '\n' + '=' * 80 + '\nMSG: '
 
 
@@ -129,12 +131,16 @@ def installed(topic: 'BagTopic') -> 'BagTopic':
     return replace(topic, definition=definition, definition_encoding=encoding)
 
 
-def _ros1_decoder(info: 'BagTopic') -> Callable[[bytes], Any]:
-    """Return the decoder of a topic of ROS 1: times have the fields of ROS 2."""
-    from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+def _decoder_of_rosbags(info: 'BagTopic') -> Callable[[bytes], Any]:
+    """Return the decoder of a topic of ROS 1, or defined in IDL."""
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
     store = get_typestore(Stores.EMPTY)
-    store.register(get_types_from_msg(info.definition, info.type))
-    return partial(store.deserialize_ros1, typename=info.type)
+    if info.encoding == ROS1:
+        store.register(get_types_from_msg(info.definition, info.type))
+        return partial(store.deserialize_ros1, typename=info.type)
+    for text in filter(str.strip, _IDL.split(info.definition)):
+        store.register(get_types_from_idl(text))
+    return partial(store.deserialize_cdr, typename=info.type)
 
 
 def make_decoder(info: 'BagTopic') -> Callable[[bytes], Any]:
@@ -150,7 +156,9 @@ def make_decoder(info: 'BagTopic') -> Callable[[bytes], Any]:
         # Its parser prints before it raises.
         with contextlib.redirect_stderr(io.StringIO()), \
                 contextlib.redirect_stdout(io.StringIO()):
-            decode = _ros1_decoder(info) if info.encoding == ROS1 else (
+            foreign = info.encoding == ROS1 or (
+                info.encoding, info.definition_encoding) == ('cdr', 'ros2idl')
+            decode = _decoder_of_rosbags(info) if foreign else (
                 DecoderFactory().decoder_for(info.encoding, Schema(
                     id=1, name=info.type, encoding=info.definition_encoding,
                     data=info.definition.encode())))
@@ -160,7 +168,7 @@ def make_decoder(info: 'BagTopic') -> Callable[[bytes], Any]:
     if decode is None:
         raise BagError(
             f'messages of topic {info.name} ({info.type or "unknown type"}) cannot be decoded: '
-            f'expected CDR with a ros2msg definition, got {info.encoding!r} with '
+            f'expected CDR with a ros2msg or ros2idl definition, got {info.encoding!r} with '
             f'{info.definition_encoding or "no definition"!r}')
 
     # Decoded arrays of primitive values take about their encoded size; arrays of messages may take

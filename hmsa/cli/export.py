@@ -20,7 +20,7 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     add_command(
         subparsers, __name__, __doc__,
-        ('run_path', 'RUN', Path, 'folder of a bag, or an .mcap file'),
+        ('run_path', 'RUN', Path, 'folder of a bag, or one of its files'),
         ('--out', 'FILE', Path,
          'file to write, ending in .csv, .parquet or .mat; an existing file is replaced',
          {'required': True}),

@@ -19,7 +19,7 @@ from typing import Any, TYPE_CHECKING
 from hmsa.cli.options import add_command, JSON, of_unit, show
 from hmsa.cli.progress import progress
 from hmsa.errors import BadInputError
-from hmsa.files import check_targets, write_text
+from hmsa.files import check_targets, may_be_bag, write_text
 from hmsa.interfaces.quantities import number_of
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ def _read(
         arguments: argparse.Namespace, belief: 'Belief') -> 'tuple[Measurement, Belief, bool]':
     """Return the recording, prior knowledge with values of a bag, and whether there is any."""
     path: Path = arguments.recording
-    if path.is_dir() or path.suffix == '.mcap':
+    if may_be_bag(path):
         from hmsa.identification.runs import read_bag
 
         if arguments.commands is not None:

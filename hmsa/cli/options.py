@@ -156,7 +156,7 @@ def add_command(
 
 def bags(name: str) -> Row:
     """Return the argument for one or more bags."""
-    return name, 'BAG', Path, 'folder of a bag, or an .mcap file', {'nargs': '+'}
+    return name, 'BAG', Path, 'folder of a bag, or one of its files', {'nargs': '+'}
 
 
 def add_options(parser: Any, *rows: Row) -> None:

@@ -52,7 +52,7 @@ _REALTIME_PRIORITY = 1
 _LATEST_CLOCK = 2**31 * 10**9
 
 PARAMETERS = (
-    ParameterSpec('storage.uri', '', 'Folder of the bag, or an .mcap file.'),
+    ParameterSpec('storage.uri', '', 'Folder of the bag, or one of its files.'),
     ParameterSpec('play.rate', 1.0, 'Playback speed relative to the recording.', '', 1e-3, 1e3,
                   read_only=False),
     ParameterSpec('play.loop', False, 'Whether to start again at the end.'),
@@ -136,8 +136,8 @@ class Player(ManagedNode):
         values = self._values
         if not values['storage.uri']:
             raise BadInputError(
-                'parameter storage.uri is empty: expected the folder of a bag or an .mcap file, '
-                'for example -p storage.uri:=run1')
+                'parameter storage.uri is empty: expected the folder of a bag or one of its '
+                'files, for example -p storage.uri:=run1')
         self._reader = BagReader(values['storage.uri'])
         self._problems_reported = 0
         self._report_problems()
