@@ -119,7 +119,7 @@ $(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml constraints.tx
 	@touch $@ $(VENV)/.motion
 
 $(VENV)/.tools: $(VENV)/.installed
-	$(EXTRAS) test studies cluster panel docs > $(VENV)/extras.txt
+	$(EXTRAS) test sweep panel docs > $(VENV)/extras.txt
 	$(INSTALL) -r $(VENV)/extras.txt
 	@touch $@
 
@@ -130,7 +130,7 @@ $(VENV)/.lint: $(VENV)/.tools
 	@touch $@
 
 $(VENV)/.bench: $(VENV)/.installed
-	$(EXTRAS) bench studies cluster > $(VENV)/extras.txt
+	$(EXTRAS) bench sweep > $(VENV)/extras.txt
 	$(INSTALL) -r $(VENV)/extras.txt
 	@touch $@
 

@@ -39,6 +39,13 @@ INSTALL_REQUIRES = [
     'zstandard>=0.18',
 ]
 
+# Sweeps and studies in chunks, on the cores of this machine or on a cluster, and Parquet.
+SWEEP = [
+    'dask>=2024.1',
+    'distributed>=2024.1',
+    'pyarrow>=14.0',
+]
+
 # rclpy and the messages are no plain requirement: where ROS is installed they are there
 # already, and a second copy from wheels would shadow them.
 EXTRAS_REQUIRE = {
@@ -61,16 +68,10 @@ EXTRAS_REQUIRE = {
         'ruff>=0.5',
         'types-PyYAML',
     ],
-    # Parquet, beside CSV.
-    'studies': [
-        'pyarrow>=14.0',
-    ],
-    # Studies on a Dask cluster.
-    'cluster': [
-        'dask>=2024.1',
-        'distributed>=2024.1',
-        'pyarrow>=14.0',
-    ],
+    'sweep': SWEEP,
+    # Earlier names of the same.
+    'studies': SWEEP,
+    'cluster': SWEEP,
     # The page that hmsa panel serves.
     'panel': [
         'tornado>=6.2',

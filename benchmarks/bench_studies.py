@@ -12,7 +12,8 @@ Lock-step compares that kernel with itself, one move at a time, and with the sam
 one core.
 """
 
-from contextlib import suppress
+from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
 import math
 import multiprocessing
 import os
@@ -29,12 +30,12 @@ from benchmarks.sheet import Sheet
 from hmsa import motion
 from hmsa.model.law import pack
 from hmsa.planning.two_step import Groups, HOLD_TOLERANCE, plan_two_step_batch, RTOL
-from hmsa_studies.chunks import Chunks, LEAST_ROWS
-from hmsa_studies.engine import compute
-from hmsa_studies.executors import dask, local_processes
+from hmsa_studies.schedulers import cluster, in_order, local_processes
+from hmsa_studies.study_folder import LEAST_ROWS, StudyFolder
 from hmsa_studies.sweep import parse_grid, Sweep
 
 WORKERS = 2
+PROCESSES = partial(local_processes, WORKERS)
 # Maximum number of chunks completed between two kills.
 _BETWEEN = 6
 
@@ -44,7 +45,7 @@ class Watched:
 
     def __init__(self, sweep, log):
         self._sweep, self._log = sweep, log
-        self.size, self.digest = sweep.size, sweep.digest
+        self.size, self.digest, self.named = sweep.size, sweep.digest, sweep.named
 
     def table(self, begin, end):
         """Compute a chunk."""
@@ -62,17 +63,17 @@ def grid(points):
 class Killer(threading.Thread):
     """Kill random workers a number of times, each some chunks after the last."""
 
-    def __init__(self, kills, chunks):
+    def __init__(self, kills, folder):
         super().__init__(daemon=True)
-        self._left, self._chunks = kills, chunks
+        self._left, self._folder = kills, folder
         self.killed = 0
 
     def run(self):
         """Kill until the count is reached."""
         dice = random.Random(1)
         while self._left:
-            aim = len(self._chunks.found()) + dice.randint(1, _BETWEEN)
-            while len(self._chunks.found()) < aim:
+            aim = len(self._folder.found()) + dice.randint(1, _BETWEEN)
+            while len(self._folder.found()) < aim:
                 sleep(0.02)
             sleep(dice.uniform(0.0, 0.3))
             with suppress(IndexError, ProcessLookupError):
@@ -92,12 +93,11 @@ def compare(*, quick):
         for words in ('quiet', 'killed'):
             log = folder / f'{words} log'
             log.mkdir()
-            study = Watched(sweep, log)
-            chunks = Chunks.of(study, folder / words)
+            chunks = StudyFolder(Watched(sweep, log), folder / words)
             killer = Killer(kills if words == 'killed' else 0, chunks)
             killer.start()
             begin = perf_counter()
-            compute(study, folder / words, lambda: local_processes(WORKERS), say=lambda _: None)
+            chunks.compute(PROCESSES, say=lambda _: None)
             spent = perf_counter() - begin
             chunks.merge(folder / f'{words}.parquet')
             tables.append((folder / f'{words}.parquet').read_bytes())
@@ -114,7 +114,7 @@ def compare(*, quick):
 
 def rates(*, quick, minutes=math.inf):
     """Compare plans per second: the kernel alone on all cores, processes, a Dask cluster."""
-    with dask('local', WORKERS):
+    with cluster('local', WORKERS):
         # Fail now, not after minutes, if it is not installed.
         pass
     size = 20_000 if quick else 2_000_000
@@ -126,13 +126,13 @@ def rates(*, quick, minutes=math.inf):
         seconds = min(280.0, max(60.0 * minutes - 100.0, 1.0))
         points = 400_000 if quick else min(100_000, int(found['kernel'] * seconds / 1000.0)) * 1000
         for words, start, rows in (
-                ('processes', lambda: local_processes(WORKERS), points),
-                ('Dask', lambda: dask('local', WORKERS), min(points, 20_000_000))):
-            with start() as (executor, _):
+                ('processes', PROCESSES, points),
+                ('on a cluster', partial(cluster, 'local', WORKERS), min(points, 20_000_000))):
+            with _running(start) as again:
                 # Each worker starts up first.
-                compute(grid(8 * LEAST_ROWS), folder / f'{words} first', executor)
+                StudyFolder(grid(8 * LEAST_ROWS), folder / f'{words} first').compute(again)
                 begin, before = perf_counter(), _spent()
-                compute(grid(rows), folder / words, executor)
+                StudyFolder(grid(rows), folder / words).compute(again)
                 taken = perf_counter() - begin
             label = f'{rows:,} by {WORKERS} {words}'
             found[label] = rows / taken
@@ -148,11 +148,18 @@ def rates(*, quick, minutes=math.inf):
         {'rates': found, 'load_average': load})
 
 
+@contextmanager
+def _running(start):
+    """Start workers for several studies; yield a function that returns them."""
+    with start() as compute:
+        yield lambda: nullcontext(compute)
+
+
 def _together(size):
     """Return the plans per second of the kernel in as many processes at once."""
-    with local_processes(WORKERS) as (executor, _):
-        list(executor.map(_alone, [1000] * WORKERS))
-        return sum(executor.map(_alone, [size] * WORKERS))
+    with _running(PROCESSES) as again:
+        list(in_order(again, _alone, [(1000,)] * WORKERS))
+        return sum(in_order(again, _alone, [(size,)] * WORKERS))
 
 
 def _alone(size):

@@ -10,7 +10,7 @@ from scipy.special import ndtr
 
 from hmsa_studies.feedback import CYCLE, CYCLES, ExpectedResidual, trial
 from hmsa_studies.scenario import CHAINED, Scenario, SCENARIOS, STRATEGIES, Strategy, TARGETS
-from hmsa_studies.tasks import Tasks
+from hmsa_studies.study_folder import RowStudy
 
 #: Errors of the shear modulus that are combined into one row.
 ERRORS = ((0.0,), (-0.1, 0.1), (-0.2, 0.2))
@@ -63,9 +63,9 @@ class Matrix:
         return [task for *_, tasks in self._trials() for task in tasks]
 
     @property
-    def study(self) -> Tasks:
+    def study(self) -> RowStudy:
         """Return the trials as a study, whose rows `left_of` reads."""
-        return Tasks(_row, self.tasks, {
+        return RowStudy(_row, self.tasks, {
             'scenario': 'string', 'strategy': 'string', 'error': 'double', 'seed': 'int64',
             **dict.fromkeys(_LEFT, 'doubles')}, (4, 100))
 

@@ -27,7 +27,7 @@ from hmsa.planning.shapers import get_shaper, SHAPERS
 from hmsa.planning.shapers.creeping import held
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa_studies.residual import Actual, arrival_of, Errors
-from hmsa_studies.tasks import Tasks
+from hmsa_studies.study_folder import RowStudy
 
 #: Parameters with errors: display name, and name in `Errors`.
 PARAMETERS = {'G': 'shear_modulus', 'zeta': 'zeta', 'J_lim': 'j_lim'}
@@ -106,6 +106,11 @@ class Case:
             raise BadInputError(
                 f'errors of up to {self.box:g} in the box and {self.span:g} in the curves: '
                 f'expected numbers above 0 to {LARGEST:g}, the first not the larger one')
+
+    @property
+    def name(self) -> str:
+        """Display name."""
+        return f'{self.start:g} to {self.target:g}, {self.nominal}'
 
     @property
     def parameters(self) -> dict[str, str]:
@@ -254,9 +259,9 @@ def _rows(case: Case, result: Result) -> Iterator[tuple[str | float, ...]]:
         yield (*fixed, name, errors.shear_modulus, errors.zeta, errors.j_lim, value, offset)
 
 
-def comparison(tasks: Sequence[tuple[Case, Candidate]]) -> Tasks:
+def comparison(tasks: Sequence[tuple[Case, Candidate]]) -> RowStudy:
     """Return a study of shapers in cases, whose rows `result_of` reads."""
-    return Tasks(_row, tasks, {
+    return RowStudy(_row, tasks, {
         **dict.fromkeys(('start', 'target', 'zeta', 'j_lim', 'c1', 'box', 'span'), 'double'),
         'shaper': 'string', 'order': 'int64', 'status': 'string', 'reason': 'string',
         'times': 'doubles', 'levels': 'doubles',

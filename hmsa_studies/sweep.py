@@ -22,9 +22,9 @@ from hmsa.model.equations import Array, signed_root
 from hmsa.model.laws import LAWS
 from hmsa.planning.shapers import get_shaper
 from hmsa_studies.axes import parse_grid
-from hmsa_studies.chunks import LEAST_ROWS, MOST_ROWS
 from hmsa_studies.plans import by_batch, by_settings, carried_out, Plans, STATUS
 from hmsa_studies.settings import FINITE, Nondimensional, Range, Setting, System
+from hmsa_studies.study_folder import LEAST_ROWS, MOST_ROWS
 from hmsa_studies.views import Axis, View
 
 __all__ = ['parse_grid', 'ROW_BYTES', 'Rows', 'Sweep']
@@ -193,11 +193,7 @@ class Sweep:
 
     def rows(self, begin: int, end: int, *, workers: int = 0) -> Rows:
         """Plan a range of rows on a number of threads; 0 for one per core."""
-        places = np.unravel_index(np.arange(begin, end), self._shape)
-        values = {
-            name: column[place]
-            for axis, place in zip(self._axes, places, strict=True)
-            for name, column in axis.items()}
+        places, values = self._values(begin, end)
         inputs: dict[str, Any] = {name: values[name] for name in self._inputs}
         if self._plain:
             plans = by_batch(
@@ -218,6 +214,14 @@ class Sweep:
         units: Array = np.array([
             (1.0, 1.0) if x is None else (x.units.time, x.units.load) for x in settings])[which]
         return Rows(inputs, plans.codes, self._results(plans, units[:, 0], units[:, 1], *left))
+
+    def _values(self, begin: int, end: int) -> tuple[Places, dict[str, Any]]:
+        """Return the places of rows on the axes, and the values of all columns there."""
+        places = np.unravel_index(np.arange(begin, end), self._shape)
+        return places, {
+            name: column[place]
+            for axis, place in zip(self._axes, places, strict=True)
+            for name, column in axis.items()}
 
     def _occurring(
             self, inputs: Mapping[str, Column],
@@ -252,6 +256,17 @@ class Sweep:
     def table(self, begin: int, end: int) -> Any:
         """Plan a range of rows on one core; return a pyarrow table."""
         return self.rows(begin, end, workers=1).arrow()
+
+    def named(self, begin: int, end: int) -> str:
+        """Return the range of each column in rows, for a message."""
+        words = []
+        for name, column in self._values(begin, end)[1].items():
+            if column.dtype.kind == 'U':
+                words.append(f'{name} {" or ".join(dict.fromkeys(column.tolist()))}')
+            else:
+                ends = dict.fromkeys((float(np.min(column)), float(np.max(column))))
+                words.append(f'{name} {" to ".join(f"{x:g}" for x in ends)}')
+        return ', '.join(words)
 
     def blocks(self, rows: int) -> Iterator[Rows]:
         """Plan the sweep and yield its rows in order, in blocks."""

@@ -7,7 +7,7 @@ import pytest
 
 # Of a module that the extra `test` does not bring, the smallest extra that does.
 EXTRAS = {
-    'dask': 'cluster', 'distributed': 'cluster', 'pyarrow': 'studies', 'rclpy': 'ros',
+    'dask': 'sweep', 'distributed': 'sweep', 'pyarrow': 'sweep', 'rclpy': 'ros',
     'sphinx': 'docs', 'tornado': 'panel'}
 
 

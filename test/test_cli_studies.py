@@ -1,7 +1,6 @@
 """``hmsa robustness`` and ``hmsa sweep``: input, output and files."""
 
 import builtins
-from concurrent.futures import ThreadPoolExecutor
 import csv
 import errno
 import io
@@ -20,9 +19,9 @@ from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.planning.shapers import SHAPERS
 from hmsa_studies import matrix, paper_data, robustness
-from hmsa_studies.executors import given, here, in_order
 from hmsa_studies.feedback import trial
 from hmsa_studies.scenario import SCENARIOS, STRATEGIES
+from hmsa_studies.schedulers import here, in_order, local
 
 ROOT = Path(__file__).resolve().parent.parent
 PNG = b'\x89PNG\r\n\x1a\n'
@@ -365,11 +364,14 @@ def test_robustness_with_feedback_compares_open_loop_with_corrections(run, monke
     assert run(*words, '--shard', '1/2')[:2] == (0, f'{out}feedback/table.parquet\n')
 
 
-def test_trials_on_any_executor_make_the_same_matrix():
+@pytest.mark.slow
+def test_trials_in_two_processes_make_the_same_matrix():
+    needs('dask')
     made = matrix.Matrix(2, SCENARIOS[:1], STRATEGIES[:2])
-    with ThreadPoolExecutor(2) as executor:
-        found = list(made.rows(in_order(lambda: given(executor), trial, made.tasks)))
+    done = []
+    found = list(made.rows(in_order(local(2), trial, made.tasks, done.append)))
     assert found == list(made.rows(in_order(here, trial, made.tasks)))
+    assert len(done) == len(made.tasks)
 
 
 def test_robustness_with_feedback_needs_a_seed(refused):

@@ -141,8 +141,9 @@ def test_everything_imported_is_required_and_everything_required_is_imported(set
     ros = {key for key in texts(manifest, 'exec_depend')
            if not key.startswith('python3-') and key not in KEYS.values()}
     extras = setup['extras_require']
-    assert names(extras['studies']) == {'pyarrow'}
-    assert names(extras['cluster']) | names(extras['panel']) == OPTIONAL
+    assert names(extras['sweep']) | names(extras['panel']) == OPTIONAL
+    # Earlier names still work.
+    assert extras['studies'] == extras['cluster'] == extras['sweep']
     assert imported() == (python | ros | OPTIONAL | BESIDE) - NOT_IMPORTED
 
 

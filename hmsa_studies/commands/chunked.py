@@ -1,10 +1,9 @@
-"""Common parts of commands that compute a study in chunks: options, executor, progress, end."""
+"""Common parts of commands that compute a study in chunks: options, workers, progress, end."""
 
 import argparse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
@@ -12,13 +11,12 @@ from hmsa.cli.options import Row
 from hmsa.errors import BadInputError
 
 if TYPE_CHECKING:
-    from hmsa_studies.chunks import Chunks, Study
-    from hmsa_studies.engine import ChunkCounts
-    from hmsa_studies.executors import Start
+    from hmsa_studies.schedulers import Start
+    from hmsa_studies.study_folder import StudyFolder
 
 
 def options(workers: str) -> tuple[Row, ...]:
-    """Return the options of the engine."""
+    """Return the options of a study in chunks."""
     return (
         ('--workers', 'N', int, workers),
         ('--shard', 'I/N', str,
@@ -38,48 +36,52 @@ def asked(arguments: argparse.Namespace) -> list[str]:
     return [f'--{x}' for x in ('shard', 'dask', 'resume') if getattr(arguments, x)]
 
 
-def engine(arguments: argparse.Namespace, workers: int) -> 'tuple[Start, int]':
-    """Return the executor, by default on the given number of cores, and the number of cores."""
-    from hmsa_studies.executors import cores, dask, local
+def workers_of(arguments: argparse.Namespace, count: int) -> 'tuple[Start, int]':
+    """Return the workers, by default as many as given, and the number of cores."""
+    from hmsa_studies.schedulers import cluster, cores, local
 
     if arguments.dask is not None:
-        return (partial(dask, arguments.dask, arguments.workers),
+        return (partial(cluster, arguments.dask, arguments.workers),
                 arguments.workers or (cores() if arguments.dask == 'local' else 1))
-    return local(arguments.workers or workers), arguments.workers or workers
+    return local(arguments.workers or count), arguments.workers or count
 
 
-def shard_of(arguments: argparse.Namespace) -> tuple[int, int]:
-    """Return the index, from 0, and the number of parts."""
-    from hmsa_studies.engine import parse_shard
-
-    return (0, 1) if arguments.shard is None else parse_shard(arguments.shard)
+def parse_shard(text: str | None) -> tuple[int, int]:
+    """Parse ``I/N``, I from 0 or 1; return I from 0, and N, or raise `BadInputError`."""
+    if text is None:
+        return 0, 1
+    part, slash, parts = text.partition('/')
+    if not (slash and part.isdecimal() and parts.isdecimal()
+            and 0 <= int(part) <= int(parts) and int(parts) > 0):
+        raise BadInputError(
+            f'shard is {text!r}: expected I/N with I from 0 to N - 1 or from 1 to N, as in 3/20')
+    return int(part) % int(parts), int(parts)
 
 
 def compute_chunks(
-        study: 'Study', folder: Path, arguments: argparse.Namespace, start: 'Start', words: str,
-        finish: 'Callable[[Chunks, ChunkCounts], int]') -> int:
-    """Compute the requested chunks of a study, and `finish` it if all chunks exist."""
+        folder: 'StudyFolder', arguments: argparse.Namespace, start: 'Start', words: str,
+        finish: Callable[[int], int]) -> int:
+    """Compute the requested chunks; if all are there, `finish` with the number computed."""
     from hmsa.files import require_arrow
-    from hmsa_studies.chunks import Chunks
-    from hmsa_studies.engine import compute
 
     require_arrow()
-    shard = shard_of(arguments)
-    chunks = Chunks.of(study, folder)
+    shard = parse_shard(arguments.shard)
+
+    def there() -> str:
+        return f'{len(folder.found()):,} of {folder.count:,}'
+
     try:
-        with progress(words, -(-study.size // shard[1])) as advance:
-            outcome = compute(
-                study, folder, start, shard=shard, resume=arguments.resume, say=say,
-                advance=advance)
-        if len(chunks.found()) == chunks.count:
-            return finish(chunks, outcome)
+        with progress(words, -(-folder.study.size // shard[1])) as advance:
+            kept, computed = folder.compute(
+                start, shard=shard, resume=arguments.resume, say=say, advance=advance)
+        if len(folder.found()) == folder.count:
+            return finish(computed)
     except KeyboardInterrupt:
-        say(f'{len(chunks.found()):,} of {chunks.count:,} chunks are in {folder}: go on with '
-            '--resume')
+        say(f'{there()} chunks are in {folder.shown}: go on with --resume')
         raise
-    say(f'{outcome.computed:,} chunks computed, {outcome.kept:,} kept; {len(chunks.found()):,} '
-        f'of {chunks.count:,} are there, and the table is written when all are')
-    print(folder)
+    say(f'{computed:,} chunks computed, {kept:,} kept; {there()} are there, and the table is '
+        'written when all are')
+    print(folder.shown)
     return 0
 
 

@@ -26,9 +26,9 @@ from hmsa.files import json_text, make_folder
 from hmsa_studies.commands import chunked
 
 if TYPE_CHECKING:
-    from hmsa_studies.executors import Start
     from hmsa_studies.matrix import Row
     from hmsa_studies.robustness import Case, Result
+    from hmsa_studies.schedulers import Start
 
 _MOVES = ((1.0, 1.1), (1.0, 1.4), (1.0, 0.7))
 # Default moves of a beam, which rests at 0.
@@ -78,13 +78,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the study, print its results and write the files."""
     paper_of(arguments), formats_of(arguments)
     in_chunks = bool(chunked.asked(arguments))
-    start, _ = chunked.engine(arguments, 1)
+    start, _ = chunked.workers_of(arguments, 1)
     return (_feedback if arguments.feedback else _shapers)(arguments, start, in_chunks)
 
 
 def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> int:
     """Compare the shapers."""
-    from hmsa_studies.executors import in_order
     from hmsa_studies.robustness import (
         candidates,
         Case,
@@ -94,6 +93,8 @@ def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> 
         result_of,
         study,
     )
+    from hmsa_studies.schedulers import in_order
+    from hmsa_studies.study_folder import StudyFolder
 
     material, limits, delivery, units = nominal(arguments)
     unit = None if arguments.params_file is None else units.time
@@ -117,17 +118,14 @@ def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> 
 
     if in_chunks:
         table = folder / 'table.parquet'
+        chunks = StudyFolder(comparison(tasks), folder)
         return chunked.compute_chunks(
-            comparison(tasks), folder, arguments, start, 'studying',
-            lambda chunks, _: finish([
+            chunks, arguments, start, 'studying', lambda _: finish([
                 result_of(*task, row)
                 for task, row in zip(tasks, chunks.merge_rows(table), strict=True)], table))
     make_folder(folder)
     with chunked.progress('studying', len(tasks)) as advance:
-        found = []
-        for result in in_order(start, study, tasks):
-            found.append(result)
-            advance(1)
+        found = list(in_order(start, study, tasks, advance))
     return finish(found)
 
 
@@ -262,10 +260,11 @@ def _print_table(case: 'Case', results: 'list[Result]', unit: float | None) -> N
 def _feedback(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> int:
     """Compare open loop with feedback."""
     from hmsa.identification.files import read_belief
-    from hmsa_studies.executors import in_order
     from hmsa_studies.feedback import trial
     from hmsa_studies.matrix import left_of, Matrix
     from hmsa_studies.scenario import scenario_of
+    from hmsa_studies.schedulers import in_order
+    from hmsa_studies.study_folder import StudyFolder
 
     if arguments.seeds < 1:
         raise BadInputError(f'--seeds is {arguments.seeds}: expected at least 1')
@@ -285,11 +284,11 @@ def _feedback(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) ->
         return _show_matrix(
             matrix.seeds, matrix.rows(in_order(start, trial, matrix.tasks)),
             as_json=arguments.json)
-    folder = arguments.out or Path('feedback')
-    table = folder / 'table.parquet'
+    folder = StudyFolder(matrix.study, arguments.out or Path('feedback'))
+    table = folder.shown / 'table.parquet'
     return chunked.compute_chunks(
-        matrix.study, folder, arguments, start, 'moving', lambda chunks, _: _show_matrix(
-            matrix.seeds, matrix.rows(map(left_of, chunks.merge_rows(table))),
+        folder, arguments, start, 'moving', lambda _: _show_matrix(
+            matrix.seeds, matrix.rows(map(left_of, folder.merge_rows(table))),
             as_json=arguments.json, table=table))
 
 

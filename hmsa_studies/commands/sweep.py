@@ -14,6 +14,7 @@ import argparse
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 import shutil
 from typing import Any, TYPE_CHECKING
@@ -26,8 +27,7 @@ from hmsa_studies.commands import chunked
 
 if TYPE_CHECKING:
     from hmsa.model.equations import Array
-    from hmsa_studies.chunks import Chunks
-    from hmsa_studies.engine import ChunkCounts
+    from hmsa_studies.study_folder import StudyFolder
     from hmsa_studies.sweep import Sweep
     from hmsa_studies.views import View
 
@@ -232,28 +232,21 @@ def _in_chunks(sweep: 'Sweep', arguments: argparse.Namespace) -> bool:
         return True
     # Outputs that could not be written are rejected at the start, without chunks.
     return sweep.size > _SMALL * sweep.rate and out.suffix.lower() in {'.csv', '.parquet'} and \
-        not out.is_dir() and out.parent.is_dir() and (
-            out.suffix.lower() == '.parquet' or _has_arrow())
+        not out.is_dir() and out.parent.is_dir() and all(map(find_spec, ('dask', 'pyarrow')))
 
 
 def _is_folder(out: Path) -> bool:
     return not out.suffix or (out.is_dir() and out.suffix.lower() not in {'.csv', '.parquet'})
 
 
-def _has_arrow() -> bool:
-    from importlib.util import find_spec
-
-    return find_spec('pyarrow') is not None
-
-
 def _plan_at_once(sweep: 'Sweep', out: Path | None, picture: _Picture) -> int:
-    from hmsa_studies.chunks import Chunks
+    from hmsa_studies.study_folder import StudyFolder
     from hmsa_studies.tables import open_writer
 
     counts: Counter[str] = Counter()
     with open_writer(out, sweep.columns) as write, \
             chunked.progress('planning', sweep.size) as advance:
-        for block in sweep.blocks(Chunks.of(sweep, Path()).rows):
+        for block in sweep.blocks(StudyFolder(sweep, Path()).rows):
             write(block)
             picture.add(block.results)
             counts.update(block.status.tolist())
@@ -268,23 +261,25 @@ def _plan_at_once(sweep: 'Sweep', out: Path | None, picture: _Picture) -> int:
 def _plan_in_chunks(
         sweep: 'Sweep', arguments: argparse.Namespace, picture: _Picture) -> int:
     from hmsa.files import require_arrow
-    from hmsa_studies.executors import cores
+    from hmsa_studies.schedulers import cores
+    from hmsa_studies.study_folder import StudyFolder
 
     require_arrow()
-    table, folder = _places(arguments.out)
+    table, place = _places(arguments.out)
     small = sweep.size <= _SMALL * sweep.rate
-    start, known = chunked.engine(arguments, 1 if small else cores())
-    _estimate(sweep, folder, known, chunked.shard_of(arguments))
+    start, known = chunked.workers_of(arguments, 1 if small else cores())
+    folder = StudyFolder(sweep, place)
+    _estimate(sweep, folder, known, chunked.parse_shard(arguments.shard))
 
-    def finish(chunks: 'Chunks', outcome: 'ChunkCounts') -> int:
-        _report(sweep.size, chunks.merge(table, picture.add))
-        pictures = picture.draw(changed=outcome.computed > 0)
-        if table.parent.resolve() != chunks.folder and arguments.shard is None:
-            shutil.rmtree(folder, ignore_errors=True)
+    def finish(computed: int) -> int:
+        _report(sweep.size, folder.merge(table, picture.add))
+        pictures = picture.draw(changed=computed > 0)
+        if table.parent.resolve() != folder.folder and arguments.shard is None:
+            shutil.rmtree(folder.folder, ignore_errors=True)
         print(table, *pictures, sep='\n')
         return 0
 
-    return chunked.compute_chunks(sweep, folder, arguments, start, 'planning', finish)
+    return chunked.compute_chunks(folder, arguments, start, 'planning', finish)
 
 
 def _places(out: Path) -> tuple[Path, Path]:
@@ -298,22 +293,21 @@ def _places(out: Path) -> tuple[Path, Path]:
     return out, out.with_name(f'{out.name}.chunks')
 
 
-def _estimate(sweep: 'Sweep', folder: Path, cores: int, shard: tuple[int, int]) -> None:
+def _estimate(
+        sweep: 'Sweep', folder: 'StudyFolder', cores: int, shard: tuple[int, int]) -> None:
     """Announce the cost of a large sweep, and refuse one that exceeds the free disk space."""
-    from hmsa_studies.chunks import Chunks
     from hmsa_studies.sweep import ROW_BYTES
 
-    chunks = Chunks.of(sweep, folder)
     if sweep.size < _LARGE:
         return
     size = sweep.size * ROW_BYTES
     seconds = sweep.size / shard[1] / (sweep.rate * cores)
     time = f'{seconds / 3600:,.1f} h' if seconds > 3600 else f'{seconds / 60:.1f} min'
-    chunked.say(f'{sweep.size:,} plans in {chunks.count:,} chunks of {chunks.rows:,}: about '
+    chunked.say(f'{sweep.size:,} plans in {folder.count:,} chunks of {folder.rows:,}: about '
          f'{size / 1e9:.3g} GB, the table as much again'
          f'{f"; part {shard[0] + 1} of {shard[1]}" if shard[1] > 1 else ""}; about {time} on '
          f'{cores} core{"s" if cores > 1 else ""}')
-    place = chunks.folder
+    place = folder.folder
     while not place.exists():
         place = place.parent
     free = shutil.disk_usage(place).free

@@ -1,6 +1,6 @@
 """Studies in chunks: the same table however it is computed, without losses."""
 
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 import os
 from pathlib import Path
 import re
@@ -14,19 +14,18 @@ import pytest
 
 from hmsa.cli import main
 from hmsa.errors import BadInputError, HmsaError
-from hmsa_studies import chunks as chunk_module
-from hmsa_studies import executors
-from hmsa_studies.chunks import Chunks, LEAST_ROWS
-from hmsa_studies.engine import compute, parse_shard
+from hmsa_studies import schedulers, study_folder
+from hmsa_studies.commands.chunked import parse_shard
+from hmsa_studies.study_folder import LEAST_ROWS, RowStudy, StudyFolder
 from hmsa_studies.sweep import parse_grid, Sweep
 from hmsa_studies.tables import open_writer
 
 needs('pyarrow')
+needs('dask')
 
 #: Three chunks, the last one not full; some rows without a plan.
 AXES = {'zeta': '0:2:400', 'target': '1.1,1.2,3.0', 'j_lim': '4:9:80'}
 WORDS = [f'--{name.replace("_", "-")}={text}' for name, text in AXES.items()]
-CHUNKS = 3
 
 
 @pytest.fixture(scope='module')
@@ -142,16 +141,16 @@ class Deadly:
 @pytest.mark.slow
 @pytest.mark.parametrize('workers', [1, 2])
 def test_a_killed_worker_costs_its_chunk_and_nothing_that_was_done(tmp_path, workers):
-    said = []
+    said, rows = [], []
     (tmp_path / 'log').mkdir()
-    outcome = compute(
-        Deadly(tmp_path / 'log'), tmp_path / 'study',
-        lambda: executors.local_processes(workers), say=said.append)
-    chunks = Chunks.of(Deadly(tmp_path / 'log'), tmp_path / 'study')
+    folder = StudyFolder(Deadly(tmp_path / 'log'), tmp_path / 'study')
+    assert folder.compute(
+        partial(schedulers.local_processes, workers), say=said.append,
+        advance=rows.append) == (0, folder.count) == (0, 6)
     assert len(said) == 1
     assert 'a worker died' in said[0]
-    assert outcome.computed == chunks.count == 6
-    assert [x for table in chunks.tables() for x in table['row'].to_pylist()] == list(
+    assert sum(rows) == Deadly.size
+    assert [x for table in folder.tables() for x in table['row'].to_pylist()] == list(
         range(Deadly.size))
     # Only what was in the workers' hands was begun twice.
     assert 1 <= len(list((tmp_path / 'log').iterdir())) - 6 <= workers
@@ -175,18 +174,11 @@ def test_interrupt_leaves_whole_chunks_and_nothing_else(tmp_path):
     assert ended.endswith('of 50 chunks are in a: go on with --resume')
     assert sorted(x.name for x in (tmp_path / 'a').iterdir()) == ['chunks', 'study.json']
     sweep = Sweep({'zeta': parse_grid('0:2:1000', 'zeta'), 'j_lim': parse_grid('1:9:2000', 'j')})
-    chunks = Chunks.of(sweep, tmp_path / 'a')
-    found = chunks.found()
+    folder = StudyFolder(sweep, tmp_path / 'a')
+    found = folder.found()
     assert len(found) == len(chunk_files(tmp_path / 'a'))
-    assert all(chunks.sound(x) for x in found.values())
-
-
-@pytest.mark.slow
-def test_any_executor_computes_a_study(sweep, tmp_path, expected):
-    with ThreadPoolExecutor(2) as executor:
-        assert compute(sweep, tmp_path / 'study', executor).computed == CHUNKS
-    Chunks.of(sweep, tmp_path / 'study').merge(tmp_path / 'table.parquet')
-    assert (tmp_path / 'table.parquet').read_bytes() == expected[0]
+    assert folder.compute(partial(schedulers.local_processes, 2), resume=True) == (
+        len(found), 50 - len(found))
 
 
 @pytest.mark.slow
@@ -200,11 +192,15 @@ def test_a_dask_cluster_writes_the_same_table(run, tmp_path, expected):
 def test_a_local_dask_cluster_leaves_the_cores_to_the_kernels():
     needs('distributed')
     dask = needs('dask')
-    before = dask.config.get('distributed.worker.profile.enabled')
-    with executors.dask('local', 1) as (executor, _):
-        get = dask.config.get
-        assert executor.submit(get, 'distributed.worker.profile.enabled').result() is False
-        assert int(executor.submit(os.getenv, 'MALLOC_TRIM_THRESHOLD_').result()) > 1e9
+    get = dask.config.get
+    before, keys = get('distributed.worker.profile.enabled'), []
+    with schedulers.cluster('local', 1) as compute:
+        profile, threshold = compute([
+            dask.delayed(get)('distributed.worker.profile.enabled'),
+            dask.delayed(os.getenv)('MALLOC_TRIM_THRESHOLD_')], keys.append)
+    assert profile is False
+    assert int(threshold) > 1e9
+    assert len(keys) == 2
     assert get('distributed.worker.profile.enabled') is before
 
 
@@ -238,7 +234,7 @@ def test_options_that_do_not_fit_are_refused_in_one_line(run, tmp_path, words, m
 
 def test_an_address_without_a_scheduler_is_refused(run, tmp_path, monkeypatch):
     needs('distributed')
-    monkeypatch.setattr(executors, 'PATIENCE', 0.5)
+    monkeypatch.setattr(schedulers, 'PATIENCE', 0.5)
     for address in ('tcp://127.0.0.1:9', 'none.json'):
         status, out, err = run(f'--dask={address}', '--out=a')
         assert (status, out, err.count('\n')) == (2, '', 1)
@@ -246,27 +242,32 @@ def test_an_address_without_a_scheduler_is_refused(run, tmp_path, monkeypatch):
         assert list(tmp_path.iterdir()) == []
 
 
-def test_a_missing_dask_is_said_with_how_to_get_it(run, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'distributed', None)
-    status, _, err = run('--dask=local', '--out=a')
+@pytest.mark.parametrize(('package', 'words'), [
+    ('distributed', ['--dask=local', '--out=a']), ('dask', ['--workers=2', '--out=a.csv'])])
+def test_a_missing_dask_is_said_with_how_to_get_it(run, tmp_path, monkeypatch, package, words):
+    monkeypatch.setitem(sys.modules, package, None)
+    status, _, err = run(*words)
     assert (status, err.count('\n')) == (2, 1)
-    assert 'pip install distributed' in err
+    assert f'pip install {package}' in err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_chunks_of_other_code_have_other_names(sweep, tmp_path, monkeypatch):
-    for name in ('hmsa', 'hmsa_ros', 'hmsa_studies'):
+    for name in ('hmsa', 'hmsa_lab', 'hmsa_ros', 'hmsa_studies'):
         shutil.copytree(
-            Path(chunk_module.__file__).parent.parent / name, tmp_path / name,
+            Path(study_folder.__file__).parent.parent / name, tmp_path / name,
             ignore=shutil.ignore_patterns('__pycache__'))
-    before = Chunks.of(sweep, tmp_path).digest
-    monkeypatch.setattr(chunk_module, '__file__', str(tmp_path / 'hmsa_studies' / 'chunks.py'))
-    for change in (False, True):
-        if change:
-            with (tmp_path / 'hmsa' / 'motion' / 'hmsa' / 'law.hpp').open('a') as source:
-                source.write('// changed\n')
-        chunk_module.code.cache_clear()
-        assert (Chunks.of(sweep, tmp_path).digest == before) is not change
-    chunk_module.code.cache_clear()
+    monkeypatch.setattr(study_folder, '__file__', str(tmp_path / 'hmsa_studies' / 'copy.py'))
+    digests = [StudyFolder(sweep, tmp_path).path(0).name]
+    for changed in (None, 'hmsa/motion/hmsa/law.hpp', 'hmsa_lab/adapt/motion.py'):
+        if changed:
+            with (tmp_path / changed).open('a') as source:
+                source.write('\n')
+        study_folder.code.cache_clear()
+        digests.append(StudyFolder(sweep, tmp_path).path(0).name)
+    study_folder.code.cache_clear()
+    assert digests[0] == digests[1]
+    assert len(set(digests)) == 3
 
 
 def test_the_folder_of_another_study_is_refused_and_kept(run, tmp_path):
@@ -280,17 +281,33 @@ def test_the_folder_of_another_study_is_refused_and_kept(run, tmp_path):
     assert 'no study.json' in run('--workers=1', '--out=a')[2]
 
 
-class Failing:
-    """A study that cannot be computed."""
-
-    size = 1
-    digest = 'failing'
-
-    def table(self, begin, end):
-        raise MemoryError(f'{begin} to {end}')
+def reciprocal(name, value):
+    """Return a row that cannot be computed for 0."""
+    return {'name': name, 'value': 1.0 / value}
 
 
-def test_a_chunk_that_fails_is_named(tmp_path):
-    with pytest.raises(HmsaError, match=r'chunk 0 failed \(MemoryError: 0 to 1\)'):
-        compute(Failing(), tmp_path)
-    assert not list(Path(tmp_path).glob('.run-*'))
+@pytest.mark.parametrize('workers', [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_chunk_that_fails_is_named_with_its_parameters(tmp_path, workers):
+    study = RowStudy(
+        reciprocal, [('a', 2.0), ('b', 4.0), ('c', 0.0), ('d', 1.0)],
+        {'name': 'string', 'value': 'double'}, (2, 2))
+    folder = StudyFolder(study, tmp_path / 'study')
+    with pytest.raises(HmsaError) as failed:
+        folder.compute(schedulers.local(workers))
+    assert str(failed.value) == (
+        'chunk 1 (c, 0.0; d, 1.0) failed (ZeroDivisionError: float division by zero): expected '
+        'workers that can compute it; correct it, then continue with --resume')
+    assert folder.found() in ([], [0])
+    assert not list((tmp_path / 'study').glob('.run-*'))
+
+
+def test_a_chunk_of_a_sweep_is_named_by_the_ranges_of_its_columns(tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise MemoryError
+
+    sweep = Sweep({'zeta': [0.1, 0.3, 0.2]}, shapers=['two_step', 'zv'])
+    monkeypatch.setattr(Sweep, 'rows', fail)
+    with pytest.raises(HmsaError, match=re.escape(
+            'chunk 0 (start 1, target 1.1, zeta 0.1 to 0.3, j_lim 5, c1 2, shaper two_step or '
+            'zv) failed (MemoryError)')):
+        StudyFolder(sweep, tmp_path).compute()
