@@ -3,6 +3,7 @@
 from pathlib import Path
 import signal
 import subprocess
+import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from extras import needs
@@ -25,6 +26,7 @@ from hmsa.bag.reader import BagReader, read_messages
 from hmsa.bag.recover import recover
 from hmsa.bag.writer import BagTopic, BagWriter
 from hmsa.cli import main
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes.capture import RawSubscription
 from hmsa_ros.nodes.recorder import Recorder as Recording
 
@@ -454,6 +456,31 @@ def test_a_bag_played_in_a_loop_is_recorded_round_by_round(record, start, ros, t
     assert len(reader.files) >= 4
     for file in reader.files[:3]:
         assert values(BagReader(file)) == list(range(200))
+
+
+def test_a_clock_that_is_set_back_begins_a_file_whose_log_times_rise(
+        ros, serve, tmp_path, monkeypatch):
+    folder, set_back = tmp_path / 'bag', 0
+    served = serve(Recording, *(x for y in (
+        f'storage.uri:={folder}', 'storage.flush_period:=0.1', 'record.topics:=[/a]')
+        for x in ('-p', y)))
+    recorder = served.nodes[0]
+    take = RawSubscription.take
+    monkeypatch.setattr(RawSubscription, 'take', lambda *limit: [
+        x._replace(received_ns=x.received_ns - set_back) for x in take(*limit)])
+    publisher = ros.publisher(Float64, '/a')
+    publisher.publish(Float64(data=1.0))
+    ros.spin_until(lambda: recorder._recorded.topics['/a'].received == 1, 'the first message')
+    # As if all readings so far had been ten seconds ahead, or the next ones behind.
+    set_back = 10 * NANOSECONDS
+    recorder._steps._clock = lambda: time.time_ns() - set_back
+    publisher.publish(Float64(data=2.0))
+    ros.spin_until(lambda: recorder._recorded.topics['/a'].received == 2, 'the second message')
+    recorder.close()
+    reader = BagReader(folder)
+    assert reader.custom_data['time_jumps'] == '1'
+    (first,), (second,) = (list(BagReader(file).messages()) for file in reader.files)
+    assert first.log_time - second.log_time > 9 * NANOSECONDS
 
 
 def test_what_comes_while_messages_are_taken_is_in_the_file_of_its_time(

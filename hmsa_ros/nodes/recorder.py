@@ -8,12 +8,12 @@ As a managed node, it opens the bag when it is configured, records while it is a
 the bag when it is cleaned up.
 """
 
-from bisect import bisect_left
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 import datetime
 from functools import partial
 import json
+from operator import gt, lt
 import os
 from pathlib import Path
 import time
@@ -29,6 +29,7 @@ from hmsa.bag.writer import BagWriter, parse_custom_data
 from hmsa.errors import BadInputError, BagError
 from hmsa.interfaces import topics
 from hmsa.interfaces.parameters import duration_from, duration_specs, ParameterSpec
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.capture import Capture, decode, SimulatedTime, Taken
 from hmsa_ros.nodes.conversions import from_time, to_status
@@ -40,6 +41,7 @@ from hmsa_ros.nodes.service_call import RemoteParameters
 from hmsa_ros.nodes.subscribing import Subscriptions
 from hmsa_ros.recording.reception import figures, judge, RecordedTopic
 from hmsa_ros.recording.writer_thread import lost_by_topic, RecordingLimits, Status, WriterThread
+from hmsa_ros.timekeeping import StepWatch
 
 PARAMETERS = (
     ParameterSpec(
@@ -120,6 +122,7 @@ class Recorder(ManagedNode):
         # While inactive, it is paused anyway.
         self._paused: bool = values['record.start_paused']
         self._sim_time = SimulatedTime() if self.simulated else None
+        self._steps, self._set_back = StepWatch(), 0
         self._experiment: dict[str, str] = {'hmsa_ros.version': __version__}
         # Number of topics with a publisher at the last look, and of nodes whose parameters are
         # stored.
@@ -203,10 +206,28 @@ class Recorder(ManagedNode):
 
     def _deliver(self, taken: Sequence[tuple[Any, list[Taken]]]) -> None:
         """Add timestamps to received messages, count them and pass them on."""
-        if self._sim_time is not None:
-            taken = self._follow(self._sim_time, taken)
+        taken = self._follow_wall(taken) if self._sim_time is None else self._follow(
+            self._sim_time, taken)
         for key, messages in taken:
             self._take_in(key, messages)
+
+    def _follow_wall(
+            self, taken: Sequence[tuple[Any, list[Taken]]]) -> list[tuple[Any, list[Taken]]]:
+        """Record messages from before the clock was set back."""
+        now, by = self._steps.read()
+        if by >= 0:
+            return [*taken]
+        earlier, rest = _parted(taken, partial(lt, now))
+        for key, messages in earlier:
+            self._take_in(key, messages)
+        # Within a file, log times rise.
+        self.get_logger().warning(
+            f'the clock of this host was set back by {-by / NANOSECONDS:.3f} s: recording '
+            'continues in a new file')
+        self._recording.begin_anew()
+        self._set_back += 1
+        self._note({'time_jumps': str(self._set_back)})
+        return rest
 
     def _follow(
             self, clock: SimulatedTime,
@@ -232,7 +253,7 @@ class Recorder(ManagedNode):
                     ticks += messages
                 else:
                     rest.append((key, messages))
-            earlier, rest = _parted(rest, message.received_ns)
+            earlier, rest = _parted(rest, partial(gt, message.received_ns))
             for key, messages in earlier:
                 self._take_in(key, messages)
             # A simulation restarted, or a bag is played in a loop.
@@ -353,12 +374,13 @@ class Recorder(ManagedNode):
 
 
 def _parted(
-        taken: Sequence[tuple[Any, list[Taken]]],
-        moment: int) -> tuple[list[tuple[Any, list[Taken]]], list[tuple[Any, list[Taken]]]]:
-    """Split messages at a moment of reception in ns."""
+        taken: Iterable[tuple[Any, list[Taken]]], before: Callable[[int], bool],
+) -> tuple[list[tuple[Any, list[Taken]]], list[tuple[Any, list[Taken]]]]:
+    """Split messages, in the order of reception, by whether their time in ns is before a jump."""
     earlier, rest = [], []
     for key, messages in taken:
-        count = bisect_left(messages, moment, key=lambda message: message.received_ns)
+        count = next(
+            (i for i, x in enumerate(messages) if not before(x.received_ns)), len(messages))
         earlier.append((key, messages[:count]))
         rest.append((key, messages[count:]))
     return earlier, rest
