@@ -61,6 +61,16 @@ def test_a_command_that_nobody_applied_is_said_though_the_motion_fits():
     assert found.largest_difference < 1e-12
 
 
+def test_samples_of_a_clock_that_was_set_back_are_no_run_to_compare():
+    run = moved()
+    # The second half repeats times of the first.
+    stamps = run.time - np.where(np.arange(100) < 50, 0, 200 * STEP)
+    order = np.argsort(stamps)
+    back = {x: getattr(run, x)[order] for x in ('logged', 'stretch', 'rate', 'flux_density')}
+    with pytest.raises(BadInputError, match=r'samples in run jump back by 0\.199 s'):
+        verify_run(replace(run, time=stamps[order], **back))
+
+
 def test_a_recording_that_begins_in_the_middle_begins_with_what_it_shows():
     # Held at 10 mT when the recording begins, moved to 20 mT later; both are sent again.
     run = moved(commands=((0, 0.01), (60, 0.01), (80, 0.02)))
@@ -146,6 +156,14 @@ def test_levels_that_a_board_rounds_took_effect():
     assert unapplied == 0
     assert lateness == pytest.approx(np.array(off) * 1e-9)
     assert lateness_of(commands, applied[:2], BEGIN + 9 * STEP)[1] == 3
+
+
+def test_a_late_command_that_the_next_one_replaced_at_once_is_late_and_not_lost():
+    commands = [RecordedLevel(BEGIN + i * STEP, 0.01 * (i + 1), BEGIN + 3 * STEP)
+                for i in range(2)]
+    applied = [RecordedLevel(BEGIN + 3 * STEP, 0.02, BEGIN + 3 * STEP)]
+    lateness, unapplied = lateness_of(commands, applied, BEGIN + 9 * STEP)
+    assert (lateness.tolist(), unapplied) == ([math.inf, 2 * STEP / NANOSECONDS], 0)
 
 
 def test_a_table_has_the_samples_in_full_precision_and_the_levels_at_their_times(tmp_path):

@@ -58,7 +58,8 @@ def lateness_of(
 
     The lateness is in s, for each command from `without_repeats`: NaN for one that never took
     effect, empty if changes were not reported. The number counts changes of level that were due
-    before ``last`` (ns), were not replaced, and never took effect.
+    before ``last`` (ns), were not replaced, and never took effect. One that came late, when the
+    next one was due, too, was replaced by that; its lateness is infinite.
     """
     if not applied:
         return np.empty(0), 0
@@ -78,10 +79,15 @@ def lateness_of(
             (x.stamp for x in standing[i + 1:] if same(x, command)), math.inf)
         when = [x.stamp for x in applied if same(x, command)
                 and command.stamp - ROUNDED_STAMP <= x.stamp < until - ROUNDED_STAMP]
+        following = standing[i + 1] if i + 1 < len(standing) else None
         if when:
             result[places[command]] = (min(when) - command.stamp) / NANOSECONDS
         elif command.stamp < last and not (before and same(before, command)):
-            unapplied += 1
+            if following and command.sent > following.stamp and any(
+                    same(x, following) and x.stamp >= following.stamp for x in applied):
+                result[places[command]] = math.inf
+            else:
+                unapplied += 1
         before = command
     return result, unapplied
 

@@ -11,8 +11,8 @@ from hmsa.errors import BadInputError
 from hmsa.interfaces.parameters import JOINT
 from hmsa.model.units import NANOSECONDS
 
-# Maximum step back in time, in ns, due to samples that overtake one another; more is a clock.
-_CLOCK_JUMP = 100_000_000
+#: Maximum step back in time, in ns, due to samples that overtake one another; more is a clock.
+CLOCK_JUMP = 100_000_000
 # Distance of a timestamp from the others, in ns, above which the sample is invalid.
 _FAR = 30 * 86_400 * NANOSECONDS
 # Larger values are not a motion of a block and cannot be plotted; the rate is in 1/s.
@@ -133,7 +133,7 @@ def _tidy(where: str, columns: Columns) -> tuple[Columns, list[str], int]:
         raise BadInputError(
             f'{where} holds no finite position: expected the stretch as a number')
     columns = _rows(columns, good)
-    if np.any(np.diff(columns['time']) < -_CLOCK_JUMP):
+    if np.any(np.diff(columns['time']) < -CLOCK_JUMP):
         notes.append(
             'The timestamps of the samples jump back: the samples are sorted by timestamp. Was '
             'the clock reset in the run?')

@@ -22,11 +22,19 @@ import numpy as np
 from hmsa.errors import BadInputError
 from hmsa.interfaces.parameters import number_of
 from hmsa.model.creep import Creep
+from hmsa.model.equations import Array
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs.bags import read_runs
-from hmsa.runs.levels import in_force, lateness_of, RecordedLevel, without_repeats
+from hmsa.runs.levels import (
+    in_force,
+    lateness_of,
+    RecordedLevel,
+    ROUNDED_STAMP,
+    without_repeats,
+)
 from hmsa.runs.parameters import creep_of, of_joint
 from hmsa.runs.record import Run
+from hmsa.runs.samples import CLOCK_JUMP
 from hmsa.runs.topics import APPLIED, COMMAND, FORCE, JOINT_STATES
 
 if TYPE_CHECKING:
@@ -48,8 +56,8 @@ class Verification:
     commands: str
     sample_count: int  # messages compared
     command_count: int  # commands applied in the simulation
-    # Commands received after their timestamp, so that the time of their effect is unknown; 0 if
-    # the plant reported it.
+    # Commands that took effect after their timestamp, or that were received after it, where
+    # nothing reported the time of their effect.
     late_count: int
     largest_difference: float  # of the stretch, or of a beam's deflection; dimensionless
     where: float  # its time after the first sample, in s
@@ -84,6 +92,12 @@ def verify_run(run: Run) -> Verification:
             f'{run.path} does not contain the parameters of the plant: name a parameter file '
             'with --params-file')
     window = _one_run(run)
+    if back := _set_back(run, window):
+        raise BadInputError(
+            f'the timestamps of the samples in {run.path} jump back by '
+            f'{back / NANOSECONDS:.3f} s, '
+            'as if the clock of plant or driver had been set: expected times that rise; record a '
+            'run whose clock is not set')
     begin = int(run.time[window.start])
     notes: list[str] = []
     creep = creep_of(run.parameters, run.joint)
@@ -116,7 +130,8 @@ def verify_run(run: Run) -> Verification:
         except BadInputError:
             left_out += 1
             refused += kind == _COMMAND
-    unapplied = _unapplied(run)
+    lateness, unapplied = _lateness(run)
+    late += int(np.count_nonzero(lateness * NANOSECONDS > ROUNDED_STAMP))
     return Verification(
         run.topics.get(JOINT_STATES, str(run.path)), run.topics.get(COMMAND, ''), count,
         len(run.commands) - refused, late, largest, where / NANOSECONDS,
@@ -141,6 +156,14 @@ def _one_run(run: Run) -> slice:
     ends = [0, *(np.flatnonzero(np.diff(run.time) > _LARGEST_LEAP) + 1).tolist(), len(run.time)]
     return max((slice(*x) for x in zip(ends, ends[1:], strict=False)),
                key=lambda x: x.stop - x.start)
+
+
+def _set_back(run: Run, window: slice) -> int:
+    """Return the ns by which timestamps jump back, in the order of the recording; 0 for none."""
+    order = np.argsort(run.logged[window], kind='stable')
+    stamps = run.time[window][order]
+    back = int((np.maximum.accumulate(stamps) - stamps).max())
+    return back if back > CLOCK_JUMP else 0
 
 
 def _start(run: Run, first: int, creep: Creep) -> 'ActuatorSimulation':
@@ -178,18 +201,23 @@ def _rests(simulation: 'ActuatorSimulation') -> bool:
         abs(simulation.rate) * simulation.actuator.time_unit < _AT_REST)
 
 
-def _unapplied(run: Run) -> int:
-    """Return how many due changes of level had no effect, according to the plant."""
+def _lateness(run: Run) -> tuple[Array, int]:
+    """
+    Return the lateness of commands in s, and how many due changes of level had no effect.
+
+    Both are according to the plant or driver; the first is empty if that did not report.
+    """
+    none = np.empty(0)
     if APPLIED not in run.topics:
-        return 0
+        return none, 0
     commands, last = without_repeats(run.commands)[0], int(run.time[-1])
     # The initial level may be sent again without a change.
     known = run.applied
     if math.isfinite(field := float(run.flux_density[0])):
         known = RecordedLevel(int(run.time[0]), field, int(run.logged[0])), *known
     if not known:
-        return sum(x.stamp < last for x in in_force((x,) for x in commands))
-    return lateness_of(commands, known, last)[1]
+        return none, sum(x.stamp < last for x in in_force((x,) for x in commands))
+    return lateness_of(commands, known, last)
 
 
 def _notes(run: Run, left_out: int, unapplied: int) -> Iterator[str]:
