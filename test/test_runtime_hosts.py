@@ -24,6 +24,7 @@ class Bench(Rig):
         self.lost = False  # whether samples show rest without a field
         self.samples = True
         self.hears = True  # whether commands arrive while the link works
+        self.mute = False  # whether receipts are lost
         self.cut_at = START + 1  # time that names the cut-off
         self._newest = 0
         self._came = 0  # time of the device at which a command arrived
@@ -54,6 +55,8 @@ class Bench(Rig):
 
     def give_receipt(self):
         """Acknowledge commands soon, and give a sign of life now and then."""
+        if self.mute:
+            return
         if self.now >= self._next or self._came and self.now >= self._next - 80 * MS:
             self._next = self.now + 100 * MS
             self.runtime.received(

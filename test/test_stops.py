@@ -90,6 +90,25 @@ def test_a_stop_that_does_not_arrive_has_not_stopped_until_it_does(fault):
     assert outcomes(rig) == ['accepted', 'unheard', 'stopped']
 
 
+def test_a_stop_is_sent_to_a_device_whose_receipts_are_silent():
+    rig = Bench()
+    rig.runtime.request(trajectory(*((1.2 + 0.1 * (i % 2), 400 * MS * i) for i in range(1, 9))))
+    rig.run(START + 500 * MS)
+    rig.mute = True
+    rig.run(START + 1380 * MS)
+    assert rig.runtime.devices.receipts.silent
+    rig.run(START + 1600 * MS)
+    rig.runtime.request(Stop('the stop'))
+    rig.run(rig.now + 4 * SECOND)
+    assert outcomes(rig) == ['accepted', 'unheard']
+    level = rig.planner.plan.levels[-1].flux_density
+    assert rig.wire == []
+    assert [x.flux_density for _, x in rig.sent][-1] == rig.plant.flux_density == level
+    rig.mute = False
+    rig.run(rig.now + 2 * SECOND)
+    assert outcomes(rig) == ['accepted', 'unheard', 'stopped']
+
+
 def test_a_stop_is_not_carried_out_before_its_time_by_the_clock_of_the_device():
     rig = Bench()
     rig.runtime.request(trajectory(*LONG))

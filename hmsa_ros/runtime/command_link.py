@@ -44,6 +44,8 @@ class CommandLink:
         self.receipts, self._around = receipts, environment
         #: Delivers a command immediately, before any other work.
         self.deliver: Callable[[Send], None] = outputs.append
+        #: Returns whether the plan is a stop, which is sent to devices that are silent, too.
+        self.stops: Callable[[], bool] = lambda: False
         self.sent = self.heartbeats = 0
         self._absent: set[str] = set()
         self._reporters: dict[str, frozenset[bytes]] = {}
@@ -73,8 +75,10 @@ class CommandLink:
 
     def send(self, now: int, *, everything: bool = False) -> None:
         """Send the levels that are due at a time in ns, or all planned levels."""
+        # Commands may arrive although nothing comes back.
+        silent = set() if self.stops() else self.receipts.silent
         for name, planner in self._planners.items():
-            if name in self.receipts.silent | self.apart | self.cut:
+            if name in silent | self.apart | self.cut:
                 # The command would arrive too late, apply at another time, or be rejected.
                 continue
             if name in self._void and name in self._following.astray:

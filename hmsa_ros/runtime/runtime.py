@@ -94,6 +94,7 @@ class Runtime:
         self._stops = Stops(
             group, self.devices, self.following.newest, self._watch, around, around.unheard,
             lambda: self.settings.tolerances)
+        self.devices.stops = lambda: self._stops.judges
         self.planning = RequestQueue(
             group, self.following, lambda: self.follower, self._reporting,
             around, lambda: self.devices.send(clock()), self._stops.begin)
