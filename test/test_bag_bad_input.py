@@ -279,7 +279,8 @@ def test_a_file_that_is_no_mcap_is_named(tmp_path, capsys):
 def test_what_is_not_there_is_said(tmp_path, capsys):
     (tmp_path / 'empty').mkdir()
     for name, expected in (
-            ('none', 'does not exist'), ('empty', 'holds no .mcap or .db3 file')):
+            ('none', 'does not exist'), ('/proc/self/mem', 'cannot be read (Input/output error)'),
+            ('empty', 'holds no .mcap or .db3 file')):
         assert main(['bag', 'info', str(tmp_path / name)]) == 2
         assert expected in capsys.readouterr().err
 

@@ -8,6 +8,7 @@ messages come at 0.57 M/s (`scan`: 0.82 M/s), 100,000 JointState are decoded in 
 """
 
 from collections.abc import Callable, Iterator
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,8 @@ def is_foreign(path: Path) -> bool:
     """Return whether rosbags reads a file, or the folder of a compressed bag."""
     if path.is_dir():
         return True
-    with path.open('rb') as file:
+    begin = b''
+    with contextlib.suppress(OSError), path.open('rb') as file:  # `ScannedFile` reports it
         begin = file.read(len(_MAGICS[0]))
     return begin.startswith(_MAGICS) or path.suffix in ('.db3', '.bag')
 
@@ -41,7 +43,8 @@ class ForeignFile:
 
     closed = True
 
-    def __init__(self, intake: ReadLimits, path: Path, number: int,
+    def __init__(
+            self, intake: ReadLimits, path: Path, number: int,
             metadata: BagMetadata | None) -> None:
         self.path = path
         self.paths = [path] if path.is_file() else sorted(
