@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 
 from hmsa.identification.known import Known
 from hmsa.planning.group import PlannerGroup
-from hmsa.planning.planner import EstimatorOptions as PlannerOptions
+from hmsa.planning.planner import Options as PlannerOptions
 from hmsa.planning.planner import Planner
 from hmsa_lab.adapt.corrections import course_of
 from hmsa_lab.adapt.estimator import Estimator, EstimatorOptions

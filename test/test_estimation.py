@@ -9,7 +9,7 @@ import pytest
 from hmsa.errors import BadInputError
 from hmsa.identification.files import read_belief
 from hmsa.model.creep import Creep
-from hmsa.planning.planner import EstimatorOptions as PlannerOptions
+from hmsa.planning.planner import Options as PlannerOptions
 from hmsa_lab.adapt.estimator import Estimator, EstimatorOptions
 from hmsa_lab.adapt.hypotheses import Evidence, Hypotheses
 from hmsa_lab.adapt.messages import confounded, sentence
