@@ -10,11 +10,15 @@ import csv
 from dataclasses import dataclass
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hmsa.errors import BadInputError
 from hmsa.model.equations import Array
+
+if TYPE_CHECKING:
+    from hmsa.identification.files import Belief
 
 #: Maximum number of values of a column, or of cases, since they are kept in memory.
 MOST_VALUES = 10_000_000
@@ -24,6 +28,8 @@ _GRID = (
     'sobol:LOW:HIGH or normal:MEAN:STD')
 # Minimum distance of a sample from 0 and 1, so that no value is infinite.
 _LEAST_SHARE = 2.0 ** -32
+# Identified names that differ from those of the block's parameters.
+_OTHERS = {'coil_time_constant': 'coil_time_constant', 'time_unit': 'actuator.density'}
 # Negative variances below this fraction are rounding errors.
 _ROUNDING = 1e-9
 
@@ -157,6 +163,37 @@ def _case(cells: Sequence[str], names: Sequence[str], where: str) -> list[float]
         except ValueError:
             raise BadInputError(f'{where}: {name} is {cell!r}, expected a number') from None
     return values
+
+
+def belief_of(found: 'Belief', path: Path) -> NormalColumns:
+    """Return the uncertainty of the block in a file; raise `BadInputError` if there is none."""
+    numbers, known = found.actuator.numbers, found.known
+    means, names, places = [], [], []
+    slopes = np.eye(len(known.names))
+    for place, name in enumerate(known.names):
+        if name in numbers:
+            column, mean = f'actuator.{name}', numbers[name]
+        elif name in _OTHERS:
+            column, mean = _OTHERS[name], found.others.get(name, 0.0)
+        else:
+            continue
+        if name == 'time_unit':
+            # rho = G (T/L)^2, to first order.
+            mean = numbers['density']
+            slopes[place, place] = 2.0 * mean / found.actuator.time_unit
+            if 'shear_modulus' in known.names:
+                slopes[place, known.names.index('shear_modulus')] = (
+                    mean / numbers['shear_modulus'])
+        names.append(column)
+        means.append(mean)
+        places.append(place)
+    if not names:
+        raise BadInputError(
+            f'{path} has no covariance of the block: expected a file that hmsa identify --out '
+            'wrote')
+    covariance = slopes @ known.covariance @ slopes.T
+    return NormalColumns(
+        tuple(names), np.array(means, dtype=np.float64), covariance[np.ix_(places, places)])
 
 
 def draw(

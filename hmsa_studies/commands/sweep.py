@@ -156,7 +156,7 @@ class _Picture:
 
 def _sweep(arguments: argparse.Namespace) -> 'Sweep':
     """Return the sweep of the arguments."""
-    from hmsa_studies.axes import draw, NOTHING, parse_values, read_cases, Spread
+    from hmsa_studies.axes import belief_of, draw, NOTHING, parse_values, read_cases, Spread
     from hmsa_studies.settings import ACTUAL, BLOCK_OF, InSI, Nondimensional, System
     from hmsa_studies.sweep import Sweep
 
@@ -176,8 +176,6 @@ def _sweep(arguments: argparse.Namespace) -> 'Sweep':
             values_of(read_parameter_file(path, entries), PLANNER, (*PLANNED, *VISCOELASTIC)),
             errors_of(known, ERRORS))
         if arguments.identified:
-            from hmsa_studies.identified import belief_of
-
             belief = belief_of(known, path)
             if arguments.residual:
                 belief = replace(belief, names=tuple(
