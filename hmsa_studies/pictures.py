@@ -11,7 +11,7 @@ import numpy as np
 from hmsa.model.equations import critical_zeta, elastic_force
 from hmsa.model.moves import Move, State
 from hmsa.model.parameters import NondimensionalParameters
-from hmsa.model.residual import percent, RESOLVED
+from hmsa.model.residual import percent
 from hmsa.planning.shapers.linear import step
 from hmsa.planning.shapers.minimum_time import minimum_time
 from hmsa.planning.shapers.request import MoveRequest
@@ -30,6 +30,8 @@ _SYMBOLS = {'G': '$G$', 'zeta': r'$\zeta$', 'J_lim': r'$J_\mathrm{lim}$'}
 _ORDERS = (('full', 1.0), ('none', 0.7), ('left', 0.5), ('top', 0.5))
 # Number of markers on a curve.
 _MARKS = 5
+# Smaller fractions of a step are rounding of the search on a grid.
+_RESOLVED = 1e-8
 
 
 def draw_robustness(
@@ -197,10 +199,10 @@ def draw_sampled(
             study.periods, 100.0 * study.bound, label='rounded, worst case', color=looks.VERMILION,
             linewidth=0.8, linestyle=(0, (1, 1)))
         axes.plot(
-            study.periods, 100.0 * np.maximum(study.rounded, RESOLVED),
+            study.periods, 100.0 * np.maximum(study.rounded, _RESOLVED),
             label='switch rounded to the grid', **{**style.UNSHAPED, 'linestyle': '-'})
         axes.plot(
-            study.periods, 100.0 * np.maximum(study.solved, RESOLVED),
+            study.periods, 100.0 * np.maximum(study.solved, _RESOLVED),
             label='solved on the grid', **style.SHAPED)
         style.note(axes, r'below $10^{-6}$ %: not resolved', (study.periods[0], 1e-6), (4, 3),
                    **style.SOFT)

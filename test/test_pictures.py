@@ -108,7 +108,7 @@ def test_paper_that_is_none_is_refused(numbers: tuple[float, ...]) -> None:
 
 def test_what_is_below_what_is_resolved_is_said_to_be() -> None:
     assert [percent(x) for x in (7e-17, 9.9e-9, 2e-8, 0.0128, -0.5, float('nan'))] == [
-        '<1e-6', '<1e-6', '2e-6', '1.3', '-50.0', '?']
+        '<0.001', '<0.001', '<0.001', '1.3', '-50.0', '?']
 
 
 def test_curves_of_a_sweep_are_named_by_symbols_and_axes_have_units_or_none() -> None:

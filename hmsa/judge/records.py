@@ -88,8 +88,9 @@ class RequestedSetpoint:
         share = self.percent(difference)
         if math.isnan(share):
             return f'{difference:.3g}'
-        shown = f'{share:.3g}' if share >= 100.0 * RESOLVED else percent(0.01 * share)
-        return f'{difference:.3g} ({shown} %)'
+        if share < 100.0 * RESOLVED:
+            return f'<{RESOLVED * self.step:.1g} ({percent(0.01 * share)} %)'
+        return f'{difference:.3g} ({share:.3g} %)'
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike
 
 from hmsa.errors import HmsaError
 
-#: Smaller fractions of a step are rounding errors.
-RESOLVED = 1e-8
+#: Smaller fractions of a step are not distinguished: no sensor resolves them.
+RESOLVED = 1e-5
 
 
 def residual_vibration(
@@ -39,8 +39,6 @@ def percent(share: float, sign: str = '') -> str:
     if math.isnan(share):
         return '?'
     if abs(share) < RESOLVED:
-        return f'<{100.0 * RESOLVED:.0e}'.replace('e-0', 'e-')
+        return f'<{100.0 * RESOLVED:g}'
     value, size = 100.0 * share, 100.0 * abs(share)
-    if size < 1e-3:
-        return f'{value:{sign}.0e}'.replace('e-0', 'e-')
     return f'{value:{sign}.{1 if size >= 1.0 else 2 if size >= 0.1 else 3}f}'
