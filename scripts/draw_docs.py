@@ -292,7 +292,7 @@ def simulated(*setpoints: tuple[float, float], rate: float) -> Run:
         commands=tuple(RecordedLevel(x.stamp, x.flux_density, x.sent) for x in levels),
         plans=(levels,),
         requests=(RecordedRequest(start, 0, tuple(points)),), plant=block, planner=block,
-        parameters_known=True)
+        parameters_known=True, origin='simulated')
 
 
 def demo(path: Path) -> None:

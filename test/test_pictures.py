@@ -19,7 +19,7 @@ from hmsa.interfaces.topics import FLUX_DENSITY_COMMAND
 from hmsa.model.residual import percent
 from hmsa.report import style
 from hmsa.report.bands import draw_bands
-from hmsa.report.charts import commanded
+from hmsa.report.charts import commanded, PANELS
 from hmsa.report.curves import decimate, through, TimeCurve
 from hmsa.report.looks import case, CASES, LineStyle, SHAPERS
 from hmsa.report.paper import KINDS, named, Paper
@@ -100,7 +100,8 @@ def test_a_picture_is_as_wide_as_asked_in_every_format(
     assert words.rstrip().endswith(r'\endgroup')
 
 
-@pytest.mark.parametrize('numbers', [(30.0,), (85.0, 2.0), (85.0, 8.0, 5000.0), (float('nan'),)])
+@pytest.mark.parametrize('numbers', [
+    (30.0,), (85.0, 2.0), (85.0, 8.0, 5000.0), (float('nan'),), (85.0, 8.0, 600.0, False, 5.0)])
 def test_paper_that_is_none_is_refused(numbers: tuple[float, ...]) -> None:
     with pytest.raises(BadInputError, match='of a picture is .* expected'):
         Paper(*numbers)
@@ -163,7 +164,7 @@ def test_runs_that_agree_are_all_seen(tmp_path: Path, repeated: bool) -> None:
 
 
 def test_time_begins_at_the_first_level_of_the_run_and_its_step_is_drawn(tmp_path: Path) -> None:
-    told = parameters(planner=ACTUATOR, plant=ACTUATOR)
+    told = parameters(planner=ACTUATOR)
     messages = simulated(period=1_000_000)
     plain = one(tmp_path / 'plain', messages, **told)
     # A sign of life with the level that an earlier run has left.
@@ -192,12 +193,50 @@ def test_time_begins_at_the_first_level_of_the_run_and_its_step_is_drawn(tmp_pat
         rows = list(csv.DictReader(file))
     panels = {
         curve: np.array([(float(x['x']), float(x['y'])) for x in rows
-                         if (x['panel'], x['curve']) == ('c', curve)])
-        for curve in ('samples', 'recorded', 'unshaped steps (simulated)')}
+                         if (x['panel'], x['curve']) == ('b', curve)])
+        for curve in ('samples', 'recorded', 'unshaped, simulated')}
     assert len(panels['recorded']) > 5 * len(panels['samples']) > 100
-    assert len(panels['unshaped steps (simulated)']) > 5 * len(panels['samples'])
+    assert len(panels['unshaped, simulated']) > 5 * len(panels['samples'])
     with pytest.raises(BadInputError, match='cannot write .*nowhere'):
         draw(tmp_path / 'nowhere' / 'run.png', [plain])
+
+
+def test_a_column_of_a_journal_has_room_for_the_caption(tmp_path: Path) -> None:
+    run = one(tmp_path / 'bag', simulated(), **parameters(planner=ACTUATOR))
+    columns = {
+        x: draw([], [run], Paper(85.0, **more)) for x, more in {
+            'usual': {}, 'low': {'height': 60.0}, 'other': {'panels': ['phase', 'residual']},
+        }.items()}
+    heights = {x: INCH * y.get_figheight() for x, y in columns.items()}
+    assert heights['usual'] < 120.0
+    assert heights['low'] == pytest.approx(60.0)
+    assert [x.get_xlabel() for x in columns['other'].axes] == [
+        r'stretch $\lambda$', 'setpoint']
+    # The plan is what happened, so that there is no difference to draw.
+    with pytest.raises(BadInputError, match='nothing to draw in the panel plan: expected'):
+        draw([], [run], Paper(panels=['response', 'plan']))
+
+
+@pytest.mark.parametrize(('name', 'panels'), [
+    ('command', 1), ('response', 1), ('phase', 1), ('error', 3), ('residual', 1)])
+def test_a_panel_on_paper_and_in_a_page_shows_the_same(
+        tmp_path: Path, name: str, panels: int) -> None:
+    run = one(tmp_path / 'bag', simulated(), **parameters(planner=ACTUATOR))
+    described, drawn = PANELS[name]([run]), draw([], [run], Paper(panels=[name])).axes
+    assert len(described) == len(drawn) == panels
+    for panel, axes in zip(described, drawn, strict=True):
+        shown = panel.to_dict()
+        assert axes.get_xlim() == pytest.approx(shown['x']['limits'])
+        assert axes.get_ylim() == pytest.approx(shown['y']['limits'])
+        assert axes.get_yscale() == shown['y']['scale']
+        lines = {str(x.get_label()): x for x in axes.get_lines()}
+        for curve in shown['curves']:
+            if curve['hidden'] or curve['form'] in ('band', 'vertical'):
+                continue
+            line = lines[curve['name']]
+            assert line.get_color() == curve['colour']
+            assert np.asarray(line.get_ydata(), dtype=float) == pytest.approx(
+                np.array(curve['y'], dtype=float), nan_ok=True)
 
 
 def script() -> ModuleType:

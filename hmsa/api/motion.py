@@ -123,9 +123,9 @@ class Motion:
         panel : {'response', 'command', 'phase'}
             With ``ax``: stretch over time, flux density over time, or rate over stretch.
         **more
-            ``width`` in mm, ``letters`` in pt, ``dpi``, and ``data`` for a CSV file of the curves;
-            see `hmsa.report.paper.Paper`. With ``ax``, properties of the line, such as
-            ``color`` and ``label`` (default the name of the motion).
+            ``width`` and ``height`` in mm, ``letters`` in pt, ``dpi``, ``panels``, and ``data``
+            for a CSV file of the curves; see `hmsa.report.paper.Paper`. With ``ax``, properties
+            of the line, such as ``color`` and ``label`` (default the name of the motion).
 
         Returns
         -------
@@ -262,13 +262,16 @@ def _draw(runs: list[Run], path: Any, paper: Mapping[str, Any]) -> Any:
     from hmsa.report.picture import draw
 
     paths = [] if path is None else [file_of(x) for x in several(path)]
-    checked: dict[str, Any] = {x: y if x == 'data' else number(y, x) for x, y in paper.items()}
+    checked: dict[str, Any] = {
+        x: y if x in ('data', 'panels') or y is None else number(y, x) for x, y in paper.items()}
+    if isinstance(panels := checked.get('panels'), str):
+        checked['panels'] = panels.split(',')
     try:
         size = Paper(**checked)
     except TypeError as error:
         raise BadInputError(
-            f'pictures have {", ".join(paper)}: expected numbers for width (mm), letters (pt) '
-            'and dpi, and data') from error
+            f'pictures have {", ".join(paper)}: expected numbers for width and height (mm), '
+            'letters (pt) and dpi, names of panels, and data') from error
     return draw(paths, parts_of(runs), size)
 
 

@@ -29,7 +29,7 @@ def add_parser(subparsers: Any) -> None:
         subparsers, __name__, __doc__,
         bags('runs'),
         ('--joint', 'NAME', str, 'joint to compare, if the bags have several', {'default': ''}),
-        JSON, *picture_options('pictures of all runs to write'))
+        JSON, *picture_options('pictures of all runs to write', panels=True))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -43,6 +43,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     repeats = [repeats_in(x) for x in arguments.runs]
     if any(repeats):
+        if paper.panels:
+            raise BadInputError(
+                'pictures of repeats have a panel for each setpoint: leave out --panels')
         return _compare_repeats(arguments, [x or [y] for x, y in zip(
             repeats, arguments.runs, strict=True)], paper)
     from hmsa.api.motion import compare, read

@@ -6,13 +6,14 @@ from pathlib import Path
 
 from hmsa.cli.options import Row
 from hmsa.files import check_targets
-from hmsa.report.paper import kind_of, KINDS, kinds_in, Paper
+from hmsa.report.paper import kind_of, KINDS, kinds_in, PANELS, Paper, WIDE
 
 _ENDS = f'{", ".join(f".{x}" for x in KINDS[:-1])} or .{KINDS[-1]}'
 
 
 def picture_options(
-        named: str = '', *, formats: str = '', data: bool = True) -> tuple[Row, ...]:
+        named: str = '', *, formats: str = '', data: bool = True,
+        panels: bool = False) -> tuple[Row, ...]:
     """
     Return the options for figures.
 
@@ -24,6 +25,8 @@ def picture_options(
         Default formats of figures in a folder; without them, the option is omitted.
     data : bool
         Whether to add ``--data``, which a command that always writes the data does not need.
+    panels : bool
+        Whether to add ``--panels``, for figures of runs.
 
     """
     standard = Paper()
@@ -35,10 +38,16 @@ def picture_options(
          'width in mm: 85 for a column, 120, or 183 for two (default %(default)g); panels that '
          'do not fit side by side are stacked',
          {'default': standard.width}),
+        ('--height', 'MM', float, 'height in mm (default: one that suits the panels)'),
         ('--font-size', 'PT', float, 'font size in pt (default %(default)g)',
          {'default': standard.letters}),
         ('--dpi', 'N', float, 'dots per inch of PNG (default %(default)g)',
          {'default': standard.dpi})]
+    if panels:
+        rows.append((
+            '--panels', 'NAME,...', str,
+            f'panels, of {", ".join(PANELS)} (default: {", ".join(WIDE)}; in a column without '
+            'phase)', {'default': ''}))
     if data:
         rows.append(('--data', 'also write the plotted values as CSV, under the same name'))
     files: tuple[Row, ...] = (
@@ -59,7 +68,8 @@ def paper_of(
     for picture in pictures:
         kind_of(picture)
     paper = Paper(arguments.width, arguments.font_size, arguments.dpi,
-                  getattr(arguments, 'data', False))
+                  getattr(arguments, 'data', False), arguments.height,
+                  [x.strip() for x in getattr(arguments, 'panels', '').split(',') if x.strip()])
     check_targets(*targets, *pictures, *paper.tables(pictures), sources=sources)
     return paper
 

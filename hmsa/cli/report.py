@@ -35,7 +35,7 @@ def add_parser(subparsers: Any) -> None:
         ('--joint', 'NAME', str,
          'joint to show, or several separated by commas (default: those with commands)',
          {'default': ''}),
-        *picture_options('figures to write in addition'))
+        *picture_options('figures to write in addition', panels=True))
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -34,7 +34,7 @@ def add_parser(subparsers: Any) -> None:
         ('--seed', 'N', int, 'of the noise (default 0)', {'default': 0}),
         ('--out', 'FILE', Path,
          'samples to write, ending in .csv, .parquet or .mat; an existing file is replaced'),
-        JSON, *picture_options('pictures to write'))
+        JSON, *picture_options('pictures to write', panels=True))
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -67,26 +67,24 @@ def timing(run: Run) -> Timing:
 
 # Data of an arrival's panel, from the begin of the move, in durations of the move.
 _PANEL_SPAN = 20.0
-# Initial view of that panel: its length in durations of the move, and the minimum of its height
-# in percent of the step.
-_SHOWN, _LEAST_PERCENT = 4.0, 5.0
+# Initial view of that panel, in durations of the move.
+_SHOWN = 4.0
 #: Shown in place of a residual.
 NOT_MOVED = 'did not move'
 
 
 @dataclass(frozen=True)
 class Part:
-    """One run of a report; a single run has no colour, and its curves have different ones."""
+    """One run of a report."""
 
     run: Run
     evaluation: Evaluation
     timing: Timing
-    colour: str = ''
 
     @classmethod
-    def of(cls, run: Run, colour: str = '', tolerances: Tolerances | None = None) -> 'Part':
+    def of(cls, run: Run, tolerances: Tolerances | None = None) -> 'Part':
         """Evaluate a run with the given tolerances, by default those of its planner."""
-        return cls(run, evaluate(run, tolerances), timing(run), colour)
+        return cls(run, evaluate(run, tolerances), timing(run))
 
 
 def worst(parts: Sequence[Part], most: int) -> list[int]:
@@ -119,12 +117,6 @@ def left_text(results: Sequence[MoveResult], *, least: bool = False) -> str:
     """Return the residual vibration of several moves as text for a heading."""
     text = residual_text(results, least=least)
     return text if text == NOT_MOVED else f'residual {text}'
-
-
-def reach(parts: Sequence[Part], number: int) -> float:
-    """Return the half height of an arrival's panel in percent of the step."""
-    return min(150.0, max([_LEAST_PERCENT, *(
-        110.0 * x.error for x in results_of(parts, number) if math.isfinite(x.error))]))
 
 
 def around(x: MoveResult, curve: TimeCurve) -> tuple[Array, Array]:

@@ -1,45 +1,43 @@
 """Draw the curves of repeated sequences as a mean and a band."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from string import ascii_lowercase
-from typing import Any
 
 import numpy as np
 
 from hmsa.model.equations import Array
 from hmsa.report import looks, style
 from hmsa.report.arrivals import around, Part, results_of, span
+from hmsa.report.charts import error_axis
+from hmsa.report.figures import Axis, Curve, Panel
 from hmsa.report.paper import Paper
 
 _POINTS = 400
 
 
 def draw_bands(
-        paths: Sequence[Path], groups: Mapping[str, Sequence[Part]], paper: Paper) -> Any:
+        paths: Sequence[Path], groups: Mapping[str, Sequence[Part]],
+        paper: Paper) -> style.Picture:
     """Draw each arrival: the mean of the repeats of each run, with a band of one std."""
+    count = max(len(x.evaluation.results) for group in groups.values() for x in group)
+    panels = [_panel(groups, i) for i in range(count)]
+    columns = paper.columns(3)
+    return style.sheet(paths, [
+        [[x] for x in panels[i:i + columns]] for i in range(0, count, columns)], paper)
+
+
+def _panel(groups: Mapping[str, Sequence[Part]], number: int) -> Panel:
+    """Describe the error around one arrival, in ms and percent of the step."""
     parts = [x for group in groups.values() for x in group]
-    count = max(len(x.evaluation.results) for x in parts)
-    columns = min(paper.columns(3), max(count, 1))
-    rows = max(-(-count // columns), 1)
-    with style.picture(paths, (0.5 + 1.6 * rows) * paper.letters / 8.0, paper) as figure:
-        panels = figure.subplots(rows, columns, squeeze=False).ravel()
-        for panel in panels[count:]:
-            panel.set_visible(False)
-        for number, panel in enumerate(panels[:count]):
-            grid = np.linspace(0.0, span(parts, number), _POINTS).astype(np.float64)
-            for place, (label, group) in enumerate(groups.items()):
-                _draw_band(figure, panel, looks.case(place), label, grid, _curves(
-                    group, number, grid))
-            panel.axhline(0.0, **style.TARGET)
-            style.finish(
-                panel, style.axis('time in the move', unit='ms'), style.axis(
-                    'error', unit='% of step') if number % columns == 0 else '',
-                ascii_lowercase[number % 26])
-            targets = dict.fromkeys(f'{x.stretch:.5g}' for x in results_of(parts, number))
-            panel.set_title(f'to {"/".join(targets)}', loc='right', fontsize='small')
-        style.legend_below(figure, *panels[:count])
-    return figure
+    end = span(parts, number)
+    grid = np.linspace(0.0, end, _POINTS).astype(np.float64)
+    curves = [curve for place, (label, group) in enumerate(groups.items())
+              for curve in _band(looks.case(place), label, grid, _curves(group, number, grid))]
+    targets = dict.fromkeys(f'{x.stretch:.5g}' for x in results_of(parts, number))
+    return Panel(
+        Axis('time in the move', unit='ms', limits=(0.0, 1e3 * end)),
+        error_axis(curves, 1e3 * end), curves, f'to {"/".join(targets)}', 1.3)
 
 
 def _curves(group: Sequence[Part], number: int, grid: Array) -> Array:
@@ -54,17 +52,17 @@ def _curves(group: Sequence[Part], number: int, grid: Array) -> Array:
     return np.array(found).reshape(-1, len(grid))
 
 
-def _draw_band(
-        figure: style.Picture, panel: Any, look: looks.LineStyle, label: str, grid: Array,
-        curves: Array) -> None:
+def _band(look: looks.LineStyle, label: str, grid: Array, curves: Array) -> list[Curve]:
+    """Describe the mean of curves, with a band of one std on both sides."""
     known = np.isfinite(curves).all(axis=0) if len(curves) else np.zeros(len(grid), dtype=bool)
     if not known.any():
-        return
+        return []
     time, curves = 1e3 * grid[known], curves[:, known]
     mean = np.mean(curves, axis=0)
-    panel.plot(time, mean, **look.line(), label=f'{label} ({len(curves)})')
+    described = [Curve(f'{label} ({len(curves)})', look, time, mean)]
     if len(curves) > 1:
         std = np.std(curves, axis=0, ddof=1)
-        panel.fill_between(time, mean - std, mean + std, color=look.colour, alpha=0.25, lw=0.0)
-        for sign, name in ((-1.0, 'mean - std'), (1.0, 'mean + std')):
-            figure.remember(panel, f'{label}, {name}', time, mean + sign * std)
+        described.append(Curve(
+            f'{label}, mean ± std', replace(look, opacity=0.25, order=1), time, mean + std, 'band',
+            lower=mean - std, listed=False))
+    return described

@@ -1,13 +1,12 @@
 """
-The figures of a report, as Plotly data.
+The figures of runs, as descriptions for paper and page.
 
-Curves are decimated to screen resolution, keeping peaks. Colours are those of
-`hmsa.report.looks`; in dark mode the page replaces them by lighter ones.
+Curves are decimated to screen resolution, keeping peaks. Of several runs, each has a style of its
+own, and simulated curves are hidden.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-import html
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 import math
 from typing import Any
 
@@ -15,14 +14,14 @@ import numpy as np
 
 from hmsa.model.equations import Array, elastic_force
 from hmsa.model.residual import RESOLVED
-from hmsa.model.units import NANOSECONDS
-from hmsa.report import looks
-from hmsa.report.arrivals import around, Part, reach, results_of, span, title
-from hmsa.report.curves import BUCKETS, decimate, numbers, TimeCurve
-from hmsa.report.evaluation import MoveResult
-from hmsa.report.looks import BLACK, BLUE, GREY, VERMILION
+from hmsa.report import looks, paper
+from hmsa.report.arrivals import around, left_text, Part, results_of, span, worst
+from hmsa.report.curves import decimate, TimeCurve
+from hmsa.report.figures import Axis, Curve, Panel
+from hmsa.report.looks import BLACK, BLUE, LineStyle, VERMILION
 from hmsa.runs.levels import held_at
 
+#: Maximum number of setpoints with a panel of their own in a page.
 MOST_PANELS = 12
 _PANEL_BUCKETS = 300
 _MOST_PHASE_POINTS = 8_000
@@ -31,7 +30,18 @@ _PHASE_GRID = 1000.0
 _MANY_MARKERS = 100
 _LONGEST_IN_MS = 2.0
 # Maximum number of samples that are also drawn as points.
-_MOST_SAMPLES = 500
+_MOST_SAMPLES = 200
+# Maximum number of periods shown for dashed lines; above it, lines are solid and thin.
+_DASHED, _THIN = 25.0, 0.6
+# Time shown after the last arrival, in durations of the move, if only rest follows: deviations
+# within this fraction of the step.
+_REST, _STILL = 8.0, 0.02
+# A plan is drawn over the recording if it differs by more than this fraction of the motion.
+_SEEN = 0.02
+# Differences of stretch, and of times in s, that are rounding.
+_IDENTICAL, _CONSTANT = 1e-9, 1.5e-9
+# Room above the largest error, as a factor; and limits of the axis in percent of the step.
+_ABOVE, _LEAST_ERROR, _MOST_ERROR = 1.5, 10.0, 200.0
 
 
 @dataclass(frozen=True)
@@ -46,17 +56,6 @@ class TimeUnit:
         return np.asarray(seconds, dtype=np.float64) / self.size
 
 
-@dataclass(frozen=True)
-class Figure:
-    """One figure: its alternative text, height in px, and Plotly's data and layout."""
-
-    key: str
-    alt: str
-    height: int
-    data: list[dict[str, Any]]
-    layout: dict[str, Any]
-
-
 def time_unit(parts: Sequence[Part]) -> TimeUnit:
     """Return the unit for the time axes: milliseconds for short runs."""
     return unit_for(max(float(np.max(np.abs(x.evaluation.time[[0, -1]]))) for x in parts))
@@ -67,119 +66,145 @@ def unit_for(seconds: float, most: float = _LONGEST_IN_MS) -> TimeUnit:
     return TimeUnit(1e-3, 'ms') if seconds <= most else TimeUnit(1.0, 's')
 
 
-def text(words: str) -> str:
-    """Return a text escaped for Plotly, which interprets some HTML tags."""
-    return html.escape(words, quote=False)
+@dataclass(frozen=True)
+class _Pen:
+    """Names and styles of the curves of one run among several, or alone."""
+
+    part: Part
+    own: LineStyle | None  # style of the run; None if it is alone
+
+    def measured(self, x: Array, y: Array, **more: Any) -> Curve:
+        """Return the curve through the samples."""
+        run = self.part.run
+        return Curve(run.origin if self.own is None else run.label,
+                     self.own or looks.RECORDED, x, y, **more)
+
+    def samples(self, x: Array, y: Array, curve: Curve) -> list[Curve]:
+        """Return the samples as points if they are few and the curve has more."""
+        run = self.part.run
+        exact = run.origin == 'simulated' and not run.number('plant.stretch_noise')
+        if exact or len(x) >= len(curve.x) or len(x) > _MOST_SAMPLES:
+            return []
+        name = 'samples' if self.own is None else f'{run.label}, samples'
+        look = LineStyle(curve.look.colour, marker='o', size=2.2, order=4)
+        return [Curve(name, look, x, y, 'points')]
+
+    def simulated(self, kind: str, x: Array, y: Array, *, hidden: bool = False) -> Curve:
+        """Return a curve that was not recorded: ``'unshaped steps'`` or ``'plan'``."""
+        look = looks.PLAN if kind == 'plan' else looks.PLAIN
+        if self.own is not None:
+            return Curve(kind, replace(look, colour=self.own.colour), x, y, hidden=True)
+        if kind != 'plan' and self.part.run.origin != 'simulated':
+            kind = 'unshaped, simulated'
+        return Curve(kind, look, x, y, hidden=hidden)
 
 
-def curve(name: str, x: Any, y: Any, mode: str = 'lines', **own: Any) -> dict[str, Any]:
-    """Return a Plotly trace of lines or markers."""
-    return {
-        'type': 'scatter', 'mode': mode, 'x': numbers(x), 'y': numbers(y), 'name': text(name),
-        **own}
+def _pens(parts: Sequence[Part]) -> list[_Pen]:
+    return [_Pen(x, None if len(parts) == 1 else looks.case(i)) for i, x in enumerate(parts)]
 
 
-def _curve(
-        part: Part, what: str, x: Any, y: Any, mode: str = 'lines', *,
-        line: Mapping[str, Any] | None = None, **own: Any) -> dict[str, Any]:
-    """
-    Return the trace of a quantity of a run.
-
-    The colour of the run takes precedence over that of line or marker. A click in the legend hides
-    the whole group.
-    """
-    colour, simulated = part.colour, what in _SIMULATED
-    trace = curve(
-        f'{part.run.label}: {what}' if colour else what, x, y, mode,
-        legendgroup=part.run.label if colour and not simulated else what, **own)
-    if 'lines' in mode:
-        # Plotly's simplification distorts flat lines by a pixel or two.
-        trace['line'] = {'simplify': False, **_KINDS.get(what, {}), **(line or {})}
-        if simulated and colour:
-            trace['visible'] = 'legendonly'
-    for style in (trace.get('line', {}), trace.get('marker', {})):
-        if colour and 'color' in style:
-            style['color'] = colour
-    return trace
+def _dense(look: LineStyle, periods: float) -> LineStyle:
+    """Return a style for a number of periods: lines that would lose their dashes are thin."""
+    return replace(look, dash=(), width=_THIN) if look.dash and periods > _DASHED else look
 
 
-def _grouped(data: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return traces with one legend entry for each group, by the name of the group."""
-    seen: set[str] = set()
-    for trace in data:
-        group = trace['legendgroup']
-        trace['showlegend'] = group not in seen
-        if group not in seen and text(group) in trace['name'].split(': '):
-            trace['name'] = text(group)
-        seen.add(group)
-    return data
-
-
-# Hidden until a click in the legend when several runs are compared.
-_SIMULATED = ('unshaped steps', 'plan')
-# Line properties of each kind of curve.
-_KINDS: dict[str, dict[str, Any]] = {
-    'recorded': looks.RECORDED.plotly(), 'unshaped steps': looks.PLAIN.plotly(),
-    'plan': looks.PLAN.plotly(), 'field in force': looks.FIELD.plotly(),
-    'command': {**looks.RECORDED.plotly(), 'shape': 'hv'}, 'target': looks.TARGET.plotly()}
-
-
-def label(quantity: str, symbol: str = '', unit: str = '') -> str:
-    """Return the label of an axis: quantity, symbol, and unit if given."""
-    return ' '.join(x for x in (quantity, symbol, f'({unit})' if unit else '') if x)
-
-
-def axis(name: str, **more: Any) -> dict[str, Any]:
-    """Return a Plotly axis."""
-    return {'title': {'text': name}, 'exponentformat': 'power', **more}
-
-
-def _recorded(part: Part, x: Array, y: Array, samples: tuple[Array, Array], *,
-              buckets: int = BUCKETS) -> list[dict[str, Any]]:
-    """Return the recorded curve, and the samples as points if they are few."""
-    data = [_curve(part, 'recorded', *decimate(x, y, buckets))]
-    if len(samples[0]) < len(x) and len(samples[0]) <= _MOST_SAMPLES:
-        data.append(_curve(
-            part, 'recorded', *samples, mode='markers',
-            marker={'size': 5, 'color': BLUE}))
-    return data
-
-
-def response(parts: Sequence[Part], unit: TimeUnit) -> Figure:
-    """Return the command over time, above setpoints and response."""
-    data = []
+def shown_times(parts: Sequence[Part]) -> tuple[float, float]:
+    """Return the range of times to show in s, without the rest at both ends."""
+    begins, ends = [], []
     for part in parts:
-        run, found = part.run, part.evaluation
-        for kind, curve in (('unshaped steps', found.plain), ('plan', found.planned)):
-            data.append(_curve(part, kind, *decimate(unit.of(curve.time), curve.stretch)))
-        data[-1:-1] = _recorded(
-            part, unit.of(found.recorded.time), found.recorded.stretch,
-            (unit.of(found.time), run.stretch))
+        found = part.evaluation
+        begin, end = float(found.time[0]), float(found.time[-1])
         if found.results:
-            spans = [(x.begin, x.end, math.nan) for x in found.results]
-            data.append(_curve(
-                part, 'target', unit.of(np.ravel(spans)),
-                np.ravel([(x.stretch, x.stretch, math.nan) for x in found.results])))
-            data.append(_curve(
-                part, 'planned arrival', unit.of([x.rests for x in found.results]),
-                [x.stretch for x in found.results], mode='markers',
-                marker={
-                    'symbol': 'diamond-open', 'size': _size(9, found.results), 'color': BLACK}))
-        data += _commands(part, unit)
+            last = found.results[-1]
+            quiet = max(last.rests, min(last.begin + _REST * last.arrival, end))
+            after = found.recorded.between(quiet, end).stretch
+            if len(after) and np.nanmax(np.abs(after - last.stretch)) <= _STILL * abs(last.step):
+                end = quiet
+        # Leave room for the step to the first level.
+        begins.append(max(begin, -0.06 * end) if end > 0.0 else begin)
+        ends.append(end)
+    begin, end = min(*begins, -0.02 * max(ends)), max(ends)
+    return begin, end if end > begin else begin + 1.0
+
+
+def _time(parts: Sequence[Part]) -> tuple[TimeUnit, Axis]:
+    """Return the unit and the axis of the time of runs."""
+    unit = time_unit(parts)
+    begin, end = unit.of(shown_times(parts)).tolist()
+    return unit, Axis('time', 't', unit.name, limits=(begin, end))
+
+
+def _position(parts: Sequence[Part]) -> Axis:
     what = parts[0].run.plant.coordinate
-    return Figure(
-        'response', f'Flux density command and {what.name} over time', 560,
-        _grouped(data), {
-            'xaxis': axis(label('time', 't', unit.name), anchor='y'),
-            'yaxis': axis(label(what.name, what.symbol), domain=[0.0, 0.6]),
-            'yaxis2': axis(
-                label('flux density', 'B', 'mT'),
-                domain=[0.68, 1.0], anchor='x')})
+    return Axis(what.name, what.symbol, tex=what.tex)
+
+
+def response(parts: Sequence[Part]) -> list[Panel]:
+    """Describe targets and response over time."""
+    unit, time = _time(parts)
+    begin, end = shown_times(parts)
+    curves: list[Curve] = []
+    for pen in _pens(parts):
+        found = pen.part.evaluation
+        curves += _targets(pen.part, unit)
+        for kind, curve in (('unshaped steps', found.plain), ('plan', found.planned)):
+            if np.isfinite(curve.stretch).any():
+                curves.append(pen.simulated(
+                    kind, *decimate(unit.of(curve.time), curve.stretch),
+                    hidden=kind == 'plan' and not _differs(pen.part)))
+        measured = pen.measured(*decimate(unit.of(found.recorded.time), found.recorded.stretch))
+        curves += [measured, *pen.samples(
+            unit.of(found.time), pen.part.run.stretch, measured)]
+    periods = (end - begin) / min(x.run.plant.period for x in parts)
+    curves = [replace(x, look=_dense(x.look, periods)) for x in _once(curves)]
+    return [Panel(time, _position(parts), curves, height=1.45)]
+
+
+def _targets(part: Part, unit: TimeUnit) -> list[Curve]:
+    """Return the targets over time, each from the start of its move to the end of the hold."""
+    found = part.evaluation
+    times: list[float] = []
+    targets: list[float] = []
+    for x in found.results:
+        # Holds that follow each other are joined; NaN leaves a gap.
+        if times and x.begin - times[-1] > 0.05 * x.arrival:
+            times.append(x.begin)
+            targets.append(math.nan)
+        times += [x.begin, x.end]
+        targets += [x.stretch, x.stretch]
+    return [Curve('target', looks.SETPOINT, unit.of(times), np.array(targets), 'steps')
+            ] if times else []
+
+
+def _once(curves: Sequence[Curve]) -> list[Curve]:
+    """Return curves without those of several runs that are the same."""
+    seen: set[tuple[Any, ...]] = set()
+    kept = []
+    for curve in curves:
+        key = (curve.name, curve.look, curve.x.tobytes(), curve.y.tobytes())
+        if key not in seen:
+            kept.append(curve)
+            seen.add(key)
+    return kept
+
+
+def _differs(part: Part) -> bool:
+    """Return whether a reader sees a difference of the plan from the recording."""
+    apart = np.abs(_deviation(part))
+    size = float(np.ptp(part.run.stretch))
+    return bool(np.isfinite(apart).any() and np.nanmax(apart) > _SEEN * size)
+
+
+def _deviation(part: Part) -> Array:
+    """Return recorded minus planned stretch at the samples; NaN without a plan."""
+    found = part.evaluation
+    difference: Array = part.run.stretch - found.planned.at(found.time).stretch
+    return difference
 
 
 def commanded(part: Part) -> tuple[list[float], list[float]]:
     """
-    Return times in s and levels of the command in the unit shown, from first to last sample.
+    Return times in s and levels of the command in mT, from first to last sample.
 
     The first level is that in force before the first command: as measured, or the one that holds
     the initial stretch.
@@ -202,80 +227,78 @@ def commanded(part: Part) -> tuple[list[float], list[float]]:
     return times, values
 
 
-def _commands(part: Part, unit: TimeUnit) -> list[dict[str, Any]]:
-    """Return the traces of the flux density."""
-    run, found = part.run, part.evaluation
-    data = []
+def command(parts: Sequence[Part]) -> list[Panel]:
+    """Describe the flux density over time: as commanded and, where it differs, as applied."""
+    unit, time = _time(parts)
+    curves = []
+    for pen in _pens(parts):
+        fields = _field(pen, unit)
+        if pen.part.evaluation.levels:
+            times, values = commanded(pen.part)
+            curve = pen.measured(unit.of(times), np.array(values), form='steps')
+            # The label of the axis names a curve that is alone.
+            curves.append(curve if pen.own else replace(
+                curve, name='command', listed=bool(fields)))
+        curves += fields
+    return [Panel(time, Axis('flux density', 'B', 'mT'), curves)]
+
+
+def _field(pen: _Pen, unit: TimeUnit) -> list[Curve]:
+    """Return the field in force as measured or reported; none if it follows the command."""
+    run, found = pen.part.run, pen.part.evaluation
+    look = looks.FIELD if pen.own is None else replace(looks.FIELD, colour=pen.own.colour)
+    name = 'field in force' if pen.own is None else pen.part.run.label
     if found.levels:
-        times, values = commanded(part)
-        switches = {x.stamp for x in found.levels}
-        size = 6 if len(found.levels) <= _MANY_MARKERS else 3
-        sizes = [size if round(x * NANOSECONDS) + found.zero in switches else 0 for x in times]
-        data.append(_curve(
-            part, 'command', unit.of(times), values, mode='lines+markers', yaxis='y2',
-            marker={'size': sizes}))
         expected = held_at(found.levels, run.time)
         follows = np.abs(run.flux_density - expected)
         if np.isfinite(follows).any() and (
                 np.nanmax(follows) <= 1e-9 * np.nanmax(np.abs(expected))):
-            return data
+            return []
     if np.isfinite(run.flux_density).any():
-        data.append(_curve(
-            part, 'field in force', *decimate(unit.of(found.time), run.flux_density * 1e3),
-            yaxis='y2'))
-    elif run.applied:
+        return [Curve(name, look, *decimate(unit.of(found.time), run.flux_density * 1e3))]
+    if run.applied:
         applied = sorted(run.applied, key=lambda x: x.stamp)
-        x = unit.of([*(found.seconds(x.stamp) for x in applied), max(
+        times = unit.of([*(found.seconds(x.stamp) for x in applied), max(
             found.seconds(applied[-1].stamp), float(found.time[-1]))])
-        y = np.array([x.flux_density for x in (*applied, applied[-1])]) * 1e3
-        data.append(_curve(part, 'field in force', x, y, yaxis='y2', line={'shape': 'hv'}))
-    return data
+        values = np.array([x.flux_density for x in (*applied, applied[-1])]) * 1e3
+        return [Curve(name, look, times, values, 'steps')]
+    return []
 
 
-def _size(usual: int, results: Sequence[MoveResult]) -> int:
-    """Return the size of the markers of results."""
-    return usual if len(results) <= _MANY_MARKERS else usual // 2
-
-
-def phase(parts: Sequence[Part]) -> tuple[Figure, float]:
-    """Return the phase plane with the equilibria, and the smallest fraction of a run shown."""
-    # Long motions would fill the plane, so only their beginning is drawn.
-    data, shown = [], 1.0
-    for part in parts:
-        found = part.evaluation
-        for kind, curve in (('unshaped steps', found.plain), ('recorded', found.recorded)):
-            x, y, share = _orbit(curve.stretch, curve.rate)
-            shown = min(shown, share)
-            data.append(_curve(part, kind, x, y))
-        for symbol, size, places in (
-                ('circle', 8, sorted({x.stretch for x in found.results})),
-                ('circle-open', 9, [found.start])):
-            data.append(_curve(
-                part, 'equilibrium', places, [0.0] * len(places), mode='markers',
-                marker={'symbol': symbol, 'size': size, 'color': BLACK}))
+def phase(parts: Sequence[Part]) -> list[Panel]:
+    """Describe the phase plane with the equilibria."""
+    curves: list[Curve] = []
+    for pen in _pens(parts):
+        found, run = pen.part.evaluation, pen.part.run
+        x, y, _ = _orbit(found.plain)
+        if len(x):
+            curves.append(pen.simulated('unshaped steps', x, y))
+        x, y, _ = _orbit(found.recorded)
+        measured = pen.measured(x, y)
+        curves += [measured, *pen.samples(run.stretch, run.rate, measured)]
+    starts = np.array(sorted({x.evaluation.start for x in parts}))
+    targets = np.array(sorted({y.stretch for x in parts for y in x.evaluation.results}))
+    for name, look, places in (
+            ('start', replace(looks.EQUILIBRIUM, filled=False), starts),
+            ('equilibrium', looks.EQUILIBRIUM, targets)):
+        if len(places):
+            curves.append(Curve(name, look, places, np.zeros(len(places)), 'points'))
     what = parts[0].run.plant.coordinate
-    name, symbol = what.name, what.symbol
-    return Figure(
-        'phase', f'{name.capitalize()} rate over {name}, with the equilibria', 480,
-        _grouped(data), {
-            'xaxis': axis(label(name, symbol), range=_room(data, 'x')),
-            'yaxis': axis(label(f'{name} rate', f'd{symbol}/dt', '1/s'), range=_room(
-                data, 'y'))}), shown
+    return [Panel(_position(parts), Axis(
+        f'{what.name} rate', f'd{what.symbol}/dt', '1/s', rf'\dot{{{what.tex}}}'), curves,
+        height=1.6)]
 
 
-def _room(data: Sequence[dict[str, Any]], key: str) -> list[float | None]:
-    """Return the range of an axis, with a margin around all visible curves."""
-    values = [
-        x for trace in data if trace.get('visible', True) is True
-        for x in trace[key] if x is not None]
-    margin = 0.04 * (max(values) - min(values) or 1.0)
-    return numbers([min(values) - margin, max(values) + margin])
+def phase_shown(parts: Sequence[Part]) -> float:
+    """Return the smallest fraction of a run that the phase plane shows, from its beginning."""
+    return min(_orbit(curve)[2] for x in parts for curve in (
+        x.evaluation.plain, x.evaluation.recorded))
 
 
-def _orbit(stretch: Array, rate: Array) -> tuple[Array, Array, float]:
+def _orbit(curve: TimeCurve) -> tuple[Array, Array, float]:
     """Return a curve in the phase plane without coincident points, and the fraction kept."""
-    finite = np.isfinite(stretch) & np.isfinite(rate)
-    x, y = stretch[finite], rate[finite]
+    finite = np.isfinite(curve.stretch) & np.isfinite(curve.rate)
+    x, y = curve.stretch[finite], curve.rate[finite]
     if not len(x):
         return x, y, 1.0
     scale = [max(float(np.ptp(z)), 1e-12) / _PHASE_GRID for z in (x, y)]
@@ -285,139 +308,187 @@ def _orbit(stretch: Array, rate: Array) -> tuple[Array, Array, float]:
     places = np.flatnonzero(keep)
     share = 1.0
     if len(places) > _MOST_PHASE_POINTS:
+        # Long motions would fill the plane.
         share = _MOST_PHASE_POINTS / len(places)
         places = places[:_MOST_PHASE_POINTS]
     return x[places], y[places], share
 
 
-def arrival(parts: Sequence[Part], number: int) -> Figure:
-    """Return the zoom on one arrival: the error in percent of the step."""
-    data = []
+def errors(parts: Sequence[Part], most: int = MOST_PANELS) -> list[Panel]:
+    """Describe the errors around the arrivals with the largest residuals."""
+    return [error(parts, i) for i in worst(parts, most)]
+
+
+def error(parts: Sequence[Part], number: int) -> Panel:
+    """Describe the error around one arrival, in percent of the step."""
     shown = span(parts, number)
     unit = unit_for(shown, 1.0)
-    for part in parts:
-        found = part.evaluation
+    curves: list[Curve] = []
+    tolerances, arrivals = [], set()
+    for pen in _pens(parts):
+        found = pen.part.evaluation
         if number >= len(found.results):
             continue
         result = found.results[number]
-        for kind, curve in (('unshaped steps', found.plain), ('plan', found.planned)):
-            if not part.colour:
-                time, distance = around(result, curve)
-                data.append(_curve(
-                    part, kind, *decimate(unit.of(time), distance, _PANEL_BUCKETS)))
+        arrivals.add(float(unit.of(result.arrival)))
+        tolerances.append(100.0 * found.allowed(result) / abs(result.step))
+        for kind, motion in (('unshaped steps', found.plain), ('plan', found.planned)):
+            time, distance = around(result, motion)
+            if pen.own is None and np.isfinite(distance).any():
+                curves.append(pen.simulated(
+                    kind, *decimate(unit.of(time), distance, _PANEL_BUCKETS),
+                    hidden=kind == 'plan' and not _differs(pen.part)))
         time, distance = around(result, found.recorded)
-        samples, away = around(result, TimeCurve(found.time, part.run.stretch, part.run.rate))
-        data += _recorded(
-            part, unit.of(time), distance, (unit.of(samples), away), buckets=_PANEL_BUCKETS)
-    arrivals = sorted({float(unit.of(x.arrival)) for x in results_of(parts, number)})
-    height = reach(parts, number)
-    return Figure(
-        f'arrival{number}', f'Setpoint {title(parts, number)}', 300, _grouped(data), {
-            # The labels of several runs do not fit into every panel.
-            'showlegend': len(parts) == 1,
-            'xaxis': axis(
-                label('time in the move', unit=unit.name),
-                range=numbers([0.0, unit.of(shown)])),
-            'yaxis': axis(label('error', unit='% of the step'), range=[-height, height]),
-            'shapes': [{
-                'type': 'line', 'x0': x, 'x1': x, 'yref': 'paper', 'y0': 0, 'y1': 1,
-                'line': {'color': GREY, 'width': 1, 'dash': '2px,2px'}} for x in arrivals]})
+        measured = pen.measured(*decimate(unit.of(time), distance, _PANEL_BUCKETS))
+        samples, away = around(result, TimeCurve(found.time, pen.part.run.stretch, found.time))
+        curves += [measured, *pen.samples(unit.of(samples), away, measured)]
+    ends = np.array([0.0, unit.of(shown)])
+    band = np.full(2, min(tolerances))
+    guides = [
+        Curve('tolerance', looks.TOLERANCE, ends, band, 'band', lower=-band),
+        Curve('end of the move', looks.ARRIVAL, np.array(sorted(arrivals)), form='vertical')]
+    results = results_of(parts, number)
+    targets = '/'.join(dict.fromkeys(f'{x.stretch:.5g}' for x in results))
+    return Panel(
+        Axis('time in the move', unit=unit.name, limits=(0.0, float(ends[1]))),
+        error_axis([*curves, *guides[:1]], float(ends[1])), [*guides, *curves],
+        f'to {targets}' if len(parts) > 1 else f'to {targets}: {left_text(results)}', 1.3)
 
 
-def residuals(parts: Sequence[Part]) -> Figure:
-    """Return the residual vibration of all setpoints, as recorded and for unshaped steps."""
-    data = []
-    for part in parts:
-        results = part.evaluation.results
-        for what, values, symbol in (
-                ('recorded', [x.residual for x in results], 'circle'),
-                ('unshaped steps', [x.residual_unshaped for x in results], 'square-open')):
-            data.append(_curve(
-                part, what, np.arange(1, len(results) + 1),
-                # Smaller values are rounding.
-                [100.0 * max(x, RESOLVED) for x in values], mode='markers',
-                marker={
-                    'symbol': symbol, 'size': _size(10, results), 'line': {'width': 1.5},
-                    'color': _KINDS[what]['color']}))
-            # One click in the legend hides both.
-            data[-1]['legendgroup'] = part.run.label if part.colour else what
-    count = max((len(x.evaluation.results) for x in parts), default=0)
-    numbered = axis('setpoint', range=[0.5, count + 0.5])
-    if count <= MOST_PANELS:
-        numbered |= {'tickmode': 'array', 'tickvals': list(range(1, count + 1)), 'ticktext': [
-            f'{i + 1}: ' + '/'.join(dict.fromkeys(
-                f'{x.stretch:.5g}' for x in results_of(parts, i))) for i in range(count)]}
-    return Figure(
-        'residuals', 'Residual vibration of each setpoint, recorded and for unshaped steps', 340,
-        _grouped(data), {
-            'xaxis': numbered,
-            'yaxis': axis(
-                label('residual vibration', unit='% of the step'), type='log',
-                **_decades(data))})
+def error_axis(curves: Sequence[Curve], end: float) -> Axis:
+    """Return an axis that shows errors of the whole step and of a percent of it."""
+    most = max((abs(x) for curve in curves for x in curve.extent('y', (0.0, end))), default=0.0)
+    limit = min(max(_ABOVE * most, _LEAST_ERROR), _MOST_ERROR)
+    return Axis('error', unit='% of step', limits=(-limit, limit), scale='symlog')
 
 
-def _decades(data: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return range and ticks of a logarithmic axis: whole decades, so at least one has a label."""
-    values = [math.log10(x) for trace in data for x in trace['y'] if x is not None]
-    if not values:
-        return {}
+def residuals(parts: Sequence[Part]) -> list[Panel]:
+    """Describe the residual vibration of all setpoints, also for unshaped steps."""
+    curves = []
+    for pen in _pens(parts):
+        results = pen.part.evaluation.results
+        places = np.arange(1.0, len(results) + 1.0)
+        size = 6.0 if len(results) <= _MANY_MARKERS else 3.0
+        for kind, values in (
+                ('', [x.residual for x in results]),
+                ('unshaped steps', [x.residual_unshaped for x in results])):
+            shares = 100.0 * np.maximum(np.array(values, dtype=np.float64), RESOLVED)
+            curve = pen.simulated(kind, places, shares) if kind else pen.measured(places, shares)
+            curves.append(replace(
+                curve, form='points', hidden=False, look=replace(
+                    curve.look, marker='s' if kind else 'o', filled=not kind, size=size),
+                # One click in the legend hides both.
+                name=curve.name if pen.own is None else pen.part.run.label))
+    if not any(len(x.x) for x in curves):
+        return []
+    count = max(len(x.evaluation.results) for x in parts)
+    ticks = tuple((i + 1.0, f'{i + 1}: ' + '/'.join(dict.fromkeys(
+        f'{x.stretch:.5g}' for x in results_of(parts, i)))) for i in range(count))
+    return [Panel(
+        Axis('setpoint', limits=(0.5, count + 0.5), ticks=ticks if count <= MOST_PANELS else ()),
+        Axis('residual vibration', unit='% of step', scale='log', limits=_decades(curves)),
+        curves, height=1.45)]
+
+
+def _decades(curves: Sequence[Curve]) -> tuple[float, float]:
+    """Return the limits of a logarithmic axis: whole decades, so at least one has a label."""
+    values = [math.log10(x) for curve in curves for x in curve.extent('y')] or [0.0]
     low, high = math.floor(min(values)), math.ceil(max(values))
-    return {
-        'range': [low - 0.2, max(high, low + 1) + 0.2], 'dtick': max(1, -(-(high - low) // 6))}
+    return 10.0 ** (low - 0.2), 10.0 ** (max(high, low + 1) + 0.2)
 
 
-def prediction(parts: Sequence[Part], unit: TimeUnit) -> Figure:
-    """Return recorded minus predicted stretch over time; no curves without a plan."""
-    data = []
-    for part in parts:
-        found = part.evaluation
-        difference = part.run.stretch - found.planned.at(found.time).stretch
-        if np.isfinite(difference).any():
-            data.append(_curve(
-                part, 'recorded', *decimate(unit.of(found.time), difference),
-                line={'width': 1.2}))
-            if not part.colour:
-                data[-1]['name'] = 'recorded − predicted'
+def deviations(parts: Sequence[Part]) -> list[Panel]:
+    """Describe recorded minus planned stretch over time; no panel where there is no difference."""
+    unit, time = _time(parts)
+    curves = []
+    for pen in _pens(parts):
+        difference = _deviation(pen.part)
+        if np.isfinite(difference).any() and np.nanmax(np.abs(difference)) > _IDENTICAL:
+            curve = pen.measured(*decimate(unit.of(pen.part.evaluation.time), difference))
+            name = curve.name if pen.own else f'{curve.name} − planned'
+            curves.append(replace(
+                curve, name=name, listed=pen.own is not None,
+                look=replace(curve.look, width=1.0)))
     what = parts[0].run.plant.coordinate
-    return Figure(
-        'prediction', f'Recorded minus predicted {what.name} over time', 300, _grouped(data), {
-            'xaxis': axis(label('time', 't', unit.name)),
-            'yaxis': axis(label('recorded − planned', what.symbol))})
+    return [Panel(time, Axis(
+        'deviation', f'Δ{what.symbol}', tex=rf'\Delta {what.tex}'), curves)
+            ] if curves else []
 
 
-def timings(parts: Sequence[Part], unit: TimeUnit) -> Figure:
-    """Return lead of the commands, delay of the samples, and their intervals."""
-    data = []
-    for part in parts:
-        found, timing = part.evaluation, part.timing
-        time = unit.of(found.time)
-        known = np.isfinite(timing.lateness)
-        stamps = unit.of([found.seconds(x.stamp) for x in timing.commands])
-        markers: dict[str, Any] = {'mode': 'markers', 'yaxis': 'y3', 'cliponaxis': False}
-        if len(timing.lead):
-            data.append(_curve(
-                part, 'command lead', stamps, timing.lead * 1e3, **markers,
-                marker={'size': 7, 'color': BLUE, 'symbol': 'circle'}))
-        if known.any():
-            data.append(_curve(
-                part, 'lateness of the command', stamps[known], timing.lateness[known] * 1e3,
-                **markers,
-                marker={'size': 8, 'color': VERMILION, 'symbol': 'x-thin-open'}))
-        if len(timing.delay):
-            data.append(_curve(
-                part, 'sample delay', *decimate(time, timing.delay * 1e3), yaxis='y2',
-                line={'color': VERMILION, 'width': 1.2}))
-        data.append(_curve(
-            part, 'interval as recorded', *decimate(time[1:], timing.arrival_interval * 1e3),
-            line={'color': VERMILION, 'width': 0.8, 'dash': '2px,1px'}, opacity=0.8))
-        data.append(_curve(
-            part, 'interval of the timestamps', *decimate(time[1:], timing.interval * 1e3),
-            line={'color': BLACK, 'width': 1.6}))
-    return Figure(
-        'timing', 'Lead of the commands, delay and interval of the samples', 640, _grouped(data), {
-            'xaxis': axis(label('time', 't', unit.name), anchor='y'),
-            'yaxis': axis('sample interval (ms)', domain=[0.0, 0.28], rangemode='tozero'),
-            'yaxis2': axis('sample delay (ms)', domain=[0.36, 0.64], anchor='x'),
-            'yaxis3': axis(
-                'command lead (ms)' if not any(len(x.timing.lateness) for x in parts)
-                else 'lead, lateness (ms)', domain=[0.72, 1.0], anchor='x', rangemode='tozero')})
+def identical(parts: Sequence[Part]) -> list[str]:
+    """Return a sentence for each run that is as planned."""
+    return [
+        f'{_of(x, parts)}The {x.run.origin} motion and the plan are identical: the largest '
+        f'difference is below {_IDENTICAL:.0e}.'.replace('e-0', 'e-') for x in parts
+        if np.isfinite(_deviation(x)).any()
+        and np.nanmax(np.abs(_deviation(x))) <= _IDENTICAL]
+
+
+def _of(part: Part, parts: Sequence[Part]) -> str:
+    return f'{part.run.label}: ' if len(parts) > 1 else ''
+
+
+def timings(parts: Sequence[Part]) -> list[Panel]:
+    """Describe command lead, lateness, sample delay and intervals, where they vary."""
+    unit, time = _time(parts)
+    panels = []
+    for quantity, group in _TIMINGS.items():
+        curves, drawn = [], []
+        for pen in _pens(parts):
+            for name, look in group.items():
+                times, values = _timing_of(pen.part)[name]
+                if _constant(values):
+                    continue
+                if not look.marker:
+                    times, values = decimate(times, values)
+                drawn.append(name)
+                curves.append(Curve(
+                    f'{_of(pen.part, parts)}{name}',
+                    look if pen.own is None else replace(look, colour=pen.own.colour),
+                    unit.of(times), 1e3 * values, 'points' if look.marker else 'line'))
+        if curves:
+            label = quantity if len(set(drawn)) > 1 else drawn[0]
+            panels.append(Panel(replace(time, limits=None), Axis(label, unit='ms'), curves))
+    # Panels above each other have one range of times.
+    ends = [x for panel in panels for x in panel.limits('x')]
+    return [replace(x, x=replace(time, limits=(min(ends), max(ends)))) for x in panels]
+
+
+def constant_timings(parts: Sequence[Part]) -> list[str]:
+    """Return a sentence for each time that does not vary."""
+    return [
+        f'{_of(x, parts)}{name.capitalize()}: {1e3 * float(np.median(values)):.6g} ms throughout.'
+        for x in parts for name, (_, values) in _timing_of(x).items()
+        if len(values) and _constant(values)]
+
+
+def _constant(values: Array) -> bool:
+    return not len(values) or float(np.ptp(values)) <= _CONSTANT
+
+
+def _timing_of(part: Part) -> dict[str, tuple[Array, Array]]:
+    """Return times of commands or samples and a quantity, both in s, by the name of the latter."""
+    found, timing = part.evaluation, part.timing
+    stamps = np.array([found.seconds(x.stamp) for x in timing.commands])
+    known = np.isfinite(timing.lateness)
+    return {
+        'command lead': (stamps[:len(timing.lead)], timing.lead),
+        'lateness of the command': (stamps[:len(known)][known], timing.lateness[known]),
+        'sample delay': (found.time[:len(timing.delay)], timing.delay),
+        'interval as recorded': (found.time[1:], timing.arrival_interval),
+        'interval of the timestamps': (found.time[1:], timing.interval)}
+
+
+# Styles of the times of each panel of `timings`.
+_TIMINGS = {
+    'lead, lateness': {
+        'command lead': LineStyle(BLUE, marker='o', size=4.5, order=3),
+        'lateness of the command': LineStyle(VERMILION, marker='x', order=3)},
+    'sample delay': {'sample delay': LineStyle(VERMILION, 1.0)},
+    'sample interval': {
+        'interval as recorded': LineStyle(VERMILION, 0.7, (2.0, 1.0)),
+        'interval of the timestamps': LineStyle(BLACK, 1.2, order=3)}}
+
+#: The panels of runs, by their paper.PANELS in `hmsa.report.paper`.
+PANELS: Mapping[str, Callable[[Sequence[Part]], list[Panel]]] = dict(zip(paper.PANELS, (
+    command, response, phase, errors, residuals, deviations, timings), strict=True))

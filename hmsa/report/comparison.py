@@ -9,7 +9,6 @@ import numpy as np
 from hmsa.errors import BadInputError
 from hmsa.report.arrivals import around, Part
 from hmsa.report.evaluation import judged_from, result_of, verdict_on
-from hmsa.report.looks import RUNS
 from hmsa.runs.record import Run
 from hmsa.table import Column, DEVIATION, Table
 
@@ -20,7 +19,7 @@ def labelled(runs: list[Run]) -> list[Run]:
     # Bags with the same name are in different folders, unless a bag is given twice.
     labels = [
         f'{run.path.resolve().parent.name}/{run.label}'
-        if labels.count(run.label) > 1 and run.origin == 'recorded'
+        if labels.count(run.label) > 1 and run.summary is not None
         else run.label for run in runs]
     return [
         replace(run, label=label if labels.count(label) == 1 else f'{label} ({i})')
@@ -28,9 +27,8 @@ def labelled(runs: list[Run]) -> list[Run]:
 
 
 def parts_of(runs: list[Run]) -> list[Part]:
-    """Return evaluated runs with unique labels and, for several runs, different colours."""
-    return [Part.of(run, RUNS[i % len(RUNS)] if len(runs) > 1 else '')
-            for i, run in enumerate(labelled(runs))]
+    """Return evaluated runs with unique labels."""
+    return [Part.of(run) for run in labelled(runs)]
 
 
 def comparison(parts: Sequence[Part]) -> Table:

@@ -111,6 +111,11 @@ class Evaluation:
     #: predicted by the plan, at the samples and between them; NaN before and without a plan
     planned: TimeCurve
     findings: tuple[Finding, ...] = ()  #: one per requested setpoint
+    tolerances: Tolerances = Tolerances()
+
+    def allowed(self, result: MoveResult) -> float:
+        """Return the tolerance of a setpoint, in stretch."""
+        return self.tolerances.of(self.findings[result.place].setpoint)[0]
 
     def seconds(self, stamp: int) -> float:
         """Return a timestamp in s of the run."""
@@ -171,7 +176,7 @@ def evaluate(run: Run, tolerances: Tolerances | None = None) -> Evaluation:
     return Evaluation(
         first, time, start, levels, found, tuple(results), recorded, plain, plan,
         TimeCurve((stamps - first) / NANOSECONDS, *_predict(run, plan, stamps)),
-        tuple(findings_of(run, tolerances, asked=asked)))
+        tuple(findings_of(run, tolerances, asked=asked)), tolerances)
 
 
 def _first(run: Run, levels: Sequence[RecordedLevel], asked: Sequence[Requested]) -> int:

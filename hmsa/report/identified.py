@@ -9,9 +9,11 @@ from hmsa.identification.measurement import UncheckedMeasurement
 from hmsa.identification.response import respond
 from hmsa.identification.result import Identification
 from hmsa.model.equations import Array
-from hmsa.report.charts import axis, curve, Figure, label, TimeUnit, unit_for
-from hmsa.report.curves import BUCKETS, decimate, numbers
-from hmsa.report.looks import BLACK, BLUE, GREY, VERMILION
+from hmsa.report import looks
+from hmsa.report.charts import TimeUnit, unit_for
+from hmsa.report.curves import BUCKETS, decimate
+from hmsa.report.figures import Axis, Curve, Figure, Panel
+from hmsa.report.looks import BLACK, BLUE, LineStyle, VERMILION
 from hmsa.report.page import document, FOLDER
 from hmsa.table import Column, Table
 
@@ -40,12 +42,13 @@ def page(found: Identification) -> str:
             f'{one} and {other} ({x:.3f})' for one, other, x in found.confounded()))
 
 
-def _samples(found: Identification, name: str, y: Array, inside: Any = slice(None),
-             mode: str = 'markers') -> dict[str, Any]:
-    """Return the trace of a quantity at the samples, over time."""
+def _samples(
+        found: Identification, name: str, y: Array, inside: Any = slice(None), *,
+        form: str = 'points') -> Curve:
+    """Return a quantity at the samples, over time."""
     time = _unit(found).of(found.recording.time)
-    return curve(name, *decimate(time[inside], y[inside]), mode, marker={
-        'size': 3 if len(time) > 200 else 6, 'color': BLUE}, line={'color': BLUE, 'width': 1.0})
+    look = LineStyle(BLUE, 0.8, marker='o', size=2.2 if len(time) > 200 else 4.5)
+    return Curve(name, look, *decimate(time[inside], y[inside]), form)
 
 
 def _unit(found: Identification) -> TimeUnit:
@@ -53,10 +56,10 @@ def _unit(found: Identification) -> TimeUnit:
     return unit_for(float(time[-1] - time[0]))
 
 
-def _time_axis(found: Identification, **more: Any) -> dict[str, Any]:
+def _time_axis(found: Identification) -> Axis:
     unit = _unit(found)
-    return axis(label('time', 't', unit.name), range=numbers(
-        unit.of(found.recording.time[[0, -1]])), **more)
+    begin, end = unit.of(found.recording.time[[0, -1]]).tolist()
+    return Axis('time', 't', unit.name, limits=(begin, end))
 
 
 def _motion(found: Identification) -> Figure:
@@ -65,17 +68,16 @@ def _motion(found: Identification) -> Figure:
     end = max(float(recording.time[-1]), float(recording.level_times[-1]))
     time, fitted = _fitted(found)
     what = recording.coordinate
-    return Figure('motion', f'Level, measured and fitted {what.name} over time', 520, [
-        _samples(found, 'measured', recording.stretch,
-                 mode='markers' if len(recording.time) <= BUCKETS else 'lines'),
-        curve('fitted', *decimate(unit.of(time), fitted), line={
-            'color': VERMILION, 'width': 1.6}),
-        curve('level', unit.of(np.append(recording.level_times, end)),
-              np.append(recording.levels, recording.levels[-1]) * 1e3, yaxis='y2',
-              line={'color': BLACK, 'width': 1.6, 'shape': 'hv'})], {
-        'xaxis': _time_axis(found, anchor='y'),
-        'yaxis': axis(label(what.name, what.symbol), domain=[0.0, 0.66]),
-        'yaxis2': axis(label('flux density', 'B', 'mT'), domain=[0.74, 1.0], anchor='x')})
+    across = _time_axis(found)
+    return Figure('motion', f'Level, measured and fitted {what.name} over time', [
+        Panel(across, Axis('flux density', 'B', 'mT'), [Curve(
+            'level', LineStyle(BLACK, 1.2), unit.of(np.append(recording.level_times, end)),
+            np.append(recording.levels, recording.levels[-1]) * 1e3, 'steps', listed=False)]),
+        Panel(across, Axis(what.name, what.symbol, tex=what.tex), [
+            _samples(found, 'measured', recording.stretch,
+                     form='points' if len(recording.time) <= BUCKETS else 'line'),
+            Curve('fitted', LineStyle(VERMILION, 1.2, order=3), *decimate(
+                unit.of(time), fitted))], height=2.4)], 520)
 
 
 def _fitted(found: Identification) -> tuple[Array, Array]:
@@ -97,29 +99,24 @@ def _fitted(found: Identification) -> tuple[Array, Array]:
 def _residuals(found: Identification) -> Figure:
     """Return the residuals over time, with outliers marked."""
     out, residual = found.fit.weights == 0.0, found.fit.residual
-    data = [_samples(found, 'residual', residual, ~out)]
+    curves = [_samples(found, 'residual', residual, ~out)]
     if np.any(out):
-        data.append(curve(
-            'outlier', _unit(found).of(found.recording.time[out]), residual[out], 'markers',
-            marker={'size': 6, 'symbol': 'x', 'color': VERMILION}))
-    return Figure('residuals', 'Residuals over time', 300, data, {
-        'xaxis': _time_axis(found), 'yaxis': axis('measured less fitted')})
+        curves.append(Curve(
+            'outlier', LineStyle(VERMILION, marker='x', order=3),
+            _unit(found).of(found.recording.time[out]), residual[out], 'points'))
+    return Figure('residuals', 'Residuals over time', [Panel(
+        _time_axis(found), Axis('measured less fitted'), curves)], legend=len(curves) > 1)
 
 
 def _correlation(found: Identification) -> Figure:
     """Return the autocorrelation of the residuals."""
     rho = found.whiteness.autocorrelation[1:_LAGS + 1]
-    lags = np.arange(1, len(rho) + 1)
     limit = 1.96 / math.sqrt(found.samples)
-    data = [{
-        'type': 'bar', 'name': 'autocorrelation', 'x': numbers(lags), 'y': numbers(rho),
-        'marker': {'color': BLUE}}]
-    ends = np.array([0.5, len(rho) + 0.5])
-    data += [curve(
-        'white noise, 95 %', ends, np.full(2, x), showlegend=x > 0.0,
-        line={'color': GREY, 'width': 1.2, 'dash': '5px,3px'}) for x in (limit, -limit)]
-    return Figure('correlation', 'Autocorrelation of the residuals over the lag', 260, data, {
-        'xaxis': axis('lag (samples)'), 'yaxis': axis('autocorrelation')})
+    return Figure('correlation', 'Autocorrelation of the residuals over the lag', [Panel(
+        Axis('lag', unit='samples'), Axis('autocorrelation'), [
+            Curve('autocorrelation', LineStyle(BLUE), np.arange(1.0, len(rho) + 1.0), rho, 'bars'),
+            Curve('white noise, 95 %', looks.TARGET, y=np.array([-limit, limit]),
+                  form='horizontal')])], 260)
 
 
 def _parameters(found: Identification) -> Table:

@@ -14,7 +14,8 @@ INDIGO, SILVER = '#2B098B', '#B0B0B0'
 #: Replacements of colours in dark mode.
 DARK = {
     BLUE: '#4DABE8', ORANGE: '#F2B93B', GREEN: '#7DB07C', PURPLE: '#E08FE0',
-    SKY_BLUE: '#B5E2FF', VERMILION: '#FF8A4A', BLACK: '#F0F0F0', GREY: '#9A9A9A'}
+    SKY_BLUE: '#B5E2FF', VERMILION: '#FF8A4A', BLACK: '#F0F0F0', GREY: '#9A9A9A',
+    SILVER: '#6A7076'}
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,9 @@ class LineStyle:
     dash: tuple[float, ...] = ()  #: on and off in line widths; empty for a solid line
     marker: str = ''  #: matplotlib's name
     order: int = 2  #: curves of higher order are drawn on top
+    size: float = 5.0  #: of the marker, in pt
+    filled: bool = True  #: the marker
+    opacity: float = 1.0
 
     def line(self, **more: Any) -> dict[str, Any]:
         """Return matplotlib's line properties, without the marker."""
@@ -33,11 +37,19 @@ class LineStyle:
             'color': self.colour, 'linewidth': self.width, 'zorder': self.order,
             'linestyle': (0, self.dash) if self.dash else '-', **more}
 
-    def plotly(self) -> dict[str, Any]:
-        """Return Plotly's line properties."""
-        dash = ','.join(f'{x * max(self.width, 1.0):g}px' for x in self.dash)
-        return {'color': self.colour, 'width': 1.3 * self.width} | (
-            {'dash': dash} if dash else {})
+    def points(self) -> dict[str, Any]:
+        """Return matplotlib's properties of markers without a line."""
+        return {
+            'color': self.colour, 'zorder': self.order, 'linestyle': 'none',
+            'marker': self.marker, 'markersize': self.size,
+            'fillstyle': 'full' if self.filled else 'none'}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the style for the page."""
+        return {
+            'colour': self.colour, 'width': self.width, 'dash': self.dash, 'order': self.order,
+            'marker': self.marker, 'size': self.size, 'filled': self.filled,
+            'opacity': self.opacity}
 
 
 RECORDED = LineStyle(BLUE, 1.6, order=3)
@@ -45,7 +57,11 @@ PLAIN = LineStyle(VERMILION, 1.0, (4.0, 1.5))
 PLAN = LineStyle(BLACK, 1.1, (1.0, 2.0), order=4)
 FIELD = LineStyle(ORANGE, 1.1, (6.0, 1.5, 1.0, 1.5))
 TARGET = LineStyle(GREY, 0.9, (2.0, 2.0), order=1)
+#: A target that is held: broad, to be seen on both sides of the curve on it.
+SETPOINT = LineStyle(SILVER, 4.0, order=1, opacity=0.7)
+TOLERANCE = LineStyle(SILVER, order=0, opacity=0.35)
 ARRIVAL = LineStyle(BLACK, 0.8, (1.0, 1.5), order=1)
+EQUILIBRIUM = LineStyle(BLACK, marker='o', size=4.5, order=5)
 
 #: Styles of the shapers, by name.
 SHAPERS = {
@@ -64,7 +80,6 @@ SHAPERS = {
 #: curves on top of it remain distinguishable.
 CASES = tuple(replace(SHAPERS[x], order=RECORDED.order) for x in (
     'two_step', 'step', 'robust', 'minimum_time', 'umzv', 'ei', 'minimax', 'zvd'))
-RUNS = tuple(x.colour for x in CASES)
 
 
 def case(number: int) -> LineStyle:

@@ -15,7 +15,6 @@ import jinja2
 import numpy as np
 
 from hmsa import __version__
-from hmsa.errors import HmsaError
 from hmsa.interfaces.actuator import parameters_of
 from hmsa.interfaces.parameters import ACTUATOR, ACTUATOR_FIELDS, LAW
 from hmsa.model.equations import critical_zeta, stretch_limits
@@ -24,8 +23,9 @@ from hmsa.model.residual import percent
 from hmsa.model.units import NANOSECONDS
 from hmsa.report import charts, curves, looks
 from hmsa.report.arrivals import NOT_MOVED, Part, residual_text, title, worst
-from hmsa.report.charts import Figure, TimeUnit
+from hmsa.report.charts import TimeUnit
 from hmsa.report.evaluation import FEW_SAMPLES, plan_points, verdict_on
+from hmsa.report.figures import Figure
 from hmsa.runs.record import Run
 from hmsa.runs.topics import APPLIED
 from hmsa.table import Column, Table
@@ -40,37 +40,43 @@ _A_DATE = 1e8
 
 
 def page(parts: Sequence[Part]) -> str:
-    """
-    Return the report of one run or several as HTML.
-
-    Raises
-    ------
-    HmsaError
-        If Plotly is not installed.
-
-    """
+    """Return the report of one run or several as HTML."""
     unit = charts.time_unit(parts)
-    phase, shown = charts.phase(parts)
-    drawn = {'response': charts.response(parts, unit), 'phase': phase}
-    arrivals = [(title(parts, i), charts.arrival(parts, i))
-                for i in worst(parts, charts.MOST_PANELS)]
-    if arrivals:
-        drawn['residuals'] = charts.residuals(parts)
-    if any(x.evaluation.plan for x in parts):
-        drawn['prediction'] = charts.prediction(parts, unit)
-    drawn['timing'] = charts.timings(parts, unit)
+    name, timings = parts[0].run.plant.coordinate.name, charts.timings(parts)
+    figures = {
+        key: Figure(key, alt, panels, height) for key, alt, panels, height in (
+            ('response', f'Flux density command and {name} over time',
+             [*charts.command(parts), *charts.response(parts)], 560),
+            ('phase', f'{name.capitalize()} rate over {name}, with the equilibria',
+             charts.phase(parts), 480),
+            ('residuals', 'Residual vibration of each setpoint, and for unshaped steps',
+             charts.residuals(parts), 340),
+            ('deviation', f'Recorded minus planned {name} over time', charts.deviations(parts),
+             300),
+            ('timing', 'Lead of the commands, delay and interval of the samples',
+             timings, 80 + 180 * len(timings))) if panels}
+    arrivals = [
+        (title(parts, i), Figure(
+            f'arrival{i}', f'Setpoint {title(parts, i)}', [charts.error(parts, i)], 320,
+            # The labels of several runs do not fit into every panel.
+            legend=len(parts) == 1)) for i in worst(parts, charts.MOST_PANELS)]
     names = ', '.join(x.run.label for x in parts)
     return document(
-        FOLDER / 'run.html', f'{names} – run report', [*drawn.values(), *(x for _, x in arrivals)],
-        **{'prediction': None, **drawn}, arrivals=arrivals, names=names, single=len(parts) == 1,
-        sources=[_source(x.run) for x in parts], summary=_summary(parts), remarks=_notes(parts),
-        what=parts[0].run.plant.coordinate.name, shown=shown,
+        FOLDER / 'run.html', f'{names} – run report',
+        [*figures.values(), *(x for _, x in arrivals)], figures=figures, arrivals=arrivals,
+        names=names, single=len(parts) == 1, sources=[_source(x.run) for x in parts],
+        summary=_summary(parts), remarks=_notes(parts), what=name,
+        shown=charts.phase_shown(parts),
+        origins=' and '.join(dict.fromkeys(x.run.origin for x in parts)),
         count=max(len(x.evaluation.results) for x in parts),
-        colours=[(x.run.label, x.colour, looks.DARK.get(x.colour, '')) for x in parts],
+        colours=[(x.run.label, looks.case(i).colour) for i, x in enumerate(parts)],
+        planned=any(x.evaluation.plan for x in parts), identical=charts.identical(parts),
+        constant=charts.constant_timings(parts),
         lateness=any(len(x.timing.lateness) for x in parts),
         repeats=sum(x.timing.repeats for x in parts),
         counted=all(x.run.summary is None or x.run.summary.lost is not None for x in parts),
         known=all(x.run.parameters_known for x in parts), setpoints=_setpoints(parts),
+        decisive=_decisive(parts),
         plan=_plan(parts, unit), times=_timing(parts), requests=_requests(parts, unit),
         losses=_losses(parts), actuator=_parameters(parts),
         recorded=_table({'run': '', 'parameter': '', 'value': ''}, [
@@ -80,43 +86,26 @@ def page(parts: Sequence[Part]) -> str:
 
 
 def document(
-        template: Path, title: str, figures: Sequence[Figure], **values: Any) -> str:
+        template: Path, title: str, drawn: Sequence[Figure], **values: Any) -> str:
     """Return a self-contained HTML page from a template that places the figures."""
     data = json.dumps(
-        {'figures': [
-            {'key': x.key, 'height': x.height, 'data': x.data, 'layout': x.layout}
-            for x in figures],
-         'dark': looks.DARK}, separators=(',', ':'), allow_nan=False)
+        [x.to_dict() for x in drawn], separators=(',', ':'), allow_nan=False)
     pages = jinja2.Environment(
         loader=jinja2.FileSystemLoader([template.parent, FOLDER]), autoescape=True,
         trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
     pages.globals |= {'zip': zip, 'numeric': _numeric}
-    return pages.get_template(template.name).render(
-        title=title, version=__version__, figures=figures, plotly=_plotly(),
-        style=(FOLDER / 'page.css').read_text(encoding='utf-8'),
-        script=(FOLDER / 'page.js').read_text(encoding='utf-8'),
+    return pages.get_template(template.name).render({'figures': drawn} | values | {
+        'title': title, 'version': __version__, 'dark': looks.DARK,
+        'style': (FOLDER / 'page.css').read_text(encoding='utf-8'),
+        'scripts': [(FOLDER / x).read_text(encoding='utf-8') for x in ('figure.js', 'page.js')],
         # In a script, "</" could close it, and "<!--" could keep it open.
-        data=data.replace('<', '\\u003c'), **values)
+        'data': data.replace('<', '\\u003c')})
 
 
 def _numeric(table: Table) -> list[bool]:
     """Return whether each column contains numbers."""
     return [any(not isinstance(row[i], str) for row in table.rows)
             for i in range(len(table.columns))]
-
-
-def _plotly() -> str:
-    """Return the source of Plotly.js."""
-    try:
-        from plotly.offline import get_plotlyjs  # type: ignore[import-untyped]
-
-        script: str = get_plotlyjs()
-    except (ImportError, OSError) as error:
-        raise HmsaError(
-            f'the page cannot be drawn without Plotly ({error}): install it with '
-            '"pip install plotly"') from error
-    # Its strings may contain the closing tag; in JavaScript both spellings mean the same.
-    return script.replace('</script', '<\\/script')
 
 
 def _time(nanoseconds: int) -> str:
@@ -226,13 +215,23 @@ def _setpoints(parts: Sequence[Part]) -> Table:
                 'unshaped step' if levels == 1 else f'{levels} levels' if levels else '–'))
     return _table({
             'run': '', 'setpoint': 'd',
-            f'target {parts[0].run.plant.coordinate.symbol} [1]': '.6g', 'verdict': '',
+            _target(parts): '.6g', 'verdict': '',
             'offset [%]': '+%', '± [%]': '%', 'vibration [%]': '%', '± of it [%]': '%',
             'frequency [Hz]': '.3g',
             'b_p [1]': '.5f', 'tau_p [1]': '.5f', 'b_1 [1]': '.5f', 'begin [ms]': '.3f',
             'arrival [ms]': '.3f', 'settled [ms]': '.3f', 'end [ms]': '.3f',
             'largest error [%]': '%', 'residual [%]': '%', 'unshaped steps [%]': '%',
             'command': ''}, rows)
+
+
+def _decisive(parts: Sequence[Part]) -> tuple[str, ...]:
+    """Return the columns of setpoints that decide, which fit on a phone."""
+    return ('run', 'setpoint', _target(parts), 'verdict', 'settled [ms]', 'offset [%]',
+            'residual [%]')
+
+
+def _target(parts: Sequence[Part]) -> str:
+    return f'target {parts[0].run.plant.coordinate.symbol} [1]'
 
 
 def _requests(parts: Sequence[Part], unit: TimeUnit) -> Table:

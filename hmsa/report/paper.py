@@ -4,13 +4,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, excerpt
 
 #: Formats of figures; ``pgf`` is for LaTeX.
 KINDS = ('png', 'pdf', 'svg', 'pgf')
 #: Widths of journal figures in mm: one, one and a half, and two columns.
 WIDTHS = (85.0, 120.0, 183.0)
-_INCH = 25.4
+#: Panels of a figure of runs, and those drawn by default: side by side, and in a column.
+PANELS = ('command', 'response', 'phase', 'error', 'residual', 'plan', 'timing')
+WIDE, NARROW = ('command', 'response', 'phase', 'error'), ('command', 'response', 'error')
+#: In mm.
+INCH = 25.4
 # Minimum width of a panel in mm, at 8 pt.
 _PANEL = 55.0
 
@@ -18,7 +22,7 @@ _PANEL = 55.0
 @dataclass(frozen=True)
 class Paper:
     """
-    The size of a figure, and whether its data is written to a CSV file.
+    The size of a figure, its panels, and whether its data is written to a CSV file.
 
     Raises
     ------
@@ -31,21 +35,29 @@ class Paper:
     letters: float = 8.0  #: font size in pt, 4 to 24
     dpi: float = 600.0  #: of PNG, 50 to 1200
     data: bool = False  #: whether the plotted data are also written as CSV
+    height: float | None = None  #: in mm, 20 to 400; None for one that suits the panels
+    panels: Sequence[str] = ()  #: of runs, of `PANELS`; by default, those that fit
 
     def __post_init__(self) -> None:
         for name, value, unit, least, most in (
                 ('width', self.width, ' mm', 40.0, 400.0),
+                ('height', 100.0 if self.height is None else self.height, ' mm', 20.0, 400.0),
                 ('font size', self.letters, ' pt', 4.0, 24.0),
                 ('dpi', self.dpi, '', 50.0, 1200.0)):
             if not least <= value <= most:
                 raise BadInputError(
                     f'the {name} of a picture is {value:g}{unit}: expected {least:g} to '
                     f'{most:g}{unit}')
+        for name in self.panels:
+            if name not in PANELS:
+                raise BadInputError(
+                    f'the panel {excerpt(name)} is unknown: expected some of '
+                    f'{", ".join(PANELS)}')
 
     @property
     def inches(self) -> float:
         """Width in inches."""
-        return self.width / _INCH
+        return self.width / INCH
 
     def columns(self, most: int) -> int:
         """Return how many panels fit side by side, 1 to ``most``."""

@@ -391,7 +391,8 @@ class _Collected:
                 if of == joint or len({y for y, _ in self.sensors}) == 1),
             parameters={**parameters, **given}, plant=plant, planner=planner,
             parameters_known=known, left_out=self.left_out + refused + lost_samples,
-            notes=(*notes, *sample_notes, *more), topics=topics, summary=summary)
+            notes=(*notes, *sample_notes, *more), topics=topics, summary=summary,
+            origin='simulated' if any(x.startswith('plant.') for x in parameters) else 'recorded')
         if not (lost := run.lost(roles.COMMAND, roles.APPLIED)):
             return run
         return replace(run, notes=(

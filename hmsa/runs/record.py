@@ -97,7 +97,8 @@ class Run:
     # Topic names by role (`hmsa.runs.topics`)
     topics: Mapping[str, str] = field(default_factory=dict)
     summary: 'BagSummary | None' = None  # None for a table
-    origin: str = 'recorded'  # or simulated
+    # ``'recorded'``, or ``'simulated'`` for samples of the simulated plant
+    origin: str = 'recorded'
 
     def __post_init__(self) -> None:
         """Check the arrays, and protect the record from changes."""

@@ -28,7 +28,6 @@ from hmsa.judge.records import worst
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.report.arrivals import Part
 from hmsa.report.comparison import ringing
-from hmsa.report.looks import RUNS
 from hmsa.runs.bags import read_run
 from hmsa.runs.parameters import Entries
 from hmsa.runs.record import Run
@@ -79,9 +78,7 @@ class Tuned:
     @property
     def parts(self) -> list[Part]:
         """The runs with the setpoints."""
-        runs = [self.before, *([] if self.after is None else [self.after])]
-        return [replace(x, colour=y) for x, y in zip(runs, RUNS, strict=False)] if (
-            len(runs) > 1) else runs
+        return [self.before, *([] if self.after is None else [self.after])]
 
     @property
     def verdict(self) -> tuple[str, str]:

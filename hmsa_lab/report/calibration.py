@@ -7,34 +7,34 @@ import numpy as np
 
 from hmsa.identification.delays import Delays, response
 from hmsa.model.equations import Array
-from hmsa.report import style
+from hmsa.report import looks, style
+from hmsa.report.figures import Axis, Curve, Panel
 from hmsa.report.looks import BLACK
 from hmsa.report.paper import Paper
 from hmsa_lab.bench.calibration import CoilCalibration
 from hmsa_lab.bench.statics import Statics
 
 _LINE = 400
+# Of the panel, relative to those of a run.
+_HEIGHT = 2.2
 # End of the figure in lags after the transport delay, and its minimum in s.
 _LAGS, _SHORTEST = 8.0, 2e-3
 
 
 def _draw(
-        paths: Sequence[Path], axes: tuple[str, str], points: tuple[Array, Array],
+        paths: Sequence[Path], axes: tuple[Axis, Axis], points: tuple[Array, Array],
         line: tuple[Array, Array], paper: Paper) -> None:
-    with style.picture(paths, 2.8 * paper.letters / 8.0, paper) as figure:
-        panel = figure.subplots()
-        panel.plot(*line, **style.SHAPED, label='fit')
-        panel.plot(*points, linestyle='none', marker='o', markersize=2.5, color=BLACK, zorder=4,
-                   label='measured')
-        style.finish(panel, *axes)
-        style.legend_below(figure)
+    style.sheet(paths, [[[Panel(*axes, [
+        Curve('fit', looks.RECORDED, *line),
+        Curve('measured', looks.LineStyle(BLACK, marker='o', size=2.5, order=4), *points,
+              'points')], height=_HEIGHT)]]], paper)
 
 
 def draw_coil(
         paths: Sequence[Path], current: Array, flux_density: Array, found: CoilCalibration,
         paper: Paper) -> None:
     """Draw readings in T over currents in A, and the mean at each."""
-    _draw(paths, (style.axis('current', 'I', 'A'), style.axis('flux density', 'B', 'mT')),
+    _draw(paths, (Axis('current', 'I', 'A'), Axis('flux density', 'B', 'mT')),
           (current, 1e3 * flux_density),
           (found.current, 1e3 * (found.flux_density + found.offset)), paper)
 
@@ -44,13 +44,13 @@ def draw_delays(paths: Sequence[Path], found: Delays, paper: Paper) -> None:
     seen = found.field
     if seen is None:
         motion = found.motion
-        _draw(paths, (style.axis('time', 't', 's'), style.axis('stretch', r'\lambda')),
+        _draw(paths, (Axis('time', 't', 's'), Axis('stretch', 'λ', tex=r'\lambda')),
               (motion.recording.time, motion.recording.stretch),
               (motion.recording.time, motion.fit.response.stretch), paper)
         return
     end = max(seen.transport.value + _LAGS * seen.lag.value, _SHORTEST)
     since, near = np.linspace(0.0, end, _LINE, dtype=np.float64), seen.since <= end
-    _draw(paths, (style.axis('time since the level', unit='ms'), 'fraction of the step'),
+    _draw(paths, (Axis('time since the level', unit='ms'), Axis('fraction of the step')),
           (1e3 * seen.since[near], seen.share[near]),
           (1e3 * since, response(since, seen.transport.value, seen.lag.value)), paper)
 
@@ -59,5 +59,5 @@ def draw_statics(
         paths: Sequence[Path], level: Array, stretch: Array, found: Statics,
         paper: Paper) -> None:
     """Draw stretches over levels in T, and the mean of both branches."""
-    _draw(paths, (style.axis('flux density', 'B', 'mT'), style.axis('stretch', r'\lambda')),
+    _draw(paths, (Axis('flux density', 'B', 'mT'), Axis('stretch', 'λ', tex=r'\lambda')),
           (1e3 * level, stretch / found.rest), (1e3 * found.level, found.stretch), paper)

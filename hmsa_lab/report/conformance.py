@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from hmsa.model.equations import Array
-from hmsa.report.charts import axis, Figure, label
-from hmsa.report.curves import numbers
-from hmsa.report.looks import BLUE
+from hmsa.report.figures import Axis, Curve, Figure, Panel
+from hmsa.report.looks import BLUE, LineStyle
 from hmsa.report.page import document
 from hmsa.table import Column, Table
 from hmsa_lab.bench.conformance import Conformance
@@ -37,7 +36,6 @@ def page(found: Conformance) -> str:
 def _histogram(name: str, times: Array) -> Figure:
     counts, edges = np.histogram(times, bins=_BINS)
     title = 'lateness of levels' if name == 'lateness' else f'duration of {name}'
-    return Figure(f'times-{name}', title, 240, [{
-        'type': 'bar', 'x': numbers((edges[1:] + edges[:-1]) / 2), 'y': numbers(counts),
-        'width': numbers(np.diff(edges)), 'marker': {'color': BLUE}}], {
-        'xaxis': axis(label(title, unit='ms')), 'yaxis': axis('number')})
+    return Figure(f'times-{name}', title, [Panel(Axis(title, unit='ms'), Axis('number'), [
+        Curve(title, LineStyle(BLUE), (edges[1:] + edges[:-1]) / 2, counts.astype(np.float64),
+              'bars', listed=False)])], 240)

@@ -74,7 +74,7 @@ def _carry_out(
 
 def second_act(picture: Path) -> tuple[AdaptingResult, ...]:
     """Run the moves with feedback off and cautious, and plot both."""
-    from hmsa.report import style
+    from hmsa.report import looks, style
     from hmsa.report.paper import SCREEN
 
     block = paper_actuator()
@@ -89,9 +89,9 @@ def second_act(picture: Path) -> tuple[AdaptingResult, ...]:
             track, found = _carry_out(block, feedback)
             results += found
             axes.plot(1e3 * track[:, 0], track[:, 1], label=label, **kind)
-        for i, target in enumerate(_TARGETS):
-            axes.plot([1e3 * i * _HOLD, 1e3 * (i + 1) * _HOLD], [target, target],
-                      label=None if i else 'target', **style.TARGET)
+        times = 1e3 * _HOLD * np.arange(len(_TARGETS) + 1)
+        axes.step(times, [*_TARGETS, _TARGETS[-1]], where='post', label='target',
+                  **looks.SETPOINT.line(alpha=looks.SETPOINT.opacity))
         axes.set_title(
             f'shear modulus {100.0 * FACTOR - 100.0:+.0f} %, unknown to the planner')
         style.finish(axes, style.axis('time', 't', 'ms'), style.axis('stretch', r'\lambda'))
