@@ -32,7 +32,6 @@ INSTALL_REQUIRES = [
     'mcap>=1.6',
     'mcap-ros2-support>=0.5',
     'numpy>=1.26',
-    'plotly>=5.15',
     'rich>=13.0',
     'rosbags>=0.11',
     'scipy>=1.11',

@@ -28,8 +28,6 @@ KEYS = {
     'lz4': 'mcap-ros2-support', 'mcap': 'mcap-ros2-support',
     'mcap-ros2-support': 'mcap-ros2-support', 'zstandard': 'mcap-ros2-support',
     'PyYAML': 'python3-yaml', 'pyserial': 'python3-serial', 'rosbags': 'python3-rosbags-pip'}
-# No key: plotly, without which only the page of a report is missing.
-WITHOUT_KEY = {'plotly'}
 # Requirements whose module has another name.
 MODULES = {'PyYAML': 'yaml', 'mcap-ros2-support': 'mcap_ros2'}
 # What only a part of the package needs.
@@ -83,7 +81,7 @@ def names(requirements: list[str]) -> set[str]:
 def keys(requirements: list[str]) -> set[str]:
     """Return the rosdep keys of a list of requirements."""
     return {KEYS.get(name, f'python3-{name.lower()}')
-            for name in names(requirements) - WITHOUT_KEY}
+            for name in names(requirements)}
 
 
 def imported() -> set[str]:
