@@ -594,6 +594,34 @@ def test_a_worker_sees_that_the_clock_is_set():
     worker.close()
 
 
+@pytest.mark.parametrize('seconds', [0.4, 2.0])
+def test_a_worker_on_a_computer_that_was_suspended_cuts_its_coil_off(seconds):
+    bench, slept = Bench(), [0]
+
+    def clock() -> int:
+        return monotonic_ns() + slept[0]
+
+    # CLOCK_BOOTTIME counts the suspension, as the wall clock does; waits do not.
+    worker = HardwareWorker(lambda: HardwareDevice(
+        [HardwareJoint(bench, 0.5, Fallback(1.0, 'zero'))], time=clock(), calls=Calls(60.0)),
+        clock, clock)
+    assert worker.started(60.0)
+    worker.receive(0, 0, 0.1)
+    wait_until(lambda: bench.levels[-1] == 0.1, 'the level')
+    slept[0] = round(seconds * 1000) * MS
+    if seconds > 1.0:
+        # As the node does on its next tick.
+        worker.stood_still(slept[0])
+    wait_until(lambda: bench.levels[-1] == 0.0, 'the end of the level')
+    notices = worker.device.notices()
+    assert [x.kind for x in notices] == [Kind.SILENT]
+    assert ('stood still for' in notices[0].text) == (seconds > 1.0)
+    worker.receive(0, clock(), 0.2)
+    wait_until(worker.device.notices, 'the refusal')
+    assert bench.levels == [0.0, 0.1, 0.0]
+    worker.close()
+
+
 @pytest.mark.parametrize('clock', [
     lambda self: 'now', lambda self: None, lambda self: 10**400])
 def test_a_clock_that_says_no_time_refuses_the_start(clock):
