@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa_ros.runtime.environment import Environment
@@ -291,3 +292,29 @@ def test_reports_that_come_late_are_no_loss():
     assert len({(x.stamp, x.flux_density) for x in bench.sent if x.stamp in {
         y for y, _ in bench.applied}}) == 12
     assert bench.left(1.3, 0.2) < 1e-3
+
+
+@pytest.mark.parametrize(('part', 'percent'), [(0.01, 4.3), (0.05, 21), (1 / 6, 67), (0.25, 95)])
+def test_one_late_level_leaves_what_the_guide_says_and_levels_that_are_all_late_nothing(
+        part, percent):
+    block = paper_actuator()
+    planner = Planner(block, Options(flux_density_min=-LIMIT, flux_density_max=LIMIT))
+    planner.setpoint(1.2, START)
+    levels = planner.due(START + 1000 * MS)
+    period = 2.0 * math.pi / planner.model.frequency(1.2) * block.time_unit * 1e9
+
+    def left(*late: int) -> float:
+        """Return the vibration in % of the step after some of the levels were late."""
+        simulation = ActuatorSimulation(block, time=START)
+        for i, x in enumerate(levels):
+            delay = round(part * period) if i in late else 0
+            simulation.command(x.stamp + delay, x.flux_density)
+        begin = levels[-1].stamp + round(part * period)
+        stretches = []
+        for k in range(200):
+            simulation.advance(begin + round(k / 100 * period))
+            stretches.append(simulation.stretch)
+        return np.ptp(stretches) / 0.2 * 100
+
+    assert [left(0), left(1)] == pytest.approx([percent, percent], rel=0.02)
+    assert left(0, 1) < 1e-4

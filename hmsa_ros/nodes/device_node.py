@@ -47,7 +47,8 @@ FALLBACK = (
     ParameterSpec(
         'lateness_limit', 0.1,
         'Largest lateness of a command that is still applied, at once; a later one is refused, '
-        'and the planner sends the rest anew, from the state.', 's', 1e-4, 1e6),
+        'and the planner sends the rest anew, from the state. One level that is late by a '
+        'twentieth of the natural period leaves 20 % of the step.', 's', 1e-4, 1e6),
 )
 
 COMMAND_SOURCE = ParameterSpec(
