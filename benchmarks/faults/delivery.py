@@ -106,7 +106,7 @@ def _delay_always(rig: Rig) -> Seen:
 
 @FAULTS.fault(
     'drop', 'a command lost', 'relay drops the second of a move',
-    'a heartbeat carries the level; the planner re-plans')
+    'no heartbeat carries the level, which would be late; the planner re-plans')
 def _drop(rig: Rig) -> Seen:
     remap = rig.relay('--drop', '2')
     pair(rig, remap=remap, planner={'lead_time': LEAD})
@@ -129,9 +129,9 @@ def _learnt(rig: Rig) -> Seen:
     rig.let_pass(1.2)
     rig.fresh('planner')
     stamps, values = rig.samples(mark)
-    # Use the plant's reports, since a level may be in force for less than a sample. The second
-    # change is the level from the heartbeat. The replanned levels take effect lead_time later;
-    # without them, vibration would fall to a hundredth by then.
+    # Use the plant's reports, since a level may be in force for less than a sample. The replanned
+    # levels take effect lead_time after the planner learns of the loss; without them, vibration
+    # would fall to a hundredth by then.
     changes = [stamp for stamp, _ in rig.applied[first:]]
     if len(changes) < 2:
         return Seen(f'{len(changes)} changes in force: expected at least 2', '-', False)
