@@ -33,6 +33,7 @@ _QUIET = {
     'distributed.admin.system-monitor.interval': '10s',
     'distributed.worker.memory.monitor-interval': '1s',
     'distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_': 1 << 30,
+    'distributed.worker.preload': [__name__],
 }
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -130,6 +131,12 @@ def cluster(address: str, workers: int | None = None) -> Iterator[Compute]:
             return list(client.gather(futures))
 
         yield compute
+
+
+def dask_setup(_: Any) -> None:
+    """Ignore Ctrl-C in a worker of a local cluster, which its parent ends; called by Dask."""
+    # Ctrl-C on a terminal would print two tracebacks for each worker.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def in_order(

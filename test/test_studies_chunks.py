@@ -195,12 +195,15 @@ def test_a_local_dask_cluster_leaves_the_cores_to_the_kernels():
     get = dask.config.get
     before, keys = get('distributed.worker.profile.enabled'), []
     with schedulers.cluster('local', 1) as compute:
-        profile, threshold = compute([
+        profile, threshold, handler = compute([
             dask.delayed(get)('distributed.worker.profile.enabled'),
-            dask.delayed(os.getenv)('MALLOC_TRIM_THRESHOLD_')], keys.append)
+            dask.delayed(os.getenv)('MALLOC_TRIM_THRESHOLD_'),
+            dask.delayed(signal.getsignal)(signal.SIGINT)], keys.append)
     assert profile is False
     assert int(threshold) > 1e9
-    assert len(keys) == 2
+    # Ctrl-C is for the parent, which ends its workers.
+    assert handler == signal.SIG_IGN
+    assert len(keys) == 3
     assert get('distributed.worker.profile.enabled') is before
 
 
