@@ -358,7 +358,7 @@ def test_refused_request_leaves_the_one_alone_that_is_being_planned():
     rig.effort = MS // 5
     rig.runtime.request(zigzag(200))
     assert rig.runtime.request(StretchRequest('a', 9.0)).code == 'out_of_range'
-    while rig.runtime.wake == 0:
+    while rig.runtime.planning:
         rig.tick()
     assert rig.status.verdict.code == 'accepted'
     assert rig.status.progress.setpoints == 200

@@ -29,6 +29,8 @@ LATCHED = Quality(1, latched=True)
 NEWEST = Quality(1, reliable=False)
 # The last changes of level, for late subscribers and for a recorder that pauses.
 CHANGES = Quality(1000, latched=True)
+# The outcomes of the last setpoints, for a recorder that has just been started or pauses.
+OUTCOME = Quality(1000, latched=True)
 CLOCK = Quality(1, reliable=False)
 
 
@@ -108,6 +110,18 @@ STATUS = Topic(
     '~/status', 'diagnostic_msgs/msg/DiagnosticStatus', LATCHED,
     'The status of the last request: a code and a sentence, the measured values of the last '
     'setpoint, and the progress of the sequence.', publishers=(PLANNER,))
+OUTCOMES = Topic(
+    '~/outcomes', 'diagnostic_msgs/msg/DiagnosticStatus', OUTCOME,
+    'The outcome of each requested setpoint, once it is judged or over, and again if that '
+    'changes; `hardware_id` is the joint, `message` a sentence, and times are in ns. Asked: '
+    '`asked` (setpoint, path or levels), `request`, `plan`, `setpoint` of `setpoints`, `target` '
+    'and `start` in `coordinate`, `begins`, `end`, and whether it is `held` after that. Planned: '
+    '`moves`, a list of begin and arrival as planned first and after each new plan, the last '
+    '`arrival`, and whether it was `corrected` from samples. Over before its time: `ended` '
+    '(replaced, stopped, or the code of the status) at `until`; setpoints that never began share '
+    'one outcome, from `setpoint` `through` another. Found: `verdict` and its figures in stretch, '
+    'unless it ended before it could be judged.',
+    publishers=(PLANNER,))
 ESTIMATE = Topic(
     '~/estimate', 'diagnostic_msgs/msg/DiagnosticArray', RELIABLE,
     'With the parameter `feedback`: a sentence for each joint, the estimated parameters with '

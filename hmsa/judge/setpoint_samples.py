@@ -51,6 +51,7 @@ class SetpointSamples:
         self._doing = doing
         self._judging: Awaited[Finding | None] | None = None
         self._end, self._goal = setpoint.end, goal
+        self._cut: int | None = None  # time in ns at which another setpoint takes its place
         self._samples: dict[int, float] = {}
         self._moving: set[int] = set()  # parts of the move that have a sample
         # Timestamp of the newest sample, the newest timestamp seen, and when that was.
@@ -94,6 +95,15 @@ class SetpointSamples:
         self.found, self.over, self.unreported = None, False, False
         self._begin_at(arrival)
 
+    @property
+    def requested(self) -> RequestedSetpoint:
+        """The setpoint as requested, with the arrival of the newest plan."""
+        return replace(self.setpoint, end=self._end)
+
+    def cut(self, time: int) -> None:
+        """Judge it by the samples before a time in ns, at which another takes its place."""
+        self._cut = time
+
     def miss(self, reason: str) -> None:
         """Record that the setpoint is not carried out, whatever the samples have shown so far."""
         if self.found is None or self.found.verdict is not Code.MISSED:
@@ -108,7 +118,7 @@ class SetpointSamples:
             return False
         if self._seen < stamp <= self._closes:
             self._seen, self._heard = stamp, steady
-        return stamp >= self.due > self._newest or (
+        return stamp >= self._next_look > self._newest or (
             stamp not in self._samples and self._counts(stamp))
 
     def add(self, stamp: int, stretch: float, now: int) -> None:
@@ -117,7 +127,7 @@ class SetpointSamples:
             self._ahead = max(self._ahead, stamp - now)
             return
         self._newest = max(self._newest, stamp)
-        if self._counts(stamp):
+        if (self._cut is None or stamp < self._cut) and self._counts(stamp):
             self._samples.setdefault(stamp, stretch)
             if stamp < self.asked:
                 self._moving.add(self._cell(stamp))
@@ -204,19 +214,30 @@ class SetpointSamples:
             return 0
         if self._judging is not None:
             return now + ANSWER
-        return self._begin if now < self._begin else self.due if now < self.due else 0
+        return self._begin if now < self._begin else (
+            self._next_look if now < self._next_look else 0)
+
+    @property
+    def _next_look(self) -> int:
+        """Time in ns at which to judge next."""
+        return self.due if self._cut is None else min(self.due, self._cut)
 
     def _ready(self, now: int, steady: int, *, observable: bool) -> bool:
         if now >= self._begin and not observable and not self._samples:
             self.due = self._closes
             return True
-        if now < self.due:
+        if now < self._next_look:
             return False
+        closes = self._closes if self._cut is None else min(self._closes, self._cut)
         if self._newest >= self.due and self._first() < ENOUGH:
             self.due = max(self.due, min(self._begin + _RARE, self._closes))
         if self._newest >= self.due:
             return True
-        if now < self._closes:
+        if self._newest >= closes:
+            # Another setpoint has taken its place.
+            self.due = self._closes
+            return True
+        if now < closes:
             return False
         if not self._waits:
             # Samples may still wait to be read.

@@ -86,7 +86,7 @@ class Experiment:
         own += [topics.JOINT_STATES.name, *(
             topics.from_outside(x.name, topics.PLANNER)
             for x in (topics.JOINT_TRAJECTORY, topics.PLAN, topics.STATUS,
-                      topics.ESTIMATE))]
+                      topics.OUTCOMES, topics.ESTIMATE))]
         space = self.namespace.strip('/')
         return [*(f'/{space}/{x}' if space else f'/{x}' for x in own), '/diagnostics', '/clock']
 

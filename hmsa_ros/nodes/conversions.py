@@ -21,6 +21,7 @@ from hmsa_ros.nodes.capture import decode
 
 if TYPE_CHECKING:
     # Imported with the planner, which a recorder does not need.
+    from hmsa.interfaces.outcome import Outcome
     from hmsa_ros.runtime.records import StatusChanged
 
 #: Contents of a receipt while commands from before a cut-off, or all commands, are rejected.
@@ -155,6 +156,13 @@ def to_planner_status(status: 'StatusChanged') -> DiagnosticStatus:
             values[key] = trouble
             severity, message = max(severity, 1), f'{message}; but {trouble}'
     return to_status('planner: request', ', '.join(each), severity, message, values)
+
+
+def to_outcome(outcome: 'Outcome') -> DiagnosticStatus:
+    """Return the outcome of a setpoint."""
+    fine = outcome.finding is not None and not outcome.finding.failed
+    return to_status(
+        'planner: outcome', outcome.joint, int(not fine), outcome.message, outcome.to_texts())
 
 
 def from_samples(data: bytes) -> Iterator[tuple[str, int, tuple[float, float, float]]]:

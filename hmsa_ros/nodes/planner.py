@@ -15,6 +15,7 @@ from rosgraph_msgs.msg import Clock
 from hmsa.errors import BadInputError, BagError
 from hmsa.interfaces import topics
 from hmsa.interfaces.actuator import actuator_from
+from hmsa.interfaces.outcome import Outcome
 from hmsa.model.actuators import unheld
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
@@ -115,8 +116,9 @@ class PlannerNode(ManagedNode):
             self, x, names, self._runtime, self._serve_soon, linked=self.linked) for x in names}
         if not self.linked:
             self._newest = ros_entities.listen(self, _NEWEST)
-        self._plan, self._status, self._estimate = (
-            ros_entities.publisher(self, x) for x in (topics.PLAN, topics.STATUS, topics.ESTIMATE))
+        self._plan, self._status, self._outcomes, self._estimate = (
+            ros_entities.publisher(self, x) for x in (
+                topics.PLAN, topics.STATUS, topics.OUTCOMES, topics.ESTIMATE))
         self._targets = TargetMarkers(self, self._settings)
         ros_entities.subscribe(self, topics.JOINT_TRAJECTORY, self._on_trajectory, raw=True)
         self.offer(topics.STOP, self._on_stop)
@@ -346,6 +348,8 @@ class PlannerNode(ManagedNode):
                 self._targets.show(self.now(), {
                     name: float(x.stretch) if x.stretch else None
                     for name, x in output.each.items()})
+            case Outcome():
+                self._outcomes.publish(conversions.to_outcome(output))
             case records.EstimateChanged():
                 self._estimate.publish(conversions.to_diagnostics(
                     output.time, conversions.to_status(

@@ -1,10 +1,11 @@
-"""The setpoints of a request as requested, and the findings from samples of each."""
+"""The setpoints of a request as requested, the findings from samples of each, and outcomes."""
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from hmsa.interfaces.outcome import LEVELS, Outcome, PATH, REPLACED, SETPOINT, STOPPED
 from hmsa.judge.records import (
     Finding,
     GoalTolerances,
@@ -16,31 +17,45 @@ from hmsa.judge.records import (
 from hmsa.judge.setpoint_samples import AHEAD, SetpointSamples
 from hmsa.model.equations import stretch_limits
 from hmsa.model.law import critical_zeta
+from hmsa.model.status import Code
 from hmsa.offload import Awaited, Doing
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.timeline import PlannedSegment, Timeline
 from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.follower import Follower
+from hmsa_ros.runtime.records import Request, Stop, Trajectory
 
 # Largest age of the newest sample for further samples to be expected, by the steady clock.
 _RECENT = 10_000_000_000
 _LEFT_OUT = 'commands came late, and there was no time left for it'
 _UNDONE = 'its commands were not sent in time, or took no effect'
 _STOPPED = 'the joint came to rest instead'
+# Why a setpoint is missed, by the code of the status that drops its plan.
+_DROPPED = {
+    Code.CUT_OFF: 'the coil was cut off', Code.INTERLOCK: 'the interlock was opened',
+    Code.CLOCKS_DIFFER: 'the clocks of planner and device differ',
+    Code.MISSED: 'plant or driver started after its commands were sent'}
+# What was asked for by the code of its plan.
+_ASKED = {Code.LEVELS: LEVELS, Code.PATH: PATH}
 
 
-@dataclass
+@dataclass(eq=False)
 class _Joint:
     """The setpoints of a joint as requested, and their findings."""
 
+    key: str
     name: str  # empty if there is only one
     doing: Doing  # executes the judging
     asked: Timeline  # plan as accepted
     plan: Timeline  # plan now
     request: int  # number of the request in the group
+    label: str | None = None  # name of the request; None for a stop, which has no outcome
     goal: GoalTolerances | None = None  # tolerances at the last setpoint
     following: int = 0  # number, from 0, of the next setpoint to watch
+    ended: str = ''  # why the request is over before its time
+    until: int | None = None  # when it is
     left: Sequence[int] = field(init=False)  # numbers of setpoints that are still planned
+    reached: int = field(init=False)  # number of the first one that is not reached any more
     holds: list[SetpointSamples] = field(
         default_factory=list)  # the last one stays after it is over
     news: list[Finding] = field(default_factory=list)  # findings that need no samples
@@ -48,9 +63,11 @@ class _Joint:
     needed: bool = False  # whether the plan was replanned after a deviation
     newest: Finding | None = None
     closed: Finding | None = None  # worst finding of the setpoints that are over
+    # Begin and arrival of the moves of setpoints that have begun, by number.
+    moves: dict[int, list[tuple[int, int | None]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.left = range(self.count)
+        self.left, self.reached = range(self.count), self.count
 
     @property
     def count(self) -> int:
@@ -60,7 +77,7 @@ class _Joint:
     @property
     def begins(self) -> int | None:
         """Time in ns at which the next setpoint to watch begins; None if there is none."""
-        if self.following >= self.count:
+        if self.following >= self.reached:
             return None
         return self.asked.segments[self.asked.kept + self.following].since
 
@@ -105,25 +122,29 @@ class _Joint:
         return {x for x in range(self.following)
                 if (one := self.segment(x)) is not None and not one.carried_out}
 
-    def stop(self, plan: Timeline) -> None:
-        """Record that a joint came to rest instead of completing a request."""
-        self.plan = plan
+    def stop(self, plan: Timeline, now: int) -> None:
+        """Record that a joint comes to rest instead of completing a request."""
+        self.plan, self.ended, self.until = plan, STOPPED, now
         for hold in self.holds:
             hold.miss(_STOPPED)
         self._miss((x for x in self.left if x >= self.following), _STOPPED)
         self.following = self.count
 
-    def change(self, plan: Timeline, now: int) -> None:
-        """Adopt a new plan; the setpoints that it leaves out are missed."""
+    def change(self, plan: Timeline, now: int, dropped: Code | None = None) -> None:
+        """Adopt a new plan, or none if dropped; the setpoints that it leaves out are missed."""
+        why = _LEFT_OUT
+        if dropped is not None:
+            why, self.ended, self.until = _DROPPED[dropped], dropped, now
         self.needed |= not self.corrected
         self.corrected = False
         begun = {x.setpoint.number - 1: x for x in self.holds}
         undone = self.undone()
         gone = self.leave_out(plan, now)
         for number in begun.keys() & gone:
-            begun[number].miss(_LEFT_OUT)
-        self._miss((x for x in gone if x not in begun and x >= self.following), _LEFT_OUT)
-        for hold in self.holds:
+            begun[number].miss(why)
+        self._miss((x for x in gone if x not in begun and x >= self.following), why)
+        # After a plan that was dropped, what was reached before stays so.
+        for hold in self.holds if plan.segments else ():
             self._keep_up(hold)
         self._miss(sorted(self.undone() - undone - begun.keys()), _UNDONE)
 
@@ -140,10 +161,13 @@ class _Joint:
             if hold.over:
                 self.close(hold.found)
         self.holds = [x for x in self.holds if not x.over or x.unreported]
+        self.moves = {x: self.moves[x] for y in self.holds
+                      if (x := y.setpoint.number - 1) in self.moves}
         self.holds.append(self._hold(number))
 
     def restart_holds(self) -> None:
         """Restart gathering samples of unfinished setpoints, since all times have changed."""
+        self.moves.clear()
         self.holds = [
             x if x.over else self._hold(x.setpoint.number - 1) for x in self.holds]
 
@@ -151,12 +175,21 @@ class _Joint:
         """Return a new hold for a setpoint."""
         setpoint = self._setpoint(number)
         hold = SetpointSamples(setpoint, self.goal if setpoint.held else None, self.doing)
+        if self.until is not None:
+            hold.cut(self.until)
         self._keep_up(hold)
         return hold
 
     def _keep_up(self, hold: SetpointSamples) -> None:
         """Have a setpoint judged from its arrival in the plan in force."""
-        segment = self.segment(hold.setpoint.number - 1)
+        number = hold.setpoint.number - 1
+        segment = self.segment(number)
+        if segment is not None:
+            moves = self.moves.setdefault(number, [])
+            asked = self.asked.segments[self.asked.kept + number]
+            for x in (asked, segment) if not moves else (segment,):
+                if not moves or moves[-1][1] != x.arrival:
+                    moves.append((x.begin, x.arrival))
         if segment is None:
             hold.miss(_LEFT_OUT)
         elif not segment.carried_out:
@@ -165,6 +198,61 @@ class _Joint:
             hold.move(segment.arrival, corrected=not self.needed)
         elif hold.setpoint.arrival is not None:
             hold.miss('its time ended before the move to it')
+
+    # -- outcomes ------------------------------------------------------------------------------
+
+    def outcome(
+            self, setpoint: RequestedSetpoint, now: int, finding: Finding | None = None,
+            through: int = 0) -> Outcome:
+        """Return the outcome of a setpoint, or of it and all up to a number from 1."""
+        number = setpoint.number - 1
+        asked = self.asked.segments[self.asked.kept + number]
+        early = self.until is not None and (
+            through or finding is None or setpoint.end is None or setpoint.end > self.until)
+        return Outcome(
+            setpoint, _ASKED.get(asked.code, SETPOINT), self.label or '', self.asked.number,
+            self.key, self.plan.levels[0].model.units.coordinate, now, through,
+            tuple(self.moves.get(number, [(asked.begin, asked.arrival)])),
+            not self.needed and len(self.moves.get(number, ())) > 1,
+            self.ended if early else '', self.until if early else None, finding)
+
+    def end(self, until: int, ended: str, now: int) -> Iterator[Outcome]:
+        """
+        End the request at a time in ns; yield the outcomes of what cannot be judged any more.
+
+        Setpoints that were to be reached before are judged by their samples until then.
+        """
+        dropped = bool(self.ended)
+        if not dropped:
+            self.until, self.ended = until, ended
+        for found in self.news:
+            yield self.outcome(found.setpoint, now, found)
+        self.news.clear()
+        kept = []
+        for hold in self.holds:
+            setpoint = hold.requested
+            if hold.unreported or hold.over and not dropped and (
+                    setpoint.end is None or setpoint.end > until):
+                yield self.outcome(setpoint, now, hold.found)
+            elif not hold.over and _rest(setpoint) >= until:
+                yield self.outcome(setpoint, now)
+            elif not hold.over:
+                hold.cut(until)
+                kept.append(hold)
+        self.holds = kept
+        for number in (x for x in self.left if x >= self.following):
+            setpoint = self._planned(number)
+            if _rest(setpoint) >= until:
+                yield self.outcome(setpoint, now, through=self.count)
+                self.reached = number
+                break
+
+    def _planned(self, number: int) -> RequestedSetpoint:
+        """Return a setpoint that has not begun, with its arrival in the plan in force."""
+        setpoint, segment = self._setpoint(number), self.segment(number)
+        if segment is None or segment.arrival == setpoint.arrival:
+            return setpoint
+        return replace(setpoint, moved=segment.arrival)
 
     def _setpoint(self, number: int) -> RequestedSetpoint:
         """Return a setpoint as requested."""
@@ -182,16 +270,28 @@ class _Joint:
             self.count, possible=stretch_limits(model.material), held=last)
 
 
+def _rest(setpoint: RequestedSetpoint) -> int:
+    """Return the planned time of rest in ns; the begin of what is only approached."""
+    arrival = setpoint.arrival if setpoint.moved is None else setpoint.moved
+    return setpoint.begins if arrival is None else arrival
+
+
 class ArrivalMonitor:
     """Gather samples of each setpoint as requested, and judge them."""
 
     def __init__(
             self, group: PlannerGroup, environment: Environment,
-            follower: Callable[[], Follower]) -> None:
+            follower: Callable[[], Follower], publish: Callable[[Outcome], None]) -> None:
+        """Begin without setpoints; ``publish`` is called with each outcome."""
         self._group, self._around, self._follower = group, environment, follower
-        #: Goal tolerances of the newest request, by joint.
-        self.goals: Mapping[str, GoalTolerances] = {}
+        self._publish = publish
+        # Goal tolerances of the newest request by joint, and its name; None for a stop.
+        self._goals: Mapping[str, GoalTolerances] = {}
+        self._label: str | None = ''
+        self._dropped: Code | None = None  # code of the status that drops a plan
         self._joints: dict[str, _Joint] = {}
+        # Requests that another replaced, with setpoints that were reached before.
+        self._replaced: list[_Joint] = []
         # Cached, since reading a clock for each sample of each joint would dominate the time.
         self._now = 0
         self._heard: int | None = None
@@ -202,15 +302,46 @@ class ArrivalMonitor:
     def restart(self) -> None:
         """Discard all findings; present plans are not judged."""
         self._opens = None
+        for joint in (*self._replaced, *self._joints.values()):
+            for hold in joint.holds:
+                if not hold.over or hold.unreported:
+                    self._tell(joint, hold.requested, hold.found)
+        self._replaced.clear()
         for name, planner in self._group.planners.items():
             plan = planner.plan
             self._begin(name, replace(plan, kept=len(plan.segments)), plan)
 
+    def asked(self, request: Request) -> None:
+        """Take name and goal tolerances of a request whose plan has just been adopted."""
+        self._label = None if isinstance(request, Stop) else request.name
+        self._goals = request.goals if isinstance(request, Trajectory) else {}
+
+    def dropped(self, code: Code, now: int) -> None:
+        """Record that plans that now have no setpoints were dropped, with a code of a status."""
+        self._dropped = code
+        self.follow(now)
+        self._dropped = None
+
     def _begin(self, name: str, asked: Timeline, plan: Timeline) -> None:
         """Watch the requested setpoints of a joint."""
         self._joints[name] = _Joint(
-            name if len(self._group.planners) > 1 else '', self._do, asked, plan,
-            self._group.number, self.goals.get(name))
+            name, name if len(self._group.planners) > 1 else '', self._do, asked, plan,
+            self._group.number, self._label, self._goals.get(name))
+
+    def _replace(self, name: str, plan: Timeline, now: int) -> None:
+        """Watch the setpoints of a new request of a joint instead of the previous ones."""
+        old = self._joints[name]
+        begin = plan.segments[plan.kept].since if plan.kept < len(plan.segments) else now
+        self._end(old, begin, STOPPED if self._label is None else REPLACED, now)
+        self._begin(name, plan, plan)
+
+    def _end(self, joint: _Joint, until: int, ended: str, now: int) -> None:
+        if joint.label is None:
+            return
+        for outcome in joint.end(until, ended, now):
+            self._publish(outcome)
+        if joint.holds or joint.begins is not None:
+            self._replaced.append(joint)
 
     def _do(self, *work: Any) -> Awaited[Any]:
         """Execute judging where feedback executes its work."""
@@ -218,9 +349,13 @@ class ArrivalMonitor:
 
     def clock_set(self, by: int) -> None:
         """Shift all times by the ns that the clock was set ahead."""
-        for name, joint in self._joints.items():
+        for joint in self._watched:
             joint.asked = joint.asked.shifted(by)
-            joint.plan = self._group.planners[name].plan
+            if joint in self._replaced:
+                joint.plan = joint.plan.shifted(by)
+                joint.until = None if joint.until is None else joint.until + by
+            else:
+                joint.plan = self._group.planners[joint.key].plan
             joint.restart_holds()
         if self._opens is not None:
             self._opens += by
@@ -233,7 +368,12 @@ class ArrivalMonitor:
     @property
     def open(self) -> bool:
         """Whether started setpoints are still to be judged."""
-        return any(x.open for x in self._joints.values())
+        return any(x.open for x in self._watched)
+
+    @property
+    def _watched(self) -> list[_Joint]:
+        """The requests with setpoints to judge, replaced ones first."""
+        return [*self._replaced, *self._joints.values()]
 
     @property
     def finished(self) -> bool:
@@ -258,10 +398,9 @@ class ArrivalMonitor:
 
     def wake(self, now: int) -> int | None:
         """Return the time in ns at which to judge next; None for never, 0 for now."""
-        times = [0 for x in self._joints.values() if x.news]
+        times = [0 for x in self._watched if x.news]
         times += [
-            y.wake(now)
-            for x in self._joints.values() for y in x.holds if not y.over or y.unreported]
+            y.wake(now) for x in self._watched for y in x.holds if not y.over or y.unreported]
         return min(times, default=None)
 
     # -- setpoints -----------------------------------------------------------------------------
@@ -276,20 +415,20 @@ class ArrivalMonitor:
             joint, plan = self._joints[name], planner.plan
             if plan.number == joint.plan.number:
                 if plan.segments is not joint.plan.segments:
-                    joint.change(plan, now)
+                    joint.change(plan, now, None if plan.segments else self._dropped)
             elif self._group.number == joint.request:
-                joint.stop(plan)
+                joint.stop(plan, now)
             else:
-                self._begin(name, plan, plan)
+                self._replace(name, plan, now)
         self._open_until(now)
 
     def _open_until(self, time: int) -> None:
         """Watch the setpoints that start by a time in ns."""
-        for joint in self._joints.values():
+        for joint in self._watched:
             while joint.begins is not None and joint.begins <= time:
                 joint.open_next()
         self._opens = min(
-            (x.begins for x in self._joints.values() if x.begins is not None), default=None)
+            (x.begins for x in self._watched if x.begins is not None), default=None)
 
     # -- samples -------------------------------------------------------------------------------
 
@@ -299,7 +438,7 @@ class ArrivalMonitor:
         self._heard = steady
         if self._opens is not None and stamp >= self._opens:
             self._open_until(min(stamp, self._around.clock() + AHEAD))
-        for joint in self._joints.values():
+        for joint in self._watched:
             for hold in joint.holds:
                 wanted |= hold.needs(stamp, steady)
         return wanted
@@ -310,8 +449,9 @@ class ArrivalMonitor:
             return
         if stamp > self._now:
             self._now = self._around.clock()
-        for hold in self._joints[name].holds:
-            hold.add(stamp, stretch, self._now)
+        for joint in self._watched:
+            for hold in joint.holds if joint.key == name else ():
+                hold.add(stamp, stretch, self._now)
 
     def judge(
             self, now: int, tolerances: Tolerances, until: int, *,
@@ -322,20 +462,34 @@ class ArrivalMonitor:
         No judging begins after the steady time ``until`` in ns.
         """
         self._now = now
-        for name, joint in self._joints.items():
+        for joint in self._watched:
+            current = joint not in self._replaced
             if joint.news:
                 joint.newest = joint.news.pop(0)
+                self._tell(joint, joint.newest.setpoint, joint.newest)
                 joint.close(joint.newest)
                 return joint.newest
             for hold in joint.holds:
                 if (steady := self._around.steady()) >= until:
                     return None
                 found = hold.judge(
-                    now, steady, tolerances, self._follower().sensor(name), observable=observable)
+                    now, steady, tolerances, self._follower().sensor(joint.key),
+                    observable=observable)
                 if hold.news:
                     hold.news = False
-                    self._follower().audit(name, hold)
+                    if current:
+                        self._follower().audit(joint.key, hold)
                 if found is not None:
+                    # Also before it is over: the planner or a recording may end.
+                    self._tell(joint, hold.requested, found)
+                if found is not None and current:
                     joint.newest = found
                     return found
+        self._replaced = [x for x in self._replaced if x.open or x.begins is not None]
         return None
+
+    def _tell(
+            self, joint: _Joint, setpoint: RequestedSetpoint, found: Finding | None) -> None:
+        """Publish the outcome of a setpoint that is decided, unless it is that of a stop."""
+        if joint.label is not None:
+            self._publish(joint.outcome(setpoint, self._now, found))

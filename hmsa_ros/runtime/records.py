@@ -6,6 +6,7 @@ from enum import IntEnum
 from typing import Any, TYPE_CHECKING
 
 from hmsa.errors import BadInputError
+from hmsa.interfaces.outcome import Outcome
 from hmsa.judge.records import Finding, GoalTolerances, Tolerances
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
@@ -197,4 +198,4 @@ class EstimateChanged:
     values: Mapping[str, object]  # in SI, with standard deviations, given values and counters
 
 
-Output = Send | PlanChanged | StatusChanged | Note | EstimateChanged
+Output = Send | PlanChanged | StatusChanged | Note | EstimateChanged | Outcome

@@ -17,7 +17,6 @@ from hmsa_ros.runtime.records import (
     Request,
     Severity,
     StatusChanged,
-    Trajectory,
     Verdict,
 )
 
@@ -110,9 +109,15 @@ class Reporting:
         self.next_change = self._group.next_change(now)
         return *self._group.progress(now), self._watch.open
 
-    def take_goals(self, request: Request) -> None:
-        """Apply the goal tolerances of a request whose plan has just been adopted."""
-        self._watch.goals = request.goals if isinstance(request, Trajectory) else {}
+    def asked(self, request: Request) -> None:
+        """Have the setpoints of a request judged whose plan has just been adopted."""
+        self._watch.asked(request)
+
+    def dropped(self, verdict: Verdict) -> None:
+        """Report that a plan was dropped before its end."""
+        self._watch.dropped(verdict.code, self._around.clock())
+        self.show()
+        self.go_on(verdict, log=True)
 
     def show(self) -> None:
         """Preview the plan; of a long plan only the beginning, and the rest in time."""

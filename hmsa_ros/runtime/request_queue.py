@@ -130,7 +130,7 @@ class RequestQueue:
         """Start to carry out a request."""
         self._following.dropped(drafts)
         changed = self._group.take(drafts, now)
-        self._reporting.take_goals(request)
+        self._reporting.asked(request)
         # Commands are sent first, since reporting takes time.
         self._send()
         warnings = [x.warning for x in drafts.values() if x.warning is not None]

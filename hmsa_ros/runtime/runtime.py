@@ -85,7 +85,8 @@ class Runtime:
             group.planners, around, receipts, self.following.newest,
             self._follows, self._note)
         self._silence = SampleTimeout(around)
-        self._watch = ArrivalMonitor(group, around, lambda: self.follower)
+        self._watch = ArrivalMonitor(
+            group, around, lambda: self.follower, self._outputs.append)
         self.devices = CommandLink(
             group.planners, receipts, self.following, self._takeover, around, self._outputs)
         self._reporting = Reporting(
@@ -240,8 +241,7 @@ class Runtime:
     def _drop(self, verdict: Verdict | None) -> None:
         """Report that a plan was dropped, if there is a verdict."""
         if verdict is not None:
-            self._reporting.show()
-            self._reporting.go_on(verdict, log=True)
+            self._reporting.dropped(verdict)
 
     def applied(self, joint: str, stamp: int, flux_density: float) -> None:
         """Record that a joint's level in T was in force from a timestamp in ns on."""
