@@ -27,6 +27,7 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks.beam_segments import Chain  # noqa: E402
 from hmsa.interfaces.actuator import actuator_from  # noqa: E402
+from hmsa.interfaces.outcome import Outcome  # noqa: E402
 from hmsa.interfaces.parameters import BLOCK  # noqa: E402
 from hmsa.model.creep import Creep  # noqa: E402
 from hmsa.model.delivery import Delivery  # noqa: E402
@@ -45,7 +46,8 @@ from hmsa.report.arrivals import Part  # noqa: E402
 from hmsa.report.paper import SCREEN  # noqa: E402
 from hmsa.report.picture import draw  # noqa: E402
 from hmsa.runs.levels import RecordedLevel  # noqa: E402
-from hmsa.runs.record import RecordedRequest, Run  # noqa: E402
+from hmsa.runs.record import Run  # noqa: E402
+from hmsa.runs.setpoints import described  # noqa: E402
 from hmsa_ros.clients.adapting import second_act  # noqa: E402
 from hmsa_ros.clients.demo import SEQUENCE  # noqa: E402
 from hmsa_studies.__main__ import PICTURES as STUDIES  # noqa: E402
@@ -287,12 +289,17 @@ def simulated(*setpoints: tuple[float, float], rate: float) -> Run:
         plant.advance(stamp)
         samples.append((stamp, plant.stretch, plant.rate, plant.flux_density))
     time, *motion = (np.array(x) for x in zip(*samples, strict=True))
+    asked, before = [], block.rest
+    for x in plan.segments:
+        setpoint = described(block, x.stretch, before, x.since, x.until)
+        asked.append(Outcome(replace(setpoint, arrival=x.arrival)))
+        before = x.stretch
     return Run(
         'run', 'actuator', Path('run'), time, time, *motion,
         commands=tuple(RecordedLevel(x.stamp, x.flux_density, x.sent) for x in levels),
         plans=(levels,),
-        requests=(RecordedRequest(start, 0, tuple(points)),), plant=block, planner=block,
-        parameters_known=True, origin='simulated')
+        outcomes=tuple(asked), plant=block, planner=block, parameters_known=True,
+        origin='simulated')
 
 
 def demo(path: Path) -> None:

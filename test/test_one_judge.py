@@ -1,4 +1,4 @@
-"""The planner and the evaluation of its record reach the same findings for the same motion."""
+"""Status, outcomes and the samples of a record give the same findings for the same motion."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -10,6 +10,7 @@ import random
 import numpy as np
 import pytest
 
+from hmsa.interfaces.outcome import newest, Outcome
 from hmsa.judge.records import SensorModel
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
@@ -17,13 +18,12 @@ from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa.report.outcome import findings_of
 from hmsa.runs.levels import RecordedLevel
-from hmsa.runs.record import LearntSensor, RecordedRequest, RecordedVerdict, Run
+from hmsa.runs.record import LearntSensor, Run
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.records import (
     EstimateChanged,
-    PlanChanged,
     Send,
     Settings,
     StatusChanged,
@@ -33,7 +33,6 @@ from hmsa_ros.runtime.runtime import Runtime
 
 MS = 1_000_000
 START = 1000 * MS
-LEVELS = ('ok', 'warning', 'error')
 
 
 # Experiments in which the planner does nothing for some time.
@@ -80,13 +79,12 @@ class Drawn:
         self.waiting: list[tuple[int, float]] = []
         self.record = Run(
             'run', 'a', Path('run'), *([np.zeros(1, dtype=np.int64)] * 2), *([np.zeros(1)] * 3),
-            requests=(RecordedRequest(START, 0, tuple((x, y) for (x,), y in self.points)),),
             plant=block, planner=block, parameters_known=True)
 
     def carry_out(self) -> Run:
         """Carry it out, and return the run as a recorder would store it."""
         self.runtime.request(Trajectory(('a',), self.points, len(self.points), name='x'))
-        plans, commands, verdicts, samples, sensors = [], [], [], [], []
+        commands, outcomes, samples, sensors = [], [], [], []
         under_way: list[tuple[int, Send]] = []
         changed, read = [], []
         end = START + self.points[-1][1] + 1500 * MS
@@ -98,19 +96,13 @@ class Drawn:
                     commands.append(RecordedLevel(x.stamp, x.flux_density, self.now))
                     late = self.late_from <= self.now < self.late_from + self.late_for
                     under_way.append((self.now + self.late * late, x))
-                elif isinstance(x, PlanChanged):
-                    plans.append(tuple(
-                        RecordedLevel(stamp, level, self.now, stretch, speed) for stamp, (
-                            stretch, speed, level) in zip(
-                                x.stamps, x.samples['a'], strict=True)))
+                elif isinstance(x, Outcome):
+                    outcomes.append(x)
                 elif isinstance(x, EstimateChanged):
                     sensors.append(LearntSensor(self.now, SensorModel.of(
                         {key: str(value) for key, value in x.values.items()})))
                 elif isinstance(x, StatusChanged):
                     watching = x.watching
-                    verdicts.append(RecordedVerdict(
-                        self.now, LEVELS[x.verdict.severity], x.verdict.code, x.verdict.message,
-                        x.plan))
                     # Of several in one tick the newest is told, and the worst of all.
                     self.online |= {
                         y.setpoint.number: str(y.verdict) for y in (
@@ -136,8 +128,8 @@ class Drawn:
         unknown = np.full(len(time), math.nan)
         return replace(
             self.record, time=time, logged=logged, stretch=stretch, rate=unknown,
-            flux_density=unknown, commands=tuple(commands), plans=tuple(plans),
-            verdicts=tuple(verdicts), sensors=tuple(sensors))
+            flux_density=unknown, commands=tuple(commands), outcomes=tuple(newest(outcomes)),
+            sensors=tuple(sensors))
 
     def shown(self) -> list[tuple[int, float]]:
         """Return the samples that arrive now."""
@@ -162,34 +154,28 @@ def carried_out(seed: int) -> tuple[Drawn, Run]:
 
 
 def said(seeds: Iterable[int]) -> set[str]:
-    """Compare online findings with those from the record; return all verdicts."""
+    """Compare the findings of status, outcomes and samples; return all verdicts."""
     seen = set()
     for seed in seeds:
         drawn, run = carried_out(seed)
-        offline = {x.setpoint.number: str(x.verdict) for x in findings_of(run)}
-        assert offline == drawn.online, seed
-        seen |= set(offline.values())
+        told = {x.setpoint.number: str(x.verdict) for x in findings_of(run)}
+        assert told == drawn.online, seed
+        # A setpoint that was missed has no samples of its own.
+        blind = replace(run, outcomes=tuple(
+            x if x.missed else replace(x, finding=None) for x in run.outcomes))
+        if drawn.way != 'ahead':
+            assert {x.setpoint.number: str(x.verdict) for x in findings_of(blind)} == told, seed
+        seen |= set(told.values())
     return seen
 
 
-def test_status_and_record_have_the_same_verdicts():
+def test_status_outcomes_and_samples_have_the_same_verdicts():
     assert said([0, 3, *STALLED]) >= {
         'arrived', 'off_target', 'undecided', 'late', 'missed'}
 
 
-@pytest.mark.parametrize('behind', [-1, 1])
-def test_a_recorder_whose_clock_lags_shows_the_same_setpoints(behind):
-    for seed in range(4):
-        _, run = carried_out(seed)
-        # Plans begin with the level in force, as of the time of the planner.
-        first = RecordedLevel(START + behind * MS, 0.0, START, 1.0, 0.0)
-        shown = replace(run, plans=((first, *run.plans[0]), *run.plans[1:]))
-        assert [x.setpoint for x in findings_of(shown)] == [
-            x.setpoint for x in findings_of(run)], seed
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize('part', range(2))
-def test_status_and_record_have_the_same_verdicts_of_many_runs(part):
+def test_status_outcomes_and_samples_have_the_same_verdicts_of_many_runs(part):
     first = 12 + 37 * part
     assert said(range(first, first + 37)) >= {'arrived', 'off_target', 'undecided', 'missed'}

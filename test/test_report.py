@@ -24,31 +24,32 @@ from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.identification.runs import recording_of
 from hmsa.interfaces.actuator import parameters_of
+from hmsa.interfaces.outcome import Outcome
 from hmsa.interfaces.parameters import ACTUATOR_FIELDS
+from hmsa.judge.records import Tolerances
 from hmsa.model.creep import Creep
 from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.residual import percent, residual_vibration
 from hmsa.model.simulation import ActuatorSimulation, simulate
 from hmsa.model.units import NANOSECONDS
-from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa.report.arrivals import Part
 from hmsa.report.charts import MOST_PANELS
 from hmsa.report.curves import BUCKETS, decimate
 from hmsa.report.evaluation import evaluate, plan_points
-from hmsa.report.outcome import level_results
+from hmsa.report.outcome import findings_of, level_results
 from hmsa.report.page import page
 from hmsa.report.picture import draw
 from hmsa.runs.bags import read_run, read_runs
 from hmsa.runs.levels import in_force, RecordedLevel, without_repeats
+from hmsa.runs.setpoints import described
 from hmsa.runs.topics import (
     APPLIED,
     COMMAND,
     JOINT_STATES,
+    OUTCOMES,
     PLAN,
-    SETPOINT,
     STATUS,
-    TRAJECTORY,
     TYPES,
 )
 from hmsa.runs.verify import verify
@@ -104,12 +105,31 @@ def trajectory(time, points):
             for after, *values in points])
 
 
-def status(level, code, message, stretch='', **more):
+def diagnostic(level, message, values, joint='actuator'):
     value = STORE.types['diagnostic_msgs/msg/KeyValue']
     return STORE.types[TYPES[STATUS]](
-        level=level, name='planner: request', message=message, hardware_id='actuator',
-        values=[value(key=x, value=y) for x, y in {
-            'code': code, 'stretch': stretch, **more}.items()])
+        level=level, name='planner', message=message, hardware_id=joint,
+        values=[value(key=x, value=y) for x, y in values.items()])
+
+
+def status(level, code, message, **more):
+    return diagnostic(level, message, {'code': code, **more})
+
+
+def outcomes(plan, actuator, *, space='', **more):
+    """Return the outcomes of the setpoints of a plan, which leave the judging to the samples."""
+    messages, start, count = [], plan.levels[0].stretch, len(plan.segments)
+    for number, x in enumerate(plan.segments, 1):
+        setpoint = described(actuator, x.stretch, start, x.since, x.until)
+        told = Outcome(
+            replace(setpoint, number=number, count=count, arrival=x.arrival, held=number == count),
+            plan=1, joint='actuator', moves=((x.begin, x.arrival),),
+            decided=x.arrival or x.until, **more)
+        messages.append((
+            told.decided, f'{space}/{OUTCOMES}', TYPES[OUTCOMES],
+            diagnostic(0, told.message, told.to_texts())))
+        start = x.stretch
+    return messages
 
 
 def parameters(**nodes):
@@ -155,11 +175,12 @@ def fresh(
     levels = [x for x in plan.levels if x.stamp >= 0]
     random = np.random.default_rng(1)
     messages = [
-        (START, f'{space}/planner/joint_trajectory', TYPES[TRAJECTORY],
+        (START, f'{space}/planner/joint_trajectory', TYPES[PLAN],
          trajectory(0, asked)),
         (START, f'{space}/planner/plan', TYPES[PLAN], trajectory(levels[0].stamp, [
             (x.stamp - levels[0].stamp, x.stretch, x.rate, x.flux_density) for x in levels])),
-        (START, f'{space}/planner/status', TYPES[STATUS], status(0, 'accepted', 'accepted'))]
+        (START, f'{space}/planner/status', TYPES[STATUS],
+         status(0, 'accepted', 'accepted', request='coil'))]
     for level in levels:
         messages.append((
             level.stamp - LEAD, f'{space}/flux_density_command', TYPES[COMMAND],
@@ -171,7 +192,7 @@ def fresh(
         stretch = simulation.stretch + noise * random.standard_normal()
         messages.append((time, f'{space}/joint_states', TYPES[JOINT_STATES], joint_state(
             time, stretch, simulation.rate, simulation.flux_density)))
-    return messages
+    return messages + outcomes(plan, actuator, space=space)
 
 
 def payload(message, kind):
@@ -232,7 +253,6 @@ def test_a_path_is_one_setpoint_which_is_judged_from_its_end_on(tmp_path):
     part = one(
         tmp_path / 'run', simulated(path=path, extra=0.1),
         **parameters(planner=ACTUATOR, plant=ACTUATOR))
-    assert [(x.points, x.path) for x in part.run.requests] == [(((1.2, None),), end)]
     finding, = part.evaluation.findings
     assert (str(finding.verdict), finding.setpoint.target) == ('arrived', 1.2)
     assert finding.setpoint.arrival == START + LEAD + end
@@ -396,39 +416,20 @@ def test_the_page_of_a_beam_speaks_of_its_deflection(tmp_path):
     assert not re.search('stretch|J_lim|chain limit', shown)
 
 
-def test_without_the_requests_setpoints_are_told_by_the_levels_that_last(tmp_path, bag):
-    messages = without(simulated(), 'joint_trajectory', 'status', 'plan')
+def test_without_outcomes_setpoints_are_told_by_the_levels_that_last(tmp_path, bag):
+    messages = without(simulated(), 'joint_trajectory', 'status', 'plan', 'outcomes')
     part = one(tmp_path / 'bag', messages, **parameters(planner=ACTUATOR, plant=ACTUATOR))
     expected, = parts_of(bag)
     for ours, theirs in zip(
             part.evaluation.results, expected.evaluation.results, strict=True):
         assert ours.stretch == pytest.approx(theirs.stretch, abs=SAME)
         assert ours.arrival == theirs.arrival
+    assert any('recorded without outcomes' in x for x in part.run.notes)
     assert part.evaluation.plan == ()
     assert 'plan-section' not in Page(page([part])).ids
 
 
-@pytest.mark.parametrize('late', [2 * LEAD, -LEAD])
-def test_a_request_that_a_recorder_received_out_of_order_counts_from_its_own_status(
-        tmp_path, bag, late):
-    messages = without(simulated(), 'joint_trajectory', 'status')
-    request, = (x for _, topic, _, x in simulated() if topic.endswith('joint_trajectory'))
-    request.header.frame_id = 'b'
-    earlier, own = status(0, 'arrived', 'arrived'), status(0, 'accepted', 'accepted')
-    for told, name, plan in ((earlier, 'a', '1'), (own, 'b', '2')):
-        told.values += [STORE.types['diagnostic_msgs/msg/KeyValue'](key=key, value=value)
-                        for key, value in (('request', name), ('plan', plan))]
-    messages += [
-        # What is latched comes when the recorder is matched.
-        (START - 2, '/planner/status', TYPES[STATUS], earlier),
-        (START + 1, '/planner/status', TYPES[STATUS], own),
-        (START + late, '/planner/joint_trajectory', TYPES[TRAJECTORY], request)]
-    part = one(tmp_path / 'bag', messages, **parameters(planner=ACTUATOR, plant=ACTUATOR))
-    expected, = parts_of(bag)
-    assert part.evaluation.findings == expected.evaluation.findings
-
-
-def test_unknown_parameters_are_said_to_be_unknown_and_the_plan_still_tells_the_setpoints(
+def test_unknown_parameters_are_said_to_be_unknown_and_outcomes_still_tell_the_setpoints(
         tmp_path):
     other = paper_actuator(NondimensionalParameters(zeta=0.1, j_lim=8.0))
     part = one(tmp_path / 'bag', simulated())
@@ -805,7 +806,8 @@ def test_broken_samples_and_commands_are_left_out_and_told(tmp_path):
         for i, x in enumerate(simulated())]
     messages.append((START, '/flux_density_command', TYPES[COMMAND], command(START, 1.0, 5.0)))
     part = one(tmp_path / 'bag', messages, **parameters(plant=ACTUATOR))
-    assert len(part.run.time) == len(without(simulated(), 'plan', 'status', 'y', 'command')) - 1
+    assert len(part.run.time) == len(without(
+        simulated(), 'plan', 'status', 'y', 'command', 'outcomes')) - 1
     assert len(part.run.commands) == 6
     notes = ' '.join(part.run.notes)
     assert '1 samples are not finite' in notes
@@ -833,7 +835,8 @@ def test_garbage_among_the_messages_does_not_spoil_the_rest(tmp_path):
     assert len(part.run.time) == len(clean.run.time) + 1
     assert np.max(np.abs(part.run.rate)) < 1e3
     notes = ' '.join(part.run.notes)
-    for topic in names:
+    # Requests are not evaluated.
+    for topic in names.keys() - {'/planner/joint_trajectory'}:
         assert f'a message of topic {topic} does not decode' in notes
     assert '1 samples are stamped more than 30 days away' in notes
     assert '2 samples are not finite numbers, or beyond 1e+06' in notes
@@ -852,21 +855,22 @@ def test_a_plan_without_a_point_is_no_plan(tmp_path):
 @pytest.mark.parametrize(('text', 'reached'), [
     ('NaN', [1.1, 1.2, 1.4]), ('"fast"', [1.1, 1.2, 1.4]), ('1e-320', [])])
 def test_a_slew_limit_that_is_none_is_not_taken_for_one(tmp_path, text, reached):
-    part = one(tmp_path / 'bag', simulated(), **parameters(planner=ACTUATOR, plant=ACTUATOR), **{
-        'plant.slew_limit': text})
+    # Without outcomes, the arrival includes the ramp.
+    part = one(
+        tmp_path / 'bag', without(simulated(), 'outcomes'),
+        **parameters(planner=ACTUATOR, plant=ACTUATOR), **{'plant.slew_limit': text})
     assert [x.stretch for x in part.evaluation.results] == reached
     assert Page(page([part])).ids
 
 
 def of_another_definition(folder, role):
     """Write a run in which one type has another definition."""
-    setpoint = STORE.types[TYPES[SETPOINT]](data=1.1)
     return write(
-        folder, [*simulated(), (START, '/planner/setpoint', TYPES[SETPOINT], setpoint)],
-        definitions={TYPES[role]: 'uint8 something\n'}, **parameters(plant=ACTUATOR))
+        folder, simulated(), definitions={TYPES[role]: 'uint8 something\n'},
+        **parameters(plant=ACTUATOR))
 
 
-@pytest.mark.parametrize('role', [COMMAND, PLAN, TRAJECTORY, SETPOINT, STATUS])
+@pytest.mark.parametrize('role', [COMMAND, PLAN, STATUS, OUTCOMES])
 def test_a_type_of_another_definition_is_told(tmp_path, role):
     run, = read_runs(of_another_definition(tmp_path / 'bag', role))
     assert f'a message of topic /{role} is not as {TYPES[role]} is defined in ROS 2' in ' '.join(
@@ -913,7 +917,7 @@ def test_a_move_that_the_recording_cut_off_is_left_out(tmp_path):
 def test_a_refused_request_is_told_with_its_reason(tmp_path):
     messages = [*simulated(), (
         START + 1000, '/planner/status', TYPES[STATUS],
-        status(2, 'out_of_range', 'target stretch is 9 <script>', '1.1'))]
+        status(2, 'out_of_range', 'target stretch is 9 <script>'))]
     text = page([one(tmp_path / 'bag', messages, **parameters(plant=ACTUATOR))])
     report = Page(text)
     assert report.table('request-table')[1]['code'][1] == 'out_of_range'
@@ -921,13 +925,82 @@ def test_a_refused_request_is_told_with_its_reason(tmp_path):
     assert '9 &lt;script&gt;' in text
 
 
-def test_a_request_that_is_not_a_number_hides_no_setpoint(tmp_path):
-    setpoint = STORE.types[TYPES[SETPOINT]](data=math.nan)
+@pytest.mark.parametrize('change', [
+    {'target': 'nan'}, {'begins': '9' * 400}, {'omega': '0.0'}, {'moves': '[' * 9000},
+    {'verdict': 'fine'}, {'setpoint': '-1'}, {'moves': '[[1, 2, 3]]'}])
+def test_an_outcome_that_no_planner_publishes_is_told_and_hides_no_setpoint(tmp_path, change):
+    messages = simulated()
+    told = next(x for x in messages if x[1].endswith('outcomes'))
+    values = {x.key: x.value for x in told[3].values} | change
     part = one(
-        tmp_path / 'bag',
-        [*simulated(), (START + 1, '/planner/setpoint', TYPES[SETPOINT], setpoint)],
+        tmp_path / 'bag', [*messages, (*told[:3], diagnostic(0, '', values))],
         **parameters(planner=ACTUATOR, plant=ACTUATOR))
     assert [x.stretch for x in part.evaluation.results] == [1.1, 1.2, 1.4]
+    assert sum('topic /planner/outcomes is not as' in x for x in part.run.notes) == 1
+
+
+def test_the_findings_of_a_run_are_those_of_its_planner(tmp_path):
+    messages = simulated(extra=0.1)
+    begin = 2 * START
+    told = {x.key: x.value for x in next(
+        y[3] for y in messages if y[1].endswith('outcomes')).values}
+    changes = (
+        # Judged, then corrected by another outcome.
+        {'verdict': 'undecided', 'samples': '3'},
+        {'verdict': 'vibrating', 'samples': '40', 'vibration': '0.0125'},
+        # Replaced before it was reached, and of before the recording.
+        {'setpoint': '2', 'ended': 'replaced', 'until': told['end']},
+        {'setpoint': '3', 'verdict': 'arrived', 'decided': str(START - 1)},
+        {'setpoint': '3', 'verdict': 'arrived', 'decided': str(begin + 60 * NANOSECONDS)})
+    part = one(
+        tmp_path / 'bag', [*without(messages, 'outcomes'), *(
+            (START + i, '/planner/outcomes', TYPES[OUTCOMES], diagnostic(0, 'it rings', {
+                **told, **x})) for i, x in enumerate(changes))],
+        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    finding, = part.evaluation.findings
+    assert (str(finding.verdict), finding.message, finding.samples, finding.vibration) == (
+        'vibrating', 'it rings', 40, 0.0125)
+    assert finding.setpoint.percent(finding.vibration) == pytest.approx(12.5)
+    assert 'ended before setpoints 2 to 3 were decided' in ' '.join(part.run.notes)
+    # With other tolerances than the planner's, the samples are judged.
+    found = findings_of(part.run, Tolerances(0.5, 0.5))
+    assert [str(x.verdict) for x in found] == ['arrived']
+
+
+def test_a_replaced_setpoint_is_measured_until_the_next_begins(tmp_path):
+    messages = simulated()
+    told = [x for x in messages if x[1].endswith('outcomes')]
+    values = {x.key: x.value for x in told[0][3].values}
+    until = values.pop('end')
+    part = one(
+        tmp_path / 'bag', [*(x for x in messages if x is not told[0]), (
+            *told[0][:3], diagnostic(0, '', {**values, 'ended': 'replaced', 'until': until,
+                                             'verdict': 'arrived', 'samples': '9'}))],
+        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert [x.stretch for x in part.evaluation.results] == [1.1, 1.2, 1.4]
+    assert max(x.error for x in part.evaluation.results) < ROUNDING
+
+
+@pytest.mark.parametrize('measured', [True, False])
+def test_levels_that_begin_at_rest_give_no_setpoint_of_noise(tmp_path, measured):
+    messages = without(
+        simulated(((1.2, 40.0), (1.0, 40.0)), noise=1e-3, extra=0.2), 'plan', 'outcomes')
+    first = min(x[0] for x in messages if x[1].endswith('command'))
+    if not measured:
+        # A driver that reports what it applies.
+        messages = [(*x[:3], joint_state(x[0], x[3].position, x[3].velocity, []))
+                    if x[1] == '/joint_states' else x for x in messages] + applied(messages)
+    pause = 100_000_000
+    messages = [(x[0] + pause, *x[1:]) if x[1].endswith('command') else x for x in messages]
+    for _, topic, _, x in messages:
+        if topic.endswith('command'):
+            x.header = header(
+                x.header.stamp.sec * NANOSECONDS + x.header.stamp.nanosec + pause)
+    rest = (first, '/flux_density_command', TYPES[COMMAND], command(first + LEAD, 0.0))
+    part = one(tmp_path / 'bag', [rest, *messages],
+               **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert [x.setpoint.target for x in part.evaluation.findings] == pytest.approx(
+        [1.2, 1.0], abs=1e-6)
 
 
 @pytest.mark.parametrize(('samples', 'levels', 'setpoints'), [
@@ -1208,77 +1281,6 @@ def rounded(messages):
     return messages
 
 
-def test_a_latched_plan_of_before_that_comes_after_a_request_is_not_the_one_for_it(tmp_path):
-    asked, planned, said, *others = simulated()
-    before = START // 2
-    old = trajectory(before, [(0, 1.0, 0.0, 0.03), (6_000_000, 1.2, 0.0, 0.06)])
-    part = one(
-        tmp_path / 'run', [
-            (START - 1, '/planner/status', TYPES[STATUS], status(0, 'arrived', 'arrived')),
-            asked, (START + 1, '/planner/plan', TYPES[PLAN], old),
-            (START + 2, *planned[1:]), (START + 3, *said[1:]), *others],
-        published={START - 1: before + 1, START + 1: before},
-        **parameters(planner=ACTUATOR, plant=ACTUATOR))
-    assert [str(x.verdict) for x in part.evaluation.findings] == ['arrived'] * 3
-
-
-def test_a_level_that_took_effect_before_its_time_begins_no_request(tmp_path):
-    asked, planned, said, *others = simulated()
-    before = START - 20_000_000
-    levels = [before, *(
-        planned[-1].header.stamp.sec * NANOSECONDS + planned[-1].header.stamp.nanosec
-        + x.time_from_start.sec * NANOSECONDS + x.time_from_start.nanosec
-        for x in planned[-1].points)]
-    # As a board reports it that counts in us.
-    plan = trajectory(before - 490, [(0, 1.0, 0.0, 0.0), *(
-        (stamp - before + 490, x.positions[0], x.velocities[0], x.effort[0])
-        for stamp, x in zip(levels[1:], planned[-1].points, strict=True))])
-    old = trajectory(before - 6_000_000, [(0, 1.0, 0.0, 0.02), (6_000_000, 1.0, 0.0, 0.0)])
-    part = one(
-        tmp_path / 'run', [
-            (START - 2, '/planner/plan', TYPES[PLAN], old),
-            (START - 1, '/planner/status', TYPES[STATUS], status(0, 'arrived', 'arrived')),
-            asked, (START + 1, '/planner/plan', TYPES[PLAN], plan), (START + 2, *said[1:]),
-            *others], **parameters(planner=ACTUATOR, plant=ACTUATOR))
-    assert [str(x.verdict) for x in part.evaluation.findings] == ['arrived'] * 3
-
-
-def test_a_plan_that_is_published_late_begins_with_what_was_sent_for_it(tmp_path):
-    asked, planned, said, *others = simulated()
-    points, passed = planned[-1].points, 1
-
-    def after(point):
-        return point.time_from_start.sec * NANOSECONDS + point.time_from_start.nanosec
-
-    begin = planned[-1].header.stamp.sec * NANOSECONDS + planned[-1].header.stamp.nanosec
-    left = trajectory(begin + after(points[passed]), [
-        (after(x) - after(points[passed]), x.positions[0], x.velocities[0], x.effort[0])
-        for x in points[passed:]])
-    found = [one(
-        tmp_path / name, [asked, (*planned[:-1], plan), said, *others],
-        **parameters(planner=ACTUATOR, plant=ACTUATOR)).evaluation.findings
-        for name, plan in (('whole', planned[-1]), ('left', left))]
-    assert [str(x.verdict) for x in found[1]] == ['arrived'] * 3
-    assert [x.setpoint for x in found[1]] == [x.setpoint for x in found[0]]
-
-
-@pytest.mark.parametrize('order', ['before', 'after'])
-def test_a_plan_between_the_same_ticks_as_its_request_is_the_one_for_it(tmp_path, order):
-    asked, planned, said, *others = simulated()
-    asked[-1].header.frame_id = 'mine'
-    said = *said[:-1], status(0, 'accepted', 'accepted', request='mine')
-    # Simulated time as a recorder sees it: until its status nothing has a time of its own, or
-    # the request comes even later.
-    late = {'before': START, 'after': START + 1}[order]
-    part = one(
-        tmp_path / 'run', [
-            (START, '/planner/status', TYPES[STATUS], status(0, 'none', 'none')),
-            (late, *asked[1:]), (START, *planned[1:]), (START + 2, *said[1:]), *others],
-        **parameters(planner=ACTUATOR, plant=ACTUATOR))
-    assert [str(x.verdict) for x in part.evaluation.findings] == ['arrived'] * 3
-    assert len(part.evaluation.results) == 3
-
-
 @pytest.mark.parametrize('missing', [
     (), ('plan', 'status'),
     *(pytest.param(('plan', *x), marks=pytest.mark.slow) for x in ((), ('command',)))])
@@ -1311,125 +1313,6 @@ def test_noise_is_no_vibration_and_an_offset_is_named(tmp_path):
     assert found[0].message in report.words
     heading = ' '.join(report.words)
     assert re.search(r'1\. to 1\.3: residual [\d.]+ %, off target', heading)
-
-
-def test_a_request_that_no_planner_answers_is_told(tmp_path):
-    asked, planned, said, *others = simulated(extra=0.1)
-    asked[-1].header.frame_id = ''
-    part = one(tmp_path / 'bag', [
-        asked, planned, (*said[:-1], status(0, 'accepted', '', plan='1')), *others,
-        (others[-1][0] - 60_000_000, *asked[1:]),
-        (others[-1][0], *said[1:-1], status(0, 'arrived', '', plan='1'))],
-        **parameters(planner=ACTUATOR, plant=ACTUATOR))
-    assert [x.setpoint.target for x in part.evaluation.findings] == [1.1, 1.2, 1.4]
-    assert any('1 of 2 requests have no answer' in x for x in part.run.notes)
-
-
-def test_a_setpoint_that_a_new_plan_leaves_out_is_missed(tmp_path):
-    messages = simulated(((1.1, 40.0), (1.2, 40.0), (1.3, 40.0)), period=500_000)
-    plan, = (x for _, topic, _, x in messages if topic.endswith('plan'))
-    begin = plan.header.stamp.sec * NANOSECONDS + plan.header.stamp.nanosec
-    times = [begin + x.time_from_start.sec * NANOSECONDS + x.time_from_start.nanosec
-             for x in plan.points]
-    # From the first setpoint to the third, as if there were no time for the second.
-    anew = trajectory(times[1], [(0, 1.1, 0.0, 0.01), (times[4] - times[1], 1.1, 0.0, 0.02),
-                                 (times[5] - times[1], 1.3, 0.0, 0.03)])
-    # Neither this request, which is refused, nor its time counts.
-    refused = trajectory(0, [(10**9, 9.0)])
-    part = one(tmp_path / 'bag', [
-        *messages, (times[1] + 1000, '/planner/plan', TYPES[PLAN], anew),
-        (times[1] + 2000, '/planner/status', TYPES[STATUS], status(1, 'replanned', 'anew')),
-        (times[3], '/planner/joint_trajectory', TYPES[TRAJECTORY], refused),
-        (times[3] + 1, '/planner/status', TYPES[STATUS], status(2, 'out_of_range', 'too far'))],
-        **parameters(planner=ACTUATOR, plant=ACTUATOR))
-    assert [str(x.verdict) for x in part.evaluation.findings] == ['arrived', 'missed', 'arrived']
-    assert 'missed' in [x['verdict'][1] for x in Page(page([part])).table('setpoint-table')]
-
-
-def test_a_setpoint_that_is_over_is_not_left_out_by_a_new_plan(tmp_path):
-    messages = simulated(((1.1, 40.0), (1.2, 40.0), (1.3, 40.0)), period=500_000)
-    plan, = (x for _, topic, _, x in messages if topic.endswith('plan'))
-    begin = plan.header.stamp.sec * NANOSECONDS + plan.header.stamp.nanosec
-    levels = [(begin + x.time_from_start.sec * NANOSECONDS + x.time_from_start.nanosec,
-               x.positions[0], 0.0, x.effort[0]) for x in plan.points]
-    held = levels[3]
-    # Held by another level, for which another correction left no time.
-    superseded = held[0] + 20_000_000, held[1], 0.0, 1.001 * held[3]
-    plans = [held, superseded, *levels[4:]], levels[4:]
-
-    def anew(plan):
-        return trajectory(plan[0][0], [(x[0] - plan[0][0], *x[1:]) for x in plan])
-    part = one(tmp_path / 'bag', [*messages, *(x for plan in plans for x in (
-        (plan[0][0] + 1000, '/planner/plan', TYPES[PLAN], anew(plan)),
-        (plan[0][0] + 2000, '/planner/status', TYPES[STATUS], status(0, 'corrected', 'anew'))))],
-        **parameters(planner=ACTUATOR, plant=ACTUATOR))
-    assert [str(x.verdict) for x in part.evaluation.findings] == ['arrived'] * 3
-
-
-def test_a_stop_after_a_refused_request_does_not_carry_it_out(tmp_path):
-    asked, planned, said, *others = simulated(extra=0.1)
-    asked[-1].header.frame_id = 'mine'
-    end = others[-1][0]
-    refused = trajectory(0, [(10**9, 9.0)])
-    refused.header.frame_id = 'too far'
-    part = one(tmp_path / 'bag', [
-        asked, planned, (*said[:-1], status(0, 'accepted', '', plan='1', request='mine')), *others,
-        (end - 3000, '/planner/joint_trajectory', TYPES[TRAJECTORY], refused),
-        (end - 2000, '/planner/status', TYPES[STATUS], status(
-            2, 'out_of_range', 'too far', plan='1', request='too far')),
-        (end - 1500, '/planner/plan', TYPES[PLAN], trajectory(end, [(0, 1.4, 0.0, 0.1)])),
-        (end - 1000, '/planner/status', TYPES[STATUS], status(0, 'stopped', '', plan='2'))],
-        **parameters(planner=ACTUATOR, plant=ACTUATOR))
-    assert [x.setpoint.target for x in part.evaluation.findings] == [1.1, 1.2, 1.4]
-
-
-@pytest.mark.parametrize(('topic', 'late'), [('setpoint', 500_000), ('joint_trajectory', 0)])
-def test_joints_that_are_moved_in_turn_keep_their_setpoints(tmp_path, late, topic):
-    joints = 'left', 'right'
-    group = PlannerGroup({x: Planner(ACTUATOR, Options(lead_time=LEAD)) for x in joints})
-    plants = {x: ActuatorSimulation(ACTUATOR, time=START) for x in joints}
-    asked = ('left', 1.1), ('right', 1.05), ('left', 1.2), ('right', 1.0), ('left', 1.0)
-    pause = 200_000_000
-    setpoint = 'std_msgs/msg/Float64'
-    messages = [(START - 1, '/planner/status', TYPES[STATUS], status(0, 'none', '', plan='0'))]
-    for number, (joint, target) in enumerate(asked, 1):
-        time = START + number * pause
-        group.take(group.draft_setpoint(joint, target, time), time)
-        stamps, samples = group.preview(time, 100)
-        plan = trajectory(stamps[0], [(x - stamps[0],) for x in stamps])
-        plan.joint_names = list(joints)
-        for i, point in enumerate(plan.points):
-            point.positions, point.velocities, point.effort = np.array(
-                [samples[x][i] for x in joints]).T.copy()
-        request = trajectory(0, [(pause, target)])
-        request.header.frame_id, request.joint_names = '', [joint]
-        messages += [
-            # The recorder may receive it last.
-            (time + late, f'/planner/{joint}/setpoint', setpoint,
-             STORE.types[setpoint](data=target)) if topic == 'setpoint' else
-            (time + late, '/planner/joint_trajectory', TYPES[TRAJECTORY], request),
-            (time + 100_000, '/planner/plan', TYPES[PLAN], plan),
-            (time + 200_000, '/planner/status', TYPES[STATUS], status(
-                0, 'accepted', 'accepted', plan=str(number)))]
-        for level in group.planners[joint].plan.levels:
-            if level.stamp > time:
-                plants[joint].command(level.stamp, level.flux_density)
-                messages.append((
-                    level.stamp - LEAD, f'/{joint}/flux_density_command', TYPES[COMMAND],
-                    command(level.stamp, level.flux_density)))
-    for time in range(START, START + 6 * pause, 500_000):
-        for plant in plants.values():
-            plant.advance(time)
-        messages.append((time, '/joint_states', TYPES[JOINT_STATES], joint_state(
-            time, *([getattr(plants[x], y) for x in joints]
-                    for y in ('stretch', 'rate', 'flux_density')), joints)))
-    parts = parts_of(write(
-        tmp_path / 'run', messages, **parameters(planner=ACTUATOR, plant=ACTUATOR)))
-    assert [(x.run.joint, [(y.setpoint.target, str(y.verdict)) for y in x.evaluation.findings])
-            for x in parts] == [
-        (x, [(target, 'arrived') for of, target in asked if of == x]) for x in joints]
-    # Each until the next.
-    assert all(y.error < ROUNDING for x in parts for y in x.evaluation.results)
 
 
 def test_the_findings_of_a_bag_are_printed_as_json(bag, tmp_path, capsys):

@@ -1,7 +1,7 @@
 """A simulated or recorded motion: samples, levels and report."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -10,12 +10,13 @@ import numpy as np
 
 from hmsa.api.arguments import file_of, number, several, whole
 from hmsa.errors import BadInputError, excerpt
+from hmsa.interfaces.outcome import Outcome
 from hmsa.model.equations import Array
 from hmsa.model.simulation import check_stretch, longest_motion, response
-from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs.levels import RecordedLevel
-from hmsa.runs.record import read_only, RecordedRequest, Run
+from hmsa.runs.record import read_only, Run
+from hmsa.runs.setpoints import described
 from hmsa.runs.tables import levels_of, samples_of, write_run
 from hmsa.table import frame, Table
 
@@ -362,16 +363,11 @@ def simulated(
     commands = tuple(
         RecordedLevel(stamp, level, -_AHEAD) for stamp, level in zip(
             switched, levels.tolist(), strict=True))
-    asked: tuple[RecordedRequest, ...] = ()
+    asked: tuple[Outcome, ...] = ()
     planned: tuple[RecordedLevel, ...] = ()
     believed = truth if plan is None else plan.actuator
     if plan is not None:
-        ends = np.cumsum(plan.setpoints[:, 1])
-        followed = plan.segments[0].move.code is Code.PATH
-        asked = (RecordedRequest(-_AHEAD, 0, tuple(
-            (x.setpoint.stretch, round(y * NANOSECONDS) if math.isfinite(y) else None)
-            for x, y in zip(plan.segments, ends.tolist(), strict=True)),
-            round(plan.move_times[0] * NANOSECONDS) if followed else None),)
+        asked = _outcomes(plan, begin)
         predicted = response(
             believed.block, believed.model.delivery, times, levels, times, begin)
         planned = tuple(
@@ -382,9 +378,25 @@ def simulated(
         for name, value in each.parameters.items()} | {'plant.stretch_noise': noise}
     return Motion(Run(
         str(label), '', Path(str(label)), stamps, stamps, stretch, speed, field,
-        commands, commands, plans=(planned,) if planned else (), requests=asked,
+        commands, commands, plans=(planned,) if planned else (), outcomes=asked,
         parameters=parameters, plant=truth.block, planner=believed.block, parameters_known=True,
         origin='simulated'))
+
+
+def _outcomes(plan: 'Plan', start: float) -> tuple[Outcome, ...]:
+    """Return the setpoints of a plan from a stretch on, to be judged by the simulated samples."""
+    found, begins, count = [], 0, len(plan.segments)
+    ends = np.cumsum(plan.setpoints[:, 1])
+    for i, (segment, duration, end) in enumerate(zip(
+            plan.segments, plan.move_times.tolist(), ends.tolist(), strict=True), 1):
+        target, until = segment.setpoint.stretch, (
+            round(end * NANOSECONDS) if math.isfinite(end) else None)
+        found.append(Outcome(replace(
+            described(plan.actuator.block, target, start, begins, until), number=i, count=count,
+            held=i == count, arrival=begins + round(duration * NANOSECONDS)
+            if math.isfinite(duration) else None)))
+        begins, start = until or begins, target
+    return tuple(found)
 
 
 def _rate(period: float) -> float:

@@ -7,6 +7,7 @@ import numpy as np
 
 from hmsa.errors import BadInputError
 from hmsa.identification.learning import learn, Learnt, SequenceRepeat, TargetWindow
+from hmsa.interfaces.outcome import LEVELS
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs.levels import ROUNDED
 from hmsa.runs.record import Run
@@ -36,8 +37,8 @@ def learn_from(runs: Sequence[Run]) -> tuple[Learnt, list[TargetWindow]]:
     """
     first = runs[0]
     begins = [_begin(x) for x in runs]
-    requested = [x.setpoint for x in setpoints_of(first)] if any(
-        x.points for x in first.requests) else []
+    given = first.outcomes and all(x.asked == LEVELS for x in first.outcomes)
+    requested = [] if given else [x.setpoint for x in setpoints_of(first)]
     if not requested:
         raise BadInputError(
             f'{first.path} has no setpoints: expected the run of a sequence as it was planned '
@@ -59,7 +60,7 @@ def learn_from(runs: Sequence[Run]) -> tuple[Learnt, list[TargetWindow]]:
 def _begin(run: Run) -> int:
     """Return the time in ns at which the first level of a run took effect."""
     largest = max((abs(x.flux_density) for x in run.levels), default=0.0)
-    asked = run.requests[0].sent if run.requests else int(run.time[0])
+    asked = min((x.setpoint.begins for x in run.outcomes), default=int(run.time[0]))
     for x in run.levels:
         # Smaller levels are due to rounding, or compensate the remanence of a core.
         if abs(x.flux_density) > ROUNDED * largest:

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from hmsa.errors import HmsaError
+from hmsa.interfaces.outcome import Outcome
 from hmsa.interfaces.topics import PLANNER
 from hmsa.judge.records import Finding, RequestedSetpoint, Tolerances
 from hmsa.model.delivery import Delivery
@@ -31,7 +32,7 @@ from hmsa.report.outcome import findings_of, tolerances_of
 from hmsa.runs.levels import in_force, RecordedLevel, without_repeats
 from hmsa.runs.parameters import creep_of
 from hmsa.runs.record import Run, Times
-from hmsa.runs.setpoints import Requested, SAME, setpoints_of, start_of
+from hmsa.runs.setpoints import SAME, setpoints_of, start_of
 
 #: With fewer samples per period, peaks are missed.
 FEW_SAMPLES = 10
@@ -179,7 +180,7 @@ def evaluate(run: Run, tolerances: Tolerances | None = None) -> Evaluation:
         tuple(findings_of(run, tolerances, asked=asked)), tolerances)
 
 
-def _first(run: Run, levels: Sequence[RecordedLevel], asked: Sequence[Requested]) -> int:
+def _first(run: Run, levels: Sequence[RecordedLevel], asked: Sequence[Outcome]) -> int:
     """Return the begin of the first level in ns, skipping the level that an earlier run left."""
     begins = asked[0].setpoint.begins if asked else int(run.time[0])
     later = [x for x in levels if x.stamp >= begins]
@@ -191,14 +192,14 @@ def _first(run: Run, levels: Sequence[RecordedLevel], asked: Sequence[Requested]
     return next((x for x in later if x.flux_density != held), later[0]).stamp
 
 
-def find_moves(run: Run, levels: Sequence[RecordedLevel], setpoints: Sequence[Requested]) -> list[
+def find_moves(run: Run, levels: Sequence[RecordedLevel], setpoints: Sequence[Outcome]) -> list[
         CommandedMove]:
     """Return the moves whose planned arrival lies within the recording."""
     last = int(run.time[-1])
     moves = []
     for place, asked in enumerate(setpoints):
         setpoint, arrival = asked.setpoint, asked.arrival
-        end = min(x for x in (asked.due, asked.until, last) if x is not None)
+        end = min(x for x in (setpoint.end, asked.until, last) if x is not None)
         inside = [x for x in levels if setpoint.begins <= x.stamp <= (arrival or end)]
         if asked.missed or setpoint.step <= SAME or not inside:
             continue

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from hmsa.interfaces.outcome import Outcome
 from hmsa.interfaces.parameters import number_of
 from hmsa.judge.records import Finding, SensorModel, Tolerances, unobserved
 from hmsa.judge.setpoint_samples import SetpointSamples
@@ -14,10 +15,9 @@ from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs.parameters import of_joint
 from hmsa.runs.record import Run
-from hmsa.runs.setpoints import Requested, setpoints_of
+from hmsa.runs.setpoints import setpoints_of
 from hmsa.table import Column, Table
 
-_LEFT_OUT = 'no time was left for it'
 _CUT_SHORT = 'the samples end before its arrival'
 _SENSOR = SensorModel()
 # Later than any timestamp, in ns.
@@ -28,10 +28,17 @@ _MOST_LEVELS = 12
 
 def findings_of(
         run: Run, tolerances: Tolerances | None = None, *,
-        asked: Sequence[Requested] | None = None) -> list[Finding]:
-    """Judge each requested setpoint, by default with the tolerances of the run's planner."""
-    tolerances = tolerances or tolerances_of(run)
-    return [_judged(run, x, tolerances) for x in (setpoints_of(run) if asked is None else asked)]
+        asked: Sequence[Outcome] | None = None) -> list[Finding]:
+    """
+    Return the finding of each requested setpoint.
+
+    It is that of the planner; with other tolerances, or without one, the samples are judged.
+    """
+    own = tolerances_of(run)
+    return [
+        x.finding if x.finding is not None and (x.missed or tolerances in (None, own))
+        else _judged(run, x, tolerances or own)
+        for x in (setpoints_of(run) if asked is None else asked)]
 
 
 def tolerances_of(run: Run) -> Tolerances:
@@ -41,41 +48,24 @@ def tolerances_of(run: Run) -> Tolerances:
     return Tolerances(**{x: y for x, y in own.items() if y is not None and y >= 0.0})
 
 
-def _judged(run: Run, asked: Requested, tolerances: Tolerances) -> Finding:
-    """Judge a setpoint as the planner does, with samples and plans in order of arrival."""
-    joints = run.parameters.get('planner.joints')
-    several = isinstance(joints, list) and len(joints) > 1
-    hold = SetpointSamples(replace(
-        asked.setpoint, joint=run.joint if several else '', held=asked.last))
-    moves, sensors = list(asked.moves), list(run.sensors)
-    sensor = _SENSOR
-    # How far the clock of the samples is ahead of the recorder's; only plans need it.
-    ahead = max(int(np.median(run.time - run.logged)), 0) if run.plans else 0
-
-    def move_until(sent: float) -> None:
-        while moves and moves[0][0] < sent:
-            _, arrival = moves.pop(0)
-            if arrival is None:
-                hold.miss(_LEFT_OUT)
-            else:
-                hold.move(arrival, corrected=asked.corrected)
-
-    if asked.left_out:
-        hold.miss(_LEFT_OUT)
+def _judged(run: Run, asked: Outcome, tolerances: Tolerances) -> Finding:
+    """Judge a setpoint by its recorded samples, as the planner does."""
+    hold = SetpointSamples(replace(asked.setpoint, moved=None))
+    if asked.setpoint.moved is not None:
+        hold.move(asked.setpoint.moved, corrected=asked.corrected)
+    sensors, sensor = list(run.sensors), _SENSOR
     part = slice(*np.searchsorted(run.time, (
         asked.setpoint.begins, _END if asked.until is None else asked.until)))
     for stamp, logged, stretch in zip(
             run.time[part].tolist(), run.logged[part].tolist(), run.stretch[part].tolist(),
             strict=True):
-        move_until(logged)
-        if hold.over and not moves:
+        if hold.over:
             break
         while sensors and sensors[0].sent <= logged:
             sensor = sensors.pop(0).sensor
-        hold.add(stamp, stretch, stamp - ahead)
+        hold.add(stamp, stretch, stamp)
         if stamp >= hold.due:
             hold.judge(stamp, logged, tolerances, sensor, observable=True)
-    move_until(math.inf)
     patience = _END
     while not hold.over:
         # All samples have been added.

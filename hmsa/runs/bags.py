@@ -5,7 +5,7 @@ Topics are found by the end of their name and their type, so that any namespace 
 bag may be recorded by this package or rosbag2, from a simulated plant or a coil.
 """
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,25 +18,24 @@ from hmsa.bag import limits
 from hmsa.bag.info import BagSummary, summarize
 from hmsa.bag.reader import BagReader, Message
 from hmsa.errors import assume, BadInputError, BagError, MissingWarning
-from hmsa.interfaces.status import whole
+from hmsa.interfaces.outcome import newest, Outcome
 from hmsa.judge.records import SensorModel
 from hmsa.model.schedule import is_axial_field
 from hmsa.model.units import NANOSECONDS
-from hmsa.runs import answers
 from hmsa.runs import topics as roles
 from hmsa.runs.levels import RecordedLevel
 from hmsa.runs.parameters import actuators, named_joint, recorded
-from hmsa.runs.record import LearntSensor, RecordedRequest, RecordedVerdict, Run
+from hmsa.runs.record import LearntSensor, RecordedVerdict, Run
 from hmsa.runs.samples import nanoseconds_of, SampleReader
-from hmsa.runs.topics import topics_by_joint
+from hmsa.runs.topics import topics_by_joint, unanswered
 
 # Time between samples that is a gap in a bag with missing messages, relative to the median.
 _UNUSUAL_STEP = 10
 # Messages between two calls of the progress callback.
 _PROGRESS_MESSAGES = 20_000
 _MOST_NOTES = 20
-# In ns, minimum time between messages of a planner, so that a request fits in between.
-_APART = 2
+# Longest time in ns from the last sample to a decision: far longer than samples are waited for.
+_LATEST = 10 * NANOSECONDS
 _LEVELS = ('ok', 'warning', 'error')
 
 
@@ -79,6 +78,8 @@ def read_runs(
     spaces = topics_by_joint(reader)
     collected = _collect(reader, spaces, progress)
     summary = summarize(reader)
+    for one in collected.values():
+        one.notes += unanswered(reader)
     label = path.resolve().stem if path.is_file() else path.resolve().name
     runs, reasons = [], []
     for space, by_joint in sorted(spaces.items()):
@@ -157,32 +158,30 @@ def _collect(
 
 @dataclass(frozen=True)
 class _Point:
-    """A point of a trajectory: time from its start in ns, and values by joint."""
+    """A change of level in a plan: time from its start in ns, and values by joint."""
 
-    time: int | None  # None if held until the next setpoint
+    time: int
     positions: tuple[float, ...]
     velocities: tuple[float, ...]
     effort: tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class _Trajectory:
-    """A request or a plan as received, with its timestamp in ns."""
+class _Plan:
+    """A plan as received, with its timestamp in ns."""
 
     sent: int
     joints: tuple[str, ...]
     stamp: int
     points: tuple[_Point, ...]
-    name: str  # of the request, if it has one
-    taken: bool = True  # False if the planner is known to have refused it
 
     @classmethod
-    def of(cls, sent: int, message: Any) -> '_Trajectory':
-        """Return the trajectory in a message."""
+    def of(cls, sent: int, message: Any) -> '_Plan':
+        """Return the plan in a message."""
         return cls(sent, tuple(message.joint_names), nanoseconds_of(message.header.stamp), tuple(
             _Point(nanoseconds_of(x.time_from_start), *(
                 tuple(map(float, y)) for y in (x.positions, x.velocities, x.effort)))
-            for x in message.points), message.header.frame_id)
+            for x in message.points))
 
 
 class _Collected:
@@ -194,13 +193,11 @@ class _Collected:
         self.applied: defaultdict[str, list[RecordedLevel]] = defaultdict(list)
         self.forces: defaultdict[str, list[tuple[int, int, float]]] = defaultdict(list)
         self.refused = Counter[str]()
-        # Of all joints; plans and verdicts are assigned after sorting.
-        self.plans: list[_Trajectory] = []
-        self.requests: list[_Trajectory] = []
-        self.stops: list[int] = []  # recording times of plans without a request
-        self.verdicts: list[RecordedVerdict] = []
-        # Plans and verdicts, with the time of publishing by the planner's clock.
-        self.published: list[tuple[int, _Trajectory | RecordedVerdict]] = []
+        # Of all joints, with the time of publishing by the planner's clock: all are latched, and
+        # a new subscriber receives old ones, perhaps after newer ones.
+        self.plans: list[tuple[int, _Plan]] = []
+        self.verdicts: list[tuple[int, RecordedVerdict]] = []
+        self.outcomes: list[tuple[int, Outcome]] = []
         # With the joint of each.
         self.sensors: list[tuple[str, LearntSensor]] = []
         self.notes: list[str] = []
@@ -239,13 +236,9 @@ class _Collected:
                 sent, nanoseconds_of(content.header.stamp) or sent,
                 float(content.wrench.force.z)))
         elif role == roles.PLAN:
-            self.published.append((message.publish_time, _Trajectory.of(sent, content)))
-        elif role == roles.TRAJECTORY:
-            self.requests.append(_Trajectory.of(sent, content))
-        elif role == roles.SETPOINT:
-            self.requests.append(_Trajectory(
-                sent, (joint,) if joint else (), 0,
-                (_Point(None, (float(content.data),), (), ()),), ''))
+            self.plans.append((message.publish_time, _Plan.of(sent, content)))
+        elif role == roles.OUTCOMES:
+            self.outcomes.append((message.publish_time, Outcome.read(content)))
         elif role == roles.ESTIMATE:
             self.sensors += (
                 (x.hardware_id, LearntSensor(
@@ -254,80 +247,23 @@ class _Collected:
         else:
             level = content.level[0] if isinstance(content.level, bytes) else int(content.level)
             values = {x.key: x.value for x in content.values}
-            self.published.append((message.publish_time, RecordedVerdict(
-                sent, _LEVELS[min(level, 2)], values.get('code', ''), content.message,
-                whole(values.get('plan')), values.get('request', ''))))
+            self.verdicts.append((message.publish_time, RecordedVerdict(
+                sent, _LEVELS[min(level, 2)], values.get('code', ''), content.message)))
 
     def order(self) -> None:
-        """
-        Sort plans and verdicts into the order in which the planner published them.
-
-        Both are latched: new subscribers receive old ones, perhaps after newer ones. Each counts
-        as received no later than those published after it, and all at different times, although
-        everything between two ticks of a clock is recorded at the same time.
-        """
-        if all(time in (0, x.sent) for time, x in self.published):
-            self._pair()
-        self.published.sort(key=lambda x: x[0])
-        times = [x.sent for _, x in self.published]
-        for i in reversed(range(len(times) - 1)):
-            times[i] = min(times[i], times[i + 1])
-        for i in range(1, len(times)):
-            times[i] = max(times[i], times[i - 1] + _APART)
-        for (_, one), sent in zip(self.published, times, strict=True):
-            kept: list[Any] = self.verdicts if isinstance(one, RecordedVerdict) else self.plans
-            kept.append(replace(one, sent=sent))
-        self._answer(times)
-
-    def _pair(self) -> None:
-        """Put plans right before their verdicts if only recording times are known."""
-        verdicts = sorted(
-            (x for _, x in self.published if isinstance(x, RecordedVerdict)), key=lambda x: x.sent)
-        before = answers.plans_of(verdicts, sorted(
-            x.sent for _, x in self.published if isinstance(x, _Trajectory)))
-        self.published = [
-            (2 * before[x.sent] - 1 if isinstance(x, _Trajectory) and x.sent in before
-             else 2 * x.sent, x) for _, x in self.published]
-
-    def _answer(self, times: Sequence[int]) -> None:
-        """
-        Determine which requests were accepted, and put each right before its plan and verdict.
-
-        A recorder may receive a request after them, and a latched earlier verdict after it.
-        ``times`` are those of all plans and verdicts, in order.
-        """
-        plans = {x.sent for x in self.plans}
-
-        def announced(verdict: RecordedVerdict) -> int:
-            place = bisect_left(times, verdict.sent)
-            return times[place - (place > 0 and times[place - 1] in plans)]
-
-        self.requests.sort(key=lambda x: x.sent)
-        found, others = answers.answered(self.requests, self.verdicts)
-        self.stops = [announced(x) for x in others]
-        unheard = sum(answer is None and not taken for answer, taken in found)
-        if unheard:
-            self.notes.append(
-                f'{unheard} of {len(found)} requests have no answer of a planner, and are not '
-                'judged: was it running, and is its ~/status recorded?')
-        for i, (request, (answer, taken)) in enumerate(zip(self.requests, found, strict=True)):
-            sent = request.sent
-            if answer is not None:
-                begun = announced(answer)
-                place = bisect_left(times, begun)
-                before = times[place - 1] if place else sent - 1
-                sent = min(max(sent, before + 1), begun - 1)
-            self.requests[i] = replace(request, sent=sent, taken=taken)
+        """Sort what the planner published into the order of publishing."""
+        for kept in (self.plans, self.verdicts, self.outcomes):
+            kept.sort(key=lambda x: x[0])
 
     def _plans(self, joint: str) -> Iterator[tuple[RecordedLevel, ...]]:
         """Yield the plans of a joint, and those without joint names."""
-        for plan in self.plans:
+        for _, plan in self.plans:
             place = _place(plan.joints, joint)
             if place is None:
                 continue
             levels = [
                 RecordedLevel(
-                    plan.stamp + (x.time or 0), x.effort[place], plan.sent, x.positions[place],
+                    plan.stamp + x.time, x.effort[place], plan.sent, x.positions[place],
                       x.velocities[place])
                 for x in plan.points
                 if min(len(x.positions), len(x.velocities), len(x.effort)) > place]
@@ -339,20 +275,14 @@ class _Collected:
                           or x.flux_density != levels[i - 1].flux_density]
             yield tuple(levels)
 
-    def _requests(self, joint: str) -> Iterator[RecordedRequest]:
-        """Yield the requests for a joint, by time."""
-        for asked in sorted(self.requests, key=lambda x: x.sent):
-            place = _place(asked.joints, joint)
-            if place is not None:
-                points = tuple(
-                    (x.positions[place], x.time) for x in asked.points
-                    if len(x.positions) == max(len(asked.joints), 1))
-                moves = len(points) > 0 and any(any(x.velocities) for x in asked.points)
-                path = points[-1][1] if moves else None
-                yield RecordedRequest(
-                    asked.sent, asked.stamp,
-                    points if path is None else ((points[-1][0], None),), path, asked.name,
-                    asked.taken)
+    def _outcomes(self, joint: str, begin: int, end: int) -> Iterator[Outcome]:
+        """Yield the outcomes of a joint that were decided in a recording, of times in ns."""
+        several = len({x.joint for _, x in self.outcomes}) > 1
+        for outcome in newest(x for _, x in self.outcomes):
+            # What is latched may be of before, also by a clock that was set back.
+            if begin < outcome.decided < end + _LATEST and (
+                    outcome.joint == joint or not several):
+                yield outcome
 
     def finish(
             self, label: str, reader: BagReader, summary: BagSummary, topics: Mapping[str, str],
@@ -360,7 +290,7 @@ class _Collected:
         """Return the run of one joint, with or without the joint's name in the topics."""
         states = topics[roles.JOINT_STATES]
         parameters = recorded(reader.custom_data, states[:-len(roles.JOINT_STATES)])
-        planned = [x for plan in self.plans for x in plan.joints]
+        planned = [x for _, plan in self.plans for x in plan.joints]
         beside = topics.get(roles.COMMAND, '').split('/')[-2:-1]
         named = joint or next(
             (x for x in (*planned, named_joint(parameters), *beside) if x in self.samples.names),
@@ -381,12 +311,14 @@ class _Collected:
             notes.append(
                 f'{refused} commands are not finite or not along z: left out, as the plant '
                 'does.')
+        time = samples['time']
+        outcomes = tuple(self._outcomes(named, int(time[0]), int(time[-1])))
+        notes += _undecided(outcomes, topics)
         run = Run(
             label, named, reader.path, **samples, commands=tuple(self.commands[key]),
             applied=_begun(self.applied[key], int(samples['time'][0])),
             forces=tuple(self.forces[key]), plans=tuple(self._plans(joint)),
-            requests=tuple(self._requests(joint)), verdicts=tuple(self.verdicts),
-            stops=tuple(self.stops), sensors=tuple(
+            verdicts=tuple(x for _, x in self.verdicts), outcomes=outcomes, sensors=tuple(
                 x for of, x in self.sensors
                 if of == joint or len({y for y, _ in self.sensors}) == 1),
             parameters={**parameters, **given}, plant=plant, planner=planner,
@@ -398,6 +330,20 @@ class _Collected:
         return replace(run, notes=(
             *run.notes, f'The recorder lost {" and ".join(lost)}: levels may be missing; record '
             'on a machine that is less busy.'))
+
+
+def _undecided(outcomes: Sequence[Outcome], topics: Mapping[str, str]) -> Iterator[str]:
+    """Yield what is not known of the setpoints of a recording, as a sentence."""
+    if roles.OUTCOMES not in topics:
+        if roles.COMMAND in topics:
+            yield (f'The run was recorded without outcomes ({roles.OUTCOMES}): its setpoints are '
+                   'the levels that lasted, not what was requested.')
+        return
+    last = max(outcomes, key=lambda x: (x.setpoint.begins, x.through), default=None)
+    if last is not None and (count := last.setpoint.count) > (
+            known := max(last.through, last.setpoint.number)):
+        which = f's {known + 1} to {count} were' if known + 1 < count else f' {count} was'
+        yield f'The recording ended before setpoint{which} decided: not evaluated.'
 
 
 def _begun(levels: Sequence[RecordedLevel], first: int) -> tuple[RecordedLevel, ...]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa.errors import BadInputError
+from hmsa.interfaces.outcome import Outcome
 from hmsa.interfaces.parameters import number_of
 from hmsa.judge.records import SensorModel
 from hmsa.model.equations import Array
@@ -32,21 +33,6 @@ def read_only(values: NDArray[Any]) -> NDArray[Any]:
 
 
 @dataclass(frozen=True)
-class RecordedRequest:
-    """A request to the planner."""
-
-    sent: int  # recording time in ns
-    stamp: int  # start of the sequence in ns; 0 for at once
-    # Stretch, and end time in ns from the start; None for a setpoint that is held until the
-    # next.
-    points: tuple[tuple[float, int | None], ...]
-    # End time of a path in ns from the start; its one point is where it ends. None for setpoints.
-    path: int | None = None
-    name: str = ''  # if any
-    taken: bool = True  # False if the planner is known to have refused it
-
-
-@dataclass(frozen=True)
 class RecordedVerdict:
     """The planner's verdict on a request."""
 
@@ -54,8 +40,6 @@ class RecordedVerdict:
     level: str  # ``'ok'``, ``'warning'`` or ``'error'``
     code: str
     message: str
-    plan: int = 0  # number of the running request, from 1; 0 if not reported
-    request: str = ''  # name of the request, if any
 
 
 @dataclass(frozen=True)
@@ -82,9 +66,9 @@ class Run:
     applied: tuple[RecordedLevel, ...] = ()  # changes of the field that took effect, as reported
     forces: tuple[tuple[int, int, float], ...] = ()  # recording time, timestamp (ns), newtons
     plans: tuple[tuple[RecordedLevel, ...], ...] = ()
-    requests: tuple[RecordedRequest, ...] = ()
     verdicts: tuple[RecordedVerdict, ...] = ()  # each once
-    stops: tuple[int, ...] = ()  # recording times in ns of plans without a recorded request
+    # Of setpoints, by begin; of a simulated run as planned, without findings
+    outcomes: tuple[Outcome, ...] = ()
     sensors: tuple[LearntSensor, ...] = ()  # by time; the given sensor applies before
     # Parameters of the nodes, by ``'node.name'``
     parameters: Mapping[str, object] = field(default_factory=dict)

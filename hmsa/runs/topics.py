@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
-import re
 from typing import Any, TYPE_CHECKING
 
 from hmsa.errors import BadInputError, HmsaError
@@ -15,11 +14,12 @@ if TYPE_CHECKING:
 TYPES = {
     declared.from_outside(x.name, declared.PLANNER): x.type for x in (
         declared.JOINT_STATES, declared.FLUX_DENSITY_COMMAND, declared.FLUX_DENSITY_APPLIED,
-        declared.DISTURBANCE_FORCE, declared.PLAN, declared.JOINT_TRAJECTORY, declared.SETPOINT,
-        declared.STATUS, declared.ESTIMATE)}
-JOINT_STATES, COMMAND, APPLIED, FORCE, PLAN, TRAJECTORY, SETPOINT, STATUS, ESTIMATE = TYPES
+        declared.DISTURBANCE_FORCE, declared.PLAN, declared.STATUS, declared.OUTCOMES,
+        declared.ESTIMATE)}
+JOINT_STATES, COMMAND, APPLIED, FORCE, PLAN, STATUS, OUTCOMES, ESTIMATE = TYPES
 # Roles with a topic for each joint if there are several.
-_OF_A_JOINT = (COMMAND, APPLIED, FORCE, SETPOINT)
+_OF_A_JOINT = (COMMAND, APPLIED, FORCE)
+_TRAJECTORY = declared.from_outside(declared.JOINT_TRAJECTORY.name, declared.PLANNER)
 
 
 def topics_by_joint(reader: 'BagReader') -> dict[str, dict[str, dict[str, str]]]:
@@ -31,15 +31,8 @@ def topics_by_joint(reader: 'BagReader') -> dict[str, dict[str, dict[str, str]]]
     found: dict[str, dict[str, str]] = {role: {} for role in TYPES}  # topics by namespace
     for topic in reader.topics.values():
         for role, kind in TYPES.items():
-            node, _, last = role.rpartition('/')
-            if topic.type != kind:
-                continue
-            if f'/{topic.name}'.endswith(f'/{role}'):
+            if topic.type == kind and f'/{topic.name}'.endswith(f'/{role}'):
                 found[role].setdefault(topic.name[:-len(role)].rstrip('/'), topic.name)
-            elif role == SETPOINT and re.search(rf'/{node}/[^/]+/{last}$', f'/{topic.name}'):
-                # .../planner/JOINT/setpoint belongs to .../JOINT/flux_density_command.
-                space, _, joint = topic.name[:-len(last) - 1].rpartition('/')
-                found[role].setdefault(f'{space[:-len(node)]}{joint}', topic.name)
     if not found[JOINT_STATES]:
         has = ', '.join(sorted(reader.topics)) or 'none: the bag is empty'
         raise BadInputError(
@@ -81,9 +74,10 @@ def _topics_in(found: Mapping[str, Mapping[str, str]], space: str) -> dict[str, 
 def unanswered(reader: 'BagReader') -> Iterator[str]:
     """Yield a sentence for each topic of sequences that contains some without a verdict."""
     for topic, known in sorted(reader.topics.items()):
-        if known.type != TYPES[TRAJECTORY] or not f'/{topic}'.endswith(f'/{TRAJECTORY}'):
+        if known.type != declared.JOINT_TRAJECTORY.type or (
+                not f'/{topic}'.endswith(f'/{_TRAJECTORY}')):
             continue
-        status = f'{topic[:-len(TRAJECTORY)]}{STATUS}'
+        status = f'{topic[:-len(_TRAJECTORY)]}{STATUS}'
         # Requests without names cannot be checked.
         answered = {'', *_texts(reader, status, lambda x: next(
             (y.value for y in x.values if y.key == 'request'), ''))}
