@@ -15,6 +15,7 @@ from hmsa.model.flows import CONSTANTS, FLOWS
 from hmsa.model.flows.record import Flow, MAXWELL
 from hmsa.model.laws import LAWS
 from hmsa.model.laws.record import Constant, Elastic
+from hmsa.model.modes import Modes
 from hmsa.model.parameters import ActuatorParameters, Geometry, NondimensionalParameters
 
 
@@ -195,10 +196,11 @@ def complete(values: Mapping[str, Any], free: Iterable[str]) -> dict[str, Any]:
                 given[constant.name] = done[name]
         done['shear_modulus'], done['law'] = scaled(given)
     if 'time_unit' in free:
-        done['density'] = done['shear_modulus'] * (done['time_unit'] / done['half_length']) ** 2
+        done['density'] = done['shear_modulus'] * (
+            done['time_unit'] / done['half_length']) ** 2 / geometry_of(done).inertia
     else:
         done['time_unit'] = done['half_length'] * math.sqrt(
-            done['density'] / done['shear_modulus'])
+            done['density'] * geometry_of(done).inertia / done['shear_modulus'])
     return done
 
 
@@ -235,7 +237,7 @@ def values_of(
                 f'{name} is {value:g}: expected a finite number of at least {quantity.least:g}')
     return {name: x.default for name, x in QUANTITIES.items()} | actuator.numbers | {
         'time_unit': actuator.time_unit, 'law': actuator.law, 'initial_stretch': actuator.rest,
-        **others}
+        'factors': actuator.factors, 'modes': actuator.modes, **others}
 
 
 def actuator_of(values: Mapping[str, Any]) -> ActuatorParameters:
@@ -245,7 +247,8 @@ def actuator_of(values: Mapping[str, Any]) -> ActuatorParameters:
         half_length=values['half_length'], half_thickness=values['half_thickness'],
         remanence=values['remanence'], chain_limit=values['chain_limit'],
         damping_coefficient=values['damping_coefficient'], law=values.get('law'),
-        creep=values.get('creep', Creep()))
+        creep=values.get('creep', Creep()), modes=values.get('modes', Modes()),
+        **values.get('factors', {}))
 
 
 def flow_of(values: Mapping[str, Any], free: Iterable[str]) -> Flow:
@@ -261,7 +264,7 @@ def flow_of(values: Mapping[str, Any], free: Iterable[str]) -> Flow:
 def group_of(values: Mapping[str, Any]) -> NondimensionalParameters:
     """Return the dimensionless group of values from `values_of`, without damping."""
     return NondimensionalParameters(
-        0.0, values['chain_limit'], geometry_of(values).c1, values.get('law'))
+        0.0, values['chain_limit'], geometry_of(values).inertia_c1, values.get('law'))
 
 
 def modulus_of(law: Elastic | None) -> tuple[str, float]:
@@ -274,7 +277,9 @@ def modulus_of(law: Elastic | None) -> tuple[str, float]:
 
 def geometry_of(values: Mapping[str, Any]) -> Geometry:
     """Return the geometric factors of values of all quantities."""
-    return Geometry(values['half_length'], values['half_thickness'], values.get('law'))
+    return Geometry(
+        values['half_length'], values['half_thickness'], values.get('law'),
+        **values.get('factors', {}))
 
 
 def damping_unit(values: Mapping[str, Any]) -> float:

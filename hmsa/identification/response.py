@@ -56,7 +56,7 @@ def _chain(
 ) -> tuple[Array, dict[str, dict[int, float]]]:
     """Return theta of the motion and, by name, its derivatives by the free parameters."""
     geometry, density = quantities.geometry_of(values), values['density']
-    inertia = density * geometry.half_length ** 2
+    inertia = density * geometry.inertia * geometry.half_length ** 2
     modulus, remanence = values['shear_modulus'], values['remanence']
     a, k = modulus / inertia, remanence / (MU_0 * inertia)
     per_damping = 0.5 * geometry.c1 * geometry.half_length / geometry.damped / inertia
@@ -138,7 +138,7 @@ class ResponseArguments:
         inner = sorted({i for x in chain.values() for i in x})
         rows = {x: i for i, x in enumerate(inner)}
         material = _packed(
-            values['chain_limit'], quantities.geometry_of(values).c1, values['law']).copy()
+            values['chain_limit'], quantities.geometry_of(values).inertia_c1, values['law']).copy()
         if 'chain_limit' in free:
             material[KIND] = GENT
         mixing = np.zeros((len(inner) + len(more), len(free) + len(more)))

@@ -5,10 +5,11 @@ from dataclasses import replace
 import math
 from typing import Any, TYPE_CHECKING
 
-from hmsa.interfaces.parameters import ACTUATOR_FIELDS, LAW, LAW_NAME, VISCOELASTIC
+from hmsa.interfaces.parameters import ACTUATOR_FIELDS, LAW, LAW_NAME, MODES, VISCOELASTIC
 from hmsa.model.creep import Creep
 from hmsa.model.flows import FLOWS
 from hmsa.model.laws import LAWS
+from hmsa.model.modes import Modes
 from hmsa.model.parameters import ActuatorParameters
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ def completed(values: Mapping[str, Any]) -> dict[str, Any]:
 def actuator_from(
         values: Mapping[str, Any], modulus: float | None = None) -> ActuatorParameters:
     """
-    Return the block of ``actuator.*``, times any ``mismatch.*``, with its law unless Gent.
+    Return the block of ``actuator.*``, times any ``mismatch.*``, with its law and ``modes.*``.
 
     ``modulus`` replaces the shear modulus that follows from the constants of a law.
     """
@@ -46,8 +47,13 @@ def actuator_from(
             {**{x.name: x.default for x in LAW}, **values})
         if modulus is not None:
             numbers['shear_modulus'] = modulus
-    return ActuatorParameters(law=elastic, **{
-        name: value * values.get(f'mismatch.{name}', 1.0) for name, value in numbers.items()})
+    continuum = {x.name: values.get(x.name, x.default) for x in MODES}
+    modes = Modes(*(tuple(continuum.pop(f'modes.{x}')) for x in (
+        'frequency_ratio', 'share', 'damping_ratio')))
+    return ActuatorParameters(
+        law=elastic, modes=modes,
+        **{name.removeprefix('actuator.'): value for name, value in continuum.items()},
+        **{name: value * values.get(f'mismatch.{name}', 1.0) for name, value in numbers.items()})
 
 
 def model_from(
@@ -82,6 +88,9 @@ def parameters_of(actuator: ActuatorParameters) -> dict[str, Any]:
     """Return the parameters of a block, the inverse of `actuator_from`."""
     values: dict[str, Any] = {
         f'actuator.{name}': value for name, value in actuator.numbers.items()}
+    # What is as in the paper's model is not said.
+    values |= actuator.modes.parameters | {
+        f'actuator.{name}': value for name, value in actuator.factors.items() if value != 1.0}
     if actuator.law is None:
         return values
     units = {x.name: x.unit for x in LAWS[actuator.law.law].constants}

@@ -224,8 +224,31 @@ def present_name(name: str) -> str:
 #: Constants of laws that are only read at startup.
 FIXED = frozenset(x.name for law in LAWS.values() for x in law.constants if x.fixed)
 
+#: Factors on the inertia, and secondary modes: what makes the block a continuum.
+MODES = (
+    ParameterSpec(
+        'actuator.mass_factor', 1.0,
+        "Factor on the inertia at rest: 1 for the paper's model, in which the block deforms "
+        'uniformly; its first mode needs 1.2 to 1.5.', '', 1e-3, 1e3),
+    ParameterSpec(
+        'actuator.transverse_mass_factor', 1.0,
+        'Factor on the inertia across the field relative to that along it, at the same inertia at '
+        'rest: how the natural frequency changes with the stretch.', '', 1e-3, 1e3),
+    ParameterSpec(
+        'modes.frequency_ratio', [],
+        'Modes: natural frequencies of up to three secondary modes in units of that of the first; '
+        "empty for none, as in the paper's model.", '', 1.0, 100.0, items=float),
+    ParameterSpec(
+        'modes.share', [],
+        'Modes: share of the static stretch that each secondary mode has; the first has the rest.',
+        '', -1.0, 1.0, items=float),
+    ParameterSpec(
+        'modes.damping_ratio', [], 'Modes: damping ratio of each secondary mode.', '', 0.0, 1.0,
+        items=float),
+)
+
 #: All parameters of a block.
-BLOCK = (*ACTUATOR, *LAW)
+BLOCK = (*ACTUATOR, *LAW, *MODES)
 
 JOINT = ParameterSpec(
     'joint', 'actuator', 'Name of the joint in trajectories and joint states.')

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from hmsa import motion
 from hmsa.errors import BadInputError
 from hmsa.model import law
-from hmsa.model.creep import MOST
 from hmsa.model.equations import Array, stretch_limits
 from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa.model.schedule import CommandSchedule
@@ -139,8 +138,13 @@ class Actuators:
         self._durations = np.zeros(count)
         self._status = np.zeros(count, np.int64)
         self._all = np.ones(count, bool)
-        groups = [x.nondimensional.branches for x in blocks]
-        self._branches = np.zeros((count if any(map(len, groups)) else 0, MOST, motion.BRANCH))
+        groups = [x.nondimensional.rows for x in blocks]
+        self._branches = np.zeros((
+            count if any(map(len, groups)) else 0, motion.ROWS, motion.BRANCH))
+        # Of each actuator: share and rows of secondary modes.
+        self._modes = [
+            (i, x.nondimensional.modes, len(x.nondimensional.branches))
+            for i, x in enumerate(blocks) if x.nondimensional.modes]
         for branches, group in zip(self._branches, groups, strict=False):
             branches[:len(group)] = group
         self.schedules = [CommandSchedule(0.0) for _ in blocks]
@@ -158,14 +162,25 @@ class Actuators:
 
     @property
     def stretch(self) -> Array:
-        """Stretch of each; a view."""
-        return self._state[:, 0]
+        """Stretch of each; a view unless there are secondary modes."""
+        return self._observed(motion.STRETCH)
 
     @property
     def rate(self) -> Array:
         """Stretch rate of each in 1/s."""
-        rates: Array = self._state[:, 1] / self._time_units
+        rates: Array = self._observed(motion.RATE) / self._time_units
         return rates
+
+    def _observed(self, place: int) -> Array:
+        """Return stretches or dimensionless rates of all modes together."""
+        seen: Array = self._state[:, place]
+        if self._modes:
+            seen = seen.copy()
+            for i, modes, count in self._modes:
+                others = self._branches[
+                    i, count + place:count + 2 * len(modes.shares):2, motion.FOLLOWER]
+                seen[i] = modes.first * seen[i] + np.array(modes.shares) @ others
+        return seen
 
     @property
     def flux_density(self) -> Array:
@@ -197,6 +212,10 @@ class Actuators:
         if len(self._branches):
             self._branches[i, :, motion.FOLLOWER] = law.elastic_force(
                 stretch, self._material[i])
+            for j, modes, count in self._modes:
+                if j == i:
+                    self._branches[i, count:count + 2 * len(modes.ratios), motion.FOLLOWER] = (
+                        (stretch, rate * self._time_units[i]) * len(modes.ratios))
         # The amplifier of a lagging coil may have arrived before the field; that of another not.
         behind = self._lags[i] > 0.0
         self._levels[i] = level if behind and math.isinf(self._slews[i]) else flux_density

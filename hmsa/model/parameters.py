@@ -12,12 +12,15 @@ from hmsa.errors import BadInputError
 from hmsa.model.creep import Creep
 from hmsa.model.laws.coordinate import Coordinate, coordinate_of
 from hmsa.model.laws.record import Elastic
+from hmsa.model.modes import Modes
 from hmsa.model.units import MU_0, Units
 
 _ZERO_ALLOWED = ('zeta', 'damping_coefficient')
 # Infinite for neo-Hookean.
 _INFINITE_ALLOWED = ('j_lim', 'chain_limit')
-_NO_NUMBERS = ('law', 'creep')
+_NO_NUMBERS = ('law', 'creep', 'modes')
+# Factors on the mass, which no recording of one mode can tell from other values.
+_FACTORS = ('mass_factor', 'transverse_mass_factor')
 # Scales and groups beyond this and its inverse belong to no block, and overflow in the equations.
 _SMALLEST = 1e-100
 
@@ -60,6 +63,8 @@ class NondimensionalParameters:
         Elastic energy in units of G. It replaces the Gent model, and J_lim has no effect.
     creep : Creep
         Viscoelastic branches, with times in time scales; default none.
+    modes : Modes
+        Secondary modes; default none.
 
     Raises
     ------
@@ -73,6 +78,7 @@ class NondimensionalParameters:
     c1: float = 2.0
     law: Elastic | None = None
     creep: Creep = Creep()
+    modes: Modes = Modes()
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -103,6 +109,13 @@ class NondimensionalParameters:
         return np.array(self.creep.rows()).reshape(-1, BRANCH)
 
     @cached_property
+    def rows(self) -> NDArray[np.float64]:
+        """Branches, then two rows for each secondary mode, for `hmsa.motion`, shape (n, 6)."""
+        if not self.modes:
+            return self.branches
+        return np.concatenate([self.branches, np.array(self.modes.rows())])
+
+    @cached_property
     def elastic(self) -> 'NondimensionalParameters':
         """The group without branches."""
         return replace(self, creep=Creep()) if self.creep else self
@@ -115,12 +128,25 @@ class Geometry:
     half_length: float
     half_thickness: float
     law: Elastic | None = None
+    mass_factor: float = 1.0
+    transverse_mass_factor: float = 1.0
 
     @property
     def c1(self) -> float:
         """Shape 2 H^2/L^2 of a block, or of the block with the inertia of a beam."""
         shape = None if self.law is None else self.law.shape
         return shape or 2.0 * (self.half_thickness / self.half_length) ** 2
+
+    @property
+    def inertia_c1(self) -> float:
+        """Shape in the inertia m = (l^-3 + c1)/6, which has the transverse factor."""
+        return self.c1 / self.transverse_mass_factor
+
+    @property
+    def inertia(self) -> float:
+        """Factor on the density, for the mass factors: m(1) is `mass_factor` of the model's."""
+        more = self.transverse_mass_factor
+        return self.mass_factor * (more * (1.0 + self.c1) / (more + self.c1))
 
     @property
     def loaded(self) -> float:
@@ -137,7 +163,9 @@ class Geometry:
 
     def damping_unit(self, density: float, shear_modulus: float) -> float:
         """Return the damping coefficient for zeta 1 in N s/m; arguments are in SI units."""
-        return self.damped * math.sqrt(density * shear_modulus)
+        # The damping in the equation of motion is zeta c1/2, with the shape in the inertia.
+        return self.damped * math.sqrt(density * self.inertia * shear_modulus) * (
+            self.inertia_c1 / self.c1)
 
 
 @dataclass(frozen=True)
@@ -165,6 +193,13 @@ class ActuatorParameters:
         Elastic energy in units of G. It replaces the Gent model, and J_lim has no effect.
     creep : Creep
         Viscoelastic branches, for planning; default none.
+    modes : Modes
+        Secondary modes; default none, as in the paper.
+    mass_factor : float
+        Factor on the inertia at rest, greater than 0; default 1.
+    transverse_mass_factor : float
+        Factor on the transverse inertia of a block relative to the axial one, greater than 0, with
+        the same inertia at rest; default 1.
 
     Raises
     ------
@@ -182,6 +217,9 @@ class ActuatorParameters:
     damping_coefficient: float
     law: Elastic | None = None
     creep: Creep = Creep()
+    modes: Modes = Modes()
+    mass_factor: float = 1.0
+    transverse_mass_factor: float = 1.0
 
     def __post_init__(self) -> None:
         """Check the values, and that they give usable scales."""
@@ -195,6 +233,10 @@ class ActuatorParameters:
                 f'the parameters of the actuator give a unit of time of {scales[0]:g} s, of flux '
                 f'density of {scales[1]:g} T and c1 of {scales[2]:g}: expected values of a block, '
                 'in SI units')
+        if self.transverse_mass_factor != 1.0 and self.law is not None and self.law.shape:
+            raise BadInputError(
+                f'transverse_mass_factor is {self.transverse_mass_factor:g}: expected 1 for a '
+                'beam, which has no transverse inertia of its own')
         self.creep.check(scales[0])
 
     @classmethod
@@ -227,6 +269,7 @@ class ActuatorParameters:
                    material.j_lim, 0.0)
         made = replace(
             cube, half_thickness=half_length * math.sqrt(material.c1 / 2.0), law=material.law,
+            modes=material.modes,
             creep=replace(material.creep, times=tuple(
                 x * cube.time_unit for x in material.creep.times)))
         return replace(made, damping_coefficient=material.zeta * made.damping_unit)
@@ -234,7 +277,14 @@ class ActuatorParameters:
     @property
     def numbers(self) -> dict[str, float]:
         """All numeric values, by name."""
-        return {x.name: getattr(self, x.name) for x in fields(self) if x.name not in _NO_NUMBERS}
+        return {
+            x.name: getattr(self, x.name) for x in fields(self)
+            if x.name not in (*_NO_NUMBERS, *_FACTORS)}
+
+    @property
+    def factors(self) -> dict[str, float]:
+        """Factors on the mass, by name."""
+        return {x: getattr(self, x) for x in _FACTORS}
 
     @property
     def coordinate(self) -> Coordinate:
@@ -249,12 +299,13 @@ class ActuatorParameters:
     @property
     def geometry(self) -> Geometry:
         """Geometric factors from sizes and model."""
-        return Geometry(self.half_length, self.half_thickness, self.law)
+        return Geometry(self.half_length, self.half_thickness, self.law, **self.factors)
 
     @property
     def time_unit(self) -> float:
-        """Time scale L sqrt(rho/G) in s."""
-        return self.half_length * math.sqrt(self.density / self.shear_modulus)
+        """Time scale L sqrt(rho/G) in s, with the density times the factor on the inertia."""
+        return self.half_length * math.sqrt(
+            self.density * self.geometry.inertia / self.shear_modulus)
 
     @cached_property
     def period(self) -> float:
@@ -291,9 +342,10 @@ class ActuatorParameters:
         return NondimensionalParameters(
             zeta=self.damping_coefficient / self.damping_unit,
             j_lim=self.chain_limit,
-            c1=self.geometry.c1,
+            c1=self.geometry.inertia_c1,
             law=self.law,
-            creep=replace(self.creep, times=tuple(x / self.time_unit for x in self.creep.times)))
+            creep=replace(self.creep, times=tuple(x / self.time_unit for x in self.creep.times)),
+            modes=self.modes)
 
 
 def paper_actuator(material: NondimensionalParameters | None = None) -> ActuatorParameters:

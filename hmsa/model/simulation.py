@@ -87,8 +87,8 @@ def simulate(
             'switches and times must not decrease, and no time may lie before the first switch')
     stretch = material.rest if stretch is None else stretch
     check_stretch(stretch, material)
-    rows = _sampled(
-        np.column_stack([switches, loads, slope]), State(stretch, rate), times, material)
+    rows = observed(_sampled(
+        np.column_stack([switches, loads, slope]), State(stretch, rate), times, material), material)
     return rows[motion.STRETCH], rows[motion.RATE]
 
 
@@ -99,16 +99,28 @@ def follow(
     pieces, last = ramps(levels, state.ramps_from, end, delivery.slew)
     if material.creep or delivery.lag > 0.0:
         return _follow_slowly(pieces, last, state, end, material, delivery)
-    stretch, rate, *_ = _sampled(pieces, state, np.array([float(end)]), material)[:, 0].tolist()
-    return State(stretch, rate, last)
+    stretch, rate, _, *followed = _sampled(
+        pieces, state, np.array([float(end)]), material)[:, 0].tolist()
+    return State(stretch, rate, last, None, tuple(followed))
 
 
 def followed_by(state: State, material: NondimensionalParameters) -> tuple[float, ...]:
-    """Return the branch states of a state: the elastic force that each branch has followed."""
-    count = len(material.branches)
-    if len(state.followed) == count:
+    """
+    Return the states of branches, and position and rate of each secondary mode.
+
+    A state without them has relaxed branches, and modes that move with the first.
+    """
+    if len(state.followed) == len(material.rows):
         return state.followed
-    return (float(law.elastic_force(state.stretch, material.packed)),) * count
+    count = len(material.branches)
+    relaxed = state.followed[:count] if len(state.followed) >= count else (
+        float(law.elastic_force(state.stretch, material.packed)),) * count
+    return (*relaxed, *(state.stretch, state.rate) * len(material.modes.ratios))
+
+
+def branches_of(state: State, material: NondimensionalParameters) -> tuple[float, ...]:
+    """Return the branch states of a state: the elastic force that each branch has followed."""
+    return followed_by(state, material)[:len(material.branches)]
 
 
 def with_followed(
@@ -117,6 +129,19 @@ def with_followed(
     branches = material.branches.copy()
     branches[:, motion.FOLLOWER] = followed
     return branches
+
+
+def observed(rows: Array, material: NondimensionalParameters) -> Array:
+    """Return stretch and rate of all modes together from rows of `sampled`, shape (2, m)."""
+    seen = rows[:motion.FIELD]
+    if not material.modes:
+        return seen
+    after = motion.FOLLOWED + len(material.branches)
+    shares = np.array(material.modes.shares)
+    seen = material.modes.first * seen
+    for place, row in ((motion.STRETCH, after), (motion.RATE, after + 1)):
+        seen[place] += shares @ rows[row::2]
+    return seen
 
 
 def paces(material: NondimensionalParameters, above: ArrayLike) -> Array:
@@ -140,7 +165,8 @@ def sampled(
     """
     Return stretch, rate, field and n branch states under levels, shape (3 + n, m).
 
-    The state is that at the start of the first level; times (m,) do not decrease. Raise
+    The stretch is that of the first mode; after the branch states come position and rate of each
+    secondary mode. The state is that at the start of the first level; times (m,) do not decrease. Raise
     `HmsaError` if a load is too large to simulate.
     """
     pieces, _ = ramps(
@@ -164,14 +190,16 @@ def response(
     if times[0] > at[0]:
         loads.insert(0, Level(float(at[0]) / units.time, held))
     rows = sampled(loads, State(start, load=held), at / units.time, material, delivery)
-    return rows[0], rows[1] / units.time, units.level(rows[2])
+    stretch, rate = observed(rows, material)
+    return stretch, rate / units.time, units.level(rows[2])
 
 
 def _sampled(
         pieces: Sequence[Piece] | Array, state: State, times: Array,
         material: NondimensionalParameters, lag: float = 0.0, rtol: float = RTOL) -> Array:
     switches, loads, slopes = np.array(pieces).T.copy()
-    branches = with_followed(material, followed_by(state, material))
+    branches = material.rows.copy()
+    branches[:, motion.FOLLOWER] = followed_by(state, material)
     out = np.empty((motion.FOLLOWED + len(branches), times.size))
     if not motion.sample(
             state.stretch, state.rate, loads[0] if math.isnan(state.load) else state.load,
@@ -194,11 +222,12 @@ def _follow_slowly(
         return State(
             stretch, rate, last if amplifier is None else field, amplifier, tuple(followed))
     share = material.branches[:, motion.RATIO] / (1.0 + material.branches[:, motion.RATIO].sum())
-    relaxed = _relaxed(np.array(followed), last, share, end - rings, material)
+    relaxed = _relaxed(np.array(followed[:len(share)]), last, share, end - rings, material)
     force = last + float(share @ (relaxed - last))
+    stretch = float(law.equilibrium_stretch(force, material.packed))
     return State(
-        float(law.equilibrium_stretch(force, material.packed)), 0.0, last, amplifier,
-        tuple(relaxed.tolist()))
+        stretch, 0.0, last, amplifier,
+        (*relaxed.tolist(), *(stretch, 0.0) * len(material.modes.ratios)))
 
 
 def _relaxed(
@@ -233,6 +262,8 @@ def longest_motion(load: float, material: NondimensionalParameters) -> float:
     frequency = law.natural_frequency(stretch, material.packed)
     longest = _MOST_PERIODS * 2.0 * math.pi / frequency
     decay = law.damping(stretch, material.packed) / (2.0 * law.mass(stretch, material.packed))
+    if material.modes:
+        decay = min(decay, frequency * material.modes.slowest_decay())
     if decay == 0.0:
         return longest
     if decay < frequency:

@@ -18,6 +18,7 @@ class Code(str, Enum):
     ROBUST = 'robust'
     MINIMAX = 'minimax'
     MINIMUM_TIME = 'minimum_time'
+    MODAL = 'modal'
     SMOOTH = 'smooth'
     LINEAR = 'linear'
     TOO_DAMPED = 'too_damped'

@@ -43,5 +43,7 @@ DONE, NO_TURN, STUCK, TOO_CLOSE = range(4)
 #: Columns of a branch: gamma, 1/tau, number and constants of its flow rule, and the force that it
 #: has followed, from which it continues; last, the number of columns.
 RATIO, SPEED, FLOW, FLOW_CONSTANT, FOLLOWER, BRANCH = 0, 1, 2, 3, 5, 6
+#: Maximum number of rows of branches and secondary modes of an actuator.
+ROWS = 9
 #: Rows that `sample` writes before those of the branch states.
 STRETCH, RATE, FIELD, FOLLOWED = range(4)

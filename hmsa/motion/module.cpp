@@ -228,7 +228,7 @@ auto two_step_late(double start, double rate, double target, double least, doubl
     if (fit(creeping <= most_branches))
         found = with_system(material.data, [&](const auto &system) {
             using System = std::decay_t<decltype(system)>;
-            return with_branches<double, System>(branches.data, creeping, [&](const auto &all) {
+            return with_branches<double, System>(branches.data, creeping, material.data, [&](const auto &all) {
                 return late(system, all, material.data, {start, rate, target},
                     {least, most, rtol, hold}, {field, load, lag, branches.data, creeping, known});
             });
@@ -274,7 +274,7 @@ int follow(int first, int last, Array<const bool> wanted, Results state, Results
     const int rows = durations.count;
     if (!fit(state.count == 3 * rows && drive.count == 4 * rows && status.count == rows
             && wanted.count == rows && first >= 0 && last <= rows
-            && (!branches.count || branches.count == branch_columns * most_branches * rows)))
+            && (!branches.count || branches.count == branch_columns * most_rows * rows)))
         return 0;
     const Plant plant{state.data, drive.data, material.data, rows ? material.count / rows : 0,
         branches.count ? branches.data : nullptr, durations.data, rtol};
@@ -283,14 +283,15 @@ int follow(int first, int last, Array<const bool> wanted, Results state, Results
         if (!wanted[i])
             continue;
         int creeping = 0;
-        const double *own = plant.branches + branch_columns * most_branches * i;
+        const double *own = plant.branches + branch_columns * most_rows * i;
+        const double *packed = plant.material + int64_t(plant.stride) * i;
         if (plant.branches)
-            while (creeping < most_branches && own[branch_columns * creeping + speed_at] > 0)
+            while (creeping < most_rows && own[branch_columns * creeping + speed_at] > 0)
                 creeping++;
-        const bool done = with_system(plant.material + int64_t(plant.stride) * i,
+        const bool done = with_system(packed,
             [&](const auto &system) {
                 using System = std::decay_t<decltype(system)>;
-                return with_branches<double, System>(own, creeping, [&](const auto &all) {
+                return with_branches<double, System>(own, creeping, packed, [&](const auto &all) {
                     return advance_row(plant, i, system, all);
                 });
             });
@@ -305,14 +306,14 @@ bool sample_of(double stretch, double rate, double field, Numbers switches, Numb
 {
     const int creeping = branches.count / branch_columns;
     if (!fit(loads.count == switches.count && slopes.count == switches.count && switches.count
-            && out.count == (3 + creeping) * times.count && creeping <= most_branches))
+            && out.count == (3 + creeping) * times.count && creeping <= most_rows))
         return false;
     const Course course{switches.count, times.count, switches.data, loads.data, slopes.data, times.data,
         stretch, rate, field, lag, material[zeta_at], rtol, branches.data, creeping, out.data};
     return apart([&] {
         return with_system(material.data, [&](const auto &system) {
             using System = std::decay_t<decltype(system)>;
-            return with_branches<double, System>(branches.data, creeping, [&](const auto &all) {
+            return with_branches<double, System>(branches.data, creeping, material.data, [&](const auto &all) {
                 return sample(system, all, course);
             });
         });
@@ -350,7 +351,7 @@ std::tuple<bool, double, int> solve(Results times, Results loads, Numbers d_time
     const int creeping = followed.count;
     if (!fit(levels && loads.count == levels && d_times.count == unknowns * levels
             && d_loads.count == unknowns * levels && branches.count == branch_columns * creeping
-            && levels <= most_levels && unknowns <= most_unknowns && creeping <= most_branches))
+            && levels <= most_levels && unknowns <= most_unknowns && creeping <= most_rows))
         return {};
     const Shot shot{levels, unknowns, times.data, loads.data, d_times.data, d_loads.data, stretch, rate,
         field, load, target, slew, lag, branches.data, creeping, followed.data, most_work};
@@ -369,6 +370,8 @@ std::tuple<bool, double, int> solve(Results times, Results loads, Numbers d_time
         if constexpr (has_own_code<System>)
             if (unknowns == 3)
                 return with(fixed<3>);
+        if (unknowns <= 4)
+            return with(fixed<4>);
         return with(fixed<most_unknowns>);
     });
     return {solved, lasts, work};

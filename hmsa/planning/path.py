@@ -21,7 +21,7 @@ from hmsa import motion
 from hmsa.model import law
 from hmsa.model.equations import Array
 from hmsa.model.moves import Level, Move, State
-from hmsa.model.simulation import follow, followed_by, sampled
+from hmsa.model.simulation import branches_of, follow, sampled
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.inverse_dynamics import held_along, loads_for
 from hmsa.planning.shapers.request import MoveRequest
@@ -180,7 +180,7 @@ class _Follower:
         self.done = 0  # intervals with known levels
         self._levels: list[Level] = []
         self._states = [request.start]
-        self._followed = followed_by(request.state, request.material)
+        self._followed = branches_of(request.state, request.material)
         # Errors of the integral and double integral of the command, and the present load.
         inertia = law.mass(request.state.stretch, request.material.packed)
         begin = self._course(np.zeros(1))

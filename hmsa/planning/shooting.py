@@ -21,7 +21,7 @@ from hmsa import motion
 from hmsa.model.delivery import Delivery
 from hmsa.model.equations import Array
 from hmsa.model.moves import Level
-from hmsa.model.simulation import followed_by
+from hmsa.model.simulation import branches_of, followed_by
 
 if TYPE_CHECKING:
     from hmsa.planning.shapers.request import MoveRequest
@@ -69,12 +69,13 @@ def _derivatives(count: int, unknowns: tuple[tuple[str, int], ...]) -> tuple[Arr
 
 def solve(
         template: Template, request: 'MoveRequest', delivery: Delivery | None = None, *,
-        wait: float = 0.0) -> Attempt:
+        wait: float = 0.0, modes: bool = False) -> Attempt:
     """
     Solve a template for rest at the target; the default delivery is that of the request.
 
     With creep and ramps, rest is at the end of the last ramp, or at least ``wait`` after the start
-    of the last level; on a command grid, after whole periods.
+    of the last level; on a command grid, after whole periods. With ``modes``, the secondary modes
+    are at rest, too.
     """
     delivery = delivery or request.delivery
     times, loads = template.times.copy(), template.loads.copy()
@@ -90,10 +91,12 @@ def solve(
         if wait > 0.0:
             times, loads = np.append(times, times[-1] + wait), np.append(loads, loads[-1])
             d_times, d_loads = (np.concatenate([x, x[-1:]]) for x in (d_times, d_loads))
+    rows = material.rows if modes else material.branches
+    followed = followed_by(state, material)[:len(rows)]
     solved, duration, done = motion.solve(
         times, loads, np.ascontiguousarray(d_times), np.ascontiguousarray(d_loads), state.stretch,
         state.rate, request.field, request.load, request.target, delivery.slew, delivery.lag,
-        material.packed, material.branches, np.array(followed_by(state, material)),
+        material.packed, rows, np.array(followed, dtype=np.float64),
         request.work.left)
     request.work.left -= done
     if not solved:

@@ -21,7 +21,7 @@ from hmsa.model.equations import acceleration
 from hmsa.model.mismatch import Uncertainty
 from hmsa.model.moves import Level, Limits, State
 from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
-from hmsa.model.simulation import follow, longest_motion, sampled
+from hmsa.model.simulation import follow, longest_motion, observed, sampled
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS, Units
 from hmsa.planning.path import Path
@@ -133,6 +133,19 @@ class JointModel:
         """Return the nondimensional acceleration in a state whose branches have relaxed."""
         return float(acceleration(state.stretch, state.rate, state.load, self.material))
 
+    def observed(self, state: State) -> tuple[float, float]:
+        """Return stretch and dimensionless rate of all modes together."""
+        modes = self.material.modes
+        if not modes or len(state.followed) != len(self.material.rows):
+            return state.stretch, state.rate
+        others = state.followed[len(self.material.branches):]
+
+        def all_of(first: float, rest: Sequence[float]) -> float:
+            return modes.first * first + sum(
+                x * y for x, y in zip(modes.shares, rest, strict=True))
+
+        return all_of(state.stretch, others[::2]), all_of(state.rate, others[1::2])
+
     def on_grid(self, time: int) -> int:
         """Return the earliest time in ns, not before the given one, that a command may have."""
         period = self.options.period
@@ -154,7 +167,8 @@ class JointModel:
         return State(
             state.stretch, state.rate / other.units.time * self.units.time, taken(state.load),
             None if state.amplifier is None else taken(state.amplifier),
-            creeping.carried(state, other.material, self.material))
+            creeping.carried(
+                state, other.material, self.material, self.units.time / other.units.time))
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,12 +185,12 @@ class PlannedLevel:
     @property
     def stretch(self) -> float:
         """Stretch at the timestamp."""
-        return self.state.stretch
+        return self.model.observed(self.state)[0]
 
     @property
     def rate(self) -> float:
         """Stretch rate at the timestamp in 1/s."""
-        return self.state.rate / self.model.units.time
+        return self.model.observed(self.state)[1] / self.model.units.time
 
     @property
     def in_force(self) -> float:
@@ -225,9 +239,9 @@ class PlannedLevel:
         after = np.array([model.time(x - self.stamp) for x in times])
         # After settling, creep may continue.
         count = int(np.searchsorted(after, settled)) if model.material.creep else len(after)
-        stretch, rate, *_ = sampled(
+        stretch, rate = observed(sampled(
             (Level(0.0, self.load),), self.state, np.minimum(after[:count], settled),
-            model.material, model.delivery) if count else np.empty((2, 0))
+            model.material, model.delivery), model.material) if count else np.empty((2, 0))
         found = [*zip(stretch.tolist(), rate.tolist(), strict=True),
                  *((x.stretch, x.rate) for x in map(self.at, times[count:]))]
         return [(x, y / model.units.time) for x, y in found]

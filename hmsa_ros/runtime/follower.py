@@ -137,6 +137,11 @@ def as_held(planner: Planner, time: int) -> Believed | None:
         equilibrium_stretch(model.load(last.flux_density), model.material)
         - equilibrium_stretch(last.load, last.model.material))
     low, high = stretch_limits(model.material)
-    return None if not low < stretch < high else (
-        stretch, state.rate / model.units.time, tuple(
-            x + model.holding(stretch) - model.holding(state.stretch) for x in state.followed))
+    if not low < stretch < high:
+        return None
+    count = len(model.material.branches)
+    more = model.holding(stretch) - model.holding(state.stretch)
+    return stretch, state.rate / model.units.time, (
+        *(x + more for x in state.followed[:count]),
+        *(x if i % 2 else x + stretch - state.stretch
+          for i, x in enumerate(state.followed[count:])))

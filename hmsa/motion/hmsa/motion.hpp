@@ -30,7 +30,7 @@ template <class S> Drive<S> following(const S &begin, double slope, double lag, 
 template <class S, class System, int NB> struct Motion {
     const System &system;
     const Branches<NB> &branches;
-    const int width = 2 + branches.count();
+    const int width = 2 + branches.rows();
     S y[room_of<S, NB>] = {};  // stretch, rate, branch states
     Step<S, room_of<S, NB>> step;
     int room = most_attempts, made = 0;  // maximum and actual number of steps in a piece
@@ -92,12 +92,12 @@ inline double faded(double line, double rest, double decay, double duration)
 }
 
 // Actuators that are advanced together, each by its own duration: rows of stretch, rate and step,
-// of the drive, of the packed material, and of the branches (most_branches, branch_columns).
+// of the drive, of the packed material, and of branches and modes (most_rows, branch_columns).
 struct Plant {
     double *state, *drive;
     const double *material;
     int stride;
-    double *branches;  // null without branches
+    double *branches;  // null without branches and modes
     const double *durations;
     double rtol;
 };
@@ -105,10 +105,10 @@ template <int NB, class System> bool advance_row(
     const Plant &plant, int i, const System &system, const Branches<NB> &branches)
 {
     double *state = plant.state + 3 * i, *drive = plant.drive + 4 * i;
-    double *rows = plant.branches ? plant.branches + branch_columns * most_branches * i : nullptr;
+    double *rows = plant.branches ? plant.branches + branch_columns * most_rows * i : nullptr;
     Motion<double, System, NB> motion{system, branches};
     motion.y[0] = state[0], motion.y[1] = state[1];
-    for (int b = 0; b < branches.count(); b++)
+    for (int b = 0; b < branches.rows(); b++)
         motion.y[2 + b] = rows[branch_columns * b + follower_at];
     const double duration = plant.durations[i];
     const double zeta = plant.material[int64_t(plant.stride) * i + zeta_at];
@@ -116,7 +116,7 @@ template <int NB, class System> bool advance_row(
     if (!motion.advance({drive[0], drive[1], drive[2], drive[3]}, duration, zeta, plant.rtol, h))
         return false;
     state[0] = motion.y[0], state[1] = motion.y[1], state[2] = h;
-    for (int b = 0; b < branches.count(); b++)
+    for (int b = 0; b < branches.rows(); b++)
         rows[branch_columns * b + follower_at] = motion.y[2 + b];
     const double line = drive[0];
     drive[0] += drive[1] * duration;
@@ -128,7 +128,7 @@ template <int NB, class System> bool advance_row(
 // Samples at increasing times of the response to an amplifier whose output is loads[m] +
 // slopes[m] (t - switches[m]) from switches[m] on; the motion begins at the first switch, which is
 // not after the first time. Rows of out (3 + branch_count, count) are stretch, rate, field and
-// branch states.
+// those of branches and modes.
 struct Course {
     int pieces, count;
     const double *switches, *loads, *slopes, *times;
@@ -142,7 +142,7 @@ template <int NB, class System> bool sample(
 {
     Motion<double, System, NB> motion{system, branches};
     motion.y[0] = course.stretch, motion.y[1] = course.rate;
-    for (int b = 0; b < branches.count(); b++)
+    for (int b = 0; b < branches.rows(); b++)
         motion.y[2 + b] = course.branches[branch_columns * b + follower_at];
     const auto piece_from = [&](int piece, double field) {
         return following(course.loads[piece], course.slopes[piece], course.lag, field);
@@ -165,7 +165,7 @@ template <int NB, class System> bool sample(
         column[0] = motion.y[0];
         column[course.count] = motion.y[1];
         column[2 * course.count] = drive.load();
-        for (int b = 0; b < branches.count(); b++)
+        for (int b = 0; b < branches.rows(); b++)
             column[(3 + b) * course.count] = motion.y[2 + b];
     }
     return true;

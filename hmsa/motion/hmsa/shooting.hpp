@@ -4,7 +4,9 @@
 #include "motion.hpp"
 
 namespace hmsa {
-constexpr int most_levels = 304, most_unknowns = 4;  // stretch, rate, field, and load
+constexpr int most_levels = 304;
+// Stretch, rate, field, and load; position and rate of each mode.
+constexpr int most_unknowns = 4 + 2 * most_modes;
 
 struct Shot {
     int levels, unknowns;
@@ -39,11 +41,13 @@ template <class System, int P> struct Shooting {
     const Shot &shot;
     Shooting(const System &a, const Shot &b) : system(a), shot(b) {}
     double zeta;
+    const double *material;  // packed
     Branches<most_branches> branches;
     int count;  // number of pieces
     double duration[2 * most_levels], begin[2 * most_levels], slope[2 * most_levels];
     double d_duration[2 * most_levels][P], d_begin[2 * most_levels][P];
-    double end[3 + most_branches], d_end[3 + most_branches][P];  // stretch, rate, field, branches
+    // Stretch, rate, field, branches, modes.
+    double end[3 + most_rows], d_end[3 + most_rows][P];
     double miss[most_unknowns], trial[most_unknowns][P];  // one row per unknown
     double frequency_at_target, stiffness, force;
     double first_times[most_levels], first_loads[most_levels];
@@ -113,7 +117,7 @@ template <class System, int P> struct Shooting {
     // Integrates the pieces; with derivatives if S has them.
     template <class S> bool respond(double rtol)
     {
-        return with_branches<S, System>(shot.branches, shot.branch_count, [&](const auto &branches) {
+        return with_branches<S, System>(shot.branches, shot.branch_count, material, [&](const auto &branches) {
             return respond<S>(branches, rtol);
         });
     }
@@ -122,7 +126,7 @@ template <class System, int P> struct Shooting {
         Motion<S, System, NB> motion{system, branches};
         motion.y[0] = motion.y[0] + shot.stretch;
         motion.y[1] = motion.y[1] + shot.rate;
-        for (int b = 0; b < branches.count(); b++)
+        for (int b = 0; b < branches.rows(); b++)
             motion.y[2 + b] = motion.y[2 + b] + shot.followed[b];
         S field = 0.0 * motion.y[0] + shot.field;
         for (int m = 0; m < count; m++) {
@@ -140,7 +144,7 @@ template <class System, int P> struct Shooting {
             if constexpr (count_of<S> > 0) {
                 // By the duration of the piece: the derivative is the equation of motion at its
                 // end.
-                S by[2 + NB];
+                S by[room_of<S, NB>];
                 change(system, branches, motion.y, field, by);
                 const double change = slope[m] - value(drive.rest) * drive.decay;
                 for (int c = 0; c < shot.unknowns; c++) {
@@ -157,13 +161,14 @@ template <class System, int P> struct Shooting {
                     d_end[row][c] = x.d[c];
         };
         put(0, motion.y[0]), put(1, motion.y[1]), put(2, field);
-        for (int b = 0; b < branches.count(); b++)
+        for (int b = 0; b < branches.rows(); b++)
             put(3 + b, motion.y[2 + b]);
         return true;
     }
     // Distance of the end from rest at the target, in units of stretch, and its derivatives. The
-    // conditions are stretch, rate, field (if it lags) and, with branches and a ramping amplifier,
-    // its last load, from which the next levels start.
+    // conditions are stretch, rate, field (if it lags), with branches and a ramping amplifier its
+    // last load, from which the next levels start, and position and rate of each mode. As many
+    // count as there are unknowns.
     double missed(bool derivatives)
     {
         const int n = derivatives ? shot.unknowns : 0;
@@ -178,13 +183,13 @@ template <class System, int P> struct Shooting {
             row++;
         }
         const bool ramps = shot.slew < infinity();
-        if (shot.branch_count > 0 && ramps) {
+        if (branches.count() > 0 && ramps) {
             miss[row] = (shot.loads[shot.levels - 1] - force) / stiffness;
             for (int c = 0; c < n; c++)
                 trial[row][c] = shot.d_loads[(shot.levels - 1) * shot.unknowns + c] / stiffness;
             row++;
         }
-        for (int b = 0; b < shot.branch_count; b++)
+        for (int b = 0; b < branches.count(); b++)
             // The field has to balance the overstress, and the amplifier to lead it.
             for (int i = 2; i < row; i++) {
                 const double share = branches.ratio[b] / stiffness;
@@ -195,6 +200,15 @@ template <class System, int P> struct Shooting {
                 for (int c = 0; c < n; c++)
                     trial[i][c] += share * above.d[0] * d_end[3 + b][c];
             }
+        for (int k = 0; k < branches.modes.count && row + 1 < shot.unknowns; k++, row += 2) {
+            const int at = 3 + branches.count() + 2 * k;
+            const double frequency = frequency_at_target * branches.modes.ratio[k];
+            miss[row] = end[at] - shot.target, miss[row + 1] = end[at + 1] / frequency;
+            for (int c = 0; c < n; c++) {
+                trial[row][c] = d_end[at][c];
+                trial[row + 1][c] = d_end[at + 1][c] / frequency;
+            }
+        }
         double squares = 0;
         for (int i = 0; i < shot.unknowns; i++)
             squares += miss[i] * miss[i];
@@ -246,13 +260,13 @@ template <class System, int P> struct Shooting {
     }
     // Coarse integrations give the derivatives and a guess for fine ones, which measure the end
     // without derivatives. Returns whether it is solved, and the duration including the last ramp.
-    bool solve(const double *material, double &lasts)
+    bool solve(const double *packed, double &lasts)
     {
         using S = Dual<double, P>;
         const int n = shot.unknowns, levels = shot.levels;
         lasts = __builtin_nan("");
-        zeta = material[zeta_at];
-        branches.read(shot.branches, shot.branch_count);
+        material = packed, zeta = material[zeta_at];
+        branches.read(shot.branches, shot.branch_count, material);
         const auto elastic = system.elastic(shot.target);
         force = elastic.v, stiffness = elastic.d[0];
         frequency_at_target = frequency(system, shot.target);

@@ -206,10 +206,61 @@ template <class C> struct AnyOf {
 
 using Any = AnyOf<double>;
 
-constexpr int most_branches = 3;
-// Columns of a branch: ratio, 1/time, number and constants of its flow rule, and the force that it
-// has followed, from which it continues.
+constexpr int most_branches = 3, most_modes = 3;
+// Maximum number of values of a state besides stretch and rate.
+constexpr int most_rows = most_branches + 2 * most_modes;
+// Rows of a state. Columns of a branch: ratio, 1/time, number and constants of its flow rule, and
+// the force that it has followed, from which it continues. After the branches, two rows for each
+// secondary mode, which end with its position and its rate: share, frequency ratio, a negative
+// number instead of a flow rule, and the damping ratio.
 enum Column { ratio_at, speed_at, flow_at, follower_at = flow_at + 1 + flow_constants, branch_columns };
+
+template <class System> double equilibrium(const System &system, const double *m, double beta);
+
+// Secondary modes: oscillators about the rest under the present load, whose frequencies are in
+// proportion to that of the first mode there.
+struct Modes {
+    int count = 0;
+    double ratio[most_modes] = {}, damping[most_modes] = {};
+    const double *material = nullptr;  // packed
+    struct Rest {
+        double load = __builtin_nan(""), stretch, per_load, squared, squared_per_load;
+    };
+    mutable Rest rest;  // under the load that was looked at last
+
+    void read(const double *rows, int rows_left)
+    {
+        for (; rows_left > 1; rows_left -= 2, rows += 2 * branch_columns) {
+            ratio[count] = rows[speed_at];
+            damping[count++] = rows[flow_at + 1];
+        }
+    }
+    template <class System> HMSA_APART void find(const System &system, double load) const
+    {
+        constexpr double aside = 1e-5;  // of a central difference
+        const auto squared = [&](double l) { return system.elastic(l).d[0] / system.mass(l); };
+        const double l = equilibrium(system, material, load), stiffness = system.elastic(l).d[0];
+        const double per_load = stiffness > 0 ? 1 / stiffness : 0;
+        rest = {load, l, per_load, abs(squared(l)),
+            (squared(l + aside) - squared(l - aside)) / (2 * aside) * per_load};
+    }
+    // Changes of positions and rates, in turns, under the load that is left for the elastic force.
+    template <class System, class S> HMSA_INLINE void change(
+        const System &system, const S &load, const S *at, S *by) const
+    {
+        if (!(value(load) == rest.load))
+            find(system, value(load));
+        const S off = load - rest.load;  // 0, with derivatives
+        const S middle = off * rest.per_load + rest.stretch;
+        const S squared = off * rest.squared_per_load + rest.squared;
+        const S frequency = squared * (0.5 / sqrt(rest.squared)) + 0.5 * sqrt(rest.squared);
+        for (int k = 0; k < count; k++, at += 2, by += 2) {
+            by[0] = at[1];
+            by[1] = squared * (ratio[k] * ratio[k]) * (middle - at[0])
+                - frequency * (2 * damping[k] * ratio[k]) * at[1];
+        }
+    }
+};
 
 // Viscoelastic branches: branch i adds the force ratio (psi'(l) - w), where w follows the elastic
 // force, w' = speed flow(psi'(l) - w). C is the type of their constants. The maximum number of
@@ -220,10 +271,26 @@ template <int NB, class C = double> struct Branches {
     AnyFlow<C> flow[flows ? NB : 1];
     double total = 1, fastest = 0;
     int in_use = NB;
+    std::conditional_t<flows, Modes, const char *> modes{};
     HMSA_INLINE int count() const { return flows ? in_use : NB; }
-    void read(const double *from, int count)
+    // Values of a state besides stretch and rate: branches, then modes.
+    HMSA_INLINE int rows() const
     {
+        if constexpr (flows)
+            return in_use + 2 * modes.count;
+        else
+            return NB;
+    }
+    void read(const double *from, int rows, const double *material = nullptr)
+    {
+        int count = 0;
+        while (count < rows && from[branch_columns * count + flow_at] >= 0)
+            count++;
         in_use = count;
+        if constexpr (flows) {
+            modes.material = material;
+            modes.read(from + branch_columns * count, rows - count);
+        }
         for (int b = 0; b < count; b++, from += branch_columns) {
             ratio[b] = from[ratio_at];
             speed[b] = from[speed_at];
@@ -259,16 +326,18 @@ template <int NB, class C = double> struct Branches {
     }
 };
 // Number of scalars in a state with branches; an even number if a step loops over them in pairs.
-template <class S, int NB> constexpr int room_of = (count_of<S> <= 1 || lanes<real<S>> > 1) && NB <= 1 ? 2 + NB : (3 + NB) / 2 * 2;
+template <int NB> constexpr int rows_of = NB == most_branches ? most_rows : NB;
+template <class S, int NB> constexpr int room_of = (count_of<S> <= 1 || lanes<real<S>> > 1) && NB <= 1 ? 2 + NB : (3 + rows_of<NB>) / 2 * 2;
 // Blocks have their own code; other models share as much as possible.
 template <class System> constexpr bool has_own_code = false;
 template <class C, template <class> class Law> constexpr bool has_own_code<Block<C, Law>> = true;
-// Calls f with the branches of rows. No branch and one linear branch have their own code, unless
-// it would be compiled again for each of many derivatives.
-template <class S, class System, class F> auto with_branches(const double *rows, int count, const F &f)
+// Calls f with the branches and modes of rows. No branch and one linear branch have their own code,
+// unless it would be compiled again for each of many derivatives.
+template <class S, class System, class F> auto with_branches(
+    const double *rows, int count, const double *material, const F &f)
 {
     const auto call = [&](auto branches) {
-        branches.read(rows, count);
+        branches.read(rows, count, material);
         return f(branches);
     };
     if constexpr (count_of<S> <= 1) {
@@ -285,13 +354,20 @@ template <int NB, class System, class S, class L> HMSA_INLINE void change(const 
     const Branches<NB> &branches, const S *x, const L &load, S *by, real<S> *squared = nullptr)
 {
     by[0] = x[1];
+    [[maybe_unused]] S left{};  // for the elastic force
     by[1] = system.acceleration(x[0], x[1], system.drag, [&](const S &force)
         __attribute__((always_inline)) {
             S net = load - force;
             branches.hold(force, x + 2, by + 2, [&](const S &held)
                 __attribute__((always_inline)) { net = net - held; });
+            if constexpr (NB == most_branches && lanes<real<S>> == 1)
+                if (branches.modes.count)
+                    left = net + force;
             return net;
         }, squared);
+    if constexpr (NB == most_branches && lanes<real<S>> == 1)
+        if (branches.modes.count)
+            branches.modes.change(system, left, x + 2 + branches.count(), by + 2 + branches.count());
 }
 
 // Frequency of small undamped motion about a stretch; the growth rate where the force falls.

@@ -12,6 +12,7 @@ from hmsa.planning.shapers.advice import advised
 from hmsa.planning.shapers.linear import ei, step, zv, zvd
 from hmsa.planning.shapers.minimax import minimax
 from hmsa.planning.shapers.minimum_time import minimum_time
+from hmsa.planning.shapers.modal import modal
 from hmsa.planning.shapers.request import Shaper
 from hmsa.planning.shapers.robust import robust
 from hmsa.planning.shapers.smooth import smooth
@@ -24,6 +25,7 @@ SHAPERS: dict[str, Shaper] = {
     # These find a plan whenever two_step does.
     **{x.__name__: advised(x, sooner=two_step) for x in (robust, minimax)},
     'minimum_time': advised(minimum_time),
+    'modal': advised(modal),
     # A failed search for a path takes long: advise which limits to relax, but not by how much.
     'smooth': advised(smooth, (math.inf,)),
     **{x.__name__: x for x in (step, zv, zvd, ei, umzv)},

@@ -18,6 +18,7 @@ from hmsa.model.equations import Array
 from hmsa.model.moves import Level, Move, State
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.simulation import (
+    branches_of,
     follow,
     followed_by,
     longest_motion,
@@ -38,16 +39,23 @@ _SHORTEST = 1e-9
 
 
 def carried(
-        state: State, before: NondimensionalParameters,
-        after: NondimensionalParameters) -> tuple[float, ...]:
-    """Return the branch states of a state for another material."""
+        state: State, before: NondimensionalParameters, after: NondimensionalParameters,
+        faster: float) -> tuple[float, ...]:
+    """
+    Return the states of branches and modes for another material, or nothing.
+
+    ``faster`` is the factor on dimensionless rates.
+    """
     # The branches remember a stretch: at rest, they are relaxed for any model.
-    if len(state.followed) != len(after.branches):
+    count = len(before.branches)
+    if len(state.followed) != len(before.rows) or len(before.rows) != len(after.rows) or (
+            count != len(after.branches)):
         return ()
-    found = tuple(
+    found = [
         float(law.elastic_force(law.equilibrium_stretch(x, before.packed), after.packed))
-        for x in state.followed)
-    return found if np.all(np.isfinite(found)) else ()
+        for x in state.followed[:count]]
+    found += [x * (faster if i % 2 else 1.0) for i, x in enumerate(state.followed[count:])]
+    return tuple(found) if np.all(np.isfinite(found)) else ()
 
 
 def arrival(request: MoveRequest, found: Move) -> State:
@@ -74,10 +82,11 @@ def held(request: MoveRequest, found: Move, span: float) -> Move:
         return found
     end = arrival(request, found)
     holding = float(law.elastic_force(request.target, material.packed))
+    behind = branches_of(end, material)
     step = max(abs(request.target - request.state.stretch), _LEAST_MOVE)
     out = np.empty((_MOST, 5))
     count, vibration = motion.staircase(
-        holding - np.array(end.followed), material.branches, request.target,
+        holding - np.array(behind), material.branches, request.target,
         material.packed, delivery.lag, delivery.period,
         max(span - found.duration, _SHORTEST), delivery.ripple / _SURE * step, out)
     times, excess, deviation, rates, fields = out[:count].T
@@ -90,17 +99,18 @@ def held(request: MoveRequest, found: Move, span: float) -> Move:
         begins = np.rint(begins / delivery.resolution) * delivery.resolution
     tail = tuple(map(Level, begins.tolist(), loads.tolist()))
     request.check(tail)
-    followed = np.empty((1 + count, len(end.followed)))
+    followed = np.empty((1 + count, len(behind)))
     motion.trail(
         np.append(0.0, times - late), np.full(1 + count, holding),
-        with_followed(material, end.followed), followed)
+        with_followed(material, behind), followed)
     field, amplifiers = before, [None] * count
     if delivery.lag > 0.0:
         field = holding + fields + late * (holding + fields - before) / delivery.lag
         amplifiers = before.tolist()
     states = list(map(
         State, (request.target + deviation - late * rates).tolist(), rates.tolist(),
-        field.tolist(), amplifiers, map(tuple, followed[1:].tolist())))
+        field.tolist(), amplifiers,
+        ((*x, *(request.target, 0.0) * len(material.modes.ratios)) for x in followed[1:].tolist())))
     if found.code in _RINGING:
         rings = int(np.searchsorted(begins, begins[0] + longest_motion(holding, material)))
         states[:rings] = _passed(request, levels + tail[:rings], begins[:rings])

@@ -15,7 +15,7 @@ import numpy as np
 
 from hmsa.model import law
 from hmsa.model.moves import Level, Move
-from hmsa.model.simulation import followed_by
+from hmsa.model.simulation import branches_of
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.shapers.request import AT_REST, MoveRequest
 from hmsa.planning.shooting import (
@@ -39,7 +39,7 @@ def at_rest(request: MoveRequest) -> bool:
     state, packed = request.state, request.material.packed
     if abs(state.stretch - request.target) > AT_REST or not request.still:
         return False
-    delivery, holding = request.delivery, request.balance(followed_by(state, request.material))
+    delivery, holding = request.delivery, request.balance(branches_of(state, request.material))
     stiffness = float(law.elastic_stiffness(request.target, packed))
     return delivery.lag == 0.0 or max(abs(request.field - holding), abs(
         request.load - holding) * (not math.isinf(delivery.slew))) <= AT_REST * stiffness

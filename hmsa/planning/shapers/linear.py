@@ -15,9 +15,10 @@ import math
 
 from hmsa.model.delivery import ramps
 from hmsa.model.moves import Level, Move
+from hmsa.model.simulation import branches_of
 from hmsa.model.status import Code
 from hmsa.planning.shapers.creeping import arrival
-from hmsa.planning.shapers.modes import oscillation
+from hmsa.planning.shapers.oscillation import oscillation
 from hmsa.planning.shapers.request import MoveRequest
 
 #: Impulses (time, weight) for a root -decay + i frequency of the motion, by time.
@@ -96,6 +97,6 @@ def shaped(request: MoveRequest, impulses: Impulses) -> Move:
         if period > 0.0:
             end = period * math.ceil(end / period - 1e-9)
         here = arrival(request, Move(Code.LINEAR, levels, end))
-        levels = levels_to(request.balance(here.followed))
+        levels = levels_to(request.balance(branches_of(here, material)))
     request.check(levels)
     return Move(Code.LINEAR, levels, end)

@@ -25,10 +25,10 @@ from hmsa.model.delivery import late, ramps
 from hmsa.model.equations import Array
 from hmsa.model.mismatch import Ellipsoid, Errors
 from hmsa.model.moves import Level, Move, State
-from hmsa.model.simulation import flow_rates, followed_by, with_followed
+from hmsa.model.simulation import branches_of, flow_rates, with_followed
 from hmsa.model.status import Code
 from hmsa.planning.shapers.creeping import arrival
-from hmsa.planning.shapers.modes import oscillation
+from hmsa.planning.shapers.oscillation import oscillation
 from hmsa.planning.shapers.request import as_errors, AT_REST, LARGEST_ERROR, MoveRequest
 from hmsa.planning.shapers.robust import robust
 
@@ -152,7 +152,7 @@ def _case(request: MoveRequest, holding: float, errors: Errors) -> _Case | None:
     peaks = (1.0 + math.exp(math.pi * root.real / root.imag)) / move
     return _Case(
         packed, stiffer, faster, stretch, state.rate / faster, with_followed(
-            material, np.array(followed_by(state, request.material)) / stiffer),
+            material, np.array(branches_of(state, request.material)) / stiffer),
         rest, law.elastic_force(rest, packed), law.elastic_stiffness(rest, packed), peaks * mode,
         peaks / stiffer * tail)
 
@@ -369,7 +369,8 @@ def _command(
 def _balance(request: MoveRequest, chain: Move, levels: Sequence[Level]) -> tuple[float, float]:
     """Return field and amplifier output at arrival, from which they follow the branches."""
     material = request.material
-    followed = arrival(request, replace(chain, levels=tuple(levels))).followed
+    followed = branches_of(
+        arrival(request, replace(chain, levels=tuple(levels))), request.material)
     holding = request.holding_load()
     above, ratios = holding - np.array(followed), material.branches[:, motion.RATIO]
     return holding + float(ratios @ above), holding + float(

@@ -14,7 +14,7 @@ from hmsa.model.equations import Array
 from hmsa.model.mismatch import Ellipsoid, Uncertainty
 from hmsa.model.moves import Level, Limits, Move, State
 from hmsa.model.parameters import NondimensionalParameters
-from hmsa.model.simulation import check_stretch, followed_by
+from hmsa.model.simulation import branches_of, check_stretch
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import Units
 from hmsa.planning.shapers.smooth_limits import PACE, SmoothLimits
@@ -152,7 +152,7 @@ class MoveRequest:
     def behind(self, stretch: float) -> Array:
         """Return the force at a stretch minus the initial branch states."""
         force = float(law.elastic_force(stretch, self.material.packed))
-        return np.array([force - x for x in followed_by(self.state, self.material)])
+        return np.array([force - x for x in branches_of(self.state, self.material)])
 
     def balance(self, followed: Sequence[float]) -> float:
         """Return the load that keeps the target at rest for given branch states."""

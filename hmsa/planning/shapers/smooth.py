@@ -19,7 +19,7 @@ from hmsa.errors import HmsaError
 from hmsa.model import law
 from hmsa.model.equations import acceleration, Array, elastic_force
 from hmsa.model.moves import Level, Move
-from hmsa.model.simulation import followed_by, sampled
+from hmsa.model.simulation import branches_of, sampled
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.inverse_dynamics import fade, held_along, loads_for
 from hmsa.planning.shapers.free import at_rest
@@ -141,7 +141,7 @@ def _free(
     """
     material, state = request.material, request.state
     load, field = request.load, request.field
-    followed = followed_by(state, material)
+    followed = branches_of(state, material)
     if not material.creep and state.rate == 0.0 and field == load == law.elastic_force(
             state.stretch, material.packed):
         nothing = np.zeros(_POINTS)
@@ -152,7 +152,7 @@ def _free(
     pull = loads
     if material.creep:
         force = elastic_force(stretch, material)
-        pull = loads - material.branches[:, motion.RATIO] @ (force - np.array(rows))
+        pull = loads - material.branches[:, motion.RATIO] @ (force - np.array(rows[:len(followed)]))
     return stretch, rate, acceleration(stretch, rate, pull, material), loads, followed
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from hmsa import motion
 from hmsa.model.moves import Level, Move
+from hmsa.model.simulation import branches_of
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.shapers.free import at_rest, free_heights, free_levels, no_single
 from hmsa.planning.shapers.push_brake import push_brake
@@ -109,7 +110,7 @@ def _late(request: MoveRequest, lag: float) -> tuple[Code, tuple[Level, ...]]:
     state, material, limits = request.state, request.material, request.limits
     status, beta_p, tau_p, beta_1, push, until = motion.two_step_late(
         state.stretch, state.rate, request.target, limits.minimum, limits.maximum, RTOL,
-        HOLD_TOLERANCE, material.packed, material.branches, state.followed, request.field,
+        HOLD_TOLERANCE, material.packed, material.branches, branches_of(state, material), request.field,
         request.load, lag)
     code = CODES[status]
     if code is not Code.TWO_STEP:

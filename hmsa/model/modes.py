@@ -1,0 +1,84 @@
+"""Secondary modes of an actuator that is a continuum: oscillators beside the first mode."""
+
+from dataclasses import dataclass
+import math
+from typing import Any
+
+from hmsa.errors import BadInputError
+
+#: Maximum number of secondary modes.
+MOST = 3
+# Numbers in place of a flow rule, in the rows of position and rate of a mode.
+_POSITION, _RATE = -1.0, -2.0
+# Maximum ratio to the frequency of the first mode: faster ones vibrate below what steps excite.
+_FASTEST = 100.0
+
+
+@dataclass(frozen=True)
+class Modes:
+    """
+    Up to three secondary modes, which vibrate beside the first.
+
+    The stretch is the sum of s_i z_i over all modes, with shares s_i that add up to 1. The first
+    mode obeys the equation of motion. Each other one is an oscillator about the same rest under
+    the present load, z'' + 2 d w z' + w^2 (z - rest) = 0, where w is in proportion to the natural
+    frequency of the first mode about this rest. At rest, all z_i equal the stretch.
+    """
+
+    ratios: tuple[float, ...] = ()  #: of frequency to that of the first mode, above 1 to 100
+    shares: tuple[float, ...] = ()  #: of the static stretch; negative for a mode in antiphase
+    dampings: tuple[float, ...] = ()  #: damping ratios, at least 0 and below 1
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        named = {
+            'frequency_ratio': self.ratios, 'share': self.shares, 'damping_ratio': self.dampings}
+        counts = {len(x) for x in named.values()}
+        if len(counts) > 1:
+            raise BadInputError(
+                ', '.join(f'modes.{x} has {len(y)}' for x, y in named.items())
+                + ' values: expected one of each for every secondary mode')
+        if len(self.ratios) > MOST:
+            raise BadInputError(
+                f'modes.frequency_ratio has {len(self.ratios)} values: expected at most {MOST} '
+                'secondary modes')
+        for name, holds, expected in (
+                ('frequency_ratio', lambda x: 1.0 < x <= _FASTEST,
+                 f'numbers above 1, up to {_FASTEST:g}'),
+                ('share', lambda x: -1.0 < x < 1.0, 'numbers between -1 and 1'),
+                ('damping_ratio', lambda x: 0.0 <= x < 1.0, 'numbers from 0 to below 1')):
+            for value in named[name]:
+                if not holds(value):
+                    raise BadInputError(f'modes.{name} has {value:g}: expected {expected}')
+        if not self.first > 0.0:
+            raise BadInputError(
+                f'modes.share has {sum(self.shares):g} in all: expected less than 1, as the first '
+                'mode has the rest')
+
+    @property
+    def first(self) -> float:
+        """Share of the first mode."""
+        return 1.0 - sum(self.shares)
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Parameters that describe the modes; none without secondary modes."""
+        return {
+            'modes.frequency_ratio': list(self.ratios), 'modes.share': list(self.shares),
+            'modes.damping_ratio': list(self.dampings)} if self else {}
+
+    def rows(self) -> list[list[float]]:
+        """Return two rows for each mode as arguments of `hmsa.motion`, with a state of 0."""
+        return [
+            [share, ratio, kind, damping, 0.0, 0.0]
+            for ratio, share, damping in zip(self.ratios, self.shares, self.dampings, strict=True)
+            for kind in (_POSITION, _RATE)]
+
+    def __bool__(self) -> bool:
+        """Return whether there are secondary modes."""
+        return bool(self.ratios)
+
+    def slowest_decay(self) -> float:
+        """Return the slowest decay rate, in units of the natural frequency of the first mode."""
+        return min(
+            (x * y for x, y in zip(self.ratios, self.dampings, strict=True)), default=math.inf)
