@@ -25,6 +25,7 @@ from hmsa.api.arguments import (
 )
 from hmsa.api.doubts import unquestioned, warn
 from hmsa.api.facts import facts
+from hmsa.api.mounting import mount_facts, with_mount
 from hmsa.errors import BadInputError, excerpt
 from hmsa.files import write_text, yaml_text
 from hmsa.interfaces.actuator import actuator_from, model_from, parameters_of
@@ -96,6 +97,10 @@ class Actuator:
         Slew rate of the amplifier in T/s; infinite for ideal steps.
     coil_time_constant : float
         L/R of the coil in s; 0 for none.
+    mount : {'paper', 'free', 'glued'}
+        The paper's block, which deforms uniformly in motion, too; or as a continuum with its
+        modes, free or with one face glued to a rigid support (`hmsa.model.continuum`). The shaper
+        ``'modal'`` brings all modes to rest.
 
     Raises
     ------
@@ -129,7 +134,8 @@ class Actuator:
             law: str = 'gent', constants: Mapping[str, Any] | None = None,
             creep: Sequence[tuple[float, float]] = (),
             flux_density_limits: float | tuple[float, float] = _STRONGEST,
-            slew_limit: float = math.inf, coil_time_constant: float = 0.0) -> None:
+            slew_limit: float = math.inf, coil_time_constant: float = 0.0,
+            mount: str = 'paper') -> None:
         given = {
             'shear_modulus': shear_modulus, 'density': density, 'half_length': half_length,
             'half_thickness': half_length if half_thickness is None else half_thickness,
@@ -141,7 +147,8 @@ class Actuator:
         if all(given[x] is None for x in DAMPED):
             zeta = ZETA
         #: Parameters that plans are made with.
-        self.model = _model(parameters_in(given), zeta, damping_ratio)
+        self.model = with_mount(
+            _model(parameters_in(given), zeta, damping_ratio), mount, damping_ratio)
         self._belief: Belief | Path | None = None
         warn(self)
 
@@ -290,7 +297,8 @@ class Actuator:
     def report(self) -> Table:
         """Return a table of the derived quantities."""
         return Table(
-            (Column('quantity'), Column('value')), tuple(facts(self.scales, self.block)))
+            (Column('quantity'), Column('value')),
+            tuple([*facts(self.scales, self.block), *mount_facts(self.block)]))
 
     def __repr__(self) -> str:
         return f'Actuator.from_parameters({self.parameters!r})'
@@ -313,7 +321,8 @@ class Actuator:
         Parameters
         ----------
         **parameters
-            As for `Actuator`; zeta stays unless damping is given.
+            As for `Actuator`; zeta stays unless damping is given, and modes stay. A mount may be
+            given to a block of the paper.
 
         Returns
         -------
@@ -336,6 +345,7 @@ class Actuator:
         if unknown:
             raise BadInputError(
                 f'{unknown[0]} is no parameter of an actuator: expected {", ".join(_KEYS)}')
+        mount = parameters.pop('mount', 'paper')
         changed = parameters_in(parameters, self.law)
         # A new model or new branches replace all previous ones.
         groups = ('law',) * (changed[LAW_NAME.name] != self.law) + (
@@ -346,6 +356,7 @@ class Actuator:
              if x.partition('.')[0] not in groups} | changed,
             None if 'actuator.damping_coefficient' in changed else zeta,
             parameters.get('damping_ratio')))
+        made.model = with_mount(made.model, mount, parameters.get('damping_ratio'))
         warn(made)
         return made
 

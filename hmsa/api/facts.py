@@ -12,7 +12,8 @@ def facts(found: Scales, block: ActuatorParameters) -> list[tuple[str, str]]:
     """Return names and values, with units, of the derived quantities."""
     beam, words = block.rest == 0.0, block.coordinate.plural
     return [
-        ('time unit' if beam else 'time unit L sqrt(rho/G)', _time_text(found.time_unit)),
+        ('time unit' if beam or block.geometry.inertia != 1.0 else 'time unit L sqrt(rho/G)',
+         _time_text(found.time_unit)),
         ('natural frequency at rest', f'{found.frequency:.5g} Hz'),
         ('damping', f'{found.damping:.4g} N s/m, zeta {found.zeta:.4g}'),
         ('critical damping at rest',

@@ -30,7 +30,7 @@ from hmsa.cli.options import (
 )
 from hmsa.errors import BadInputError
 from hmsa.files import check_targets, write_text, yaml_text
-from hmsa.interfaces.parameters import LAW, LAW_NAME, PUBLISH_RATE
+from hmsa.interfaces.parameters import LAW, LAW_NAME, MODES, PUBLISH_RATE
 from hmsa.interfaces.quantities import (
     DAMPING,
     default_of,
@@ -72,6 +72,10 @@ def add_parser(subparsers: Any) -> None:
          'its setpoints are deflections of the tip over the length'),
         *map(_option, (*QUANTITIES, *(x for x in EVERY if x not in QUANTITIES), DAMPING)),
         LAW_OPTION,
+        ('--mount', 'MOUNT', str,
+         'how a block is held: free, glued (with one face, to a rigid support), or paper (the '
+         "paper's model: uniform deformation, one mode; default)",
+         {'default': 'paper', 'choices': ('paper', 'free', 'glued')}),
         ('--joint', 'NAME', str,
          f'joint name (default {_JOINT}), or several separated by commas for identical actuators',
          {'default': ''}),
@@ -114,8 +118,9 @@ def run(arguments: argparse.Namespace) -> int:
             given[quantity.key] = default_of(quantity, given)
     from hmsa.api.doubts import doubts as doubts_of
     from hmsa.api.facts import facts
+    from hmsa.api.mounting import mount_facts
 
-    made = _actuator(form, given, arguments.law)
+    made = _actuator(form, given, arguments.law, arguments.mount)
     found = made.scales
     given.setdefault('shear_modulus', made.block.shear_modulus)
     doubts = doubts_of(made)
@@ -126,7 +131,8 @@ def run(arguments: argparse.Namespace) -> int:
             f'{"; ".join(shown)} {"is a guess" if len(missing) == 1 else "are guesses"}: a plan '
             'is only as exact as its parameters; measure them and pass the values')
     parameters = _parameters(made)
-    table = [f'{name:<26} {value}' for name, value in facts(found, made.block)]
+    table = [f'{name:<29} {value}' for name, value in [
+        *facts(found, made.block), *mount_facts(made.block)]]
     write_text(path, '\n'.join([
         '# Parameters of an actuator for planner and plant, written by hmsa init:',
         *(f'#   hmsa {x} --ros-args --params-file {quote(path.name)}' for x in _NODES),
@@ -199,7 +205,8 @@ def _known(key: str, given: Mapping[str, float]) -> bool:
     return key in given or (key in _DAMPED and DAMPING.key in given)
 
 
-def _actuator(form: str, given: Mapping[str, float], law: str | None) -> 'Actuator':
+def _actuator(
+        form: str, given: Mapping[str, float], law: str | None, mount: str) -> 'Actuator':
     """Return the actuator with its coil."""
     from hmsa.api.actuator import Actuator
     from hmsa.api.doubts import unquestioned
@@ -210,6 +217,8 @@ def _actuator(form: str, given: Mapping[str, float], law: str | None) -> 'Actuat
         _ARGUMENTS.get(x, x): given[x]
         for x in (*(y.key for y in FORMS[form] if y.key not in (*_COIL, *_DAMPED)), *damping)
         if x in given}
+    if mount != 'paper':
+        values['mount'] = mount
     values |= {'flux_density_limits': (given['flux_min'], given['flux_max']),
                'slew_limit': given['slew_limit'] or math.inf}
     if law is not None:
@@ -220,7 +229,7 @@ def _actuator(form: str, given: Mapping[str, float], law: str | None) -> 'Actuat
 
 def _lines(form: str, parameters: Mapping[str, Any], guessed: Collection[str]) -> list[str]:
     """Return the nodes' parameters in YAML, each below its description, which marks guesses."""
-    texts = {x.name: (x.description.rstrip('.'), x.unit) for x in LAW} | {
+    texts = {x.name: (x.description.rstrip('.'), x.unit) for x in (*LAW, *MODES)} | {
         x.parameter: (x.text, x.unit) for x in (*QUANTITIES, DAMPING)}
     if form == 'beam':
         texts |= {

@@ -49,7 +49,7 @@ def actuator_from(
             numbers['shear_modulus'] = modulus
     continuum = {x.name: values.get(x.name, x.default) for x in MODES}
     modes = Modes(*(tuple(continuum.pop(f'modes.{x}')) for x in (
-        'frequency_ratio', 'share', 'damping_ratio')))
+        'frequency_ratio', 'share', 'damping_ratio', 'ratio_exponent')))
     return ActuatorParameters(
         law=elastic, modes=modes,
         **{name.removeprefix('actuator.'): value for name, value in continuum.items()},

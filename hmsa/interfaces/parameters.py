@@ -245,6 +245,10 @@ MODES = (
     ParameterSpec(
         'modes.damping_ratio', [], 'Modes: damping ratio of each secondary mode.', '', 0.0, 1.0,
         items=float),
+    ParameterSpec(
+        'modes.ratio_exponent', [],
+        'Modes: exponent of the stretch at rest with which each frequency ratio grows; empty for '
+        'constant ratios.', '', -5.0, 5.0, items=float),
 )
 
 #: All parameters of a block.

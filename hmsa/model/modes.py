@@ -12,6 +12,8 @@ MOST = 3
 _POSITION, _RATE = -1.0, -2.0
 # Maximum ratio to the frequency of the first mode: faster ones vibrate below what steps excite.
 _FASTEST = 100.0
+# Largest exponent of the stretch.
+_STEEPEST = 5.0
 
 
 @dataclass(frozen=True)
@@ -21,18 +23,23 @@ class Modes:
 
     The stretch is the sum of s_i z_i over all modes, with shares s_i that add up to 1. The first
     mode obeys the equation of motion. Each other one is an oscillator about the same rest under
-    the present load, z'' + 2 d w z' + w^2 (z - rest) = 0, where w is in proportion to the natural
-    frequency of the first mode about this rest. At rest, all z_i equal the stretch.
+    the present load, z'' + 2 d w z' + w^2 (z - rest) = 0, where w is the natural frequency of the
+    first mode about this rest times a ratio, which may grow with a power of the stretch there. At
+    rest, all z_i equal the stretch.
     """
 
     ratios: tuple[float, ...] = ()  #: of frequency to that of the first mode, above 1 to 100
     shares: tuple[float, ...] = ()  #: of the static stretch; negative for a mode in antiphase
     dampings: tuple[float, ...] = ()  #: damping ratios, at least 0 and below 1
+    #: Exponents of the stretch in the ratios, -5 to 5; empty for 0.
+    exponents: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the values."""
         named = {
             'frequency_ratio': self.ratios, 'share': self.shares, 'damping_ratio': self.dampings}
+        if self.exponents:
+            named['ratio_exponent'] = self.exponents
         counts = {len(x) for x in named.values()}
         if len(counts) > 1:
             raise BadInputError(
@@ -46,8 +53,10 @@ class Modes:
                 ('frequency_ratio', lambda x: 1.0 < x <= _FASTEST,
                  f'numbers above 1, up to {_FASTEST:g}'),
                 ('share', lambda x: -1.0 < x < 1.0, 'numbers between -1 and 1'),
-                ('damping_ratio', lambda x: 0.0 <= x < 1.0, 'numbers from 0 to below 1')):
-            for value in named[name]:
+                ('damping_ratio', lambda x: 0.0 <= x < 1.0, 'numbers from 0 to below 1'),
+                ('ratio_exponent', lambda x: abs(x) <= _STEEPEST,
+                 f'numbers from {-_STEEPEST:g} to {_STEEPEST:g}')):
+            for value in named.get(name, ()):
                 if not holds(value):
                     raise BadInputError(f'modes.{name} has {value:g}: expected {expected}')
         if not self.first > 0.0:
@@ -65,13 +74,16 @@ class Modes:
         """Parameters that describe the modes; none without secondary modes."""
         return {
             'modes.frequency_ratio': list(self.ratios), 'modes.share': list(self.shares),
-            'modes.damping_ratio': list(self.dampings)} if self else {}
+            'modes.damping_ratio': list(self.dampings),
+            'modes.ratio_exponent': list(self.exponents)} if self else {}
 
     def rows(self) -> list[list[float]]:
         """Return two rows for each mode as arguments of `hmsa.motion`, with a state of 0."""
         return [
-            [share, ratio, kind, damping, 0.0, 0.0]
-            for ratio, share, damping in zip(self.ratios, self.shares, self.dampings, strict=True)
+            [share, ratio, kind, damping, exponent, 0.0]
+            for ratio, share, damping, exponent in zip(
+                self.ratios, self.shares, self.dampings,
+                self.exponents or (0.0,) * len(self.ratios), strict=True)
             for kind in (_POSITION, _RATE)]
 
     def __bool__(self) -> bool:

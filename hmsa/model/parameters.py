@@ -237,6 +237,10 @@ class ActuatorParameters:
             raise BadInputError(
                 f'transverse_mass_factor is {self.transverse_mass_factor:g}: expected 1 for a '
                 'beam, which has no transverse inertia of its own')
+        if any(self.modes.exponents) and self.rest == 0.0:
+            raise BadInputError(
+                'modes.ratio_exponent is given for a beam: expected none, as its deflection at '
+                'rest is 0')
         self.creep.check(scales[0])
 
     @classmethod

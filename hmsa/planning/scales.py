@@ -103,7 +103,7 @@ def scales(actuator: ActuatorParameters, least: float, most: float) -> Scales:
     return Scales(
         time_unit=actuator.time_unit,
         frequency=1.0 / actuator.period,
-        c1=material.c1, zeta=material.zeta, critical_zeta=critical,
+        c1=actuator.geometry.c1, zeta=material.zeta, critical_zeta=critical,
         damping=actuator.damping_coefficient,
         critical_damping=critical * actuator.damping_unit, flux_density_unit=units.load,
         flux_densities=tuple(

@@ -202,6 +202,7 @@ template <class System, int P> struct Shooting {
             }
         for (int k = 0; k < branches.modes.count && row + 1 < shot.unknowns; k++, row += 2) {
             const int at = 3 + branches.count() + 2 * k;
+            // As a unit of rates, without the exponent.
             const double frequency = frequency_at_target * branches.modes.ratio[k];
             miss[row] = end[at] - shot.target, miss[row + 1] = end[at + 1] / frequency;
             for (int c = 0; c < n; c++) {

@@ -212,16 +212,17 @@ constexpr int most_rows = most_branches + 2 * most_modes;
 // Rows of a state. Columns of a branch: ratio, 1/time, number and constants of its flow rule, and
 // the force that it has followed, from which it continues. After the branches, two rows for each
 // secondary mode, which end with its position and its rate: share, frequency ratio, a negative
-// number instead of a flow rule, and the damping ratio.
+// number instead of a flow rule, the damping ratio, and the exponent of the stretch at rest with
+// which the frequency ratio grows.
 enum Column { ratio_at, speed_at, flow_at, follower_at = flow_at + 1 + flow_constants, branch_columns };
 
 template <class System> double equilibrium(const System &system, const double *m, double beta);
 
 // Secondary modes: oscillators about the rest under the present load, whose frequencies are in
-// proportion to that of the first mode there.
+// proportion to that of the first mode there, and to a power of the stretch.
 struct Modes {
     int count = 0;
-    double ratio[most_modes] = {}, damping[most_modes] = {};
+    double ratio[most_modes] = {}, damping[most_modes] = {}, exponent[most_modes] = {};
     const double *material = nullptr;  // packed
     struct Rest {
         double load = __builtin_nan(""), stretch, per_load, squared, squared_per_load;
@@ -232,7 +233,8 @@ struct Modes {
     {
         for (; rows_left > 1; rows_left -= 2, rows += 2 * branch_columns) {
             ratio[count] = rows[speed_at];
-            damping[count++] = rows[flow_at + 1];
+            damping[count] = rows[flow_at + 1];
+            exponent[count++] = rows[flow_at + 2];
         }
     }
     template <class System> HMSA_APART void find(const System &system, double load) const
@@ -255,9 +257,12 @@ struct Modes {
         const S squared = off * rest.squared_per_load + rest.squared;
         const S frequency = squared * (0.5 / sqrt(rest.squared)) + 0.5 * sqrt(rest.squared);
         for (int k = 0; k < count; k++, at += 2, by += 2) {
+            S grown = 0.0 * off + ratio[k];
+            if (exponent[k] != 0)
+                grown = grown * power(middle, exponent[k]);
             by[0] = at[1];
-            by[1] = squared * (ratio[k] * ratio[k]) * (middle - at[0])
-                - frequency * (2 * damping[k] * ratio[k]) * at[1];
+            by[1] = squared * grown * grown * (middle - at[0])
+                - frequency * grown * (2 * damping[k]) * at[1];
         }
     }
 };

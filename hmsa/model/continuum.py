@@ -1,0 +1,287 @@
+"""
+Modes of a block as a continuum, by the Rayleigh-Ritz method with polynomials.
+
+The model of the paper deforms the block uniformly, which is exact at rest in a uniform field, but
+not in motion: its faces bulge, and several modes take part. Small motion of an incompressible
+Gent block about uniform stretch l, under the dead traction of the field on its faces across it
+(R. Zhao et al., J. Mech. Phys. Solids 124, 244, 2019), has the energy
+
+    W1 |dF|^2 + 2 W11 (F:dF)^2 + p/2 (tr(A A) - tr(A)^2) + K/2 tr(A)^2,    A = F^-1 dF,
+
+per volume of the undeformed block, with F = diag(l^-1/2, l^-1/2, l), W1 and W11 the derivatives of
+the energy by the first invariant, and p = 2 W1/l, for which the sides are free of stress. A bulk
+modulus K that is far above G replaces incompressibility. Displacements are products of Legendre
+polynomials, as in resonant ultrasound spectroscopy (W. M. Visscher et al., J. Acoust. Soc. Am. 90,
+2154, 1991). Lengths are in units of L, with G = rho = 1.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+import math
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+from hmsa.errors import BadInputError, excerpt
+from hmsa.model import law
+from hmsa.model.equations import Array
+from hmsa.model.modes import Modes
+
+#: Ways to hold the block, and the paper's model.
+MOUNTS = ('paper', 'free', 'glued')
+
+# Degree of the polynomials: the frequency of the cube is then within 1e-6 of the exact one of its
+# Lame mode, and the strongest secondary ones within 1e-3 of those of degree 15 (test_continuum).
+_DEGREE = {'free': 11, 'glued': 9}
+_BULK = 300.0
+# Modes of frequencies this close act as one.
+_TOGETHER = 1e-3
+# Shares of the static stretch below which a mode is none that the field excites, and below which a
+# secondary mode is left out.
+_UNSEEN, _WEAKEST = 1e-6, 0.01
+# Secondary modes that are kept, and the maximum ratio of their frequencies. A third one lengthens
+# the commands of `modal`, and leaves no less on finite elements (benchmarks continuum).
+_COUNT, _FASTEST = 2, 5.0
+# Shapes H/L for which the polynomials were compared with finite elements and bar theory.
+_SHAPES = 0.02, 10.0
+# Largest damping ratio of a secondary mode.
+_MOST_DAMPED = 0.95
+# Logarithms between which the transverse factor is sought.
+_LOGS = -9.0, 3.0
+# Stretches about which the natural frequency of the first mode determines the transverse factor.
+_STRETCHES = (0.9, 1.1, 1.2)
+# Stretches near rest that determine how the ratios of frequencies change with it.
+_BESIDE = (0.97, 1.03)
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Modes that the field excites, by frequency."""
+
+    frequencies: Array  #: natural frequencies, in units of sqrt(G/rho)/L, shape (n,)
+    shares: Array  #: of the static mean stretch, shape (n,)
+    compliance: float  #: static mean stretch under a small load, in units of that of the free block
+
+    @property
+    def first(self) -> int:
+        """Index of the mode with the largest share."""
+        return int(np.argmax(self.shares))
+
+
+@dataclass(frozen=True)
+class Mounted:
+    """How a mounted block differs from the paper's model."""
+
+    stiffness: float  #: factor on the shear modulus
+    mass_factor: float
+    transverse_mass_factor: float
+    modes: Modes
+
+
+@lru_cache(maxsize=64)
+def spectrum(shape: float, mount: str, stretch: float = 1.0, j_lim: float = math.inf) -> Spectrum:
+    """
+    Return the modes of a block that a field along its axis excites.
+
+    Parameters
+    ----------
+    shape : float
+        H/L.
+    mount : {'free', 'glued'}
+        Free, or with one face across the field glued to a rigid support.
+    stretch : float
+        Uniform stretch about which the block vibrates; 1 for a glued one.
+    j_lim : float
+        Limiting extensibility of the Gent model; infinite for neo-Hookean.
+
+    Returns
+    -------
+    Spectrum
+        In units of L, G and rho.
+
+    """
+    from scipy.linalg import eigh, solve  # slow to import
+
+    span = 2.0 * shape if mount == 'glued' else shape
+    basis = _Basis.of(mount, span)
+    side = stretch ** -0.5
+    scale = np.array([side, side, stretch])
+    left = 1.0 - (2.0 * side ** 2 + stretch ** 2 - 3.0) / j_lim
+    by_invariant, bend = 0.5 / left, 0.5 / (j_lim * left ** 2)
+    pressure = 2.0 * by_invariant * side ** 2
+    component = basis.component
+    alike = component[:, None] == component
+    mass = np.where(alike, basis.integral(), 0.0)
+    stiffness = np.where(
+        alike, 2.0 * by_invariant * sum(basis.integral(x, x) for x in range(3)), 0.0)
+    for c, e in product(range(3), repeat=2):
+        # F:dF and tr(A) contain the gradient of each displacement along itself, tr(A A) also others.
+        inverse = 1.0 / (scale[c] * scale[e])
+        stiffness += np.where(
+            (component == c)[:, None] & (component == e),
+            (4.0 * bend * scale[c] * scale[e] + (_BULK - pressure) * inverse)
+            * basis.integral(c, e) + pressure * inverse * basis.integral(e, c), 0.0)
+    squared, vectors = eigh(stiffness, mass)
+    flexible = float(basis.load @ solve(stiffness, basis.load, assume_a='sym'))
+    shares = (vectors.T @ basis.load) ** 2 / squared / flexible
+    # A unit load stretches a free block by 1/3, if it is small.
+    return Spectrum(*_together(np.sqrt(np.abs(squared)), shares), 3.0 * flexible / span)
+
+
+@dataclass(frozen=True)
+class _Basis:
+    """Products of polynomials in the three directions, for a part of the block by symmetry."""
+
+    component: NDArray[np.int64]  #: direction of each displacement, shape (n,)
+    degrees: NDArray[np.int64]  #: of its polynomials, shape (3, n)
+    tables: tuple[Array, ...]  #: integrals by direction, see `_integrals`
+    load: Array  #: mean on the face of the load, along the field, shape (n,)
+
+    @classmethod
+    def of(cls, mount: str, span: float) -> '_Basis':
+        """
+        Return the basis for an eighth of a free block, and a quarter of a glued one.
+
+        Each displacement is odd in its own direction and even in the others; those of a glued block
+        are in proportion to the distance from the support.
+        """
+        most, glued = _DEGREE[mount], mount == 'glued'
+        across = [legendre.Legendre.basis(n) for n in range(most + 1)]
+        along = across
+        if glued:
+            distance = legendre.Legendre([0.5, 0.5], domain=[0.0, 1.0])
+            along = [
+                distance * legendre.Legendre.basis(n, domain=[0.0, 1.0]) for n in range(most)]
+        rows = []
+        for c in range(3):
+            x, y, z = (range(c == axis, most + 1, 2) for axis in range(3))
+            rows += [
+                (c, *degrees) for degrees in product(x, y, range(most) if glued else z)
+                if sum(degrees) + glued <= most]
+        component, *degrees = np.array(rows, dtype=np.int64).T
+        tables = (
+            _integrals(across, 1.0), _integrals(across, 1.0), _integrals(along, span))
+        means, ends = tables[0][0, 0, 0], np.array([float(x(1.0)) for x in along])
+        load = np.where(component == 2, 1.0, 0.0) * (
+            means[degrees[0]] * means[degrees[1]] * ends[degrees[2]])
+        return cls(component, np.array(degrees), tables, load)
+
+    def integral(self, one: int | None = None, other: int | None = None) -> Array:
+        """
+        Return the integrals of all products of two displacements, shape (n, n).
+
+        Of the first, the derivative by direction ``one`` is taken, of the second that by ``other``.
+        """
+        found: Array = np.ones(())
+        for axis, (table, degree) in enumerate(zip(self.tables, self.degrees, strict=True)):
+            found = found * table[int(axis == one), int(axis == other)][
+                degree[:, None], degree]
+        return found
+
+
+def _integrals(polynomials: Sequence[legendre.Legendre], length: float) -> Array:
+    """Return integrals over a length of products of polynomials of 0 to 1, or their slopes."""
+    points, weights = legendre.leggauss(len(polynomials) + 2)
+    points, weights = 0.5 + 0.5 * points, 0.5 * length * weights
+    values = np.array([
+        [x(points) for x in polynomials], [x.deriv()(points) / length for x in polynomials]])
+    found: Array = np.einsum('dim,ejm,m->deij', values, values, weights)
+    return found
+
+
+def _together(frequencies: Array, shares: Array) -> tuple[Array, Array]:
+    """Return the modes without those that the field does not excite, near ones as one."""
+    kept = np.flatnonzero(shares > _UNSEEN)
+    found: list[list[float]] = []
+    for frequency, share in zip(frequencies[kept], shares[kept], strict=True):
+        if found and frequency < found[-1][0] * (1.0 + _TOGETHER):
+            found[-1][1] += share
+        else:
+            found.append([frequency, share])
+    return tuple(np.array(found).T)
+
+
+@lru_cache(maxsize=64)
+def mounted(shape: float, mount: str, j_lim: float, damping_ratio: float) -> Mounted:
+    """
+    Return how a mounted block differs from the paper's model.
+
+    Parameters
+    ----------
+    shape : float
+        H/L, 0.02 to 10.
+    mount : {'paper', 'free', 'glued'}
+        One of `MOUNTS`.
+    j_lim : float
+        Limiting extensibility.
+    damping_ratio : float
+        Of the first mode. That of the others grows with their frequency, as by a viscous stress.
+
+    Returns
+    -------
+    Mounted
+        Factors and up to three secondary modes.
+
+    Raises
+    ------
+    BadInputError
+        If an argument is out of range.
+
+    """
+    if mount not in MOUNTS:
+        raise BadInputError(f'mount is {excerpt(mount)}: expected one of {", ".join(MOUNTS)}')
+    if mount == 'paper':
+        return Mounted(1.0, 1.0, 1.0, Modes())
+    if not _SHAPES[0] <= shape <= _SHAPES[1]:
+        raise BadInputError(
+            f'half_thickness/half_length is {shape:g}: expected {_SHAPES[0]:g} to '
+            f'{_SHAPES[1]:g} for mount {mount}')
+    found = spectrum(shape, mount)
+    free = mount == 'free'
+    # A free block deforms uniformly at rest: what its compliance exceeds 1 by is that of the volume.
+    stiffness = 1.0 if free else 1.0 / found.compliance
+    factor = stiffness * 18.0 / (1.0 + 2.0 * shape ** 2) / found.frequencies[found.first] ** 2
+    ratios = found.frequencies / found.frequencies[found.first]
+    # A change of level excites a mode in proportion to its share.
+    strong = sorted([i for i in np.argsort(-found.shares) if 1.0 < ratios[i] <= _FASTEST
+                     and found.shares[i] >= _WEAKEST][:_COUNT])
+    exponents = _exponents(shape, j_lim, found.frequencies[strong]) if free else ()
+    return Mounted(
+        stiffness, float(factor), _transverse(shape, j_lim, factor) if free else 1.0, Modes(
+            tuple(ratios[strong].tolist()), tuple(found.shares[strong].tolist()),
+            tuple(min(damping_ratio * x, _MOST_DAMPED) for x in ratios[strong].tolist()),
+            exponents))
+
+
+def _exponents(shape: float, j_lim: float, frequencies: Array) -> tuple[float, ...]:
+    """Return the exponents of the stretch with which the ratios of some frequencies grow."""
+    logs = []
+    for stretch in _BESIDE:
+        there = spectrum(shape, 'free', stretch, j_lim)
+        near = [np.argmin(abs(there.frequencies - x)) for x in frequencies]
+        logs.append(np.log(there.frequencies[near] / there.frequencies[there.first]))
+    found: Array = (logs[1] - logs[0]) / math.log(_BESIDE[1] / _BESIDE[0])
+    return tuple(np.clip(found, -5.0, 5.0).tolist())
+
+
+def _transverse(shape: float, j_lim: float, factor: float) -> float:
+    """Return the transverse factor that fits the first mode about several stretches best."""
+    from scipy.optimize import minimize_scalar  # slow to import
+
+    c1 = 2.0 * shape ** 2
+    wanted = []
+    for stretch in _STRETCHES:
+        found = spectrum(shape, 'free', stretch, j_lim)
+        stiffness = float(law.elastic_stiffness(stretch, law.pack(0.0, j_lim, c1)))
+        wanted.append(stiffness / float(found.frequencies[found.first]) ** 2)
+
+    def off(log: float) -> float:
+        more = math.exp(log)
+        return sum((math.log(
+            factor * (1.0 + c1) / (more + c1) * (more * x ** -3 + c1) / 6.0 / y)) ** 2
+            for x, y in zip(_STRETCHES, wanted, strict=True))
+
+    return math.exp(minimize_scalar(off, bounds=_LOGS, method='bounded').x)
