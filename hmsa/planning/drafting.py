@@ -239,9 +239,11 @@ def draft_stop(outset: PlanStart) -> Draft:
     # grid, with ramps or at a limit), plan a move to a stretch near by.
     model, state = outset.model, outset.state
     found = brake(model, state)
-    # A coil that must not step brakes as the shaper smooth does, from the turning point on.
-    smooth = model.options.shaper == 'smooth'
-    if (not smooth and holdable(model, found.stretch) == found.stretch
+    # A coil that must not step brakes as the shaper smooth does, from the turning point on, and a
+    # block with modes as modal does.
+    own = model.options.shaper if model.options.shaper == 'smooth' or (
+        model.options.shaper == 'modal' and model.material.modes) else ''
+    if (not own and holdable(model, found.stretch) == found.stretch
             and not model.material.creep
             and (model.delivery.ideal or found.duration == 0.0 and _settled(model, state))):
         move = Move(Code.HOLD, tuple(
@@ -252,7 +254,7 @@ def draft_stop(outset: PlanStart) -> Draft:
         levels, placed = _placed(model, outset.begin, outset.check, Segment(
             Setpoint(found.stretch, math.inf), 0.0, state, end, move, end.load))
         return Draft(outset.begin, tuple(levels), (placed,))
-    ways = [(0.0, 'smooth')] * smooth + [(x, 'two_step') for x in _BRAKE_SHARES]
+    ways = [(0.0, own)] * bool(own) + [(x, 'two_step') for x in _BRAKE_SHARES]
     for share, shaper in ways:
         stretch = holdable(model, brake(model, state, share).stretch)
         try:

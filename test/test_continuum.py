@@ -1,0 +1,250 @@
+"""Modes of a block as a continuum, against closed forms and an independent integration."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from hmsa import Actuator
+from hmsa.errors import BadInputError
+from hmsa.model import law
+from hmsa.model.actuators import Actuators, Setup
+from hmsa.model.continuum import mounted, spectrum
+from hmsa.model.delivery import Delivery
+from hmsa.model.modes import Modes
+from hmsa.model.moves import Level, State
+from hmsa.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa.model.simulation import follow, observed, sampled
+from hmsa.planning.group import PlannerGroup
+from hmsa.planning.planner import Options, Planner
+from hmsa.planning.shapers import get_shaper
+from hmsa.planning.shapers.request import MoveRequest
+
+TWO = Modes((1.37, 1.95), (0.19, 0.04), (0.08, 0.12), (0.5, -0.3))
+BLOCK = replace(paper_actuator(), modes=TWO, mass_factor=1.2, transverse_mass_factor=1.8)
+GROUP = BLOCK.nondimensional
+
+
+# -- the spectrum -------------------------------------------------------------------------------
+
+def test_first_mode_of_the_cube_is_its_lame_mode():
+    # Shear waves that reflect without conversion: pi/sqrt(2) for a half length of 1.
+    found = spectrum(1.0, 'free')
+    assert found.frequencies[found.first] == pytest.approx(math.pi / math.sqrt(2.0), rel=1e-4)
+
+
+def test_slender_block_is_a_bar():
+    # A free bar with the mean load at its ends: odd quarter waves, with E = 3 G, and the shares of
+    # 8/pi^2/n^2. Lateral inertia lowers the frequency by a few parts in a thousand.
+    found = spectrum(10.0, 'free')
+    first = found.first
+    assert found.frequencies[first] == pytest.approx(
+        0.5 * math.pi / 10.0 * math.sqrt(3.0), rel=5e-3)
+    assert found.shares[first] == pytest.approx(8.0 / math.pi ** 2, rel=0.01)
+
+
+def test_glued_slender_block_is_a_bar_of_twice_the_length():
+    free, glued = spectrum(6.0, 'free'), spectrum(6.0, 'glued')
+    assert glued.frequencies[glued.first] == pytest.approx(
+        0.5 * free.frequencies[free.first], rel=0.03)
+    assert 0.97 < glued.compliance < 1.0
+
+
+@pytest.mark.parametrize('stretch', [0.9, 1.1, 1.2])
+def test_statics_about_a_stretch_are_those_of_the_model(stretch):
+    found = spectrum(0.7, 'free', stretch, 5.0)
+    stiffness = float(law.elastic_stiffness(stretch, law.pack(0.0, 5.0, 0.98)))
+    assert found.compliance / 3.0 * stiffness == pytest.approx(1.0, abs=2e-3)
+    assert np.sum(found.shares) == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize('shape', [0.3, 1.0, 2.0])
+def test_factors_reproduce_the_first_mode_about_any_stretch(shape):
+    found = mounted(shape, 'free', 5.0, 0.05)
+    block = replace(
+        paper_actuator(NondimensionalParameters(c1=2.0 * shape ** 2)),
+        mass_factor=found.mass_factor, transverse_mass_factor=found.transverse_mass_factor)
+    unit = block.half_length * math.sqrt(block.density / block.shear_modulus)
+    for stretch in (0.9, 1.0, 1.1, 1.2):
+        exact = spectrum(shape, 'free', stretch, 5.0 if stretch != 1.0 else math.inf)
+        frequency = float(law.natural_frequency(stretch, block.nondimensional.packed))
+        assert frequency / block.time_unit * unit == pytest.approx(
+            exact.frequencies[exact.first], rel=0.03)
+
+
+@pytest.mark.parametrize(('shape', 'mount', 'said'), [
+    (0.01, 'free', 'is 0.01: expected 0.02 to 10'), (1.0, 'hung', "mount is 'hung': expected one")])
+def test_shape_or_mount_out_of_range_is_refused(shape, mount, said):
+    with pytest.raises(BadInputError, match=said):
+        mounted(shape, mount, 5.0, 0.05)
+
+
+# -- parameters ---------------------------------------------------------------------------------
+
+@pytest.mark.parametrize(('values', 'said'), [
+    (((1.4,), (0.1, 0.2), (0.1,)), 'modes.share has 2, .*: expected one of each'),
+    (((1.0,), (0.1,), (0.1,)), 'modes.frequency_ratio has 1: expected numbers above 1'),
+    (((1.4,), (1.2,), (0.1,)), 'modes.share has 1.2: expected numbers between'),
+    (((1.4, 2.0), (0.6, 0.5), (0.1, 0.1)), 'modes.share has 1.1 in all: expected less than 1'),
+    (((1.4,), (0.1,), (1.0,)), 'modes.damping_ratio has 1: expected'),
+    (((1.4,), (0.1,), (0.1,), (9.0,)), 'modes.ratio_exponent has 9: expected numbers from -5'),
+    (((1.4,) * 4, (0.1,) * 4, (0.1,) * 4), 'has 4 values: expected at most 3'),
+    (((math.nan,), (0.1,), (0.1,)), 'modes.frequency_ratio has nan')])
+def test_modes_out_of_range_are_refused_by_name(values, said):
+    with pytest.raises(BadInputError, match=said):
+        Modes(*values)
+
+
+def test_mass_factor_changes_the_frequency_and_not_the_statics_or_the_force_of_damping():
+    paper, heavy = paper_actuator(), replace(
+        paper_actuator(), mass_factor=4.0, transverse_mass_factor=3.0)
+    assert heavy.period == pytest.approx(2.0 * paper.period, rel=1e-12)
+    assert heavy.units.load == paper.units.load
+    one, other = (Actuators([Setup(x)]) for x in (paper, heavy))
+    for block in (one, other):
+        block.command(0, 0, 0.05)
+        block.advance(3_000_000_000)
+    assert one.stretch[0] == pytest.approx(other.stretch[0], rel=1e-9)
+    # The decay of a vibration is c over twice the mass.
+    decays = [float(law.damping(1.0, x.nondimensional.packed)) / (
+        2.0 * float(law.mass(1.0, x.nondimensional.packed))) / x.time_unit for x in (paper, heavy)]
+    assert decays[1] == pytest.approx(decays[0] / 4.0, rel=1e-12)
+
+
+def test_beam_has_no_transverse_factor_and_no_exponent():
+    strip = Actuator.beam(length=10e-3, thickness=1e-3, width=5e-3, youngs_modulus=2e6).block
+    with pytest.raises(BadInputError, match='transverse_mass_factor is 2: expected 1'):
+        replace(strip, transverse_mass_factor=2.0)
+    with pytest.raises(BadInputError, match='ratio_exponent is given for a beam'):
+        replace(strip, modes=TWO)
+
+
+# -- motion -------------------------------------------------------------------------------------
+
+def oracle(levels, end):
+    """Return stretch and rate of all modes at an end time, by SciPy, from rest at 1."""
+    group, c1 = GROUP, GROUP.c1
+
+    def elastic(x):
+        above = x - x ** -2
+        g = 1.0 - (x * x + 2.0 / x - 3.0) / group.j_lim
+        return above / g, ((1.0 + 2.0 * x ** -3) + 2.0 * above ** 2 / (group.j_lim * g)) / g
+
+    def motion(_, y, load):
+        x, v = y[:2]
+        force, _ = elastic(x)
+        mass = (x ** -3 + c1) / 6.0
+        rest = brentq(lambda z: elastic(z)[0] - load, 0.5, 2.0, xtol=1e-15)
+        squared = elastic(rest)[1] / ((rest ** -3 + c1) / 6.0)
+        by = [v, (load - force - 0.5 * group.zeta * c1 * v + 0.25 * x ** -4 * v * v) / mass]
+        for i, (ratio, damping, exponent) in enumerate(zip(
+                TWO.ratios, TWO.dampings, TWO.exponents, strict=True)):
+            w = math.sqrt(squared) * ratio * rest ** exponent
+            z, u = y[2 + 2 * i:4 + 2 * i]
+            by += [u, w * w * (rest - z) - 2.0 * damping * w * u]
+        return by
+
+    y = np.array([1.0, 0.0] * 3)
+    for (begin, load), (until, _) in zip(levels, (*levels[1:], (end, 0.0)), strict=True):
+        y = solve_ivp(motion, (begin, until), y, method='DOP853', rtol=1e-11, atol=1e-12,
+                      args=(load,)).y[:, -1]
+    return y
+
+
+def test_motion_with_modes_is_that_of_scipy():
+    levels, end = ((0.0, 0.2), (1.1, -0.1), (2.3, 0.35)), 4.0
+    wanted = oracle(levels, end)
+    rows = sampled([Level(*x) for x in levels], State(1.0, load=0.2), np.array([end]), GROUP)
+    assert rows[[0, 1, 3, 4, 5, 6], 0] == pytest.approx(wanted, abs=1e-9)
+    shares = np.array([TWO.first, *TWO.shares])
+    assert observed(rows, GROUP)[:, 0] == pytest.approx(
+        [shares @ wanted[::2], shares @ wanted[1::2]], abs=1e-9)
+
+
+def test_plant_shows_the_motion_of_all_modes():
+    plant = Actuators([Setup(paper_actuator()), Setup(BLOCK)])
+    unit, load = BLOCK.time_unit, BLOCK.units.load
+    for i in (0, 1):
+        plant.command(i, 0, 0.2 * load)
+        plant.command(i, round(1.1 * unit * 1e9), -0.1 * load)
+    plant.advance(round(2.5 * unit * 1e9))
+    wanted = oracle(((0.0, 0.2), (1.1, -0.1)), 2.5)
+    shares = np.array([TWO.first, *TWO.shares])
+    assert plant.stretch[1] == pytest.approx(shares @ wanted[::2], abs=1e-7)
+    assert plant.rate[1] * unit == pytest.approx(shares @ wanted[1::2], abs=1e-6)
+
+
+# -- plans --------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('delivery', [
+    Delivery(), Delivery(period=0.1), Delivery(slew=2.0), Delivery(lag=0.2),
+    Delivery(period=0.05, slew=3.0, lag=0.1)], ids=['ideal', 'grid', 'ramps', 'lag', 'all'])
+def test_modal_brings_all_modes_to_rest_from_rest_and_from_motion(delivery):
+    shape, state, random = get_shaper('modal'), State(1.0), np.random.default_rng(1)
+    for i, target in enumerate(random.uniform(0.85, 1.35, 12).tolist()):
+        request = MoveRequest(state, target, GROUP, delivery=delivery)
+        move = shape(request)
+        end = follow(move.levels, request.start, move.duration, GROUP, delivery)
+        assert [end.stretch, *end.followed[::2]] == pytest.approx([target] * 3, abs=1e-9)
+        assert [end.rate, *end.followed[1::2]] == pytest.approx([0.0] * 3, abs=1e-8)
+        if i % 2:
+            half = 0.6 * move.duration
+            state = follow(
+                [x for x in move.levels if x.time < half], request.start, half, GROUP, delivery)
+        else:
+            state = State(target)
+
+
+def test_modal_without_modes_is_the_two_step_command():
+    request = MoveRequest(State(1.0), 1.2, paper_actuator().nondimensional)
+    assert get_shaper('modal')(request) == get_shaper('two_step')(request)
+
+
+def test_modal_keeps_the_limits_of_the_coil_or_is_refused():
+    block = Actuator(mount='free', flux_density_limits=0.06)
+    assert np.max(np.abs(block.plan([(1.05, 0.5), (0.96, 0.5)], 'modal').flux_densities)) <= 0.06
+    with pytest.raises(BadInputError, match='expected'):
+        block.plan([(1.3, 0.5)], 'modal')
+
+
+def test_mounted_block_rests_by_modal_and_rings_by_two_step():
+    block = Actuator(half_length=5e-3, zeta=0.1, mount='free')
+    setpoints = [(1.1, 0.5), (1.2, 0.5), (0.95, 0.5)]
+    left = {x: block.plan(setpoints, x).simulate().report()['residual'] for x in (
+        'two_step', 'modal')}
+    assert min(left['two_step']) > 0.1
+    assert max(left['modal']) < 1e-6
+
+
+def test_damping_ratio_of_a_mounted_block_is_that_of_its_first_mode():
+    block = Actuator(damping_ratio=0.05, mount='glued')
+    assert block.damping_ratio == pytest.approx(0.05, rel=1e-12)
+    assert block.block.modes.dampings == pytest.approx(
+        [0.05 * x for x in block.block.modes.ratios], rel=1e-12)
+
+
+def test_parameter_file_keeps_mount_and_modes(tmp_path):
+    block = Actuator(half_length=5e-3, zeta=0.1, mount='free')
+    block.to_yaml(tmp_path / 'block.yaml')
+    assert Actuator.from_yaml(tmp_path / 'block.yaml') == block
+    with pytest.raises(BadInputError, match='has modes already'):
+        block.replace(mount='glued')
+
+
+def test_stop_in_a_modal_move_brings_all_modes_to_rest():
+    ms = 1_000_000
+    planner = Planner(BLOCK, Options(
+        shaper='modal', flux_density_min=-0.5, flux_density_max=0.5, lead_time=ms))
+    group = PlannerGroup({'a': planner})
+    draft, = group.draft_setpoint('a', 1.3, 0).values()
+    group.take({'a': draft}, 0)
+    stop = planner.draft_stop(5 * ms)
+    last = stop.levels[-1]
+    assert stop.segments[-1].arrival == last.stamp < draft.segments[-1].arrival + 10 * ms
+    state = last.at(last.stamp)
+    assert [state.stretch, *state.followed[::2]] == pytest.approx(
+        [stop.segments[-1].stretch] * 3, abs=1e-8)
+    assert [state.rate, *state.followed[1::2]] == pytest.approx([0.0] * 3, abs=1e-7)
