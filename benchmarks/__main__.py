@@ -17,7 +17,8 @@ actuators that deviate from the model. harm compares feedback with open loop in 
 laboratories, for half an hour. laboratory tunes laboratories behind a serial board, for a quarter
 of an hour; line makes cables, boards, amplifiers and sensors fail there, for two minutes. studies
 kills the workers of a study. rates measures how many plans per second studies compute, for about
-seven minutes. lockstep compares the kernel of batches with C.
+seven minutes. lockstep compares the kernel of batches with C. continuum plays commands on finite
+elements, for five minutes.
 A page is a Markdown file; a table replaces the text between its marks ``<!-- begin NAME -->`` and
 ``<!-- end NAME -->``.
 """
@@ -42,7 +43,7 @@ NAMES = ('judge', 'planner', 'plant', 'preemption', 'joints', 'controller', 'rec
          'crash')
 #: Only run on request: they take long and need the machine for themselves.
 LONG = ('faults', 'soak', 'feedback', 'identification', 'defects', 'harm', 'laboratory',
-        'line', 'studies', 'rates', 'lockstep')
+        'line', 'studies', 'rates', 'lockstep', 'continuum')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -163,6 +164,10 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import bench_studies
 
         add(bench_studies.rates(quick=options.quick, minutes=options.minutes))
+    if 'continuum' in names:
+        from benchmarks import bench_continuum
+
+        add(bench_continuum.compare(quick=options.quick))
     if 'lockstep' in names:
         from benchmarks import bench_studies
 

@@ -21,7 +21,7 @@ from hmsa import motion
 from hmsa.model.delivery import Delivery
 from hmsa.model.equations import Array
 from hmsa.model.moves import Level
-from hmsa.model.simulation import branches_of, followed_by
+from hmsa.model.simulation import followed_by
 
 if TYPE_CHECKING:
     from hmsa.planning.shapers.request import MoveRequest
