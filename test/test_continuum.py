@@ -76,7 +76,8 @@ def test_factors_reproduce_the_first_mode_about_any_stretch(shape):
 
 
 @pytest.mark.parametrize(('shape', 'mount', 'said'), [
-    (0.01, 'free', 'is 0.01: expected 0.02 to 10'), (1.0, 'hung', "mount is 'hung': expected one")])
+    (0.01, 'free', 'is 0.01: expected 0.02 to 10'),
+    (1.0, 'hung', "mount is 'hung': expected one")])
 def test_shape_or_mount_out_of_range_is_refused(shape, mount, said):
     with pytest.raises(BadInputError, match=said):
         mounted(shape, mount, 5.0, 0.05)

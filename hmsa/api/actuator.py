@@ -298,7 +298,7 @@ class Actuator:
         """Return a table of the derived quantities."""
         return Table(
             (Column('quantity'), Column('value')),
-            tuple([*facts(self.scales, self.block), *mount_facts(self.block)]))
+            (*facts(self.scales, self.block), *mount_facts(self.block)))
 
     def __repr__(self) -> str:
         return f'Actuator.from_parameters({self.parameters!r})'

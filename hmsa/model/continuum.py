@@ -63,7 +63,8 @@ class Spectrum:
 
     frequencies: Array  #: natural frequencies, in units of sqrt(G/rho)/L, shape (n,)
     shares: Array  #: of the static mean stretch, shape (n,)
-    compliance: float  #: static mean stretch under a small load, in units of that of the free block
+    #: Static mean stretch under a small load, in units of that of the free block.
+    compliance: float
 
     @property
     def first(self) -> int:
@@ -118,7 +119,8 @@ def spectrum(shape: float, mount: str, stretch: float = 1.0, j_lim: float = math
     stiffness = np.where(
         alike, 2.0 * by_invariant * sum(basis.integral(x, x) for x in range(3)), 0.0)
     for c, e in product(range(3), repeat=2):
-        # F:dF and tr(A) contain the gradient of each displacement along itself, tr(A A) also others.
+        # F:dF and tr(A) contain the gradient of each displacement along itself, tr(A A) also
+        # others.
         inverse = 1.0 / (scale[c] * scale[e])
         stiffness += np.where(
             (component == c)[:, None] & (component == e),
@@ -145,8 +147,8 @@ class _Basis:
         """
         Return the basis for an eighth of a free block, and a quarter of a glued one.
 
-        Each displacement is odd in its own direction and even in the others; those of a glued block
-        are in proportion to the distance from the support.
+        Each displacement is odd in its own direction and even in the others; those of a glued
+        block are in proportion to the distance from the support.
         """
         most, glued = _DEGREE[mount], mount == 'glued'
         across = [legendre.Legendre.basis(n) for n in range(most + 1)]
@@ -173,7 +175,8 @@ class _Basis:
         """
         Return the integrals of all products of two displacements, shape (n, n).
 
-        Of the first, the derivative by direction ``one`` is taken, of the second that by ``other``.
+        Of the first, the derivative by direction ``one`` is taken, of the second that by
+        ``other``.
         """
         found: Array = np.ones(())
         for axis, (table, degree) in enumerate(zip(self.tables, self.degrees, strict=True)):
@@ -241,7 +244,7 @@ def mounted(shape: float, mount: str, j_lim: float, damping_ratio: float) -> Mou
             f'{_SHAPES[1]:g} for mount {mount}')
     found = spectrum(shape, mount)
     free = mount == 'free'
-    # A free block deforms uniformly at rest: what its compliance exceeds 1 by is that of the volume.
+    # A free block deforms uniformly at rest: its compliance exceeds 1 by that of the volume.
     stiffness = 1.0 if free else 1.0 / found.compliance
     factor = stiffness * 18.0 / (1.0 + 2.0 * shape ** 2) / found.frequencies[found.first] ** 2
     ratios = found.frequencies / found.frequencies[found.first]

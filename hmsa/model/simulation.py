@@ -87,9 +87,10 @@ def simulate(
             'switches and times must not decrease, and no time may lie before the first switch')
     stretch = material.rest if stretch is None else stretch
     check_stretch(stretch, material)
-    rows = observed(_sampled(
-        np.column_stack([switches, loads, slope]), State(stretch, rate), times, material), material)
-    return rows[motion.STRETCH], rows[motion.RATE]
+    seen, speed = observed(_sampled(
+        np.column_stack([switches, loads, slope]), State(stretch, rate), times, material),
+        material)
+    return seen, speed
 
 
 def follow(

@@ -109,8 +109,9 @@ def held(request: MoveRequest, found: Move, span: float) -> Move:
         amplifiers = before.tolist()
     states = list(map(
         State, (request.target + deviation - late * rates).tolist(), rates.tolist(),
-        field.tolist(), amplifiers,
-        ((*x, *(request.target, 0.0) * len(material.modes.ratios)) for x in followed[1:].tolist())))
+        field.tolist(), amplifiers, (
+            (*x, *(request.target, 0.0) * len(material.modes.ratios))
+            for x in followed[1:].tolist())))
     if found.code in _RINGING:
         rings = int(np.searchsorted(begins, begins[0] + longest_motion(holding, material)))
         states[:rings] = _passed(request, levels + tail[:rings], begins[:rings])

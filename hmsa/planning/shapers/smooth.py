@@ -152,7 +152,8 @@ def _free(
     pull = loads
     if material.creep:
         force = elastic_force(stretch, material)
-        pull = loads - material.branches[:, motion.RATIO] @ (force - np.array(rows[:len(followed)]))
+        pull = loads - material.branches[:, motion.RATIO] @ (
+            force - np.array(rows[:len(followed)]))
     return stretch, rate, acceleration(stretch, rate, pull, material), loads, followed
 
 

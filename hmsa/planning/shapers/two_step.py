@@ -110,8 +110,8 @@ def _late(request: MoveRequest, lag: float) -> tuple[Code, tuple[Level, ...]]:
     state, material, limits = request.state, request.material, request.limits
     status, beta_p, tau_p, beta_1, push, until = motion.two_step_late(
         state.stretch, state.rate, request.target, limits.minimum, limits.maximum, RTOL,
-        HOLD_TOLERANCE, material.packed, material.branches, branches_of(state, material), request.field,
-        request.load, lag)
+        HOLD_TOLERANCE, material.packed, material.branches, branches_of(state, material),
+        request.field, request.load, lag)
     code = CODES[status]
     if code is not Code.TWO_STEP:
         # The reason is that of the elastic motion.
