@@ -210,6 +210,10 @@ def _warnings(
         best: Fit, known: Precision, outliers: int, given: Collection[str]) -> list[str]:
     """Return further information for the reader, one sentence each."""
     found, recording = [], best.recording
+    if best.values['modes']:
+        found.append(
+            'secondary modes are kept from the parameters, and the fit is of one mode: their '
+            'vibration counts as noise')
     if outliers:
         found.append(
             f'{outliers} of {len(recording.time)} samples are more than six standard deviations '

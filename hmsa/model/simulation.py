@@ -167,8 +167,8 @@ def sampled(
     Return stretch, rate, field and n branch states under levels, shape (3 + n, m).
 
     The stretch is that of the first mode; after the branch states come position and rate of each
-    secondary mode. The state is that at the start of the first level; times (m,) do not decrease. Raise
-    `HmsaError` if a load is too large to simulate.
+    secondary mode. The state is that at the start of the first level; times (m,) do not decrease.
+    Raise `HmsaError` if a load is too large to simulate.
     """
     pieces, _ = ramps(
         levels, state.ramps_from, max(float(times[-1]), levels[-1].time), delivery.slew)

@@ -70,6 +70,7 @@ SHAPERS = {
     'minimax': LineStyle(SKY_BLUE, 1.5, (5.0, 1.0, 1.0, 1.0), 'D', 5),
     'minimum_time': LineStyle(ORANGE, 1.5, (8.0, 2.0), '^', 4),
     'smooth': LineStyle(INDIGO, 1.3, (1.0, 1.0), 'P', 4),
+    'modal': LineStyle(GREEN, 1.6, (3.0, 1.0, 1.0, 1.0), 'h', 5),
     'step': LineStyle(VERMILION, 1.2, (3.0, 2.0), 'X', 3),
     'zv': LineStyle(SILVER, 1.5, (8.0, 1.5, 1.0, 1.5), 'v', 3),
     'zvd': LineStyle(GREY, 1.2, (2.0, 1.0), '<', 3),

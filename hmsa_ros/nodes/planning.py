@@ -223,6 +223,11 @@ def settings_from(values: JointParameters) -> Settings:
         'trajectory_mode', 'replan_late', 'after_cut_off', 'max_points', 'allow_partial_joints',
         'feedback', 'feedback_cautious', 'feedback_tolerance', 'feedback_trim', 'feedback_frozen',
         'feedback_file')}
+    modal = [x for x, y in values.each(lambda _, own: own['modes.frequency_ratio']).items() if y]
+    if modal and values['feedback'] in ('adapt', 'cautious'):
+        raise BadInputError(
+            f'parameter feedback is {values["feedback"]} and {modal[0]} has modes.*: expected '
+            'observe or off, since feedback does not support secondary modes')
     times: dict[str, Any] = {x: _nanoseconds(values[x]) for x in (
         'heartbeat_period', 'lateness_tolerance', 'takeover_timeout', 'takeover_max_age')}
     return Settings(
