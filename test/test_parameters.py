@@ -43,6 +43,8 @@ DIMENSIONLESS = {
     'sensor.gain', 'sensor.offset', 'sensor.rest_length',
     'smooth_periods', 'stretch_bias', 'stretch_gain', 'stretch_noise', 'viscoelastic.ratio',
     'viscoelastic.exponent', 'viscoelastic.stress',
+    'actuator.mass_factor', 'actuator.transverse_mass_factor', 'modes.frequency_ratio',
+    'modes.share', 'modes.damping_ratio', 'modes.ratio_exponent',
     # Each number of them has its own unit.
     'identification.values', 'identification.covariance',
     'arrival_tolerance', 'feedback_tolerance', 'stretch_tolerance', 'vibration_tolerance',

@@ -43,8 +43,9 @@ OWN = (
     _changeable(
         'shaper', 'two_step', 'Shaper that plans each move.', choices=tuple(SHAPERS)),
     _changeable(
-        'robust_order', 2, 'Number of two-step commands that the shaper robust cascades.', '',
-        1, MOST_ORDER),
+        'robust_order', 2,
+        'Number of two-step commands that the shaper robust cascades, and of half periods that '
+        'modal takes, nearly.', '', 1, MOST_ORDER),
     _changeable(
         'minimax_errors', list(ERRORS),
         'Relative errors in shear modulus, damping coefficient and J_lim for which the shaper '
