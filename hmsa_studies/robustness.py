@@ -167,7 +167,8 @@ def candidates(
     """Return the shapers to compare, each once, those in `ORDERED` with each order."""
     found = [
         Candidate(name, order)
-        for name in (SHAPERS if shapers is None else shapers)
+        # Without secondary modes, modal is the two-step command.
+        for name in ([x for x in SHAPERS if x != 'modal'] if shapers is None else shapers)
         for order in (orders if name in ORDERED else (2,))]
     return tuple(dict.fromkeys(found))
 

@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 
-from hmsa.errors import BadInputError
-from hmsa.model.continuum import mounted
+from hmsa.errors import BadInputError, excerpt
+from hmsa.model.continuum import mounted, MOUNTS
 from hmsa.model.equations import critical_zeta
 from hmsa.model.modes import Modes
 from hmsa.model.moves import State
@@ -29,6 +29,9 @@ def with_mount(model: JointModel, mount: str, ratio: float | None) -> JointModel
     Raise `BadInputError` for a beam, an unknown mount, or a shape that is out of range.
     """
     block = model.actuator
+    if not isinstance(mount, str) or mount not in MOUNTS:
+        raise BadInputError(
+            f'mount is {excerpt(mount)}: expected one of {", ".join(MOUNTS)}')
     if mount == 'paper':
         return model
     if block.rest == 0.0:
@@ -67,9 +70,9 @@ def mount_facts(actuator: ActuatorParameters) -> list[tuple[str, str]]:
     left, tuned = (_left(actuator, x) for x in (paper, replace(actuator, modes=Modes())))
     return [
         ('if it deformed uniformly', f'{1.0 / paper.period:.5g} Hz'),
-        ('secondary modes, f/f1 (share)', modes),
-        ("two_step of the paper's model", f'leaves {left:.2g} % of a step to {1.0 + _MOVE:g}'),
-        ('two_step for the first mode', f'leaves {tuned:.2g} %; shaper modal, none')]
+        ('modes, f/f1 (share)', modes),
+        ("two_step, paper's model", f'leaves {left:.2g} % of a step to {1.0 + _MOVE:g}'),
+        ('two_step, first mode', f'leaves {tuned:.2g} %; shaper modal, none')]
 
 
 def _left(actual: ActuatorParameters, planned: ActuatorParameters) -> float:

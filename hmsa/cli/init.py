@@ -131,7 +131,7 @@ def run(arguments: argparse.Namespace) -> int:
             f'{"; ".join(shown)} {"is a guess" if len(missing) == 1 else "are guesses"}: a plan '
             'is only as exact as its parameters; measure them and pass the values')
     parameters = _parameters(made)
-    table = [f'{name:<29} {value}' for name, value in [
+    table = [f'{name:<26} {value}' for name, value in [
         *facts(found, made.block), *mount_facts(made.block)]]
     write_text(path, '\n'.join([
         '# Parameters of an actuator for planner and plant, written by hmsa init:',

@@ -10,12 +10,12 @@ from typing import Any
 
 BLACK, GREY, BLUE, VERMILION = '#000000', '#717171', '#0072B2', '#D55E00'
 GREEN, SKY_BLUE, ORANGE, PURPLE = '#264825', '#58BFFC', '#FFA900', '#590058'
-INDIGO, SILVER = '#2B098B', '#B0B0B0'
+INDIGO, SILVER, VIOLET = '#2B098B', '#B0B0B0', '#4411FF'
 #: Replacements of colours in dark mode.
 DARK = {
     BLUE: '#4DABE8', ORANGE: '#F2B93B', GREEN: '#7DB07C', PURPLE: '#E08FE0',
     SKY_BLUE: '#B5E2FF', VERMILION: '#FF8A4A', BLACK: '#F0F0F0', GREY: '#9A9A9A',
-    SILVER: '#6A7076'}
+    SILVER: '#6A7076', VIOLET: '#9C85FF'}
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ SHAPERS = {
     'minimax': LineStyle(SKY_BLUE, 1.5, (5.0, 1.0, 1.0, 1.0), 'D', 5),
     'minimum_time': LineStyle(ORANGE, 1.5, (8.0, 2.0), '^', 4),
     'smooth': LineStyle(INDIGO, 1.3, (1.0, 1.0), 'P', 4),
-    'modal': LineStyle(GREEN, 1.6, (3.0, 1.0, 1.0, 1.0), 'h', 5),
+    'modal': LineStyle(VIOLET, 1.6, (3.0, 1.0, 1.0, 1.0), 'h', 5),
     'step': LineStyle(VERMILION, 1.2, (3.0, 2.0), 'X', 3),
     'zv': LineStyle(SILVER, 1.5, (8.0, 1.5, 1.0, 1.5), 'v', 3),
     'zvd': LineStyle(GREY, 1.2, (2.0, 1.0), '<', 3),
