@@ -317,6 +317,11 @@ class StudyFolder:
         look : callable
             Called with the pyarrow table of each chunk.
 
+        Returns
+        -------
+        dict of str to int
+            Number of rows of each status.
+
         """
         counts: Counter[str] = Counter()
         tables = self.tables()

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 import math
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from hmsa.planning.timeline import JointModel
 _MOVE, _PERIODS, _LOOK = 0.1, 2.0, 400
 
 
-def with_mount(model: JointModel, mount: str, ratio: float | None) -> JointModel:
+def with_mount(model: JointModel, mount: Any, ratio: float | None) -> JointModel:
     """
     Return the model with factors and modes of a mounted block.
 
