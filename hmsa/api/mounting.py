@@ -85,6 +85,6 @@ def _left(actual: ActuatorParameters, planned: ActuatorParameters) -> float:
     levels = [replace(x, time=x.time * faster) for x in move.levels]
     end = levels[-1].time
     period = actual.period / actual.time_unit
-    times = np.linspace(end, end + _PERIODS * period, _LOOK)
+    times = np.linspace(end, end + _PERIODS * period, _LOOK, dtype=np.float64)
     stretch = observed(sampled(levels, State(1.0), times, material), material)[0]
     return 100.0 * float(np.ptp(stretch)) / _MOVE

@@ -188,10 +188,11 @@ class _Basis:
 def _integrals(polynomials: Sequence[legendre.Legendre], length: float) -> Array:
     """Return integrals over a length of products of polynomials of 0 to 1, or their slopes."""
     points, weights = legendre.leggauss(len(polynomials) + 2)
-    points, weights = 0.5 + 0.5 * points, 0.5 * length * weights
+    at: Array = 0.5 + 0.5 * points
+    lengths: Array = 0.5 * length * weights
     values = np.array([
-        [x(points) for x in polynomials], [x.deriv()(points) / length for x in polynomials]])
-    found: Array = np.einsum('dim,ejm,m->deij', values, values, weights)
+        [x(at) for x in polynomials], [x.deriv()(at) / length for x in polynomials]])
+    found: Array = np.einsum('dim,ejm,m->deij', values, values, lengths)
     return found
 
 

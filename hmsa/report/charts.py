@@ -367,7 +367,7 @@ def residuals(parts: Sequence[Part]) -> list[Panel]:
     curves = []
     for pen in _pens(parts):
         results = pen.part.evaluation.results
-        places = np.arange(1.0, len(results) + 1.0)
+        places = np.arange(1.0, len(results) + 1.0, dtype=np.float64)
         size = 6.0 if len(results) <= _MANY_MARKERS else 3.0
         for kind, values in (
                 ('', [x.residual for x in results]),

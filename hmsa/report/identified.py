@@ -114,7 +114,8 @@ def _correlation(found: Identification) -> Figure:
     limit = 1.96 / math.sqrt(found.samples)
     return Figure('correlation', 'Autocorrelation of the residuals over the lag', [Panel(
         Axis('lag', unit='samples'), Axis('autocorrelation'), [
-            Curve('autocorrelation', LineStyle(BLUE), np.arange(1.0, len(rho) + 1.0), rho, 'bars'),
+            Curve('autocorrelation', LineStyle(BLUE), np.arange(
+                1.0, len(rho) + 1.0, dtype=np.float64), rho, 'bars'),
             Curve('white noise, 95 %', looks.TARGET, y=np.array([-limit, limit]),
                   form='horizontal')])], 260)
 
