@@ -219,7 +219,16 @@ def _nanoseconds(seconds: float) -> int:
 
 
 def settings_from(values: JointParameters) -> Settings:
-    """Return the settings of a runtime described by the parameters for all joints."""
+    """
+    Return the settings of a runtime described by the parameters for all joints.
+
+    Raises
+    ------
+    BadInputError
+        If a name of feedback_parameters is unknown, or feedback is to correct an actuator that has
+        secondary modes.
+
+    """
     plain: dict[str, Any] = {x: values[x] for x in (
         'trajectory_mode', 'replan_late', 'after_cut_off', 'max_points', 'allow_partial_joints',
         'feedback', 'feedback_cautious', 'feedback_tolerance', 'feedback_trim', 'feedback_frozen',
