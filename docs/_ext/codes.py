@@ -14,6 +14,7 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'Levels that minimise the worst residual vibration for parameter errors within the given '
         'bounds.', ''),
     Code.MINIMUM_TIME: ('Maximum push, maximum brake, then the holding level.', ''),
+    Code.MODAL: ('Levels after which all given modes are at rest.', ''),
     Code.SMOOTH: ('A continuous level along a smooth path of the stretch.', ''),
     Code.LINEAR: ('A linear input shaper, designed at the target; it leaves residual '
                   'vibration.', ''),

@@ -6,7 +6,7 @@ not in motion: its faces bulge, and several modes take part. Small motion of an 
 Gent block about uniform stretch l, under the dead traction of the field on its faces across it
 (R. Zhao et al., J. Mech. Phys. Solids 124, 244, 2019), has the energy
 
-    W1 |dF|^2 + 2 W11 (F:dF)^2 + p/2 (tr(A A) - tr(A)^2) + K/2 tr(A)^2,    A = F^-1 dF,
+    W1 dF:dF + 2 W11 (F:dF)^2 + p/2 (tr(A A) - tr(A)^2) + K/2 tr(A)^2,    A = F^-1 dF,
 
 per volume of the undeformed block, with F = diag(l^-1/2, l^-1/2, l), W1 and W11 the derivatives of
 the energy by the first invariant, and p = 2 W1/l, for which the sides are free of stress. A bulk
