@@ -25,6 +25,9 @@ from hmsa_ros.nodes.temporary_node import leave, visit
 # In s: wait for a subscriber at the start, interval of checks then and later (each takes 0.1 ms),
 # wait for the last acknowledgement.
 _PATIENCE, _LOOK, _AGAIN, _LAST = 8.0, 0.02, 0.25, 0.3
+# Time in s for which a subscriber counts before the coil is used: the services by which a recorder
+# is known are discovered after its subscriptions.
+_KNOWN = 0.2
 # Tolerance of the length of a direction, and maximum length of an array.
 _ROUNDED, _LONGEST = 1e-3, 4096
 
@@ -47,8 +50,13 @@ class _Topic:
         self._count, self._looked = 0, -math.inf  # subscribers, and time in s, at the last check
         try:
             self.name = self._node.resolve_topic_name(name)
-            until = monotonic() + _PATIENCE
-            while not self.matched and monotonic() < until:
+            since = monotonic()
+            until = since + _PATIENCE
+            while monotonic() < until:
+                if not self.matched:
+                    since = monotonic()
+                elif monotonic() - since >= _KNOWN:
+                    break
                 sleep(_LOOK)
                 if not type_name:
                     found = self._node.get_subscriptions_info_by_topic(self.name)
