@@ -45,7 +45,7 @@ OWN = (
     _changeable(
         'robust_order', 2,
         'Number of two-step commands that the shaper robust cascades, and of half periods that '
-        'modal takes, nearly.', '', 1, MOST_ORDER),
+        'modal takes.', '', 1, MOST_ORDER),
     _changeable(
         'minimax_errors', list(ERRORS),
         'Relative errors in shear modulus, damping coefficient and J_lim for which the shaper '

@@ -3,8 +3,8 @@ Rest of the first mode and of all secondary modes, for actuators that are contin
 
 A move has two free levels for the first mode and two more for each secondary one, and further ones
 on real hardware as in `free`. They have equal durations. A command that is as short as possible
-would excite the modes that no model contains: by default it takes about two half periods of the
-first mode.
+would excite the modes that no model contains: by default it takes two half periods of the first
+mode.
 """
 
 from collections.abc import Iterator
@@ -19,8 +19,6 @@ from hmsa.planning.shapers.request import AT_REST, MoveRequest
 from hmsa.planning.shapers.two_step import two_step
 from hmsa.planning.shooting import Attempt, heights, solve, within_limits
 
-# Duration in half periods of the first mode, per order.
-_PER_ORDER = 0.95
 # Durations to try, in units of the wanted one: near solutions that swing back and forth there are
 # others without (benchmarks continuum).
 _LENGTHS = (1.0, 1.06, 0.94, 1.14, 1.25, 1.4, 1.6, 2.0)
@@ -30,7 +28,7 @@ _BEYOND = 0.3
 
 def modal(request: MoveRequest) -> Move:
     """
-    Come to rest with all modes, in nearly ``request.order`` half periods of the first mode.
+    Come to rest with all modes, in ``request.order`` half periods of the first mode.
 
     Without secondary modes, the two-step command does so, and is returned. Raise `RefusedError` if
     no such command keeps the limits.
@@ -78,7 +76,7 @@ def _solutions(request: MoveRequest, holding: float) -> Iterator[tuple[tuple[Lev
     """Yield commands that end at rest within the limits."""
     delivery = request.delivery
     count = request.unknowns + 2 * len(request.material.modes.ratios)
-    whole = _PER_ORDER * request.order * math.pi / request.frequency
+    whole = request.order * math.pi / request.frequency
     hardware, before = delivery.lag + delivery.ramp(holding - request.load), 0.0
     for length in _LENGTHS:
         each = (length * whole + hardware) / count
