@@ -1,7 +1,9 @@
 """Modes of a block as a continuum, against closed forms and an independent integration."""
 
 from dataclasses import replace
+import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from hmsa import Actuator
+from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.model import law
 from hmsa.model.actuators import Actuators, Setup
@@ -233,6 +236,21 @@ def test_parameter_file_keeps_mount_and_modes(tmp_path):
     assert Actuator.from_yaml(tmp_path / 'block.yaml') == block
     with pytest.raises(BadInputError, match='has modes already'):
         block.replace(mount='glued')
+
+
+def test_file_of_a_mount_is_planned_with_its_modes(tmp_path, capsys):
+    path = str(tmp_path / 'block.yaml')
+    assert main(['init', '--half-length', '20mm', '--zeta', '0.1', '--flux-max', '400mT', '--yes',
+                 '--mount', 'free', '--out', path]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"two_step, paper's model +leaves \d+ % of a step to 1\.1", out)
+    assert main(['plan', '1.1:1', '0.95:1', '--shaper', 'modal', '--params-file', path,
+                 '--json']) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert [x['status'] for x in plan['segments']] == ['modal', 'modal']
+    assert main(['init', '--beam', '--length', '25mm', '--thickness', '1mm', '--width', '5mm',
+                 '--yes', '--mount', 'free', '--out', str(tmp_path / 'beam.yaml')]) == 2
+    assert 'mount free is given for a beam: expected a block' in capsys.readouterr().err
 
 
 def test_stop_in_a_modal_move_brings_all_modes_to_rest():

@@ -57,6 +57,10 @@ BAD_OF_A_NODE = {
         'nothing_to_estimate': (
             ['--ros-args', '-p', 'feedback_parameters:=[]'],
             'parameter feedback_parameters: free parameter missing: expected some of'),
+        'feedback_of_one_mode': (
+            ['--ros-args', '-p', 'feedback:=adapt', '-p', 'modes.frequency_ratio:=[1.4]', '-p',
+             'modes.share:=[0.2]', '-p', 'modes.damping_ratio:=[0.1]'],
+            'parameter feedback is adapt and actuator has modes.*: expected observe or off'),
         'limits_out_of_order': (
             ['--ros-args', '-p', 'flux_density_max:=-0.6'],
             'flux_density_min is -0.5 T: expected less than flux_density_max'),
