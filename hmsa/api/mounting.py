@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from hmsa.errors import BadInputError, excerpt
-from hmsa.model.continuum import mounted, MOUNTS
+from hmsa.errors import BadInputError
+from hmsa.model.continuum import check_mount, mounted
 from hmsa.model.equations import critical_zeta
 from hmsa.model.modes import Modes
 from hmsa.model.moves import State
@@ -30,9 +30,7 @@ def with_mount(model: JointModel, mount: Any, ratio: float | None) -> JointModel
     Raise `BadInputError` for a beam, an unknown mount, or a shape that is out of range.
     """
     block = model.actuator
-    if not isinstance(mount, str) or mount not in MOUNTS:
-        raise BadInputError(
-            f'mount is {excerpt(mount)}: expected one of {", ".join(MOUNTS)}')
+    check_mount(mount)
     if mount == 'paper':
         return model
     if block.rest == 0.0:

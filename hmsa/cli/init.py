@@ -41,6 +41,7 @@ from hmsa.interfaces.quantities import (
     OPTIONAL,
     QUANTITIES,
 )
+from hmsa.model.modes import MOUNTS
 
 if TYPE_CHECKING:
     from hmsa.api.actuator import Actuator
@@ -75,7 +76,7 @@ def add_parser(subparsers: Any) -> None:
         ('--mount', 'MOUNT', str,
          'how a block is held: free, glued (with one face, to a rigid support), or paper (the '
          "paper's model: uniform deformation, one mode; default)",
-         {'default': 'paper', 'choices': ('paper', 'free', 'glued')}),
+         {'default': MOUNTS[0], 'choices': MOUNTS}),
         ('--joint', 'NAME', str,
          f'joint name (default {_JOINT}), or several separated by commas for identical actuators',
          {'default': ''}),
@@ -217,7 +218,7 @@ def _actuator(
         _ARGUMENTS.get(x, x): given[x]
         for x in (*(y.key for y in FORMS[form] if y.key not in (*_COIL, *_DAMPED)), *damping)
         if x in given}
-    if mount != 'paper':
+    if mount != MOUNTS[0]:
         values['mount'] = mount
     values |= {'flux_density_limits': (given['flux_min'], given['flux_max']),
                'slew_limit': given['slew_limit'] or math.inf}

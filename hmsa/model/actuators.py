@@ -141,10 +141,10 @@ class Actuators:
         groups = [x.nondimensional.rows for x in blocks]
         self._branches = np.zeros((
             count if any(map(len, groups)) else 0, motion.ROWS, motion.BRANCH))
-        # Of each actuator: share and rows of secondary modes.
-        self._modes = [
-            (i, x.nondimensional.modes, len(x.nondimensional.branches))
-            for i, x in enumerate(blocks) if x.nondimensional.modes]
+        # Secondary modes by actuator, and the place of their first row.
+        self._modes = {
+            i: (x.nondimensional.modes, len(x.nondimensional.branches))
+            for i, x in enumerate(blocks) if x.nondimensional.modes}
         for branches, group in zip(self._branches, groups, strict=False):
             branches[:len(group)] = group
         self.schedules = [CommandSchedule(0.0) for _ in blocks]
@@ -176,10 +176,9 @@ class Actuators:
         seen: Array = self._state[:, place]
         if self._modes:
             seen = seen.copy()
-            for i, modes, count in self._modes:
-                others = self._branches[
-                    i, count + place:count + 2 * len(modes.shares):2, motion.FOLLOWER]
-                seen[i] = modes.first * seen[i] + np.array(modes.shares) @ others
+            for i, (modes, count) in self._modes.items():
+                seen[i] = modes.all_of(seen[i], self._branches[
+                    i, count + place:count + 2 * len(modes.shares):2, motion.FOLLOWER])
         return seen
 
     @property
@@ -212,10 +211,10 @@ class Actuators:
         if len(self._branches):
             self._branches[i, :, motion.FOLLOWER] = law.elastic_force(
                 stretch, self._material[i])
-            for j, modes, count in self._modes:
-                if j == i:
-                    self._branches[i, count:count + 2 * len(modes.ratios), motion.FOLLOWER] = (
-                        (stretch, rate * self._time_units[i]) * len(modes.ratios))
+            if i in self._modes:
+                modes, count = self._modes[i]
+                self._branches[i, count:count + 2 * len(modes.ratios), motion.FOLLOWER] = (
+                    (stretch, rate * self._time_units[i]) * len(modes.ratios))
         # The amplifier of a lagging coil may have arrived before the field; that of another not.
         behind = self._lags[i] > 0.0
         self._levels[i] = level if behind and math.isinf(self._slews[i]) else flux_density

@@ -1,11 +1,14 @@
 """Secondary modes of an actuator that is a continuum: oscillators beside the first mode."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 import math
 from typing import Any
 
 from hmsa.errors import BadInputError
 
+#: Ways to hold a block, of which the first is the paper's: it has no secondary modes.
+MOUNTS = ('paper', 'free', 'glued')
 #: Maximum number of secondary modes.
 MOST = 3
 # Numbers in place of a flow rule, in the rows of position and rate of a mode.
@@ -76,6 +79,11 @@ class Modes:
             'modes.frequency_ratio': list(self.ratios), 'modes.share': list(self.shares),
             'modes.damping_ratio': list(self.dampings),
             'modes.ratio_exponent': list(self.exponents)} if self else {}
+
+    def all_of(self, first: Any, others: Iterable[Any]) -> Any:
+        """Return the sum over all modes of what each shows: numbers or arrays of one shape."""
+        return self.first * first + sum(
+            x * y for x, y in zip(self.shares, others, strict=True))
 
     def rows(self) -> list[list[float]]:
         """Return two rows for each mode as arguments of `hmsa.motion`, with a state of 0."""

@@ -138,11 +138,8 @@ def observed(rows: Array, material: NondimensionalParameters) -> Array:
     if not material.modes:
         return seen
     after = motion.FOLLOWED + len(material.branches)
-    shares = np.array(material.modes.shares)
-    seen = material.modes.first * seen
-    for place, row in ((motion.STRETCH, after), (motion.RATE, after + 1)):
-        seen[place] += shares @ rows[row::2]
-    return seen
+    return np.array([
+        material.modes.all_of(x, rows[after + i::2]) for i, x in enumerate(seen)])
 
 
 def paces(material: NondimensionalParameters, above: ArrayLike) -> Array:

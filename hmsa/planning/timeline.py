@@ -139,12 +139,7 @@ class JointModel:
         if not modes or len(state.followed) != len(self.material.rows):
             return state.stretch, state.rate
         others = state.followed[len(self.material.branches):]
-
-        def all_of(first: float, rest: Sequence[float]) -> float:
-            return modes.first * first + sum(
-                x * y for x, y in zip(modes.shares, rest, strict=True))
-
-        return all_of(state.stretch, others[::2]), all_of(state.rate, others[1::2])
+        return modes.all_of(state.stretch, others[::2]), modes.all_of(state.rate, others[1::2])
 
     def on_grid(self, time: int) -> int:
         """Return the earliest time in ns, not before the given one, that a command may have."""
