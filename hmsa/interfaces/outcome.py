@@ -60,7 +60,7 @@ class Outcome:
     @property
     def arrival(self) -> int | None:
         """Planned rest at the target by the newest plan; None if only approached."""
-        return self.setpoint.arrival if self.setpoint.moved is None else self.setpoint.moved
+        return self.setpoint.newest_arrival
 
     @property
     def key(self) -> tuple[str, int, int, int]:

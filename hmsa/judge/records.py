@@ -69,6 +69,11 @@ class RequestedSetpoint:
         return max(min(settled, last), self.begins)
 
     @property
+    def newest_arrival(self) -> int | None:
+        """Planned rest at the target by the newest plan; None if only approached."""
+        return self.arrival if self.moved is None else self.moved
+
+    @property
     def step(self) -> float:
         """Distance of the target from the previous setpoint."""
         return abs(self.target - self.start)

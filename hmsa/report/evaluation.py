@@ -143,8 +143,7 @@ def verdict_on(evaluation: Evaluation, number: int) -> str:
     """
     finding, result = evaluation.findings[number], result_of(evaluation, number)
     setpoint, words = finding.setpoint, str(finding.verdict).replace('_', ' ')
-    approached = setpoint.arrival is None and setpoint.moved is None
-    rang = approached and setpoint.decay < setpoint.frequency and (
+    rang = setpoint.newest_arrival is None and setpoint.decay < setpoint.frequency and (
         result is not None and not result.settled <= result.arrival)
     return f'{words} after ringing' if finding.arrived and rang else words
 

@@ -272,7 +272,7 @@ class _Joint:
 
 def _rest(setpoint: RequestedSetpoint) -> int:
     """Return the planned time of rest in ns; the begin of what is only approached."""
-    arrival = setpoint.arrival if setpoint.moved is None else setpoint.moved
+    arrival = setpoint.newest_arrival
     return setpoint.begins if arrival is None else arrival
 
 
