@@ -34,14 +34,24 @@ POLL_SECONDS = 0.02
 # Interval of checks of a condition while callbacks are served.
 SPIN_SECONDS = 0.01
 DOMAINS = range(1, 102)
-# A module of tests with one of these lines needs ROS as soon as it is imported.
-ROS_IMPORT = re.compile(
-    r'^(from|import) (rclpy|\w+_(msgs|interfaces|srvs)|hmsa_ros\.(nodes|lab|panel|watch))\b', re.M)
+ROS_PACKAGE = re.compile(r'rclpy|\w+_(msgs|interfaces|srvs)')
 _turns = itertools.count(os.getpid())
+
+
+class SkipWithoutRos:
+    """Skips what imports ROS where there is none: a module of tests, or a test."""
+
+    @staticmethod
+    def find_spec(name: str, *_: Any) -> None:
+        """Skip if a package that no other finder has found is one of ROS."""
+        if ROS_PACKAGE.fullmatch(name):
+            pytest.skip("rclpy is not installed: pip install '.[ros]'", allow_module_level=True)
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Ignore warnings that cannot be fixed here, and start processes alike."""
+    if not has('rclpy'):
+        sys.meta_path.append(SkipWithoutRos)
     for number in (signal.SIGINT, signal.SIGHUP):
         # As nohup and the background of a shell leave them. Processes inherit what is ignored,
         # not what is handled.
@@ -96,14 +106,7 @@ def pytest_xdist_auto_num_workers() -> int:
 def pytest_make_collect_report(
         collector: pytest.Collector
 ) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
-    """
-    Let each worker begin with other modules, so that each is compiled only once.
-
-    Modules that need ROS are skipped where there is none.
-    """
-    if (isinstance(collector, pytest.Module) and not has('rclpy')
-            and ROS_IMPORT.search(collector.path.read_text(encoding='utf-8'))):
-        collector.collect = lambda: needs('rclpy')
+    """Let each worker begin with other modules, so that each is compiled only once."""
     report = yield
     worker = os.environ.get('PYTEST_XDIST_WORKER', 'gw0')
     if isinstance(collector, pytest.Directory):
