@@ -1,13 +1,14 @@
 """Classes of hardware that pass ``hmsa check-driver``, and messages about the others."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hmsa.cli import main
-from hmsa_lab.bench import conformance
-from hmsa_lab.bench.bench import PhaseResults
+from hmsa_lab.bench import bench, conformance
+from hmsa_lab.bench.bench import Bench, PhaseResults
 from hmsa_ros.device.protocol import Sample
 
 # One class for all: a block at a level, whose state survives its process, in a file.
@@ -110,6 +111,30 @@ def test_without_a_sensor_it_says_what_it_could_not_try(lab, capsys):
     assert [x.partition(':')[0] for x in found['untried']] == [
         'samples', 'polarity, and whether the coil is off', 'off_at_close', 'off_at_exception',
         'off_at_sigterm']
+
+
+def test_a_coil_that_was_cut_off_while_the_host_stood_still_is_set_again(lab, monkeypatch):
+    monkeypatch.setattr(bench, 'SILENCE', 0.2)
+    Path('coil_lab.py').write_text(BENCH)
+    with Bench('coil_lab:Coil', {}, 1e-3, 200.0) as coil:
+        coil.hold(0.1, [1e-3])
+        coil.beats = False
+        while not coil.coil.is_cut_off:
+            coil.run(0.1)
+        coil.beats = True
+        coil.hold(0.1, [1e-3])
+        assert coil.coil.asked == 1e-3
+
+
+@pytest.mark.parametrize(('slow', 'of', 'slept', 'passed'), [
+    (1, 30, 0, True), (3, 30, 0, True), (12, 30, 0, False), (30, 30, 0, False),
+    (12, 30, 40, True), (30, 30, 40, False), (90, 1000, 0, False), (90, 1000, 10, True)])
+def test_calls_that_a_busy_host_slows_down_are_not_blamed_on_the_class(slow, of, slept, passed):
+    trial = conformance.ConformanceTrial('', '', {}, level=1e-3, rate=200.0)
+    trial._check_calls(
+        {'applied': np.array([0.05] * slow + [1e-4] * (of - slow))},
+        [0.04] * slept + [1e-4] * (100 - slept))
+    assert [x.passed for x in trial._checks] == [passed]
 
 
 def phase(stretch):

@@ -33,8 +33,9 @@ _TIMED, _APART, _TRIES = 30, 0.03, 4
 _CALL, _LATE, _CLOCK, _REPEATED = 0.02, 2e-3, 1e-3, 0.6
 # Temperature limit of a coil after small levels, in degrees Celsius.
 _HOTTEST = 150.0
-# Fraction of calls that must keep their limit.
-_MOST = 0.95
+# Fraction of calls that may exceed their limit, on a host that is never busy, and standard
+# deviations of the number of those that do: of 30 calls, 1 or 2 are expected and 3 prove nothing.
+_FEW, _CHANCE = 0.05, 2.0
 # Standard deviations of its mean from which a response is significant, so that noise cannot make
 # the coil seem on or off, and minimum fraction of the response between rest and either level for
 # 0 T to count as off.
@@ -362,11 +363,12 @@ class ConformanceTrial:
     # -- calls ---------------------------------------------------------------------------------
 
     def _check_calls(self, durations: Mapping[str, Array], host: Sequence[float]) -> None:
-        # A busy host slows down every call.
-        busy = float(np.quantile(host, _MOST))
+        # A busy host slows down calls as it does the waits of this trial.
+        few = _FEW + float(np.mean(np.array(host) > _CALL))
         for name, found in durations.items():
+            some = few + _CHANCE * math.sqrt(few / len(found))
             self._note(
-                f'{name}_time', max(float(np.quantile(found, _MOST)) - busy, 0.0), 's',
+                f'{name}_time', float(np.quantile(found, max(1.0 - some, 0.5))), 's',
                 # Waiting at the end delays no level.
                 _END if name == 'close' else _CALL,
                 f'{name} takes {np.median(found) * 1e3:.3g} ms (at most {found.max() * 1e3:.3g})',
