@@ -22,6 +22,7 @@ import time
 from typing import Any, ClassVar
 
 from extras import has, needs
+from forks import Forked, ForkServer
 from hypothesis import HealthCheck, Phase, settings
 import pytest
 
@@ -256,14 +257,14 @@ class Process:
 
     Attributes
     ----------
-    popen : subprocess.Popen
+    popen : subprocess.Popen or forks.Forked
         The process.
     stdout_path, stderr_path : pathlib.Path
         Files of its output.
 
     """
 
-    popen: 'subprocess.Popen[bytes]'
+    popen: 'subprocess.Popen[bytes] | Forked'
     stdout_path: Path
     stderr_path: Path
 
@@ -318,6 +319,7 @@ class Starter:
 
     env: Mapping[str, str]
     folder: Path
+    fork_server: Callable[[Mapping[str, str]], ForkServer]
     processes: list[Process] = field(default_factory=list)
 
     def __call__(self, *command: str | os.PathLike[str], **extra_env: str) -> Process:
@@ -325,10 +327,14 @@ class Starter:
         number = len(self.processes)
         stdout_path = self.folder / f'{number}.out'
         stderr_path = self.folder / f'{number}.err'
+        words, env = [os.fspath(x) for x in command], {**self.env, **extra_env}
         with stdout_path.open('wb') as stdout, stderr_path.open('wb') as stderr:
-            popen = subprocess.Popen(
-                [os.fspath(part) for part in command], stdin=subprocess.DEVNULL,
-                stdout=stdout, stderr=stderr, env={**self.env, **extra_env})
+            if (words[:3] == [sys.executable, '-m', 'hmsa_ros']
+                    and (server := self.fork_server(self.env)).suits(env)):
+                popen = server.start(words[3:], env, stdout_path, stderr_path)
+            else:
+                popen = subprocess.Popen(
+                    words, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr, env=env)
         process = Process(popen, stdout_path, stderr_path)
         self.processes.append(process)
         return process
@@ -363,12 +369,27 @@ def handlers() -> Iterator[None]:
         signal.signal(number, handler)
 
 
+@pytest.fixture(scope='session')
+def fork_server() -> Iterator[Callable[[Mapping[str, str]], ForkServer]]:
+    """Return a function that returns the server of this worker."""
+    servers: list[ForkServer] = []
+
+    def server(env: Mapping[str, str]) -> ForkServer:
+        if not servers:
+            servers.append(ForkServer(env))
+        return servers[0]
+
+    yield server
+    for each in servers:
+        each.close()
+
+
 @pytest.fixture
 def start(
-        ros_env: Mapping[str, str],
+        ros_env: Mapping[str, str], fork_server: Callable[[Mapping[str, str]], ForkServer],
         tmp_path_factory: pytest.TempPathFactory) -> Iterator[Starter]:
     """Return a starter of child processes in the test's ROS domain."""
-    starter = Starter(ros_env, tmp_path_factory.mktemp('processes'))
+    starter = Starter(ros_env, tmp_path_factory.mktemp('processes'), fork_server)
     yield starter
     starter.stop_all()
 

@@ -1,0 +1,148 @@
+"""
+Processes of ``hmsa`` forked from one that has imported everything.
+
+Most of the time of a process that a test starts is its imports. The rest is as in a new process:
+arguments, environment, working directory, streams, signals and the end.
+"""
+
+from collections.abc import Mapping, Sequence
+import gc
+import json
+import os
+from pathlib import Path
+import select
+import signal
+import socket
+import subprocess
+import sys
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+# Variables that a process reads while it starts and imports: with others it is no fork.
+EARLY = ('PYTHON', 'LC_', 'LANG', 'LD_', 'OMP_')
+
+
+class Forked:
+    """A process with the part of `subprocess.Popen` that tests use."""
+
+    def __init__(self, server: 'ForkServer', args: Sequence[str], pid: int) -> None:
+        self.args, self.pid, self.returncode = args, pid, None
+        self._server, self._end = server, os.pidfd_open(pid)
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Return the exit status as `subprocess.Popen.wait` does."""
+        if self.returncode is None:
+            end = select.poll()
+            end.register(self._end, select.POLLIN)
+            if not end.poll(None if timeout is None else 1e3 * timeout):
+                raise subprocess.TimeoutExpired(self.args, timeout)
+            self.returncode = self._server.ask(reap=self.pid)
+            os.close(self._end)
+        return self.returncode
+
+    def poll(self) -> int | None:
+        """Return the exit status if it has ended."""
+        try:
+            return self.wait(0.0)
+        except subprocess.TimeoutExpired:
+            return None
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal unless it has ended."""
+        if self.poll() is None:
+            signal.pidfd_send_signal(self._end, number)
+
+    def terminate(self) -> None:
+        """Send SIGTERM."""
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """Send SIGKILL."""
+        self.send_signal(signal.SIGKILL)
+
+
+class ForkServer:
+    """The process that forks others: it has imported nodes, commands and message types."""
+
+    def __init__(self, env: Mapping[str, str]) -> None:
+        self._env = dict(env)
+        self._line, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with its:
+            self._process = subprocess.Popen(
+                [sys.executable, __file__, str(its.fileno())], env=self._env,
+                pass_fds=[its.fileno()], cwd=ROOT)
+
+    def ask(self, **request: Any) -> int:
+        """Return the answer to a request."""
+        self._line.send(json.dumps(request).encode())
+        return int(self._line.recv(100))
+
+    def suits(self, env: Mapping[str, str]) -> bool:
+        """Return whether a process with an environment may be a fork."""
+        names = {x for x in {*env, *self._env} if x.startswith(EARLY)}
+        return all(env.get(x) == self._env.get(x) for x in names)
+
+    def start(
+            self, arguments: Sequence[str], env: Mapping[str, str], stdout: Path,
+            stderr: Path) -> Forked:
+        """Start ``hmsa`` with arguments, without input."""
+        return Forked(self, ('hmsa', *arguments), self.ask(
+            arguments=arguments, env=dict(env), folder=os.getcwd(), stdout=str(stdout),
+            stderr=str(stderr)))
+
+    def close(self) -> None:
+        """End it; processes that it has started go on."""
+        self._line.close()
+        self._process.wait()
+
+
+def become(
+        arguments: Sequence[str], env: Mapping[str, str], folder: str, stdout: str,
+        stderr: str) -> None:
+    """Take on what distinguishes one process from another."""
+    os.environ.clear()
+    os.environ.update(env)
+    os.chdir(folder)
+    sys.path[0] = folder
+    sys.argv[1:] = arguments
+    for number, (path, flags) in enumerate((
+            (os.devnull, os.O_RDONLY), (stdout, os.O_WRONLY), (stderr, os.O_WRONLY))):
+        file = os.open(path, flags)
+        os.dup2(file, number)
+        os.close(file)
+
+
+def serve(line: socket.socket) -> None:
+    """Fork a process or reap one at each request; return in each process, and at the end."""
+    while text := line.recv(2**20):
+        request = json.loads(text)
+        if 'reap' in request:
+            answer = os.waitstatus_to_exitcode(os.waitpid(request['reap'], 0)[1])
+        elif not (answer := os.fork()):
+            line.close()
+            become(**request)
+            return
+        line.send(str(answer).encode())
+    # Without the cleaning up of what was only imported.
+    os._exit(0)
+
+
+if __name__ == '__main__':
+    sys.path[0] = str(ROOT)
+    from rclpy.type_support import check_for_type_support
+
+    from hmsa.entry import main
+    from hmsa.interfaces import topics
+    from hmsa.plugins import COMMANDS, NODES, registered
+    from hmsa_ros.nodes.ros_entities import interface_class
+
+    for group in (NODES, COMMANDS):
+        for entry in registered(group).values():
+            if not entry.value.startswith('hmsa_studies'):
+                entry.load()
+    for interface in vars(topics).values():
+        if isinstance(interface, topics.Topic | topics.Service):
+            check_for_type_support(interface_class(interface.type))
+    gc.freeze()
+    serve(socket.socket(fileno=int(sys.argv[1])))
+    sys.exit(main())
