@@ -204,6 +204,16 @@ def test_a_goal_already_reached_is_held_against_its_own_tolerance():
     assert 'expected at most 1e-05 off' in bench.outcomes['y'].message
 
 
+def test_a_goal_already_reached_arrives_within_a_tolerance_that_the_one_before_had_not():
+    bench = Bench(shear_modulus=1.1)
+    bench.add([(1.3, 100)])
+    bench.run(700)
+    assert bench.ended() == ('aborted', ErrorCode.GOAL_TOLERANCE_VIOLATED)
+    bench.add([(1.3, 100)], 'y', goal_tolerance=[('a', 0.1, -1.0)])
+    bench.run(700)
+    assert bench.ended('y') == SUCCESS
+
+
 @pytest.mark.parametrize('points', [[(1.3, 300)], dense(duration=300)], ids=['rests', 'path'])
 def test_a_sample_off_the_path_aborts_the_goal_and_the_actuator_comes_to_rest(points):
     bench = Bench()

@@ -31,6 +31,8 @@ _UNSEEN = (math.nan, math.nan)
 # Value that disables a tolerance.
 _NONE = -1.0
 _REPLACED = 'another request took the place of the goal'
+# Verdicts whose figures decide, since they may be those of other tolerances.
+_MEASURED = (Code.ARRIVED, Code.OFF_TARGET, Code.VIBRATING)
 
 
 class ErrorCode(IntEnum):
@@ -300,7 +302,8 @@ def _failure(request: Trajectory, finding: Finding) -> str:
     offset, vibration = request.goals[setpoint.joint or request.joints[0]].of(setpoint)
     if setpoint.number < setpoint.count:
         return '' if finding.arrived else finding.message
-    if finding.arrived and not (abs(finding.offset) > offset or finding.vibration > vibration):
+    if finding.verdict in _MEASURED and (
+            abs(finding.offset) <= offset and finding.vibration <= vibration):
         return ''
     return (f'{finding.message}: expected at most {offset:.3g} off, and a vibration of at most '
             f'{vibration:.3g} peak to peak')
