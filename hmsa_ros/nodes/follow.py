@@ -18,7 +18,7 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectoryPoint
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, excerpt
 from hmsa.interfaces import topics
 from hmsa.planning import path
 from hmsa_ros.nodes import conversions, ros_entities
@@ -31,6 +31,8 @@ from hmsa_ros.runtime.runtime import Runtime
 
 # Rate of feedback and states in Hz, as for a joint_trajectory_controller.
 _RATE = 20.0
+# Tolerances of a multi_dof_trajectory.
+_OF_COMPONENTS = ('component_path_tolerance', 'component_goal_tolerance')
 # Queue length for the newest samples of several joints, each with its own publisher.
 _NEWEST = 20
 
@@ -77,6 +79,12 @@ class FollowJointTrajectory:
         try:
             if goal.multi_dof_trajectory.points:
                 raise BadInputError('the goal has a multi_dof_trajectory: expected a trajectory')
+            for kind in _OF_COMPONENTS:
+                if given := getattr(goal, kind):
+                    raise BadInputError(
+                        f'the goal has {kind}, of {excerpt(given[0].joint_name)}: expected none, '
+                        'as a joint has a stretch and no components; use path_tolerance and '
+                        'goal_tolerance')
             request = replace(read_trajectory(serialize_message(goal.trajectory)), name=name)
         except BadInputError as error:
             verdict = self._runtime.planning.refuse(error, Trajectory((), (), 0, name=name))
