@@ -2,7 +2,9 @@
 # installed goes into .venv.
 
 PYTHON ?= python3
-VENV ?= .venv
+# The ROS 2 distribution, jazzy or kilted: each has its own environment.
+ROS ?= jazzy
+VENV ?= .venv$(if $(filter-out jazzy,$(ROS)),-$(ROS))
 # Passed to the command or to pytest, as in: make demo ARGS='--out /tmp/demo --json'
 ARGS ?=
 # For make constraints.
@@ -12,7 +14,7 @@ BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder
 # Bytecode is written when a module is first imported, not for all of them now.
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet --no-compile \
-	-c constraints.txt
+	-c constraints$(if $(filter-out jazzy,$(ROS)),-$(ROS)).txt
 # Of the package that is installed: to install it again would compile the motion again.
 EXTRAS := $(BIN)/python scripts/list_extras.py
 
@@ -33,7 +35,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 .PHONY: help
 help: ## list the targets (default)
 	@sed -n 's/^\([a-z]*\):.*## /\1	/p' $(MAKEFILE_LIST) | expand -t 14
-	@echo "Variables: PYTHON=$(PYTHON) VENV=$(VENV) ARGS='$(ARGS)'"
+	@echo "Variables: PYTHON=$(PYTHON) ROS=$(ROS) VENV=$(VENV) ARGS='$(ARGS)'"
 
 .PHONY: demo
 demo: env ## run the demonstration
@@ -46,6 +48,11 @@ test: tools ## run all tests but the slow ones, in parallel
 .PHONY: full
 full: tools ## run the slow tests too, and random examples, as before a release
 	$(PYTEST) -m 'not lint' --hypothesis-profile full $(ARGS)
+	$(MAKE) actions
+
+.PHONY: actions
+actions: $(VENV)/.control_msgs tools ## build control_msgs, and test the action that needs it
+	. $(CURDIR)/$(VENV)/control_msgs/setup.sh && $(PYTEST) test/test_follow.py
 
 .PHONY: check
 check: tools ## run the tests that need no nodes
@@ -85,8 +92,8 @@ release: env ## build sdist and wheels into dist/, and test them in empty enviro
 	$(BIN)/python scripts/make_release.py $(ARGS)
 
 .PHONY: constraints
-constraints: ## rewrite constraints.txt, with each of $(PYTHONS)
-	$(PYTHON) scripts/make_constraints.py $(PYTHONS)
+constraints: ## rewrite constraints.txt (with ROS=kilted, its own file), with each of $(PYTHONS)
+	$(PYTHON) scripts/make_constraints.py $(ROS) $(PYTHONS)
 
 .PHONY: clean
 clean: ## remove the environment, builds and caches
@@ -101,7 +108,7 @@ env: $(VENV)/.motion ## make the environment
 tools: $(VENV)/.tools env ## make the environment, with what tests and documentation need
 
 # The stamps come last in their recipes: an environment left half made has none and is made anew.
-$(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml constraints.txt
+$(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml $(wildcard constraints*.txt)
 	@$(PYTHON) -c 'import sys; sys.exit(0 if (3, 10) <= sys.version_info[:2] <= (3, 14) else 1)' \
 	2>/dev/null || { echo "hmsa_ros: $(PYTHON) is $$($(PYTHON) --version 2>/dev/null || echo not a Python that" \
 	"runs): expected Python 3.10 to 3.14; name one, as in: make PYTHON=python3.13" >&2; exit 1; }
@@ -115,7 +122,7 @@ $(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml constraints.tx
 	"and Ubuntu: apt install g++" >&2; exit 1; }
 	@echo "Making the environment $(VENV), which takes some minutes the first time"
 	$(PYTHON) -m venv --clear $(VENV)
-	$(INSTALL) -e '.[ros]'
+	$(INSTALL) -e '.[$(ROS)]'
 	@touch $@ $(VENV)/.motion
 
 $(VENV)/.tools: $(VENV)/.installed
@@ -132,6 +139,11 @@ $(VENV)/.lint: $(VENV)/.tools
 $(VENV)/.bench: $(VENV)/.installed
 	$(EXTRAS) bench sweep > $(VENV)/extras.txt
 	$(INSTALL) -r $(VENV)/extras.txt
+	@touch $@
+
+# Apart from the environment, which is one without control_msgs.
+$(VENV)/.control_msgs: $(wildcard test/control_msgs/* test/control_msgs/*/*) | $(VENV)/.installed
+	test/control_msgs/build.sh $(ROS) $(BIN)/python $(VENV)/control_msgs
 	@touch $@
 
 # The installation compiles the motion, too; this is for when its sources change.

@@ -45,13 +45,19 @@ SWEEP = [
     'pyarrow>=14.0',
 ]
 
+
+
+def ros(distro):
+    """Return what a ROS 2 distribution brings: rclpy and the messages."""
+    return [f'ros-{distro}-common-interfaces', f'ros-{distro}-rclpy[fastrtps]']
+
+
 # rclpy and the messages are no plain requirement: where ROS is installed they are there
-# already, and a second copy from wheels would shadow them.
+# already, and a second copy from wheels would shadow them. An environment holds one distribution.
 EXTRAS_REQUIRE = {
-    'ros': [
-        'ros-jazzy-common-interfaces',
-        'ros-jazzy-rclpy[fastrtps]',
-    ],
+    'ros': ros('jazzy'),
+    'jazzy': ros('jazzy'),
+    'kilted': ros('kilted'),
     'test': [
         'hypothesis>=6.98',
         'pyserial>=3.5',

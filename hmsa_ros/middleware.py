@@ -2,14 +2,29 @@
 
 import os
 from pathlib import Path
+import re
+import sysconfig
 
 #: Environment variable of ROS 2, whose own default is SUBNET.
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 # If any of these is set, the user has chosen which hosts can discover the nodes.
 _DECIDED = (RANGE, 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER', 'ROS_LOCALHOST_ONLY')
-#: Environment variable of Fast DDS, in the version of ROS 2 Jazzy.
-PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+#: Environment variables of profiles: of Fast DDS 2, in ROS 2 Jazzy, and of Fast DDS 3. The
+#: middleware of later distributions reads the first one too, and warns.
+PROFILES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
+_FAST_DDS_2 = 'jazzy'
+_WHEEL = re.compile(r'ros_([a-z]+)_rclpy-.*\.dist-info')
 _HERE = Path(__file__).parent
+
+
+def ros_distro() -> str:
+    """Return the ROS distribution that is sourced, or else installed from wheels; '' for none."""
+    if sourced := os.environ.get('ROS_DISTRO'):
+        return sourced
+    folder = Path(sysconfig.get_path('purelib'))
+    names = sorted(
+        match[1] for x in folder.glob('ros_*_rclpy-*') if (match := _WHEEL.fullmatch(x.name)))
+    return names[-1] if names else ''
 
 
 def prepare_middleware() -> None:
@@ -25,6 +40,12 @@ def prepare_middleware() -> None:
     """
     if not any(os.environ.get(name) for name in _DECIDED):
         os.environ[RANGE] = 'LOCALHOST'
-    if not os.environ.get(PROFILES):
+    if not any(os.environ.get(name) for name in PROFILES):
         local = os.environ.get(RANGE) == 'LOCALHOST' or os.environ.get('ROS_LOCALHOST_ONLY') == '1'
-        os.environ[PROFILES] = str(_HERE / f'fastdds{"_localhost" if local else ""}.xml')
+        version = 2 if ros_distro() == _FAST_DDS_2 else 3
+        os.environ[PROFILES[version - 2]] = str(profiles(version, local=local))
+
+
+def profiles(version: int, *, local: bool) -> Path:
+    """Return the profiles of a major version of Fast DDS, for nodes of this host or of several."""
+    return _HERE / f'fastdds{version if version > 2 else ""}{"_localhost" if local else ""}.xml'

@@ -1,5 +1,5 @@
 """
-Write constraints.txt: install everything in each Python given and pin what came.
+Write the constraints of a ROS 2 distribution: install everything in each Python and pin what came.
 
 Used by ``make constraints``; needs the network.
 """
@@ -11,10 +11,10 @@ import sys
 import tempfile
 
 ROOT = Path(__file__).resolve().parent.parent
-EXTRAS = 'ros,test,lint,sweep,panel,bench,docs,release'
+EXTRAS = 'test,lint,sweep,panel,bench,docs,release'
 HEADER = """\
 # What the package was last tested with, all of it, for Python {first} to {last}: written by
-#     make constraints PYTHONS='{commands}'
+#     make constraints {choice}PYTHONS='{commands}'
 # which installs hmsa_ros[{extras}] in a fresh environment of each of these Pythons,
 # without constraints, and pins the versions that pip chose.
 """
@@ -38,13 +38,13 @@ def version_of(python: str) -> tuple[int, int]:
     return int(major), int(minor)
 
 
-def installed_by(python: str) -> dict[str, str]:
+def installed_by(python: str, extras: str) -> dict[str, str]:
     """Install everything with one Python and return the versions by name."""
     with tempfile.TemporaryDirectory() as directory:
         subprocess.check_call([python, '-m', 'venv', directory])
         inside = str(Path(directory, 'bin', 'python'))
         subprocess.check_call(
-            [inside, '-m', 'pip', 'install', '--quiet', f'{ROOT}[{EXTRAS}]'],
+            [inside, '-m', 'pip', 'install', '--quiet', f'{ROOT}[{extras}]'],
             stdout=sys.stderr)
         versions: dict[str, str] = json.loads(
             subprocess.check_output([inside, '-I', '-c', LIST], text=True))
@@ -87,22 +87,28 @@ def lines(name: str, versions: list[str | None], pythons: list[str]) -> list[str
     return result
 
 
-def main(commands: list[str]) -> int:
+def main(arguments: list[str]) -> int:
     """Write the file; return the exit status."""
+    distro, *commands = arguments or ('',)
     if not commands:
-        print('make_constraints.py: expected at least one Python, as in python3.12',
-              file=sys.stderr)
+        print('make_constraints.py: expected a distribution and at least one Python, as in '
+              'jazzy python3.12', file=sys.stderr)
         return 2
+    # The first distribution has the plain names.
+    first = distro == 'jazzy'
+    extras = f'{"ros" if first else distro},{EXTRAS}'
     commands = sorted(commands, key=version_of)
     pythons = ['{}.{}'.format(*version_of(command)) for command in commands]
-    found = [installed_by(command) for command in commands]
-    text = HEADER.format(first=pythons[0], last=pythons[-1], extras=EXTRAS,
+    found = [installed_by(command, extras) for command in commands]
+    text = HEADER.format(first=pythons[0], last=pythons[-1], extras=extras,
+                         choice='' if first else f'ROS={distro} ',
                          commands=' '.join(f'python{python}' for python in pythons))
     for name in sorted(set().union(*found)):
         for line in lines(name, [versions.get(name) for versions in found], pythons):
             text += line + '\n'
-    (ROOT / 'constraints.txt').write_text(text, encoding='utf-8')
-    print(f'wrote {ROOT / "constraints.txt"}')
+    file = ROOT / f'constraints{"" if first else f"-{distro}"}.txt'
+    file.write_text(text, encoding='utf-8')
+    print(f'wrote {file}')
     return 0
 
 

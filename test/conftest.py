@@ -26,7 +26,7 @@ from forks import Forked, ForkServer
 from hypothesis import HealthCheck, Phase, settings
 import pytest
 
-from hmsa_ros.middleware import PROFILES
+from hmsa_ros.middleware import PROFILES, profiles, ros_distro
 
 ROOT = Path(__file__).resolve().parent.parent
 # Limit of every wait: generous, since only failing tests reach it.
@@ -229,6 +229,13 @@ def ros_domain_id() -> Iterator[int]:
         gc.collect()
 
 
+def own_profiles() -> dict[str, str]:
+    """Return the environment that selects this package's profiles for nodes of this host."""
+    version = 2 if ros_distro() == 'jazzy' else 3
+    return {**dict.fromkeys(PROFILES, ''), PROFILES[version - 2]: str(
+        profiles(version, local=True))}
+
+
 @pytest.fixture
 def ros_env(
         ros_domain_id: int, tmp_path_factory: pytest.TempPathFactory,
@@ -238,7 +245,7 @@ def ros_env(
         'ROS_DOMAIN_ID': str(ros_domain_id),
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
         # Messages lost before discovery are sent again at once, also by the test's nodes.
-        PROFILES: str(ROOT / 'hmsa_ros' / 'fastdds_localhost.xml'),
+        **own_profiles(),
         'ROS_LOG_DIR': str(tmp_path_factory.mktemp('ros_log')),
         'PYTHONPATH': os.pathsep.join(
             [str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])]),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.faults.hosts import ACROSS, hosts, unavailable
+from hmsa_ros.middleware import PROFILES
 
 WHY = unavailable()
 ONLOOKER = Path(__file__).with_name('onlooker.py')
@@ -45,7 +46,7 @@ class Laboratory:
         import sys
         return self._start(
             *self.hosts.on(host, sys.executable, *map(str, arguments)),
-            FASTRTPS_DEFAULT_PROFILES_FILE='', **ACROSS)
+            **dict.fromkeys(PROFILES, ''), **ACROSS)
 
     def hmsa(self, host, *arguments):
         return self.run(host, '-m', 'hmsa_ros', *arguments)

@@ -7,7 +7,7 @@ from time import monotonic
 
 import pytest
 
-from hmsa_ros.middleware import prepare_middleware, PROFILES, RANGE
+from hmsa_ros.middleware import prepare_middleware, PROFILES, profiles, RANGE
 
 OTHERS = ('ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER', 'ROS_LOCALHOST_ONLY')
 # More than a reader's queue in shared memory holds, from a writer that keeps all of it.
@@ -52,7 +52,7 @@ while True:
 
 @pytest.fixture(autouse=True)
 def undecided(monkeypatch):
-    for name in (RANGE, PROFILES, *OTHERS):
+    for name in (RANGE, *PROFILES, *OTHERS):
         monkeypatch.setenv(name, '')
 
 
@@ -78,16 +78,30 @@ def test_who_names_others_is_left_alone(monkeypatch, name):
 def test_no_send_waits_for_another_host(monkeypatch, reach, waits):
     monkeypatch.setenv(RANGE, reach)
     prepare_middleware()
-    profiles = Path(os.environ[PROFILES]).read_text()
-    assert ('<non_blocking_send>true</non_blocking_send>' in profiles) is not waits
+    selected = Path(''.join(os.environ[x] for x in PROFILES)).read_text()
+    assert ('<non_blocking_send>true</non_blocking_send>' in selected) is not waits
     # On one host ROS 2 adds its own transports to any named here.
-    assert ('<userTransports>' in profiles) is not waits
+    assert ('<userTransports>' in selected) is not waits
 
 
-def test_who_has_profiles_of_his_own_keeps_them(monkeypatch):
-    monkeypatch.setenv(PROFILES, '/somewhere/else.xml')
+@pytest.mark.parametrize('name', PROFILES)
+def test_who_has_profiles_of_his_own_keeps_them(monkeypatch, name):
+    monkeypatch.setenv(name, '/somewhere/else.xml')
     prepare_middleware()
-    assert os.environ[PROFILES] == '/somewhere/else.xml'
+    assert ''.join(os.environ[x] for x in PROFILES) == os.environ[name] == '/somewhere/else.xml'
+
+
+@pytest.mark.parametrize(('distro', 'place'), [('jazzy', 0), ('kilted', 1), ('rolling', 1)])
+def test_profiles_are_those_of_the_middleware_of_the_distribution(monkeypatch, distro, place):
+    monkeypatch.setenv('ROS_DISTRO', distro)
+    prepare_middleware()
+    assert [bool(os.environ[x]) for x in PROFILES] == [place == 0, place == 1]
+
+
+@pytest.mark.parametrize('local', [True, False])
+def test_profiles_of_both_versions_differ_in_a_name_only(local):
+    old, new = (profiles(x, local=local).read_text().split('<dds>')[1] for x in (2, 3))
+    assert old.replace('heartbeatPeriod', 'heartbeat_period') == new != old
 
 
 @pytest.mark.slow
@@ -96,7 +110,8 @@ def test_what_a_busy_reader_misses_comes_again_sooner_than_by_default(start, wai
     reader = start.python('-c', READER)
     reader.wait_for_output('reads')
     writers = [
-        start.python('-c', WRITER, name, **{PROFILES: ''}) for name in ('default', 'ours')]
+        start.python('-c', WRITER, name, **dict.fromkeys(PROFILES, ''))
+        for name in ('default', 'ours')]
     for writer in writers:
         writer.wait_for_output('ready')
     def lost_and_early(number):

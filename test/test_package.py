@@ -22,6 +22,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ('hmsa', 'hmsa_ros', 'hmsa_lab', 'hmsa_studies')
 SOURCES = [x for y in PACKAGES for x in (ROOT / y).rglob('*.py')]
 PYTHONS = ('3.10', '3.11', '3.12', '3.13', '3.14')
+DISTROS = ('jazzy', 'kilted')
 # Where the key of a requirement is not python3- and its name in lower case.
 # mcap, lz4 and zstandard come along with mcap-ros2-support.
 KEYS = {
@@ -147,8 +148,25 @@ def test_everything_imported_is_required_and_everything_required_is_imported(set
 
 def test_rclpy_and_messages_come_only_with_the_extra_for_machines_without_ros(setup):
     assert not any('ros-' in name for name in names(setup['install_requires']))
-    assert names(setup['extras_require']['ros']) == {
-        'ros-jazzy-rclpy', 'ros-jazzy-common-interfaces'}
+    for extra, distro in (('ros', 'jazzy'), *((x, x) for x in DISTROS)):
+        assert names(setup['extras_require'][extra]) == {
+            f'ros-{distro}-rclpy', f'ros-{distro}-common-interfaces'}
+
+
+def test_whatever_is_private_in_rclpy_is_listed():
+    trees = [ast.parse(x.read_text(encoding='utf-8'))
+             for y in ('hmsa_ros', 'hmsa_lab') for x in (ROOT / y).rglob('*.py')]
+    nodes = [x for tree in trees for x in ast.walk(tree)]
+    own = {x.name for x in nodes if isinstance(x, (ast.FunctionDef, ast.ClassDef))} | {
+        x.attr for x in nodes if isinstance(x, ast.Attribute) and isinstance(x.ctx, ast.Store)
+        and isinstance(x.value, ast.Name)} | {
+        x.id for x in nodes if isinstance(x, ast.Name) and isinstance(x.ctx, ast.Store)}
+    used = {x.attr for x in nodes if isinstance(x, ast.Attribute)
+            and re.fullmatch('_[a-z]\\w+', x.attr)} - own
+    text = (ROOT / 'CONTRIBUTING.md').read_text(encoding='utf-8')
+    listed = set(re.findall(r'`(_\w+)`', text.partition('### What is private in rclpy')[2]))
+    # Fields of other libraries.
+    assert used - {'_asdict', '_exit'} <= listed
 
 
 def test_every_module_of_the_package_is_installed(setup):
@@ -194,10 +212,16 @@ def test_setup_cfg_puts_scripts_where_ros2_run_looks():
         '$base/lib/hmsa_ros', '$base/lib/hmsa_ros']
 
 
+def constraints_of(distro):
+    end = '' if distro == 'jazzy' else f'-{distro}'
+    return (ROOT / f'constraints{end}.txt').read_text(encoding='utf-8')
+
+
+@pytest.mark.parametrize('distro', DISTROS)
 @pytest.mark.parametrize('python', PYTHONS)
-def test_constraints_pin_every_requirement_once_for_each_python(setup, python):
+def test_constraints_pin_every_requirement_once_for_each_python(setup, python, distro):
     pins: dict[str, str] = {}
-    for line in (ROOT / 'constraints.txt').read_text().splitlines():
+    for line in constraints_of(distro).splitlines():
         if line.startswith('#'):
             continue
         pin = Requirement(line)
@@ -207,7 +231,8 @@ def test_constraints_pin_every_requirement_once_for_each_python(setup, python):
     requirements = [Requirement(text) for text in sum(
         setup['extras_require'].values(), setup['install_requires'])]
     for requirement in requirements:
-        if requirement.name != 'setuptools':
+        if requirement.name != 'setuptools' and not requirement.name.startswith(
+                tuple(f'ros-{x}-' for x in DISTROS if x != distro)):
             version = pins[requirement.name.lower()].removeprefix('==')
             assert requirement.specifier.contains(version)
 
@@ -215,8 +240,9 @@ def test_constraints_pin_every_requirement_once_for_each_python(setup, python):
 def test_supported_pythons_are_the_ones_that_the_constraints_were_made_for(setup):
     supported = SpecifierSet(setup['python_requires'])
     assert [f'3.{minor}' for minor in range(20) if f'3.{minor}' in supported] == list(PYTHONS)
-    header = (ROOT / 'constraints.txt').read_text().partition('\n')[0]
-    assert f'for Python {PYTHONS[0]} to {PYTHONS[-1]}' in header
+    for distro in DISTROS:
+        header = constraints_of(distro).partition('\n')[0]
+        assert f'for Python {PYTHONS[0]} to {PYTHONS[-1]}' in header
 
 
 def test_every_file_that_names_the_supported_pythons_names_the_same():

@@ -146,7 +146,7 @@ for arguments in {commands!r}:
     assert result.stdout.split() == ['1'] * len(commands)
     for arguments, line in zip(commands, result.stderr.splitlines(), strict=True):
         assert re.fullmatch(
-            f'hmsa: error: hmsa {arguments[0]} needs ROS 2 Jazzy .*source /opt/ros/jazzy.*'
+            f'hmsa: error: hmsa {arguments[0]} needs ROS 2, Jazzy or Kilted .*/opt/ros/jazzy.*'
             r'pip install "\.\[ros\]"\)', line)
     assert not [*tmp_path.iterdir()]
 

@@ -12,6 +12,7 @@ from benchmarks.faults.hosts import ACROSS, Hosts, hosts, unavailable
 from benchmarks.faults.rig import Child, PATIENCE, Rig, ROOT
 from benchmarks.faults.table import Seen
 from hmsa.errors import HmsaError
+from hmsa_ros.middleware import PROFILES
 
 FAULTS = Register()
 _ONLOOKER = ROOT / 'test' / 'onlooker.py'
@@ -23,7 +24,7 @@ class _Apart:
     def __init__(self, rig: Rig, made: Hosts) -> None:
         self._rig, self.hosts = rig, made
         self._seen = rig.folder / 'seen.npy'
-        rig.environment |= {**ACROSS, 'FASTRTPS_DEFAULT_PROFILES_FILE': ''}
+        rig.environment |= {**ACROSS, **dict.fromkeys(PROFILES, '')}
 
     def run(self, host: str, name: str, *words: str) -> Child:
         """Start this Python interpreter with arguments on a host."""

@@ -124,8 +124,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not of_ros(error):
             raise
         return complain(HmsaError(
-            f'{arguments.parser.prog} needs ROS 2 Jazzy ({error}): source its setup file (source '
-            '/opt/ros/jazzy/setup.bash), or install it with this package (in its '
+            f'{arguments.parser.prog} needs ROS 2, Jazzy or Kilted ({error}): source its setup '
+            'file (source /opt/ros/jazzy/setup.bash), or install it with this package (in its '
             'clone: pip install ".[ros]")'))
     except KeyboardInterrupt:
         return ENDING.status

@@ -78,7 +78,7 @@ class Buffer(ctypes.Structure):
 
 
 class _Info(ctypes.Structure):
-    """rmw_message_info_t of Jazzy."""
+    """rmw_message_info_t of Jazzy and Kilted."""
 
     _fields_ = [
         ('source', ctypes.c_int64), ('received', ctypes.c_int64),

@@ -14,7 +14,6 @@ import datetime
 from functools import partial
 import json
 from operator import gt, lt
-import os
 from pathlib import Path
 import time
 from typing import Any
@@ -30,6 +29,7 @@ from hmsa.errors import BadInputError, BagError
 from hmsa.interfaces import topics
 from hmsa.interfaces.parameters import duration_from, duration_specs, ParameterSpec
 from hmsa.model.units import NANOSECONDS
+from hmsa_ros.middleware import ros_distro
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.capture import Capture, decode, SimulatedTime, Taken
 from hmsa_ros.nodes.conversions import from_time, to_status
@@ -136,7 +136,7 @@ class Recorder(ManagedNode):
             values['storage.uri'] or datetime.datetime.now().strftime('hmsa_%Y_%m_%d-%H_%M_%S'),
             preset=values['storage.storage_preset_profile'],
             custom_data={**self._experiment, **parse_custom_data(values['storage.custom_data'])},
-            ros_distro=os.environ.get('ROS_DISTRO', 'jazzy'), fsync=values['storage.fsync'])
+            ros_distro=ros_distro(), fsync=values['storage.fsync'])
         self.folder: Path = writer.folder
         self._recording = WriterThread(writer, limits, self.complain)
         self._capture = Capture(self._deliver)
