@@ -107,8 +107,24 @@ def test_a_device_whose_clock_is_set_halts_the_plan_and_is_found_again(when, by)
     rig.set_device(-by)
     rig.run(rig.now + 1200 * MS)
     rig.runtime.request(StretchRequest('a', 1.25))
-    rig.run(rig.now + SECOND)
+    rig.run(rig.now + LEAD + HOLD)
     assert rig.status.verdict.severity is Severity.OK
+    assert rig.residual(1.25) < 1e-6
+
+
+@pytest.mark.parametrize('by', [5000, -5000, 3_600_000])
+def test_without_samples_a_start_after_clocks_agree_again_knows_that_the_coil_was_off(by):
+    rig = Apart()
+    rig.samples = rig.observable = False
+    rig.runtime.request(trajectory((1.2, HOLD), (1.3, 8 * HOLD)))
+    rig.run(START + 130 * MS)
+    rig.set_device(by * MS)
+    rig.settle()
+    assert rig.cut
+    rig.set_device(-by * MS)
+    rig.run(rig.now + SECOND)
+    rig.runtime.request(StretchRequest('a', 1.25))
+    rig.run(rig.now + LEAD + HOLD)
     assert rig.residual(1.25) < 1e-6
 
 

@@ -262,6 +262,10 @@ class Runtime:
         if joint in self.devices.apart or not self.devices.receipts.is_past(joint, stamp, now):
             # The clock of the device was set, and the time is unknown.
             self.following.newest[joint] = 0, flux_density
+            if joint in self.devices.apart and self._takeover.engaged:
+                # Its plan is dropped. The level applies by now, until a request replaces it.
+                self.group.applied(
+                    joint, now, flux_density, self.settings.lateness_tolerance)
             return
         self.follower.applied(joint, stamp, flux_density)
         if self._takeover.engaged:
