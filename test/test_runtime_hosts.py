@@ -1,10 +1,23 @@
 """A planner and a device on another host, without ROS: silence, cut-offs, clocks, lost states."""
 
 from dataclasses import replace
+import math
 
 import pytest
-from test_runtime_planner import HOLD, LEAD, MS, PATIENT, QUIET, Rig, SEQUENCE, START, trajectory
+from test_runtime_planner import (
+    HOLD,
+    LEAD,
+    MS,
+    PATIENT,
+    QUIET,
+    Rig,
+    SEQUENCE,
+    SLENDER,
+    START,
+    trajectory,
+)
 
+from hmsa.planning.planner import Planner
 from hmsa_ros.runtime.environment import ObservedSample
 from hmsa_ros.runtime.records import Severity, Stop, StretchRequest
 
@@ -23,6 +36,7 @@ class Bench(Rig):
         self.refused = []
         self.lost = False  # whether samples show rest without a field
         self.samples = True
+        self.rates = True  # whether samples contain a rate
         self.hears = True  # whether commands arrive while the link works
         self.mute = False  # whether receipts are lost
         self.cut_at = START + 1  # time that names the cut-off
@@ -34,7 +48,8 @@ class Bench(Rig):
         if self.samples:
             stretch = 1.0 if self.lost else self.plant.stretch
             yield 'a', ObservedSample(
-                self.now + self.ahead, stretch, 0.0 if self.lost else self.plant.rate,
+                self.now + self.ahead, stretch,
+                math.nan if not self.rates else 0.0 if self.lost else self.plant.rate,
                 self.plant.flux_density, -self.ahead)
 
     def deliver(self):
@@ -351,8 +366,10 @@ def test_after_a_cut_off_the_planner_may_go_on_by_itself_with_a_shaped_move():
     assert rig.residual(1.4) < 1e-6
 
 
-def test_a_move_does_not_start_from_a_state_that_samples_contradict():
+@pytest.mark.parametrize('rates', [True, False])
+def test_a_move_does_not_start_from_a_state_that_samples_contradict(rates):
     rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS))
+    rig.rates = rates
     rig.runtime.request(StretchRequest('a', 1.2))
     rig.run(START + 800 * MS)
     # The board has begun anew with its coil off, and nobody has noticed.
@@ -362,6 +379,38 @@ def test_a_move_does_not_start_from_a_state_that_samples_contradict():
     assert any('is at 1 on joint_states, where 1.2 was predicted' in x for x in rig.notes())
     assert rig.residual(1.05) < 1e-6
     assert max(x.flux_density for t, x in rig.sent if t > START + 800 * MS) < 0.06
+
+
+def test_a_planner_starts_from_rest_that_samples_without_a_rate_show():
+    rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS))
+    rig.rates = False
+    level = Planner(rig.blocks['a'], rig.options).model.flux_density(
+        Planner(rig.blocks['a'], rig.options).model.holding(1.3))
+    rig.plant.set_state(1.3, 0.0, level, level)
+    rig.runtime.request(StretchRequest('a', 1.15))
+    rig.run(START + 200 * MS + LEAD + HOLD)
+    assert rig.residual(1.15) < 1e-6
+    assert rig.notes() == []
+
+
+def test_a_start_that_samples_without_a_rate_do_not_show_is_named():
+    rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS), blocks={'a': SLENDER})
+    rig.rates = False
+    rig.plant.set_state(1.1, 0.0, 0.0)
+    rig.runtime.request(StretchRequest('a', 1.15))
+    rig.run(START + 400 * MS)
+    assert rig.sent == []
+    rig.run(START + 700 * MS)
+    assert rig.status.verdict.code == 'accepted'
+    assert any('contain no rate, and do not show rest: it is assumed at rest' in x
+               for x in rig.notes())
+    # Later it rests elsewhere, then moves.
+    rig.run(START + 800 * MS)
+    rig.plant.set_state(1.3, 0.0, rig.plant.flux_density)
+    rig.runtime.request(StretchRequest('a', 1.2))
+    rig.run(rig.now + 700 * MS)
+    assert any('do not show rest: planning continues from the prediction' in x
+               for x in rig.notes())
 
 
 def test_a_model_that_cannot_be_followed_is_no_longer_in_the_way_once_it_is_replaced():

@@ -1,5 +1,6 @@
 """The actual state of the joints, from samples before the first and before later requests."""
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 import math
 
@@ -10,6 +11,7 @@ from hmsa.planning.planner import Planner
 from hmsa_ros.runtime.environment import Environment, ObservedSample
 from hmsa_ros.runtime.receipts import Receipts
 from hmsa_ros.runtime.records import Settings
+from hmsa_ros.runtime.stillness import Stillness
 
 # Largest age of a sample that shows where a joint is, in ns by the steady clock; and of one that
 # does although its level has changed since, as it does all the time along a path.
@@ -29,7 +31,11 @@ _QUIET = 20.0
 
 
 class Takeover:
-    """Wait for samples of the joints before the first request, and start from them."""
+    """
+    Wait for samples of the joints before the first request, and start from them.
+
+    Samples without a rate show the state of a joint once they show that it rests.
+    """
 
     def __init__(
             self, planners: Mapping[str, Planner], environment: Environment, receipts: Receipts,
@@ -48,6 +54,7 @@ class Takeover:
         self.engaged = False
         # The newest sample of each joint.
         self._samples: dict[str, ObservedSample] = {}
+        self._still: defaultdict[str, Stillness] = defaultdict(Stillness)
         # Joints to check before they are planned for, and those that may not be where predicted.
         self._unsure: set[str] = set()
         self._doubted: set[str] = set()
@@ -68,10 +75,12 @@ class Takeover:
             self.engaged = True
 
     def observe(self, joint: str, seen: ObservedSample) -> None:
-        """Record a sample; ignore unknown joints, NaN values and samples out of order."""
-        if joint not in self._planners or not math.isfinite(
-                seen.stretch + seen.rate + seen.flux_density):
+        """Record a sample; ignore unknown joints, unknown values and samples out of order."""
+        if joint not in self._planners or math.isinf(seen.rate) or not math.isfinite(
+                seen.stretch + seen.flux_density):
             return
+        if math.isnan(seen.rate):
+            self._still[joint].add(seen.stamp, seen.stretch)
         last, steady = self._samples.get(joint), self._around.steady()
         # Samples are out of order by less than that; else, a clock was set.
         if last is None or seen.stamp >= last.stamp or last.stamp - seen.stamp > _DISORDER or (
@@ -82,17 +91,20 @@ class Takeover:
         """Stop waiting, and discard the samples."""
         self._until = self._look_until = None
         self._samples.clear()
+        self._still.clear()
         self._unsure.clear()
         self._doubted.clear()
 
     def forget(self, joint: str) -> None:
-        """Discard the sample of a joint whose clock was set."""
+        """Discard the samples of a joint whose clock was set."""
         self._samples.pop(joint, None)
+        self._still.pop(joint, None)
 
     def clock_set(self, by: int) -> None:
         """Shift samples by the ns that the clock was set ahead, so that they do not age."""
         self._samples = {
             name: x._replace(stamp=x.stamp + by) for name, x in self._samples.items()}
+        self._still.clear()
 
     def go_on(self, settings: Settings) -> None:
         """
@@ -115,6 +127,7 @@ class Takeover:
                 self._check_age(name, seen, settings)
                 # It is old, but the newest available.
                 samples[name] = seen
+        samples = {name: y for name, x in samples.items() if (y := self._complete(name, x))}
         if not over and (len(samples) < len(self._planners) or self._around.unheard()):
             return
         self._until, self.engaged = None, True
@@ -124,8 +137,18 @@ class Takeover:
                 self._take(name, samples[name])
             elif observable:
                 self._note(
-                    f'no sample of joint {name} on joint_states: it is assumed at rest where '
-                    'it began (initial_stretch)')
+                    (f'samples of joint {name} contain no rate, and do not show rest'
+                     if name in self._samples else f'no sample of joint {name} on joint_states')
+                    + ': it is assumed at rest where it began (initial_stretch)')
+
+    def _complete(self, name: str, seen: ObservedSample) -> ObservedSample | None:
+        """Return a sample with a rate, which is zero if the joint is seen to rest; else None."""
+        if not math.isnan(seen.rate):
+            return seen
+        level = self._newest.get(name)
+        since = max(self._planners[name].changed(seen.stamp), 0 if level is None else level[0])
+        rest = self._still[name].rest(self._planners[name].model, since)
+        return None if rest is None else seen._replace(stretch=rest, rate=0.0)
 
     def _take(self, name: str, seen: ObservedSample, *, keep: bool = False) -> bool:
         """Start a joint from a sample; return whether it can. ``keep`` retains its setpoints."""
@@ -182,6 +205,7 @@ class Takeover:
         """Have a joint planned from a sample next, since it may not be where predicted."""
         self._doubted.add(joint)
         self._unsure.add(joint)
+        self._still.pop(joint, None)
 
     def look(self, settings: Settings, *, keep: bool) -> bool:
         """
@@ -200,14 +224,26 @@ class Takeover:
                 continue
             new = self._look_until is not None and (
                 seen.came > self._look_until - settings.takeover_timeout)
-            outdated = self._contradicts(name, seen) and self._is_outdated(name, seen)
-            if not self._is_current(seen, settings) or outdated or (
+            contradicts = self._contradicts(name, seen)
+            outdated = contradicts and self._is_outdated(name, seen)
+            decides = contradicts or name in self._doubted
+            state = self._complete(name, seen) if decides else seen
+            if state is None:
+                # A later sample of a vibration may agree by chance.
+                self._doubted.add(name)
+            if state is None or not self._is_current(seen, settings) or outdated or (
                     name in self._doubted and not new):
                 if not settings.takeover_timeout:
                     continue
                 if not self._is_over(name, seen, settings, outdated=outdated):
                     return False
-            self._compare(name, seen, settings, keep=keep)
+            if state is None:
+                self._note(
+                    f'joint {name} is at {seen.stretch:.4g} on joint_states, but its samples '
+                    'contain no rate, and do not show rest: planning continues from the '
+                    'prediction')
+                continue
+            self._compare(name, state, settings, keep=keep)
         self._settle()
         return True
 
