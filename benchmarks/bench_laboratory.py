@@ -34,6 +34,7 @@ from hmsa.model.equations import natural_frequency
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
+from hmsa.planning.timeline import PlannedSegment
 from hmsa.runs.levels import ROUNDED
 from hmsa_lab.bench import _board, line, serial_board
 from hmsa_lab.bench.assembly import Assembly, CoilModel, SensorScale
@@ -284,7 +285,7 @@ class Trial:
     def __init__(self, driver: Driver, planner: Planner) -> None:
         self.lab, self.driver = driver.board.lab, driver
         self.loop = Loop(PlannerGroup({_JOINT: planner}), Settings(
-            takeover_timeout=0, heartbeat_period=100 * _MS), self.driver)
+            takeover_timeout=0, heartbeat_period=100 * _MS), self.driver, driver.device.guards)
         self.verdicts: dict[int, str] = {}
         self.loop.deliver = self._record
         self.loop.run(self.loop.now + 500 * _MS)
@@ -298,16 +299,21 @@ class Trial:
         self.verdicts.clear()
         self.loop.runtime.request(Trajectory(
             (_JOINT,), [((x,), round(1e9 * y)) for x, y in points], len(points), raw=raw))
+        self._planned = self._segments
         begin = self.loop.now
         self.loop.run(begin + 2 * _LEAD + round(1e9 * (points[-1][1] + 5.0 * self.lab.period)))
         return begin
+
+    @property
+    def _segments(self) -> Sequence[PlannedSegment]:
+        return self.loop.runtime.group.planners[_JOINT].plan.segments
 
     def moves(self, hold: float) -> list[Left]:
         """Execute the moves and one back to rest; return their true errors."""
         targets = (*self.lab.bench.targets, 1.0)
         self.begin = self.request([(x, hold * (i + 1)) for i, x in enumerate(targets)], raw=False)
-        segments = self.loop.runtime.group.planners[_JOINT].plan.segments[-len(targets):]
-        # Replanned segments start later than the first level.
+        # A cut-off drops the plan. Replanned segments start later than the first level.
+        segments = (self._segments or self._planned)[-len(targets):]
         first = self._first()
         self.targets = [
             TargetWindow(x, hold * i, hold * (i + 1), 1e-9 * (y.arrival - first))
@@ -316,9 +322,10 @@ class Trial:
             self.verdicts.get(i + 1, 'unobserved') for i in range(len(targets))])
 
     def _first(self) -> int:
-        """Return when the first level of the last request took effect."""
-        return next(
-            x for x, y in self.driver.changes_seen if x >= self.begin and abs(y) > _NONE)
+        """Return when the first level of the last request took effect, or was to."""
+        return next((
+            x for x, y in self.driver.changes_seen if x >= self.begin and abs(y) > _NONE),
+            self.begin + _LEAD)
 
     def _left(self, rests: Sequence[float], verdicts: Sequence[str]) -> list[Left]:
         """Return true errors of moves that come to rest at times in s after the first level."""

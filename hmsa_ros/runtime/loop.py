@@ -2,7 +2,7 @@
 Run the controller and a device in one loop, in simulated time, as fast as possible.
 
 The controller is `hmsa_ros.runtime.runtime.Runtime`, as in the nodes. The loop passes it
-the time, the applied levels and the samples.
+the time, the applied levels, the cut-offs and the samples.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,6 +11,7 @@ from typing import Protocol
 from hmsa.model.equations import Array
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup
+from hmsa_ros.device.watchdog import GuardedJoint
 from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.records import Output, Send, Settings
 from hmsa_ros.runtime.runtime import Runtime
@@ -55,13 +56,16 @@ class Loop:
         Settings of the controller.
     device : SimulatedDevice
         The device to command; its time is that of the loop.
+    guards : sequence of GuardedJoint, optional
+        The guards of its joints, if it rejects commands after a cut-off.
 
     """
 
     def __init__(
-            self, group: PlannerGroup, settings: Settings, device: LoopDevice) -> None:
+            self, group: PlannerGroup, settings: Settings, device: LoopDevice,
+            guards: Sequence[GuardedJoint] = ()) -> None:
         self.now = device.time  #: in ns
-        self.device = device
+        self.device, self._guards = device, guards
         self.runtime = Runtime(
             group, settings, Environment(
                 clock=lambda: self.now, steady=lambda: self.now, one_clock=lambda: True))
@@ -98,6 +102,9 @@ class Loop:
         self.now = max(self.now, self.device.time)
         for joint, stamp, level in self.device.changes():
             self.runtime.applied(self._names[joint], stamp, level)
+        for guard in self._guards:
+            self.runtime.cut_off(
+                self._names[guard.number], in_force=guard.is_cut_off, time=guard.cut_off_time)
         for stamp, *measured in self.device.samples():
             if self.runtime.looks_at(stamp):
                 for name, *values in zip(
