@@ -166,6 +166,24 @@ def test_a_late_command_that_the_next_one_replaced_at_once_is_late_and_not_lost(
     assert (lateness.tolist(), unapplied) == ([math.inf, 2 * STEP / NANOSECONDS], 0)
 
 
+@pytest.mark.parametrize('reports', [True, False])
+@pytest.mark.parametrize('anew', [0.01, 0.02])
+def test_a_command_that_came_too_late_is_paired_with_nothing_that_is_sent_later(anew, reports):
+    """The rejected level is sent again at a later time, by itself or after another one."""
+    begin, *levels = moved(commands=((5, 0.02), (60, anew), (80, 0.02))).applied
+    late = replace(levels[0], sent=levels[0].stamp + 25 * STEP)
+    run = moved(commands=((60, anew), (80, 0.02)))
+    run = replace(
+        run, commands=(late, *levels[1:]), parameters={'plant.lateness_limit': 0.02},
+        **({} if reports else {'applied': (), 'topics': {COMMAND: run.topics[COMMAND]}}))
+    found = verify_run(run)
+    assert (found.unapplied_count, found.late_count, found.rejected_count) == (0, 0, 1)
+    assert found.largest_difference < 1e-12
+    assert '1 commands came later than lateness_limit and were rejected' in found.note
+    # One that the recorder alone received late was applied.
+    assert replace(run, applied=(begin, *levels)).rejected == 0
+
+
 def test_a_table_has_the_samples_in_full_precision_and_the_levels_at_their_times(tmp_path):
     run = moved()
     for columns, name in ((samples_of(run), 'a.csv'), (levels_of(run), 'b.csv')):

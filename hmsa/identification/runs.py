@@ -33,7 +33,7 @@ def recording_of(
     """Return the recording of a run, as `read_bag`; raise `BadInputError` if it has no level."""
     block = actuator or run.planner
     # A recorder receives earlier latched changes after the first new one.
-    levels = run.reported or in_force((x,) for x in without_repeats(run.commands)[0])
+    levels = run.reported or in_force((x,) for x in without_repeats(run.accepted)[0])
     if not levels:
         raise BadInputError(
             f'{run.path} has no command that took effect: expected the levels of the field')

@@ -320,6 +320,12 @@ CREEP_TOLERANCE = ParameterSpec(
 PUBLISH_RATE = ParameterSpec(
     'publish_rate', 1000.0, "Sample rate, in the plant's own time.", 'Hz', 1e-3, 1e6)
 
+LATENESS_LIMIT = ParameterSpec(
+    'lateness_limit', 0.1,
+    'Largest lateness of a command that is still applied, at once; a later one is refused, '
+    'and the planner sends the rest anew, from the state. One level that is late by a '
+    'twentieth of the natural period leaves 20 % of the step.', 's', 1e-4, 1e6)
+
 #: Factors by which the plant's parameters differ from the planner's.
 MISMATCH = tuple(
     ParameterSpec(

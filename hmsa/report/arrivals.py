@@ -18,8 +18,6 @@ from hmsa.runs.record import Run, Times
 # A change of level that took effect within this time in s of its timestamp was on time: the clock
 # of a board with a schedule of its own is known to a few us.
 _PUNCTUAL = 1e-5
-# Clocks that differ by more than this, in s, are different clocks.
-_SAME_CLOCK = 60.0
 
 
 @dataclass(frozen=True)
@@ -50,11 +48,11 @@ class Timing:
 
 def timing(run: Run) -> Timing:
     """Return the timing of the commands and samples of a run."""
-    commands, repeats = without_repeats(run.commands)
+    commands, repeats = without_repeats(run.accepted)
     delay = (run.logged - run.time) / NANOSECONDS
     interval = np.diff(run.time) / NANOSECONDS
     lead = np.array([x.stamp - x.sent for x in commands], dtype=np.int64) / NANOSECONDS
-    if abs(float(np.median(delay))) > _SAME_CLOCK:
+    if not run.one_clock:
         delay, lead = np.empty(0), np.empty(0)
     recorded: Times = np.sort(run.logged)
     usual = float(np.median(interval)) if len(interval) else math.inf

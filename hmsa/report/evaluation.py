@@ -155,7 +155,7 @@ def result_of(evaluation: Evaluation, number: int) -> MoveResult | None:
 
 def evaluate(run: Run, tolerances: Tolerances | None = None) -> Evaluation:
     """Evaluate a run with the given tolerances, by default those of its planner."""
-    levels = in_force((x,) for x in without_repeats(run.commands)[0])
+    levels = in_force((x,) for x in without_repeats(run.accepted)[0])
     plan = in_force(run.plans)
     asked = setpoints_of(run)
     first = _first(run, levels, asked)

@@ -171,6 +171,9 @@ def _notes_of(part: Part) -> Iterable[str]:
     if not len(part.timing.lead) and part.run.commands:
         yield ('The clock of the recorder differs from that of the timestamps: the lead of the '
                'commands is unknown (record with use_sim_time if time is simulated).')
+    if part.run.rejected:
+        yield (f'{part.run.rejected} changes of level came later than lateness_limit and were '
+               'rejected.')
     if part.timing.unapplied:
         yield (f'{part.timing.unapplied} changes of level did not take effect according to '
                f'{part.run.topics[APPLIED]}.')

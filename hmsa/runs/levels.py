@@ -15,6 +15,8 @@ from hmsa.model.units import NANOSECONDS
 ROUNDED = 1e-3
 #: Maximum clock error of a device in reported timestamps, in ns.
 ROUNDED_STAMP = 100_000
+# Largest usual difference in ns between the recording of a command and its arrival at a device.
+_RECORDED = 20_000_000
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,25 @@ def without_repeats(commands: Sequence[RecordedLevel]) -> tuple[tuple[RecordedLe
     schedule = CommandSchedule(math.nan)
     kept = tuple(x for x in commands if schedule.insert(x.stamp, x.flux_density))
     return kept, len(commands) - len(kept)
+
+
+def came_too_late(
+        commands: Sequence[RecordedLevel], applied: Sequence[RecordedLevel] | None,
+        limit: float) -> list[bool]:
+    """
+    Return for each command whether it came later than a limit in s, and was rejected.
+
+    ``applied`` contains the reported levels, None if there are no reports. A command that took
+    effect was not rejected, although the recorder may have received it late.
+    """
+    if applied is None:
+        return [x.sent - x.stamp > limit * NANOSECONDS for x in commands]
+    same = _same_for(commands)
+    return [
+        x.sent - x.stamp > limit * NANOSECONDS - _RECORDED and not any(
+            same(x, y) and x.stamp - ROUNDED_STAMP <= y.stamp <= x.sent + _RECORDED
+            for y in applied)
+        for x in commands]
 
 
 def lateness_of(

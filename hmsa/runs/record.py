@@ -2,20 +2,22 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 import math
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any, cast, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmsa.errors import BadInputError
 from hmsa.interfaces.outcome import Outcome
-from hmsa.interfaces.parameters import number_of
+from hmsa.interfaces.parameters import LATENESS_LIMIT, number_of
 from hmsa.judge.records import SensorModel
 from hmsa.model.equations import Array
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
-from hmsa.runs.levels import in_force, RecordedLevel
+from hmsa.model.units import NANOSECONDS
+from hmsa.runs.levels import came_too_late, in_force, RecordedLevel, without_repeats
 from hmsa.runs.parameters import of_joint
 from hmsa.runs.topics import APPLIED
 
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
     from hmsa.bag.info import BagSummary
 
 Times = NDArray[np.int64]
+# Larger median delays of samples in ns mean that the recorder used another clock.
+_SAME_CLOCK = 60 * NANOSECONDS
 
 
 def read_only(values: NDArray[Any]) -> NDArray[Any]:
@@ -107,6 +111,29 @@ class Run:
         return value if value is not None and 0.0 <= value < math.inf else 0.0
 
     @property
+    def one_clock(self) -> bool:
+        """Whether the recorder used the clock of the timestamps."""
+        return abs(float(np.median(self.logged - self.time))) <= _SAME_CLOCK
+
+    @cached_property
+    def accepted(self) -> tuple[RecordedLevel, ...]:
+        """Commands that did not come too late, as plant or driver show, or their parameters."""
+        known = number_of(of_joint(self.parameters, self.joint, f'plant.{LATENESS_LIMIT.name}'))
+        reports = self.applied if self.reported else None
+        if not self.one_clock or known is None and reports is None:
+            return self.commands
+        late = came_too_late(
+            self.commands, reports,
+            cast(float, LATENESS_LIMIT.default) if known is None else known)
+        return tuple(x for x, too in zip(self.commands, late, strict=True) if not too)
+
+    @cached_property
+    def rejected(self) -> int:
+        """Number of changes of level that came too late."""
+        kept = {id(x) for x in self.accepted}
+        return sum(id(x) not in kept for x in without_repeats(self.commands)[0])
+
+    @property
     def reported(self) -> tuple[RecordedLevel, ...]:
         """
         Levels that the plant reported as applied, by time.
@@ -129,7 +156,7 @@ class Run:
         if reported := self.reported:
             return reported
         if self.commands:
-            return in_force((x,) for x in self.commands)
+            return in_force((x,) for x in self.accepted)
         known = np.flatnonzero(np.isfinite(self.flux_density))
         values = self.flux_density[known]
         places = known[np.append(True, values[1:] != values[:-1])] if len(known) else known

@@ -29,7 +29,7 @@ def setpoints_of(run: Run) -> list[Outcome]:
     asked = [x for x in run.outcomes if x.asked != LEVELS]
     if asked:
         return [x for x in asked if x.finding is not None or not x.ended]
-    return _held(run, in_force((x,) for x in without_repeats(run.commands)[0]))
+    return _held(run, in_force((x,) for x in without_repeats(run.accepted)[0]))
 
 
 def start_of(run: Run, stamp: int) -> float:

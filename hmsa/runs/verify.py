@@ -64,6 +64,8 @@ class Verification:
     note: str = ''  # losses, noise, skipped messages
     left_out: int = 0  # messages that do not fit their topic
     unapplied_count: int = 0  # changes of level reported as never in effect
+    # Changes of level that came later than plant or driver accept, and were rejected.
+    rejected_count: int = 0
 
 
 def verify(path: str | os.PathLike[str]) -> list[Verification]:
@@ -134,8 +136,9 @@ def verify_run(run: Run) -> Verification:
     late += int(np.count_nonzero(lateness * NANOSECONDS > ROUNDED_STAMP))
     return Verification(
         run.topics.get(JOINT_STATES, str(run.path)), run.topics.get(COMMAND, ''), count,
-        len(run.commands) - refused, late, largest, where / NANOSECONDS,
-        '; '.join([*notes, *_notes(run, left_out, unapplied)]), left_out, unapplied)
+        len(run.accepted) - refused, late, largest, where / NANOSECONDS,
+        '; '.join([*notes, *_notes(run, left_out, unapplied)]), left_out, unapplied,
+        run.rejected)
 
 
 def _commands(run: Run, first: int) -> Iterator[tuple[int, int, int, float]]:
@@ -146,7 +149,7 @@ def _commands(run: Run, first: int) -> Iterator[tuple[int, int, int, float]]:
             if level.stamp > begin:
                 yield logged - 1, _COMMAND, level.stamp, level.flux_density
         return
-    for level in run.commands:
+    for level in run.accepted:
         if level.sent > logged or level.stamp > begin:
             yield level.sent, _COMMAND, level.stamp, level.flux_density
 
@@ -210,7 +213,7 @@ def _lateness(run: Run) -> tuple[Array, int]:
     none = np.empty(0)
     if APPLIED not in run.topics:
         return none, 0
-    commands, last = without_repeats(run.commands)[0], int(run.time[-1])
+    commands, last = without_repeats(run.accepted)[0], int(run.time[-1])
     # The initial level may be sent again without a change.
     known = run.applied
     if math.isfinite(field := float(run.flux_density[0])):
@@ -235,6 +238,9 @@ def _notes(run: Run, left_out: int, unapplied: int) -> Iterator[str]:
     if noise:
         yield (f'the samples are measured with {" and ".join(noise)}: expected differences of '
                'that size, from the first sample on')
+    if run.rejected:
+        yield (f'{run.rejected} commands came later than lateness_limit and were rejected; what '
+               'was sent anew is compared')
     if unapplied:
         yield (f'{unapplied} commands never took effect, as {run.topics[APPLIED]} shows: '
                'no node applied them')

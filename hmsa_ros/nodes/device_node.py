@@ -14,7 +14,7 @@ from sensor_msgs.msg import JointState, MagneticField
 
 from hmsa.errors import BadInputError
 from hmsa.interfaces import topics
-from hmsa.interfaces.parameters import JOINT, ParameterSpec
+from hmsa.interfaces.parameters import JOINT, LATENESS_LIMIT, ParameterSpec
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.health import judge_commands
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
@@ -44,11 +44,7 @@ FALLBACK = (
     ParameterSpec(
         'safe_ramp_rate', 1.0, 'Rate of the ramp to zero, which has steps of 1 ms.', 'T/s',
         1e-9, 1e12),
-    ParameterSpec(
-        'lateness_limit', 0.1,
-        'Largest lateness of a command that is still applied, at once; a later one is refused, '
-        'and the planner sends the rest anew, from the state. One level that is late by a '
-        'twentieth of the natural period leaves 20 % of the step.', 's', 1e-4, 1e6),
+    LATENESS_LIMIT,
 )
 
 COMMAND_SOURCE = ParameterSpec(
