@@ -11,7 +11,6 @@ from typing import Protocol
 from hmsa.model.equations import Array
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup
-from hmsa_ros.device.watchdog import GuardedJoint
 from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.records import Output, Send, Settings
 from hmsa_ros.runtime.runtime import Runtime
@@ -44,6 +43,17 @@ class LoopDevice(Protocol):
         """Return the samples: timestamp, and stretch, rate (1/s) and field of each joint."""
 
 
+class LoopGuard(Protocol):
+    """Guard of a joint of a device, which rejects commands after a cut-off."""
+
+    number: int  #: of the joint
+    cut_off_time: int  #: time in ns that names the cut-off in force; 0 for none
+
+    @property
+    def is_cut_off(self) -> bool:
+        """Whether levels are rejected until a cut-off is acknowledged."""
+
+
 class Loop:
     """
     Run a controller and a device.
@@ -56,14 +66,14 @@ class Loop:
         Settings of the controller.
     device : SimulatedDevice
         The device to command; its time is that of the loop.
-    guards : sequence of GuardedJoint, optional
+    guards : sequence of LoopGuard, optional
         The guards of its joints, if it rejects commands after a cut-off.
 
     """
 
     def __init__(
             self, group: PlannerGroup, settings: Settings, device: LoopDevice,
-            guards: Sequence[GuardedJoint] = ()) -> None:
+            guards: Sequence[LoopGuard] = ()) -> None:
         self.now = device.time  #: in ns
         self.device, self._guards = device, guards
         self.runtime = Runtime(
