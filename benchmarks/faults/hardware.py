@@ -247,7 +247,8 @@ def _hung(rig: Rig, word: str, method: str) -> Seen:
 
 for _word, _call in (('K', 'write'), ('S', 'read')):
     FAULTS.fault(
-        f'driver_{_call}_blocks', f'{_call} does not return', 'the board obeys without answer',
+        f'driver_{_call}_blocks', f'{_call} does not return',
+        'the board obeys, but does not answer',
         'off from another thread after hardware.timeout, exit 1 within 5 s')(
             lambda rig, word=_word, call=_call: _hung(rig, word, call))
 
@@ -323,14 +324,14 @@ def _stalled(rig: Rig, who: str, latest: float) -> Seen:
         rig.spin(_STALL)
         processes[who].send(signal.SIGCONT)
         rig.spin_until(lambda: any(x['code'] == CUT_OFF for x in rig.verdicts), 'the status')
-        off = next(x for x, level in bench.board.record if x > begin and not level)
+        off = bench.board.off_since(begin)
         rig.spin(1.0)
-        again = bench.board.largest_since(off)
+        again = bench.board.largest_since(begin + off)
         rig.setpoint(1.1)
         rig.spin_until(lambda: bench.board.level, 'the level of a request')
         return Seen(
-            f'{again:g} T before the next request', f'off after {off - begin:.2f} s',
-            not again and off - begin < latest)
+            f'{again:g} T before the next request', f'off after {off:.2f} s',
+            not again and off < latest)
 
 
 FAULTS.fault(

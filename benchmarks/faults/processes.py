@@ -3,6 +3,7 @@
 from pathlib import Path
 import signal
 import subprocess
+from time import time_ns
 
 import numpy as np
 from std_msgs.msg import Float64
@@ -160,13 +161,15 @@ def _plant_restarted(rig: Rig) -> Seen:
     rig.ready('plant', 'planner')
     move(rig, 1.2, start=1.0)
     plant.end(signal.SIGKILL)
-    mark = rig.count()
+    # Samples of the old plant may still wait to be read.
+    killed = time_ns()
     rig.start('plant')
-    rig.spin_until(lambda: rig.count() > mark, 'samples of the new plant')
+    rig.spin_until(lambda: rig.time > killed, 'samples of the new plant')
     rig.ready('plant', 'planner')
     rig.let_pass(1.5)
     code = rig.verdicts[-1]['code']
-    field = float(np.abs(rig.samples(mark)[1][:, 2]).max())
+    stamps, values = rig.samples()
+    field = float(np.abs(values[stamps > killed, 2]).max())
     first, _ = move(rig, 1.1, start=1.0)
     worst = moves(rig, (1.3, 1.1), start=1.1)
     return Seen(
