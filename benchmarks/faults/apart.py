@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 import os
+import signal
 import sys
 from time import monotonic, sleep
 
@@ -103,6 +104,41 @@ for _seconds in (2.0, 25.0):
         'network namespaces; link down at 1.35, safe_flux zero; later a request of 1.2',
         'no field until the request; outage and cut-off reported; next move shaped')(
             lambda rig, seconds=_seconds: _outage(rig, seconds))
+
+
+@FAULTS.fault(
+    'hosts_address', 'host of the plant comes back with another address',
+    'network namespaces; link down at 1.35, safe_flux zero; a request of 1.2, again after a '
+    'restart of the plant',
+    'both nodes name it; the first request is rejected (`unheard`), the second one arrives')
+def _address(rig: Rig) -> Seen:
+    if why := unavailable():
+        return Seen(f'not tried: {why}', '-', met=True)
+    options = 'plant', '--ros-args', '-p', 'safe_flux:=zero'
+    with hosts('bench', 'desk') as made:
+        apart = _Apart(rig, made)
+        plant, planner = apart.node('bench', *options), apart.node('desk', 'planner')
+        onlooker = apart.look_on('bench')
+        apart.send('desk', '1.1:1', '--wait')
+        apart.send('desk', '1.1:1', '1.35:600')
+        sleep(3.0)
+        made.cut('bench')
+        made.move('bench')
+        made.join('bench')
+        wait(lambda: 'the field goes to zero' in plant.said, 'the watchdog')
+        wait(lambda: 'restart the nodes on this host' in plant.said, 'the plant')
+        wait(lambda: 'another address now (then restart it)' in planner.said, 'the planner')
+        refused = apart.send('desk', '1.2:1', '--wait')
+        _, _, stretches, fields = apart.seen(onlooker)
+        plant.end(signal.SIGINT)
+        apart.run('bench', 'restarted', '-m', 'hmsa_ros', *options)
+        onlooker = apart.look_on('bench')
+        status = apart.send('desk', '1.2:1', '--wait')
+        after, peak = fields[-1], float(apart.seen(onlooker)[2].max())
+    return Seen(
+        f'named; exit {refused}, {after:g} T, at {stretches[-1]:.4f}; after a restart exit '
+        f'{status}, at most {peak:.4f}', '-',
+        refused != 0 and after == 0.0 and status == 0 and 1.199 < peak < 1.202)
 
 
 def _recorder(rig: Rig, where: str) -> Seen:

@@ -16,6 +16,8 @@ ACROSS = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}
 _TOOLS = ('ip', 'nsenter', 'unshare')
 # An Ethernet address that no host has.
 _NOBODY = '02:00:00:00:00:99'
+# Difference between a host's first address and another one.
+_ANOTHER = 100
 _HOLD = 'mount -t tmpfs shm /dev/shm && ip link set lo up && echo ready && exec sleep infinity'
 
 
@@ -41,6 +43,7 @@ class Hosts:
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
+        self._moved: set[str] = set()  # hosts that have another address
         self._holders: dict[str, subprocess.Popen[str]] = {}
         for name in ('switch', *names):
             self._holders[name] = subprocess.Popen(
@@ -63,7 +66,8 @@ class Hosts:
 
     def address(self, name: str) -> str:
         """Return the address of a host."""
-        return f'10.99.0.{1 + self._names.index(name)}'
+        more = _ANOTHER if name in self._moved else 0
+        return f'10.99.0.{1 + self._names.index(name) + more}'
 
     def on(self, name: str, *command: str) -> list[str]:
         """Return a command that runs another command on a host."""
@@ -83,6 +87,13 @@ class Hosts:
     def join(self, name: str) -> None:
         """Join a host to the others again."""
         self._ip('switch', f'link set {name} up')
+
+    def move(self, name: str) -> None:
+        """Give a host another address, as DHCP may after an outage."""
+        self._ip(name, f'addr del {self.address(name)}/24 dev eth0')
+        self._moved.add(name)
+        self._ip(name, f'addr add {self.address(name)}/24 dev eth0')
+        self._ip(name, 'route replace default dev eth0')
 
     def lose(self, sender: str, receiver: str) -> None:
         """Lose packets from one host to another; the opposite direction works."""
