@@ -148,7 +148,7 @@ $(VENV)/.control_msgs: $(wildcard test/control_msgs/* test/control_msgs/*/*) | $
 
 # The installation compiles the motion, too; this is for when its sources change.
 $(VENV)/.motion: $(wildcard hmsa/*.c hmsa_lab/bench/*.cpp \
-	hmsa_lab/bench/hmsa_board/*.hpp hmsa/motion/*.cpp hmsa/motion/hmsa/*.hpp) | $(VENV)/.installed
+	hmsa_lab/bench/hmsa_board/*.hpp hmsa/judge/*.cpp hmsa/motion/*.cpp hmsa/motion/hmsa/*.hpp) | $(VENV)/.installed
 	@test -e $@ && test -z "$$(find $^ -newer $@)" \
 	|| { echo "Compiling the motion"; $(BIN)/python setup.py --quiet build_ext --inplace; }
 	@touch $@

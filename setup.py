@@ -100,13 +100,17 @@ EXTRAS_REQUIRE = {
 }
 
 # The same bits on every x86-64: no instructions beyond the baseline, nothing fused or reordered.
+COMPILED = [
+    '-std=c++17', '-O2', '-ftree-vectorize', '-ffp-contract=off', '-fno-math-errno',
+    '-fno-trapping-math', '-fvisibility=hidden', '-fno-exceptions', '-fno-rtti', '-Wno-psabi',
+    '-g0']
 MOTION = Extension(
     'hmsa.motion._motion', ['hmsa/motion/module.cpp'],
     include_dirs=['hmsa/motion'], depends=sorted(glob('hmsa/motion/hmsa/*.hpp')),
-    language='c++', extra_compile_args=[
-        '-std=c++17', '-O2', '-ftree-vectorize', '-ffp-contract=off', '-fno-math-errno',
-        '-fno-trapping-math', '-fvisibility=hidden', '-fno-exceptions', '-fno-rtti', '-Wno-psabi',
-        '-g0'])
+    language='c++', extra_compile_args=COMPILED)
+RINGING = Extension(
+    'hmsa.judge._ringing', ['hmsa/judge/_ringing.cpp'], language='c++',
+    extra_compile_args=COMPILED)
 BOARD = Extension(
     'hmsa_lab.bench._board', ['hmsa_lab/bench/_board.cpp'],
     include_dirs=['hmsa_lab/bench'], depends=['hmsa_lab/bench/hmsa_board/board.hpp'],
@@ -155,13 +159,14 @@ setup(
     packages=find_packages(include=['hmsa*']),
     package_data={
         'hmsa': [
-            'py.typed', '*.pyi', 'cli/completion.[bfz]*', 'motion/*.pyi', 'motion/hmsa/*.hpp',
-            'report/*.css', 'report/*.html', 'report/*.js', 'report/*.mplstyle'],
+            'py.typed', '*.pyi', 'cli/completion.[bfz]*', 'judge/*.pyi', 'motion/*.pyi',
+            'motion/hmsa/*.hpp', 'report/*.css', 'report/*.html', 'report/*.js',
+            'report/*.mplstyle'],
         'hmsa_ros': ['py.typed', '*.xml'],
         'hmsa_lab': [
             'py.typed', 'bench/*.pyi', 'bench/hmsa_board/*', 'panel/index.html', 'panel/panel.*',
             'report/*.html']},
-    ext_modules=[MOTION, BOARD, DEADLINE],
+    ext_modules=[MOTION, RINGING, BOARD, DEADLINE],
     cmdclass={'build_ext': BuildMotion},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + PACKAGE]),

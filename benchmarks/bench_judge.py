@@ -30,7 +30,8 @@ KINDS = {
     'short': '1.5 to 3 periods', 'frozen': 'sensor frozen on the way',
     'nan': 'sensor not a number', 'out': 'sensor out of range',
     'unordered': 'in no order, repeated', 'edge': 'within 20 % of the tolerance',
-    'transient': 'pushed once during the hold'}
+    'transient': 'pushed once during the hold',
+    'second': 'second mode, 1.25 to 2 tolerances', 'both': 'first and second mode'}
 #: Kinds in which some or all samples do not show the stretch.
 BROKEN = ('frozen', 'nan', 'out')
 TOLERANCES = Tolerances(arrival=0.02, vibration=0.02, stretch=1e-3)
@@ -41,6 +42,9 @@ _CLEAR = 15.0
 # Periods at the start and at the end of a creeping setpoint over which its rest is averaged.
 _SLICE = 6
 _FINE = 400
+# Second modes: range of their frequencies relative to the first, samples in a period of the first,
+# and noise relative to the step.
+_RATIOS, _SAMPLES, _NOISE = (1.2, 6.5), 60, 0.003
 # Multiple of the tolerance from which a push counts as beyond it.
 _BEYOND = 1.2
 # Peak-to-peak noise in a period that is rarely exceeded, in standard deviations.
@@ -73,6 +77,8 @@ class Truth:
     decay: float
     creep: float
     slow: float
+    second: float = 0.0  #: amplitude of a second mode
+    ratio: float = 1.0  #: frequency and decay of it, relative to the first
 
     def rests(self, time: np.ndarray) -> np.ndarray:
         """Return the mean over periods."""
@@ -80,8 +86,9 @@ class Truth:
 
     def vibrates(self, time: np.ndarray) -> np.ndarray:
         """Return the vibration about the mean."""
-        return np.asarray(
-            self.amplitude * np.exp(-self.decay * time) * np.cos(self.omega * time + self.phase))
+        return np.asarray(sum(
+            size * np.exp(-x * self.decay * time) * np.cos(x * self.omega * time + x * self.phase)
+            for size, x in ((self.amplitude, 1.0), (self.second, self.ratio))))
 
     def stretch(self, time: np.ndarray, step: float, move: float) -> np.ndarray:
         """Return the stretch from ``step`` before the setpoint, in a move of duration ``move``."""
@@ -120,6 +127,21 @@ def draw(seed: int, kind: str) -> Trial:
     if kind == 'edge':
         share, off = limit * random.uniform(0.8, 1.2), random.uniform() < 0.5
         truth = replace(truth, offset=share * off, amplitude=0.5 * share * (not off))
+    if kind in ('second', 'both'):
+        interval, noise, hold = period / _SAMPLES, _NOISE * size, max(hold, 6.0 * period)
+        if kind == 'both':
+            noise = size * spread(1e-5, 0.01)
+        first = limit * random.uniform(0.0, 2.0) * (kind == 'both')
+        second = limit * (random.uniform(1.25, 2.0) if kind == 'second'
+                          else random.uniform(0.0, 2.0))
+        truth = Truth(
+            0.0, 0.5 * first, random.uniform(0.0, 2.0 * math.pi),
+            model * random.uniform(0.85, 1.1), model * random.uniform(0.0, 0.03), 0.0, 1.0,
+            0.5 * second, spread(*_RATIOS))
+        if kind == 'second':
+            # Peak to peak, whatever its phase and decay.
+            shown = np.ptp(truth.vibrates(np.linspace(0.0, hold, 40 * _SAMPLES)))
+            truth = replace(truth, second=0.5 * second**2 / float(shown))
     move = 0.6 * period
     time = np.arange(-random.uniform(1.0, 2.0) * period - move, hold, interval)
     stamps = time
@@ -209,6 +231,10 @@ def _clarity(
     fading, phase = np.exp(-truth.decay * time), truth.omega * time
     basis = np.stack([
         np.ones_like(time), fading * np.cos(phase), fading * np.sin(phase)], axis=1)
+    if truth.second:
+        fading = np.exp(-truth.ratio * truth.decay * time)
+        basis = np.column_stack((basis[:, :1 if not truth.amplitude else 3], fading * np.cos(
+            truth.ratio * phase), fading * np.sin(truth.ratio * phase)))
     gram = basis.T @ basis
     if np.linalg.cond(gram) > 1e10:
         return 0.0

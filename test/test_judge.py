@@ -1,5 +1,7 @@
 """The judge's findings for motions with a known truth, in closed form."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.special import stdtrit
@@ -45,6 +47,70 @@ def test_verdict_is_the_truth(motion, verdict):
 def test_what_is_beyond_is_never_called_arrived(motion):
     verdicts = {str(judge(*held(seed=x, **motion), setpoint()).verdict) for x in range(60)}
     assert 'arrived' not in verdicts
+
+
+def ringing(*modes, noise=0.1, rate=5000, seconds=0.2, seed=1):
+    """Return samples of modes: peak to peak in % of STEP, ratio to OMEGA, and damping ratio."""
+    time = np.arange(0.0, seconds, 1.0 / rate)
+    motion = sum(0.5 * size * np.exp(-damping * ratio * OMEGA * time) * np.cos(
+        ratio * OMEGA * time + ratio) for size, ratio, damping in modes)
+    error = noise * np.random.default_rng(seed).standard_normal(len(time))
+    return (time * 1e9).astype(np.int64), 1.4 + STEP * 0.01 * (motion + error)
+
+
+@pytest.mark.parametrize('ratio', [1.2, 1.37, 2.1, 3.6, 6.2])
+@pytest.mark.parametrize('first', [0.0, 1.0])
+def test_a_second_mode_rings_at_its_own_frequency(ratio, first):
+    time, stretch = ringing((3.0, ratio, 0.005), (first, 0.95, 0.02), noise=0.3)
+    found = judge(time, stretch, setpoint(end=200 * MS))
+    assert found.verdict == 'vibrating'
+    assert 2.0 * np.pi * found.frequency == pytest.approx(ratio * OMEGA, rel=0.02)
+    most = np.ptp(ringing((3.0, ratio, 0.005), (first, 0.95, 0.02), noise=0.0)[1])
+    assert found.vibration == pytest.approx(most, rel=0.1)
+    quiet = ringing((1.0, ratio, 0.005), (0.3, 0.95, 0.02), noise=0.1)
+    assert judge(*quiet, setpoint(end=200 * MS)).arrived
+
+
+def test_several_modes_are_named_largest_first():
+    time, stretch = ringing((6.0, 1.0, 0.01), (10.0, 1.7, 0.01), (1.0, 4.0, 0.01))
+    message = judge(time, stretch, setpoint(end=200 * MS)).message
+    assert 'rings at 146 and 85.9 Hz' in message
+
+
+@pytest.mark.parametrize(('modes', 'verdict'), [
+    (((20.0, 1.0, 0.05), (18.0, 1.25, 0.05)), 'vibrating'),
+    (((6.0, 0.9, 0.08), (8.0, 1.37, 0.08), (3.0, 1.95, 0.08)), 'vibrating'),
+    (((0.6, 1.0, 0.05), (0.6, 1.36, 0.05)), 'arrived')])
+def test_less_noise_and_more_samples_leave_nothing_undecided(modes, verdict):
+    for noise in (0.3, 0.1, 0.03, 0.01, 1e-3, 0.0):
+        for rate in (5000, 20_000):
+            time, stretch = ringing(*modes, noise=noise, rate=rate)
+            assert judge(time, stretch, setpoint(end=200 * MS)).verdict == verdict, (noise, rate)
+
+
+@pytest.mark.parametrize('change', ['noise', 'rate'])
+def test_what_undecided_advises_decides(change):
+    found = judge(*ringing((1.5, 1.0, 0.02), noise=2.0), setpoint(end=200 * MS))
+    assert found.verdict == 'undecided'
+    more, less = map(float, re.search(
+        '([0-9.]+) times as many samples a second, or ([0-9.]+) times', found.message).groups())
+    better = {'noise': 2.0 / less} if change == 'noise' else {'noise': 2.0, 'rate': 5000 * more}
+    assert judge(*ringing((1.5, 1.0, 0.02), **better), setpoint(end=200 * MS)).arrived
+
+
+def test_frequencies_that_samples_do_not_resolve_are_said():
+    time, stretch = held(noise=0.1, rate=400)
+    assert 'samples resolve up to 180 Hz' in judge(time, stretch, setpoint()).message
+    time, stretch = held(noise=0.1, rate=4000)
+    assert 'resolve' not in judge(time, stretch, setpoint()).message
+
+
+def test_steps_of_a_sensor_that_rounds_are_no_vibration():
+    time, stretch = ringing((1.9, 1.0, 0.0), noise=0.0)
+    rounded = 1.4 + 0.003 * np.round((stretch - 1.4) / 0.003)
+    assert np.ptp(rounded) > 0.02 * STEP
+    found = judge(time, rounded, setpoint(end=200 * MS))
+    assert found.verdict == 'undecided'
 
 
 def test_tolerances_count_against_the_step_as_requested():

@@ -13,7 +13,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa.judge.fit import BoundedValue, FEWEST, fit, VibrationFit
+from hmsa.judge._ringing import largest
+from hmsa.judge.fit import BoundedValue, FEWEST, fit, INDEPENDENT, MODES, VibrationFit
 from hmsa.judge.records import (
     Finding,
     PERIODS,
@@ -32,7 +33,7 @@ Stamps = NDArray[np.int64]
 #: Samples of a window at low sampling rates.
 ENOUGH = 24
 # Parts of a period, in each of which samples are averaged.
-_KEPT = 32
+_KEPT = 64
 # RMS deviation from the target, relative to a tolerance, below which it is always within the
 # tolerance.
 _QUIET = 0.3
@@ -46,8 +47,14 @@ _SEEN = 12
 _TOGETHER = (1, 3, 9)
 # Factor on the distance of the bounds that a miss requires, relative to an arrival.
 _SURER = 1.5
+# Factor on the reduction of noise that the present estimates demand: they are noisy themselves.
+_ADVISED = 1.5
+# Samples per value, of a sensor that rounds.
+_REPEATED = 3
 # Changes between samples, relative to the step, that belong to a motion that fades.
 _FADED = 1e-9
+# Size of a mode, relative to the largest, from which it is named.
+_SHOWN = 0.2
 # Number of changes below which the rounding of a sensor is not tested.
 _FEW_CHANGES = 3
 _NO_SENSOR = SensorModel()
@@ -101,13 +108,12 @@ def _judged(
         stamps: Stamps, values: Array, setpoint: RequestedSetpoint, tolerances: Tolerances,
         sensor: SensorModel, begin: int) -> Finding:
     """Judge usable samples of a setpoint from a time in ns on."""
-    held = stamps >= begin
+    first, last = int(np.searchsorted(stamps, begin)), len(stamps)
     if setpoint.end is not None and not setpoint.held and begin < setpoint.end:
-        held &= stamps <= setpoint.end
-    count = int(np.count_nonzero(held))
-    if not count:
+        last = int(np.searchsorted(stamps, setpoint.end, 'right'))
+    if first >= last:
         return unobserved(setpoint)
-    every = stamps[held], values[held]
+    every = stamps[first:last], values[first:last]
     stamps, values = _thinned(*every, begin, setpoint)
     allowed, swing = tolerances.of(setpoint)
     least = min(allowed, swing)
@@ -118,17 +124,18 @@ def _judged(
         rest = values[part] - setpoint.target
         moves = number > 0 and (
             _largest(stamps[part], rest, setpoint) - _PEAKS * noise > swing)
-        if number and not moves and np.mean(np.square(rest)) <= quiet**2:
+        if number and not moves and float(rest @ rest) <= quiet**2 * len(rest):
             continue
         # In later windows the vibration counts from their own start.
         origin = int(stamps[part][0]) if number else begin
-        seconds = ((stamps[part] - origin) / NANOSECONDS).astype(np.float64)
+        seconds: Array = (stamps[part] - origin) / NANOSECONDS
         decided = partial(
             _decided, count=len(rest), setpoint=setpoint, limits=(allowed, swing), sensor=sensor,
             moves=moves if number else None)
         shown = fit(
             seconds, rest, setpoint.frequency, setpoint.decay,
-            partial(_settles, decided=decided, nothing=_NOTHING * least))
+            partial(_settles, decided=decided, nothing=_NOTHING * least),
+            nothing=_NOTHING * least)
         if shown is not None:
             findings.append(decided(shown))
             noise = min(noise, shown.usual)
@@ -145,9 +152,17 @@ def _judged(
         return replace(found, verdict=Code.UNDECIDED, message=(
             f'{found.message}, but nothing moves by more than {setpoint.words(most)}: it does not '
             'ring like an actuator'))
+    if found.verdict is Code.VIBRATING:
+        step = _rounded_to(every[1])
+        if found.vibration - step <= swing:
+            return replace(found, verdict=Code.UNDECIDED, message=(
+                f'{found.message}, but the sensor rounds to {setpoint.words(step)}'))
     if not found.arrived:
         return found
-    moves = most - _PEAKS * noise * math.sqrt(len(every[0]) / len(stamps)) > swing
+    # Of many samples in a period the range of the noise is larger.
+    dense = len(every[0]) * setpoint.period / max(int(every[0][-1] - every[0][0]), 1)
+    peaks = max(_PEAKS, 2.0 * math.sqrt(2.0 * math.log(max(dense, 2.0))) + 2.0)
+    moves = most - peaks * noise * math.sqrt(len(every[0]) / len(stamps)) > swing
     for together in _TOGETHER:
         if moves or len(values) < 2 * together:
             break
@@ -164,14 +179,7 @@ def _judged(
 
 def _largest(stamps: Stamps, rest: Array, setpoint: RequestedSetpoint) -> float:
     """Return the largest peak-to-peak motion within a period of a window."""
-    period = setpoint.period
-    most = 0.0
-    # A motion within half a period lies in one period of the first or the shifted division.
-    for begin in (stamps[0], stamps[0] - period // 2):
-        _, first = np.unique((stamps - begin) // period, return_index=True)
-        swings = np.maximum.reduceat(rest, first) - np.minimum.reduceat(rest, first)
-        most = max(most, float(np.max(swings)))
-    return most
+    return largest(stamps, rest, int(stamps[0]), setpoint.period)
 
 
 # -- samples ------------------------------------------------------------------------------------
@@ -180,18 +188,24 @@ def _usable(
         time: Stamps, stretch: Array, setpoint: RequestedSetpoint,
         sensor: SensorModel) -> tuple[Stamps, Array, str]:
     """Return the valid samples by time, corrected for the sensor, and the reason if none is."""
-    stamps = np.asarray(time, dtype=np.int64)
-    values = np.asarray(stretch, dtype=np.float64)
+    stamps = np.ascontiguousarray(time, dtype=np.int64)
+    values = np.ascontiguousarray(stretch, dtype=np.float64)
     finite = np.isfinite(values)
-    if len(values) and not finite.any():
-        return stamps[:0], values[:0], 'the sensor shows no numbers'
-    stamps, values = stamps[finite], values[finite]
-    stamps, first = np.unique(stamps, return_index=True)
-    values = (values[first] - sensor.bias) / sensor.gain
-    stamps = stamps - round(sensor.latency * NANOSECONDS)
+    if not finite.all():
+        if not finite.any():
+            return stamps[:0], values[:0], 'the sensor shows no numbers'
+        stamps, values = stamps[finite], values[finite]
+    if not (stamps[1:] > stamps[:-1]).all():
+        stamps, first = np.unique(stamps, return_index=True)
+        values = values[first]
+    if sensor is not _NO_SENSOR:
+        values = (values - sensor.bias) / sensor.gain
+        stamps = stamps - round(sensor.latency * NANOSECONDS)
     low, high = setpoint.possible
     inside = (values > low) & (values < high)
     outside = len(values) - int(np.count_nonzero(inside))
+    if not outside:
+        return stamps, values, _frozen(values, setpoint)
     if 2 * outside > len(values):
         value = float(np.median(values[~inside]))
         return stamps[:0], values[:0], (
@@ -203,6 +217,8 @@ def _usable(
 
 def _frozen(values: Array, setpoint: RequestedSetpoint) -> str:
     """Return a message if a sensor is constant at the end after motion; empty if not."""
+    if len(values) < FEWEST or (values[1 - FEWEST:] != values[-FEWEST:-1]).any():
+        return ''
     changes = np.abs(np.diff(values))
     moved = np.flatnonzero(changes)
     same = len(changes) - int(moved[-1] + 1 if len(moved) else 0) + 1
@@ -221,13 +237,25 @@ def _frozen(values: Array, setpoint: RequestedSetpoint) -> str:
     return f'{words}: it is frozen'
 
 
+def _rounded_to(values: Array) -> float:
+    """Return the step to which a sensor rounds; 0 if it does not."""
+    shown = np.unique(values)
+    steps = np.diff(shown)
+    # Steps of which rounding errors of the conversion are no part.
+    steps = steps[steps > 1e-6 * np.ptp(shown)] if len(shown) > 1 else steps
+    return float(np.min(steps)) if len(steps) and _REPEATED * len(shown) < len(values) else 0.0
+
+
 def _thinned(
         stamps: Stamps, values: Array, begin: int, setpoint: RequestedSetpoint
 ) -> tuple[Stamps, Array]:
     """Return the mean sample of each part of a period, in which the vibration hardly changes."""
-    part = max(setpoint.period // _KEPT, 1)
-    _, first, counts = np.unique(
-        (stamps - begin) // part, return_index=True, return_counts=True)
+    parts = (stamps - begin) // max(setpoint.period // _KEPT, 1)
+    new = parts[1:] != parts[:-1]
+    if new.all():
+        return stamps, values
+    first = np.append(0, np.flatnonzero(new) + 1)
+    counts = np.diff(first, append=len(stamps))
     after = np.add.reduceat(stamps - begin, first) // counts
     return begin + after, np.add.reduceat(values, first) / counts
 
@@ -236,7 +264,8 @@ def _looks(stamps: Stamps, begin: int, setpoint: RequestedSetpoint) -> Iterator[
     """Yield the samples of each window: adjacent at first, then ever farther apart."""
     length = setpoint.look
     if len(stamps) > 1:
-        length = max(length, ENOUGH * round(float(np.median(np.diff(stamps)))))
+        gaps = np.sort(stamps[1:] - stamps[:-1])
+        length = max(length, ENOUGH * int(gaps[len(gaps) // 2]))
     last = int(stamps[-1])
     place, edges = 0, []
     while begin + place * length < last:
@@ -301,12 +330,16 @@ def _decided(
         vibration = vibration._replace(value=math.nan, std=math.nan)
     message = f'{setpoint.where}: rests {_distance(offset.value, setpoint)}'
     if vibrates:
-        message += (f' and rings at {frequency:.3g} Hz, {setpoint.words(vibration.value)} '
-                    'peak to peak')
+        shown = [x / (2.0 * math.pi) for x, swing in found.modes if swing > _SHOWN * found.modes[
+            0][1]]
+        message += (f' and rings at {" and ".join(f"{x:.3g}" for x in shown)} Hz, '
+                    f'{setpoint.words(vibration.value)} peak to peak')
     elif off and math.isnan(vibration.value):
         message += f'; {count} samples at this rate do not show whether it vibrates'
     if code is Code.UNDECIDED:
-        message += _open(offset, vibration, limits, setpoint, sensor)
+        message += _open(offset, vibration, limits, setpoint, sensor, found.independent)
+    if code in (Code.ARRIVED, Code.UNDECIDED) and found.resolved < MODES * setpoint.frequency:
+        message += f'; samples resolve up to {found.resolved / (2.0 * math.pi):.3g} Hz'
     return Finding(
         code, message, setpoint, count, offset.value, offset.std, vibration.value, vibration.std,
         frequency, found.noise)
@@ -324,21 +357,29 @@ def _widened(figure: BoundedValue, std: float) -> BoundedValue:
 
 def _open(
         offset: BoundedValue, vibration: BoundedValue, limits: tuple[float, float],
-        setpoint: RequestedSetpoint,
-        sensor: SensorModel) -> str:
+        setpoint: RequestedSetpoint, sensor: SensorModel, independent: float) -> str:
     """Return which bounds are too wide and how to narrow them, as the rest of a sentence."""
-    parts, more = [], 1.0
+    parts, within, beyond = [], 1.0, math.inf
     for figure, limit, name in zip(
             (offset, vibration), limits, ('an offset', 'a vibration, peak to peak,'), strict=True):
         most = max(-figure.low, figure.high)
         if most <= limit:
             continue
         parts.append(f'{name} of up to {setpoint.words(most)}')
-        # Bounds shrink with the square root of the number of samples.
         value = 0.0 if math.isnan(figure.value) else abs(figure.value)
-        more = max(more, ((most - value) / max(abs(limit - value), 1e-2 * limit))**2)
-    mend = (f'{max(more, 1.1):.2g} times as many samples a second, or '
-            f'{max(math.sqrt(more), 1.1):.2g} times less noise, would decide it')
+        apart = max(abs(limit - value), 1e-2 * limit)
+        if value > limit:
+            # One that is shown to be beyond decides alone.
+            beyond = min(beyond, _SURER * (value - max(figure.low, -figure.high)) / apart)
+        else:
+            within = max(within, (most - value) / apart)
+    # Bounds shrink with the noise, and with the square root of the number of samples.
+    less = _ADVISED * max(beyond if math.isfinite(beyond) else within, 1.0)
+    mend = (f'{less**2:.2g} times as many samples a second, or {less:.2g} times less noise, would '
+            'decide it')
+    if independent < INDEPENDENT:
+        mend = ('what remains is no noise, so that neither more samples nor less noise would '
+                'decide it')
     if 3.0 * sensor.std(setpoint.target) > 0.5 * limits[0]:
         mend = ('a calibrated sensor would decide it: what it shows may be off by '
                 f'{setpoint.words(3.0 * sensor.std(setpoint.target))}')
