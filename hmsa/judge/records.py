@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
+from functools import cached_property
 import math
 
 from hmsa.model.residual import percent, RESOLVED
@@ -200,7 +201,7 @@ class Finding:
         """Whether samples show that the setpoint was not arrived at in time."""
         return VERDICTS.index(self.verdict) > VERDICTS.index(Code.UNDECIDED)
 
-    @property
+    @cached_property
     def rank(self) -> tuple[int, float]:
         """Severity by `VERDICTS`, then the deviation relative to the step."""
         figures = (abs(self.offset), self.vibration)

@@ -197,8 +197,10 @@ class SetpointSamples:
         self._answer = setpoint, found
         self.over = self.due >= self._closes or self.due >= self._enough and not (
             found.open or found.failed and self.due < self._grace)
+        last = self._closes if self.due >= self._enough else self._enough
         due = self._begin + max(2 * after, self._length)
-        self.due = min(due, self._closes if self.due >= self._enough else self._enough)
+        # Not twice within a short time.
+        self.due = due if last - due >= after else last
         before = self.found
         if before is not None and found.open and (
                 before.failed or before.arrived and found.verdict is Code.UNOBSERVED):
@@ -207,6 +209,12 @@ class SetpointSamples:
         self.found = found
         same = before is not None and before.verdict is found.verdict
         return None if same and not self.over else found
+
+    def rests(self, now: int, *, observable: bool) -> bool:
+        """Return whether there is nothing to judge at a time in ns."""
+        if self.unreported or self._judging is not None:
+            return False
+        return self.over or now < (self._next_look if observable else self._begin)
 
     def wake(self, now: int) -> int:
         """Return the time in ns at which to judge next; 0 for now."""

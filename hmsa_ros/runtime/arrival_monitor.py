@@ -470,6 +470,8 @@ class ArrivalMonitor:
                 joint.close(joint.newest)
                 return joint.newest
             for hold in joint.holds:
+                if hold.rests(now, observable=observable):
+                    continue
                 if (steady := self._around.steady()) >= until:
                     return None
                 found = hold.judge(
