@@ -14,6 +14,9 @@ OGDEN = 3.0  # number of terms, then mu and alpha of each
 TABLE = 4.0  # number of pieces, then the result of `hmsa.model.laws.curve.Curve.packed`
 BEAM = 5.0  # result of `hmsa.model.laws.bending.packed`
 ARRUDA_BOYCE = 6.0  # mu, lambda_m
+ELASTICA = 7.0  # result of `hmsa.model.laws.elastica.packed`
+#: Families whose coordinate is the deflection of a tip.
+BEAMS = (BEAM, ELASTICA)
 
 #: Index of the first constant in a packed material.
 CONSTANTS = 6
@@ -57,12 +60,12 @@ class Elastic:
     @property
     def rest(self) -> float:
         """Coordinate at rest without a field: 1, or deflection 0 of a beam."""
-        return 0.0 if self.family == BEAM else 1.0
+        return 0.0 if self.family in BEAMS else 1.0
 
     @property
     def coordinate(self) -> str:
         """Name of the coordinate."""
-        return 'deflection' if self.family == BEAM else 'stretch'
+        return 'deflection' if self.family in BEAMS else 'stretch'
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@
 namespace hmsa {
 // Indices in a packed material, and families of models (hmsa/model/law.py, laws/record.py).
 enum Place { kind_at, zeta_at, c1_at, damping_at, lower_at, upper_at, constants_at };
-enum Family { gent, neo_hookean, polynomial, ogden, table, beam, arruda_boyce };
+enum Family { gent, neo_hookean, polynomial, ogden, table, beam, arruda_boyce, elastica };
 
 // Functions of the stretch alone are differentiated by it, and then by the chain rule, unless the
 // constants of the model have derivatives, too.
@@ -33,7 +33,7 @@ template <bool direct, class L, class S> HMSA_INLINE decltype(auto) outer(const 
 // A block: inertia m = (l^-3 + c1)/6, and a constant damping. C is the type of its constants.
 template <class C, template <class> class Law> struct Block {
     static constexpr double rest = 1;
-    static constexpr bool direct = count_of<C> > 0;
+    static constexpr bool direct = count_of<C> > 0, may_bend = false;
     using Bare = Block<double, Law>;  // without derivatives
     real<C> c1;
     C drag;
@@ -70,15 +70,18 @@ template <class C, template <class> class Law> struct Block {
 };
 
 // A clamped beam by the deflection of its tip, odd in it, from tables of degree 7
-// (hmsa/model/laws/bending.py): it has its own inertia, and a damping that grows with it.
+// (hmsa/model/laws/bending.py, elastica.py): it has its own inertia, and a damping that grows with
+// it. The tables of the elastica have functions of its second mode, too.
 struct Beam {
+    static constexpr int one_mode = 26, two_modes = 66;
     double drag;
     const double *c;
+    int width;  // of a piece
 
     const double *piece(double a) const
     {
         const int i = int((1 - __builtin_sqrt(1 - a / c[1])) * c[3]), last = int(c[0]) - 1;
-        return c + 8 + 26 * (i < 0 ? 0 : i > last ? last : i);
+        return c + 8 + width * (i < 0 ? 0 : i > last ? last : i);
     }
     template <class S> S force(const S &l) const
     {
@@ -107,6 +110,43 @@ struct Beam {
         falls = horner_slope<7>(p + 10, u) * (0.5 * sign) * i_mass;
         damps = horner<7>(p + 18, u) * i_mass;
     }
+    // An even function of a deflection within the tables, and its slope.
+    template <class S> struct Even { S value, slope; };
+    template <class S> Even<S> even(int number, const S &l) const
+    {
+        const double x = value(l), a = min(abs(x), c[2]), sign = x < 0 ? -1 : 1;
+        const double *p = piece(a), *factors = p + 2 + 8 * number, u = a - *p;
+        double f = factors[7], once = 0, twice = 0;
+        for (int k = 6; k >= 0; k--) {
+            twice = twice * u + once;
+            once = once * u + f;
+            f = f * u + factors[k];
+        }
+        if (!(abs(x) <= c[2]))
+            once = twice = 0;
+        return {through(l, f, sign * once), through(l, sign * once, 2 * twice)};
+    }
+    // Adds to the acceleration of the first mode what the second does to it, and returns that of
+    // the second: their Lagrangian is that of elastica.py, with the position y = l + a/h(0).
+    template <class S> S second(const S &l, const S &v, const S &y, const S &rate, const S &net,
+        double ratio, double share, double damping, S &acceleration) const
+    {
+        const double stiffness = c[8 + 3], mass = c[8 + 10];  // of a straight beam
+        const double squared = ratio * ratio, drags = 2 * damping * ratio * sqrt(stiffness / mass);
+        const Even<S> g = even(3, l), h = even(4, l), square = even(5, l);
+        const S e = even(6, l).value, k = even(7, l).value;
+        const S a = y - l, a_rate = rate - v;
+        S i_mass, falls, damps;
+        inertia(l, i_mass, falls, damps);
+        const S part = g.value * h.value * share, first = inverse(1.0 - part);
+        acceleration = acceleration + first * (
+            (g.slope * h.value + g.value * h.slope) * (0.5 * share) * v * v
+            + i_mass * share * ((net * g.slope - square.slope * a * (0.5 * stiffness)) * a
+                - (e - h.value * k) * a_rate * (drags * mass / squared)));
+        return acceleration * (1.0 - h.value)
+            + (net * g.value - square.value * a * stiffness) * (squared / mass)
+            - h.slope * v * v - (e * v + k * a_rate) * drags;
+    }
     double energy(double l) const
     {
         const double a = abs(l), way = a - c[2], inside = min(a, c[2]);
@@ -118,7 +158,7 @@ struct Beam {
 // An actuator of any model except Gent, chosen at run time: its steps make calls, those of Gent do
 // not. C is the type of the constants.
 template <class C> struct AnyOf {
-    static constexpr bool direct = count_of<C> > 0;
+    static constexpr bool direct = count_of<C> > 0, may_bend = true;
     using Bare = AnyOf<double>;
     int kind;
     double rest, c1, drag;
@@ -130,13 +170,14 @@ template <class C> struct AnyOf {
     void read(int, const double *m)
     {
         kind = int(m[kind_at]), c1 = m[c1_at], drag = m[damping_at];
-        rest = kind == beam ? 0 : 1;
+        rest = kind == beam || kind == elastica ? 0 : 1;
         switch (kind) {
         case polynomial: return polynomial_law.Polynomial<C>::read(0, m + constants_at);
         case arruda_boyce: return polynomial_law.read(0, m + constants_at);
         case ogden: return ogden_law.read(0, m + constants_at);
         case table: return table_law.read(0, m + constants_at);
-        default: beam_law = {drag, m + constants_at};
+        default:
+            beam_law = {drag, m + constants_at, kind == beam ? Beam::one_mode : Beam::two_modes};
         }
     }
     void seed(int constant, int j)
@@ -168,7 +209,7 @@ template <class C> struct AnyOf {
     // 1/m, m'/(2 m), and the factor on the damping at rest, over m.
     template <class L> HMSA_APART void inertia(const L &l, L &i_mass, L &falls, L &damps) const
     {
-        if (kind == beam)
+        if (rest == 0)
             return beam_law.inertia(l, i_mass, falls, damps);
         const L l2 = l * l, l4 = l2 * l2, q = inverse(l + l4 * c1);
         i_mass = 6.0 * l4 * q;
@@ -219,10 +260,12 @@ enum Column { ratio_at, speed_at, flow_at, follower_at = flow_at + 1 + flow_cons
 template <class System> double equilibrium(const System &system, const double *m, double beta);
 
 // Secondary modes: oscillators about the rest under the present load, whose frequencies are in
-// proportion to that of the first mode there, and to a power of the stretch.
+// proportion to that of the first mode there, and to a power of the stretch. The first of them is
+// the second mode of the elastica, if the actuator is one.
 struct Modes {
     int count = 0;
-    double ratio[most_modes] = {}, damping[most_modes] = {}, exponent[most_modes] = {};
+    double share[most_modes] = {}, ratio[most_modes] = {}, damping[most_modes] = {},
+        exponent[most_modes] = {};
     const double *material = nullptr;  // packed
     struct Rest {
         double load = __builtin_nan(""), stretch, per_load, squared, squared_per_load;
@@ -232,6 +275,7 @@ struct Modes {
     void read(const double *rows, int rows_left)
     {
         for (; rows_left > 1; rows_left -= 2, rows += 2 * branch_columns) {
+            share[count] = rows[ratio_at];
             ratio[count] = rows[speed_at];
             damping[count] = rows[flow_at + 1];
             exponent[count++] = rows[flow_at + 2];
@@ -247,16 +291,29 @@ struct Modes {
             (squared(l + aside) - squared(l - aside)) / (2 * aside) * per_load};
     }
     // Changes of positions and rates, in turns, under the load that is left for the elastic force.
+    // The first two of a state are those of the first mode, those of others start at a place.
     template <class System, class S> HMSA_INLINE void change(
-        const System &system, const S &load, const S *at, S *by) const
+        const System &system, const S &load, const S *state, S *changes, int place) const
     {
+        const S *at = state + place;
+        S *by = changes + place;
+        int k = 0;
+        if constexpr (System::may_bend)
+            if (system.kind == elastica) {
+                by[0] = at[1];
+                by[1] = system.beam_law.second(state[0], state[1], at[0], at[1],
+                    S(load - system.force(state[0])), ratio[0], share[0], damping[0], changes[1]);
+                if (++k == count)
+                    return;
+                at += 2, by += 2;
+            }
         if (!(value(load) == rest.load))
             find(system, value(load));
         const S off = load - rest.load;  // 0, with derivatives
         const S middle = off * rest.per_load + rest.stretch;
         const S squared = off * rest.squared_per_load + rest.squared;
         const S frequency = squared * (0.5 / sqrt(rest.squared)) + 0.5 * sqrt(rest.squared);
-        for (int k = 0; k < count; k++, at += 2, by += 2) {
+        for (; k < count; k++, at += 2, by += 2) {
             S grown = 0.0 * off + ratio[k];
             if (exponent[k] != 0)
                 grown = grown * power(middle, exponent[k]);
@@ -372,7 +429,7 @@ template <int NB, class System, class S, class L> HMSA_INLINE void change(const 
         }, squared);
     if constexpr (NB == most_branches && lanes<real<S>> == 1)
         if (branches.modes.count)
-            branches.modes.change(system, left, x + 2 + branches.count(), by + 2 + branches.count());
+            branches.modes.change(system, left, x, by, 2 + branches.count());
 }
 
 // Frequency of small undamped motion about a stretch; the growth rate where the force falls.

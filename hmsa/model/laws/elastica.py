@@ -1,0 +1,209 @@
+"""
+The elastica: a clamped beam in its exact shapes at rest, and its second mode about each of them.
+
+In a field across it, a beam that is magnetised along its length has the shapes at rest
+
+    theta'' + b cos(theta) = 0,    theta(0) = theta'(1) = 0,
+
+with the rotation ``theta`` of the tangent at fractions s of the length, and the load b in units of
+E I/l^2. They form a family with the deflection u of the tip as its coordinate. The work of the
+field is b u exactly. Small motion about a member of the family has the modes of an inextensible
+rod; the first one determines the inertia that belongs to u, the second is a further coordinate a:
+with the momenta of both, and without terms of third order in a,
+
+    L = mu(u) u'^2/2 + (a' + h(u) u')^2/2 - U(u) + b u + (b - U'(u)) g(u) a - l(u) a^2/2,
+
+where g is what the mode moves the tip, l the square of its frequency, h its part in a change of
+u, and mu = (1 - g h) U'/l_1 gives the first frequency. Viscous bending dissipates with
+the coefficients d u'^2 + 2 e u' a' + k a'^2. Rotations are polynomials, by the method of
+Rayleigh and Ritz.
+"""
+
+from functools import cache
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import ArrayLike, NDArray
+
+from hmsa.model.laws.bending import angle_of, ROOT, slope
+
+Array = NDArray[np.float64]
+
+# Polynomials of the rotation, and points of the quadrature: with twice as many, the functions
+# change by 1e-12 of their values (test_elastica).
+_TERMS, _POINTS = 16, 48
+# Number and degree of the pieces of the tables, their end, and the deflection of a stop.
+_PIECES, _DEGREE = 32, 7
+_END, _STOP = 0.86, 1.0
+_NEWTON, _EXACT = 40, 1e-13
+#: Share of the first mode in the static deflection of a straight beam, 12/1.8751^4: loads here are
+#: those of `hmsa.model.laws.bending` over it.
+FIRST_SHARE = 12.0 / ROOT ** 4
+
+
+class Second(NamedTuple):
+    """The second mode of a straight beam."""
+
+    ratio: float  #: of its frequency to that of the first mode
+    share: float  #: of the static deflection
+
+
+class _Rod:
+    """Integrals of rods whose rotation is a sum of polynomials that vanish at the clamp."""
+
+    def __init__(self) -> None:
+        x, weights = legendre.leggauss(_POINTS)
+        at: Array = 0.5 + 0.5 * x
+        self.weights: Array = 0.5 * weights
+        values = legendre.legvander(x, _TERMS - 1).T
+        slopes = 2.0 * np.array([
+            legendre.legval(x, legendre.legder(row)) for row in np.eye(_TERMS)])
+        self.rotations: Array = at * values
+        bends = values + at * slopes
+        #: Twice the bending energy is the quadratic form of this.
+        self.bending: Array = (bends * self.weights) @ bends.T
+        integrals = legendre.legval(x, legendre.legint(np.eye(_POINTS), lbnd=-1)).T
+        self.up_to: Array = 0.5 * integrals @ np.linalg.inv(
+            legendre.legvander(x, _POINTS - 1))
+        # The first mode of a straight beam, as a guess.
+        weighted: Array = self.rotations * self.weights
+        overlaps: Array = weighted @ self.rotations.T
+        self.first: Array = np.linalg.solve(overlaps, weighted @ slope(at)).astype(np.float64)
+
+    def lever(self, shapes: Array) -> Array:
+        """Return the changes of the deflection of the tip with each polynomial, shape (n, m)."""
+        made: Array = (np.cos(shapes @ self.rotations) * self.weights) @ self.rotations.T
+        return made
+
+    def stiffness(self, shapes: Array, loads: Array) -> Array:
+        """Return the tangent stiffness under loads, shape (n, m, m)."""
+        softer = loads[:, None] * self.weights * np.sin(shapes @ self.rotations)
+        made: Array = self.bending + (self.rotations * softer[:, None]) @ self.rotations.T
+        return made
+
+    def mass(self, shapes: Array) -> Array:
+        """Return the mass matrices for a mass of 1, shape (n, m, m)."""
+        turned = shapes @ self.rotations
+        along, across = (
+            (of(turned)[:, None] * self.rotations) @ self.up_to.T for of in (np.sin, np.cos))
+        made: Array = (along * self.weights) @ np.swapaxes(along, 1, 2) + (
+            across * self.weights) @ np.swapaxes(across, 1, 2)
+        return made
+
+    def rest(self, deflections: Array) -> tuple[Array, Array]:
+        """Return shapes (n, m) and loads at rest, by Newton's method."""
+        count = len(deflections)
+        shapes = angle_of(deflections)[:, None] * self.first
+        loads = np.einsum('ni,ni->n', shapes @ self.bending, shapes) / (
+            np.einsum('ni,ni->n', self.lever(shapes), shapes))
+        matrices = np.zeros((count, _TERMS + 1, _TERMS + 1))
+        for _ in range(_NEWTON):
+            lever = self.lever(shapes)
+            matrices[:, :-1, :-1] = self.stiffness(shapes, loads)
+            matrices[:, :-1, -1], matrices[:, -1, :-1] = -lever, lever
+            off = np.column_stack([
+                shapes @ self.bending - loads[:, None] * lever,
+                np.sin(shapes @ self.rotations) @ self.weights - deflections])
+            step = np.linalg.solve(matrices, off[..., None])[..., 0]
+            shapes, loads = shapes - step[:, :-1], loads - step[:, -1]
+            if np.max(np.abs(step)) < _EXACT:
+                break
+        return shapes, loads
+
+    def states(self, deflections: Array) -> Array:
+        """Return load, U'/l_1, d, g, h, l, e and k at deflections above 0, shape (8, n)."""
+        shapes, loads = self.rest(deflections)
+        stiffness, mass = self.stiffness(shapes, loads), self.mass(shapes)
+        lever = self.lever(shapes)
+        # As a symmetric problem, of flexibility: slow modes have the large eigenvalues.
+        lower = np.linalg.inv(np.linalg.cholesky(stiffness))
+        slow, modes = np.linalg.eigh(lower @ mass @ np.swapaxes(lower, 1, 2))
+        squares = 1.0 / slow[:, :-3:-1]
+        second = np.sqrt(squares[:, 1:]) * np.einsum('nij,ni->nj', lower, modes[:, :, -2])
+        # All polynomials are 1 at the tip, which the second mode turns against its deflection of a
+        # straight beam.
+        second *= np.sign(second.sum(axis=1))[:, None]
+        flexible = np.linalg.solve(stiffness, lever[..., None])[..., 0]
+        per_load = np.einsum('ni,ni->n', lever, flexible)
+        family = flexible / per_load[:, None]
+        g = np.einsum('ni,ni->n', second, lever)
+        h = np.einsum('ni,nij,nj->n', second, mass, family)
+        d, e, k = (np.einsum('ni,ij,nj->n', x, self.bending, y) for x, y in (
+            (family, family), (second, family), (second, second)))
+        return np.stack([
+            loads, 1.0 / (per_load * squares[:, 0]), (d - h * e) / (1.0 - g * h), g, h,
+            squares[:, 1], e, k])
+
+
+@cache
+def _straight() -> Array:
+    """Return the states of a straight beam, in the limit."""
+    made: Array = _Rod().states(np.array([1e-7]))[:, 0]
+    return made
+
+
+@cache
+def second_mode() -> Second:
+    """Return the second mode of a straight beam."""
+    _, inertia, _, g, h, square, _, _ = _straight().tolist()
+    return Second(math.sqrt(square * inertia / 3.0), g * h)
+
+
+@cache
+def packed() -> tuple[float, ...]:
+    """
+    Return the constants of ``Beam`` in ``motion/hmsa/system.hpp``.
+
+    The order is that of `hmsa.model.laws.bending.packed`. Each piece has further coefficients, of
+    g, h, l, e and k over their values at rest.
+    """
+    share = (1.0 - np.sqrt(1.0 - _END / _STOP)) / _PIECES
+    breaks = _STOP * (1.0 - (1.0 - share * np.arange(_PIECES + 1)) ** 2)
+    breaks[-1] = _END
+    widths = np.diff(breaks)
+    nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))
+    at = breaks[:-1, None] + widths[:, None] * nodes
+    values = _Rod().states(at.ravel()).reshape(8, *at.shape)
+    values[1:] /= _straight()[1:, None, None]
+    # The first frequency of a straight beam is sqrt(3), with a stiffness of 3 `FIRST_SHARE`.
+    values[:2] *= FIRST_SHARE
+    powers = nodes[:, None] ** np.arange(_DEGREE + 1)
+    factors = np.linalg.solve(powers, values[..., None])[..., 0]
+    pieces = factors / widths[:, None] ** np.arange(_DEGREE + 1)
+    # The force on a straight beam is exactly zero.
+    pieces[0, 0, 0] = 0.0
+    at_end = widths[-1] ** np.arange(_DEGREE + 1)
+    last = pieces[:3, -1] @ at_end
+    stiffness = float(pieces[0, -1, 1:] @ (np.arange(1, _DEGREE + 1) * at_end[:-1]))
+    # The energy is the integral of the force.
+    within = (pieces[0] / np.arange(1, _DEGREE + 2)
+              * widths[:, None] ** np.arange(1, _DEGREE + 2)).sum(axis=1)
+    rows = np.column_stack([
+        breaks[:-1], np.append(0.0, np.cumsum(within)[:-1]), *pieces])
+    return (
+        float(_PIECES), _STOP, _END, float(1.0 / share), float(last[0]), stiffness,
+        float(last[1]), float(last[2]), *rows.ravel().tolist())
+
+
+def lever(deflections: ArrayLike) -> tuple[Array, Array]:
+    """Return g over its value at rest, and the derivative, at deflections within the tables."""
+    wanted = np.asarray(deflections, dtype=np.float64)
+    size = np.clip(np.abs(wanted), 0.0, _END)
+    breaks, factors = _lever_pieces()
+    piece = np.searchsorted(breaks, size, side='right') - 1
+    within, rows = size - breaks[piece], factors[piece]
+    value = slope_there = np.zeros_like(size)
+    for k in range(_DEGREE, -1, -1):
+        slope_there = slope_there * within + value
+        value = value * within + rows[..., k]
+    return value, np.sign(wanted) * slope_there
+
+
+@cache
+def _lever_pieces() -> tuple[Array, Array]:
+    """Return the starts of the pieces, and the polynomial coefficients of g over its rest."""
+    rows = np.array(packed()[8:]).reshape(_PIECES, -1)
+    first = 2 + 3 * (_DEGREE + 1)
+    return rows[:, 0], rows[:, first:first + _DEGREE + 1]
