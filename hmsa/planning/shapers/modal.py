@@ -2,15 +2,23 @@
 Rest of the first mode and of all secondary modes, for actuators that are continua.
 
 A move has two free levels for the first mode and two more for each secondary one, and further ones
-on real hardware as in `free`. They have equal durations. A command that is as short as possible
-would excite the modes that no model contains: by default it takes two half periods of the first
-mode.
+on real hardware as in `free`.
+
+Those of a block have equal durations. A command that is as short as possible would excite the
+modes that no model contains: by default it takes two half periods of the first mode. The secondary
+modes of a beam are fast and weak: its command is the two-step command, convolved with an input
+shaper of zero vibration (N. C. Singer, W. P. Seering, J. Dyn. Syst. Meas. Control 112, 76, 1990)
+for each of them, and changed as little as rest demands. It has more levels than conditions.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 import math
 
+import numpy as np
+
 from hmsa.model import law
+from hmsa.model.equations import Array
 from hmsa.model.moves import Level, Move
 from hmsa.model.simulation import followed_by
 from hmsa.model.status import Code, RefusedError
@@ -24,11 +32,18 @@ from hmsa.planning.shooting import Attempt, heights, solve, within_limits
 _LENGTHS = (1.0, 1.06, 0.94, 1.14, 1.25, 1.4, 1.6, 2.0)
 # Largest load beyond those of start and end, in units of the largest change that the motion needs.
 _BEYOND = 0.3
+# Durations of levels in units of those of their ramps, at least.
+_MORE = 1.25
+# Durations and loads of the free levels.
+_Guess = tuple[list[float], list[float]]
 
 
 def modal(request: MoveRequest) -> Move:
     """
-    Come to rest with all modes, in ``request.order`` half periods of the first mode.
+    Come to rest with all modes.
+
+    A block takes ``request.order`` half periods of the first mode; a beam as long as the two-step
+    command, half a period of each secondary mode, and half periods of the first beyond order 2.
 
     Without secondary modes, the two-step command does so, and is returned. Raise `RefusedError` if
     no such command keeps the limits.
@@ -74,23 +89,114 @@ def _largest_change(request: MoveRequest, holding: float) -> float:
 
 def _solutions(request: MoveRequest, holding: float) -> Iterator[tuple[tuple[Level, ...], float]]:
     """Yield commands that end at rest within the limits."""
+    guesses = _equal if request.material.rest != 0.0 else _around_two_steps
+    before: tuple[float, ...] = ()
+    for wanted, loads in guesses(request, holding):
+        durations = tuple(_on_grid(x, request) for x in wanted)
+        if durations == before:
+            continue
+        before = durations
+        begins = [math.fsum(durations[:i]) for i in range(len(durations) + 1)]
+        template = heights([Level(*x) for x in zip(begins, (*loads, holding), strict=True)])
+        if len(durations) > request.unknowns + 2 * len(request.material.modes.ratios):
+            free = _directions(np.array(begins), request)
+            template = replace(template, d_times=np.zeros_like(free), d_loads=free)
+        found = within_limits(solve(template, request, modes=True), request)
+        if found is not None:
+            yield found
+
+
+def _equal(request: MoveRequest, holding: float) -> Iterator[_Guess]:
+    """Yield equal durations, and loads from the present one to the last as a raised cosine."""
     delivery = request.delivery
     count = request.unknowns + 2 * len(request.material.modes.ratios)
     whole = request.order * math.pi / request.frequency
-    hardware, before = delivery.lag + delivery.ramp(holding - request.load), 0.0
+    hardware = delivery.lag + delivery.ramp(holding - request.load)
+    loads = [request.load + (holding - request.load) * 0.5 * (
+        1.0 - math.cos(math.pi * (i + 1) / (count + 1))) for i in range(count)]
     for length in _LENGTHS:
-        each = (length * whole + hardware) / count
-        if delivery.period > 0.0:
-            each = math.ceil(each / delivery.period - 1e-9) * delivery.period
-        each = delivery.rounded(each)
-        if each == before:
+        yield [(length * whole + hardware) / count] * count, loads
+
+
+def _around_two_steps(request: MoveRequest, holding: float) -> Iterator[_Guess]:
+    """Yield the durations and loads of a two-step command that is shaped for all other modes."""
+    half, delivery = math.pi / request.frequency, request.delivery
+    try:
+        move = two_step(replace(request, work=request.work.more(request.work.left)))
+    except RefusedError:
+        move = Move(Code.HOLD, (Level(0.0, 0.5 * (request.load + holding)),), math.inf)
+    delays, impulses = [], [(0.0, 1.0)]
+    for frequency, damping in sorted(_others(request), reverse=True):
+        delay = math.pi / frequency
+        # Of a vibration, this fraction is left a half period later.
+        left = math.exp(-math.pi * damping / math.sqrt(1.0 - damping ** 2))
+        impulses = [(x + shift, y * share / (1.0 + left))
+                    for x, y in impulses for shift, share in ((0.0, 1.0), (delay, left))]
+        delays.append(delay)
+    more = sum(delays)
+    first = move.duration if more < move.duration < math.inf else half
+    levels = [x for x in move.levels if x.time < first]
+    shortest = first + max(request.order - 2, 0) * half + more
+    # The last levels act on modes that have forgotten the others.
+    ends = [0.5 * x for x in reversed(delays) for _ in range(2)]
+    for length in _LENGTHS:
+        middle = (length * shortest - 2.0 * more) / request.unknowns
+        if middle <= 0.0:
             continue
-        before = each
-        # From the present load to the last one as a raised cosine.
-        guess = [
-            Level(i * each, request.load + (holding - request.load) * 0.5 * (
-                1.0 - math.cos(math.pi * (i + 1) / (count + 1)))) for i in range(count)]
-        found = within_limits(solve(
-            heights([*guess, Level(count * each, holding)]), request, modes=True), request)
-        if found is not None:
-            yield found
+        durations, loads, begin = [], [], 0.0
+        for duration in (*delays, *[middle] * request.unknowns, *ends):
+            at = (first + more) / (length * shortest) * (begin + 0.5 * duration)
+            loads.append(math.fsum(
+                part * _load(levels, at - delay, request.load, holding, first)
+                for delay, part in impulses))
+            begin += duration
+            ramp = delivery.ramp(loads[-1] - (loads[-2] if len(loads) > 1 else request.load))
+            durations.append(max(duration, _MORE * ramp))
+        yield durations, loads
+
+
+def _load(
+        levels: Sequence[Level], time: float, before: float, after: float, end: float) -> float:
+    """Return the load at a time of a command that ends at another one."""
+    if time >= end:
+        return after
+    return next((x.load for x in reversed(levels) if x.time <= time), before)
+
+
+def _others(request: MoveRequest) -> list[tuple[float, float]]:
+    """Return frequencies and damping ratios of the secondary modes of a beam."""
+    # They hardly change with the deflection.
+    straight = float(law.natural_frequency(0.0, request.material.packed))
+    modes = request.material.modes
+    return [(x * straight, y) for x, y in zip(modes.ratios, modes.dampings, strict=True)]
+
+
+def _directions(begins: Array, request: MoveRequest) -> Array:
+    """
+    Return one column of changes of the loads for each condition, the last of which stays.
+
+    They are the effects of the loads on modes and field at the end, in linear motion: the smallest
+    change of the guess that meets the conditions is a sum of them.
+    """
+    packed, frequency = request.material.packed, request.frequency
+    decay = float(law.damping(request.target, packed)) / (
+        2.0 * float(law.mass(request.target, packed)))
+    roots = [complex(-decay, frequency)] + [
+        x * complex(-y, math.sqrt(1.0 - y ** 2)) for x, y in _others(request)]
+    left = begins[-1] - begins
+    effects = [part for root in roots for of in (np.exp(root * left),)
+               for part in (np.diff(of.real), np.diff(of.imag))]
+    if request.delivery.lag > 0.0:
+        effects.append(np.diff(np.exp(-left / request.delivery.lag)))
+    made: Array = np.zeros((len(begins), len(effects)))
+    for column, effect in enumerate(effects):
+        made[:-1, column] = effect / np.linalg.norm(effect)
+    return made
+
+
+def _on_grid(duration: float, request: MoveRequest) -> float:
+    """Return a duration that the command can have."""
+    period = request.delivery.period
+    if period > 0.0:
+        duration = math.ceil(duration / period - 1e-9) * period
+    return request.delivery.rounded(duration)
