@@ -141,9 +141,9 @@ class Actuators:
         groups = [x.nondimensional.rows for x in blocks]
         self._branches = np.zeros((
             count if any(map(len, groups)) else 0, motion.ROWS, motion.BRANCH))
-        # Secondary modes by actuator, and the place of their first row.
+        # Actuators with secondary modes, and the place of the first row of these.
         self._modes = {
-            i: (x.nondimensional.modes, len(x.nondimensional.branches))
+            i: (x.nondimensional, len(x.nondimensional.branches))
             for i, x in enumerate(blocks) if x.nondimensional.modes}
         for branches, group in zip(self._branches, groups, strict=False):
             branches[:len(group)] = group
@@ -176,9 +176,10 @@ class Actuators:
         seen: Array = self._state[:, place]
         if self._modes:
             seen = seen.copy()
-            for i, (modes, count) in self._modes.items():
-                seen[i] = modes.all_of(seen[i], self._branches[
-                    i, count + place:count + 2 * len(modes.shares):2, motion.FOLLOWER])
+            for i, (material, count) in self._modes.items():
+                seen[i] = material.observed(
+                    self._state[i, 0], self._state[i, 1], self._branches[
+                        i, count:count + 2 * len(material.modes.shares), motion.FOLLOWER])[place]
         return seen
 
     @property
@@ -212,9 +213,10 @@ class Actuators:
             self._branches[i, :, motion.FOLLOWER] = law.elastic_force(
                 stretch, self._material[i])
             if i in self._modes:
-                modes, count = self._modes[i]
-                self._branches[i, count:count + 2 * len(modes.ratios), motion.FOLLOWER] = (
-                    (stretch, rate * self._time_units[i]) * len(modes.ratios))
+                material, count = self._modes[i]
+                number = len(material.modes.ratios)
+                self._branches[i, count:count + 2 * number, motion.FOLLOWER] = (
+                    (stretch, rate * self._time_units[i]) * number)
         # The amplifier of a lagging coil may have arrived before the field; that of another not.
         behind = self._lags[i] > 0.0
         self._levels[i] = level if behind and math.isinf(self._slews[i]) else flux_density

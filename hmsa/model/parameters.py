@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 import math
 import sys
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from hmsa.errors import BadInputError
 from hmsa.model.creep import Creep
 from hmsa.model.laws.coordinate import Coordinate, coordinate_of
-from hmsa.model.laws.record import Elastic
+from hmsa.model.laws.record import Elastic, ELASTICA
 from hmsa.model.modes import Modes
 from hmsa.model.units import MU_0, Units
 
@@ -114,6 +115,24 @@ class NondimensionalParameters:
         if not self.modes:
             return self.branches
         return np.concatenate([self.branches, np.array(self.modes.rows())])
+
+    def observed(self, stretch: Any, rate: Any, others: Any) -> tuple[Any, Any]:
+        """
+        Return stretch and rate of all modes together, numbers or arrays of one shape.
+
+        Those of the first mode come first, then positions and rates of the others in turns.
+        """
+        modes = self.modes
+        seen, speed = (modes.all_of(x, others[i::2]) for i, x in enumerate((stretch, rate)))
+        if self.law is None or self.law.family != ELASTICA:
+            return seen, speed
+        from hmsa.model.laws import elastica  # as above
+
+        # The share of the second mode of a bent beam is another one than that of a straight beam.
+        gain, slope = elastica.lever(stretch)
+        beside, apart, share = others[0] - stretch, others[1] - rate, modes.shares[0]
+        return (seen + share * (gain - 1.0) * beside,
+                speed + share * ((gain - 1.0) * apart + slope * rate * beside))
 
     @cached_property
     def elastic(self) -> 'NondimensionalParameters':

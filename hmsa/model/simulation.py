@@ -138,8 +138,7 @@ def observed(rows: Array, material: NondimensionalParameters) -> Array:
     if not material.modes:
         return seen
     after = motion.FOLLOWED + len(material.branches)
-    return np.array([
-        material.modes.all_of(x, rows[after + i::2]) for i, x in enumerate(seen)])
+    return np.array(material.observed(seen[0], seen[1], rows[after:]))
 
 
 def paces(material: NondimensionalParameters, above: ArrayLike) -> Array:

@@ -135,11 +135,11 @@ class JointModel:
 
     def observed(self, state: State) -> tuple[float, float]:
         """Return stretch and dimensionless rate of all modes together."""
-        modes = self.material.modes
-        if not modes or len(state.followed) != len(self.material.rows):
+        if not self.material.modes or len(state.followed) != len(self.material.rows):
             return state.stretch, state.rate
-        others = state.followed[len(self.material.branches):]
-        return modes.all_of(state.stretch, others[::2]), modes.all_of(state.rate, others[1::2])
+        seen, speed = self.material.observed(
+            state.stretch, state.rate, state.followed[len(self.material.branches):])
+        return float(seen), float(speed)
 
     def on_grid(self, time: int) -> int:
         """Return the earliest time in ns, not before the given one, that a command may have."""
