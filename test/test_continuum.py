@@ -250,7 +250,7 @@ def test_file_of_a_mount_is_planned_with_its_modes(tmp_path, capsys):
     assert [x['status'] for x in plan['segments']] == ['modal', 'modal']
     assert main(['init', '--beam', '--length', '25mm', '--thickness', '1mm', '--width', '5mm',
                  '--yes', '--mount', 'free', '--out', str(tmp_path / 'beam.yaml')]) == 2
-    assert 'mount free is given for a beam: expected a block' in capsys.readouterr().err
+    assert 'mount free is given for a beam: expected paper, clamped' in capsys.readouterr().err
 
 
 def test_stop_in_a_modal_move_brings_all_modes_to_rest():

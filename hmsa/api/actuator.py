@@ -100,7 +100,7 @@ class Actuator:
     mount : {'paper', 'free', 'glued'}
         The paper's block, which deforms uniformly in motion, too; or as a continuum with its
         modes, free or with one face glued to a rigid support (`hmsa.model.continuum`). The shaper
-        ``'modal'`` brings all modes to rest.
+        ``'modal'`` brings all modes to rest. ``'clamped'`` is for a beam, see `beam`.
 
     Raises
     ------
@@ -191,7 +191,7 @@ class Actuator:
     def beam(
             cls, *, length: float, thickness: float, width: float, youngs_modulus: float,
             damping_ratio: float | None = None, damping_coefficient: float | None = None,
-            **more: Any) -> 'Actuator':
+            mount: str = 'paper', **more: Any) -> 'Actuator':
         """
         Return a beam, clamped at one end and magnetised along its length.
 
@@ -205,6 +205,9 @@ class Actuator:
             E in Pa.
         damping_ratio, damping_coefficient : float, optional
             Damping ratio of the first mode, or c of the tip in N s/m; default a ratio of 0.05.
+        mount : {'paper', 'clamped'}
+            A beam in the shape of its first mode; or along its elastica, which is exact at rest,
+            with its second mode, which the shaper ``'modal'`` brings to rest, too.
         **more
             Density, remanence, creep and coil parameters of `Actuator`.
 
@@ -224,10 +227,14 @@ class Actuator:
         >>> strip = Actuator.beam(length=10e-3, thickness=1e-3, width=5e-3, youngs_modulus=2e6)
         >>> strip.plan([(0.1, 0.5)]).report()['status']
         ['two_step']
+        >>> strip = Actuator.beam(
+        ...     length=10e-3, thickness=1e-3, width=5e-3, youngs_modulus=2e6, mount='clamped')
+        >>> strip.plan([(0.3, 0.5), (-0.1, 0.5)], 'modal').report()['status']
+        ['modal', 'modal']
 
         """
         with unquestioned():
-            made = cls(**_damping(damping_ratio, damping_coefficient), **{
+            made = cls(mount=mount, **_damping(damping_ratio, damping_coefficient), **{
                 'half_length': 0.5 * number(length, 'length', 'm'),
                 'half_thickness': 0.5 * number(thickness, 'thickness', 'm'), 'law': 'beam',
                 'constants': {'youngs_modulus': youngs_modulus, 'width': width}, **more})

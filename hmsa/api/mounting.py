@@ -1,4 +1,4 @@
-"""A block with the modes that it has as a continuum, free or glued to a support."""
+"""An actuator with the modes that it has as a continuum: a block free or glued, a beam clamped."""
 
 from dataclasses import replace
 import math
@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 
 from hmsa.errors import BadInputError
-from hmsa.model.continuum import check_mount, mounted
-from hmsa.model.equations import critical_zeta
-from hmsa.model.modes import Modes
+from hmsa.interfaces.actuator import actuator_from, parameters_of
+from hmsa.model.continuum import check_mount, clamped, mounted
+from hmsa.model.equations import critical_zeta, elastic_force, equilibrium_stretch
+from hmsa.model.laws.beam import ELASTIC_CURVE
+from hmsa.model.modes import Modes, MOUNTS
 from hmsa.model.moves import State
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.simulation import observed, sampled
@@ -17,28 +19,38 @@ from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.timeline import JointModel
 
-# Move from rest of which the vibration is told, in stretch; time in natural periods, and samples,
-# in which it is looked for.
-_MOVE, _PERIODS, _LOOK = 0.1, 2.0, 400
+# Moves from rest of which the vibration is told, of a block and of a beam; time in natural
+# periods, and samples, in which it is looked for.
+_MOVE, _BEND, _PERIODS, _LOOK = 0.1, 0.3, 2.0, 400
+_PAPER, *_BLOCK, _CLAMPED = MOUNTS
 
 
 def with_mount(model: JointModel, mount: Any, ratio: float | None) -> JointModel:
     """
-    Return the model with factors and modes of a mounted block.
+    Return the model with factors and modes of a mounted actuator.
 
     ``ratio`` is the damping ratio of the first mode; by default, the damping coefficient stays.
-    Raise `BadInputError` for a beam, an unknown mount, or a shape that is out of range.
+    Raise `BadInputError` for an unknown mount or one of another actuator, or a shape that is out
+    of range.
     """
-    block = model.actuator
+    actuator = model.actuator
     check_mount(mount)
-    if mount == 'paper':
+    if mount == _PAPER:
         return model
-    if block.rest == 0.0:
-        raise BadInputError(f'mount {mount} is given for a beam: expected a block')
-    if block.modes or any(x != 1.0 for x in block.factors.values()):
+    if (actuator.rest == 0.0) is not (mount == _CLAMPED):
+        form, others = ('beam', [_CLAMPED]) if actuator.rest == 0.0 else ('block', _BLOCK)
+        raise BadInputError(
+            f'mount {mount} is given for a {form}: expected {", ".join([_PAPER, *others])}')
+    if actuator.modes or any(x != 1.0 for x in actuator.factors.values()):
         raise BadInputError(
             f'mount {mount} is given for an actuator that has modes already: expected one made '
             'with mount')
+    return JointModel((_clamped if mount == _CLAMPED else _held)(actuator, mount, ratio), (
+        model.options))
+
+
+def _held(block: ActuatorParameters, mount: str, ratio: float | None) -> ActuatorParameters:
+    """Return a block with its modes."""
     shape = block.half_thickness / block.half_length
     given = math.inf if block.law is not None else block.chain_limit
 
@@ -55,34 +67,68 @@ def with_mount(model: JointModel, mount: Any, ratio: float | None) -> JointModel
         ratio = first.nondimensional.zeta / critical
     else:
         block = replace(block, damping_coefficient=ratio * critical * first.damping_unit)
-    return JointModel(made(ratio), model.options)
+    return made(ratio)
+
+
+def _clamped(beam: ActuatorParameters, _: str, ratio: float | None) -> ActuatorParameters:
+    """Return a beam along its elastica, with its second mode."""
+    made = replace(
+        actuator_from(parameters_of(beam) | {'law.shape': ELASTIC_CURVE}), creep=beam.creep)
+    critical = float(critical_zeta(0.0, made.nondimensional))
+    if ratio is None:
+        ratio = made.nondimensional.zeta / critical
+    else:
+        made = replace(made, damping_coefficient=ratio * critical * made.damping_unit)
+    return replace(made, modes=clamped(ratio))
 
 
 def mount_facts(actuator: ActuatorParameters) -> list[tuple[str, str]]:
-    """Return names and values of what the modes of a block change; none without modes."""
+    """Return names and values of what modes change; none for a block without modes."""
+    if actuator.rest == 0.0:
+        return _facts_of_beam(actuator)
     if not actuator.modes:
         return []
-    modes = ', '.join(
-        f'{x:.3g} ({100.0 * y:.2g} %)'
-        for x, y in zip(actuator.modes.ratios, actuator.modes.shares, strict=True))
     paper = replace(actuator, mass_factor=1.0, transverse_mass_factor=1.0, modes=Modes())
     left, tuned = (_left(actuator, x) for x in (paper, replace(actuator, modes=Modes())))
     return [
         ('if it deformed uniformly', f'{1.0 / paper.period:.5g} Hz'),
-        ('modes, f/f1 (share)', modes),
+        ('modes, f/f1 (share)', _modes_text(actuator.modes)),
         ("two_step, paper's model", f'leaves {left:.2g} % of a step to {1.0 + _MOVE:g}'),
         ('two_step, first mode', f'leaves {tuned:.2g} %; shaper modal, none')]
 
 
+def _facts_of_beam(beam: ActuatorParameters) -> list[tuple[str, str]]:
+    """Return what the first mode alone leaves, and with secondary modes, what they change."""
+    first = actuator_from(parameters_of(replace(beam, modes=Modes())) | {'law.shape': ''})
+    actual = beam if beam.modes else _clamped(replace(beam, mass_factor=1.0), '', None)
+    load = elastic_force(_BEND, first.nondimensional)
+    off = 100.0 * (float(equilibrium_stretch(load, actual.nondimensional)) / _BEND - 1.0)
+    left = (f'leaves {_left(actual, first):.2g} % of a step to {_BEND:g}, and rests '
+            f'{abs(off):.2g} % off')
+    if not beam.modes:
+        return [('two_step, as an elastica', f'{left}; mount {_CLAMPED} and shaper modal, none')]
+    return [
+        ('modes, f/f1 (share)', _modes_text(beam.modes)),
+        ("two_step, mode's shape", left),
+        ('two_step, elastica',
+         f'leaves {_left(beam, replace(beam, modes=Modes())):.2g} %; shaper modal, none')]
+
+
+def _modes_text(modes: Modes) -> str:
+    return ', '.join(
+        f'{x:.3g} ({100.0 * y:.2g} %)' for x, y in zip(modes.ratios, modes.shares, strict=True))
+
+
 def _left(actual: ActuatorParameters, planned: ActuatorParameters) -> float:
     """Return the vibration in % of a step after a two-step command, peak to peak."""
-    material, target = actual.nondimensional, 1.0 + _MOVE
-    move = get_shaper('two_step')(MoveRequest(
-        State(1.0), target, planned.nondimensional))
+    material, rest = actual.nondimensional, actual.rest
+    move = _BEND if rest == 0.0 else _MOVE
+    levels = get_shaper('two_step')(MoveRequest(
+        State(rest), rest + move, planned.nondimensional)).levels
     faster = planned.time_unit / actual.time_unit
-    levels = [replace(x, time=x.time * faster) for x in move.levels]
+    levels = tuple(replace(x, time=x.time * faster) for x in levels)
     end = levels[-1].time
     period = actual.period / actual.time_unit
     times = np.linspace(end, end + _PERIODS * period, _LOOK, dtype=np.float64)
-    stretch = observed(sampled(levels, State(1.0), times, material), material)[0]
-    return 100.0 * float(np.ptp(stretch)) / _MOVE
+    stretch = observed(sampled(levels, State(rest), times, material), material)[0]
+    return 100.0 * float(np.ptp(stretch)) / move

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from hmsa.errors import BadInputError, excerpt
 from hmsa.model import law
 from hmsa.model.equations import Array
+from hmsa.model.laws import elastica
 from hmsa.model.modes import Modes, MOUNTS
 
 # Degree of the polynomials: the first frequency of the cube is then within 1e-4 of that of its
@@ -259,6 +260,18 @@ def mounted(shape: float, mount: str, j_lim: float, damping_ratio: float) -> Mou
             tuple(ratios[strong].tolist()), tuple(found.shares[strong].tolist()),
             tuple(min(damping_ratio * x, _MOST_DAMPED) for x in ratios[strong].tolist()),
             exponents))
+
+
+def clamped(damping_ratio: float) -> Modes:
+    """
+    Return the secondary mode of a beam along its elastica.
+
+    That of the first mode of the straight beam is the damping ratio; of the second, it grows with
+    the frequency, as by a viscous stress.
+    """
+    second = elastica.second_mode()
+    return Modes(
+        (second.ratio,), (second.share,), (min(damping_ratio * second.ratio, _MOST_DAMPED),))
 
 
 def _exponents(shape: float, j_lim: float, frequencies: Array) -> tuple[float, ...]:

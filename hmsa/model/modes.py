@@ -7,8 +7,9 @@ from typing import Any
 
 from hmsa.errors import BadInputError
 
-#: Ways to hold a block, of which the first is the paper's: it has no secondary modes.
-MOUNTS = ('paper', 'free', 'glued')
+#: Ways to hold an actuator, of which the first is the paper's: it has no secondary modes. The last
+#: is that of a beam, the others those of a block.
+MOUNTS = ('paper', 'free', 'glued', 'clamped')
 #: Maximum number of secondary modes.
 MOST = 3
 # Numbers in place of a flow rule, in the rows of position and rate of a mode.
