@@ -18,7 +18,7 @@ laboratories, for half an hour. laboratory tunes laboratories behind a serial bo
 of an hour; line makes cables, boards, amplifiers and sensors fail there, for two minutes. studies
 kills the workers of a study. rates measures how many plans per second studies compute, for about
 seven minutes. lockstep compares the kernel of batches with C. continuum plays commands on finite
-elements, for five minutes.
+elements, for five minutes; beam on an exact rod, for three.
 A page is a Markdown file; a table replaces the text between its marks ``<!-- begin NAME -->`` and
 ``<!-- end NAME -->``.
 """
@@ -43,7 +43,7 @@ NAMES = ('judge', 'planner', 'plant', 'preemption', 'joints', 'controller', 'rec
          'crash')
 #: Only run on request: they take long and need the machine for themselves.
 LONG = ('faults', 'soak', 'feedback', 'identification', 'defects', 'harm', 'laboratory',
-        'line', 'studies', 'rates', 'lockstep', 'continuum')
+        'line', 'studies', 'rates', 'lockstep', 'continuum', 'beam')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -62,8 +62,8 @@ def main(arguments: list[str] | None = None) -> int:
                         help='faults: beginning of the key of a fault to inject')
     parser.add_argument('--runs', type=int, default=None,
                         help='harm: laboratories (default 400); laboratory, line: of each kind '
-                             '(default 20); identification, judge, defects: '
-                             'simulated runs of each kind '
+                             '(default 20); beam: random sequences (default 6); identification, '
+                             'judge, defects: simulated runs of each kind '
                              '(default 200, defects 30), in identification at most 40 of those')
     parser.add_argument('--hours', type=float, default=8.0,
                         help='soak: simulated time (default 8)')
@@ -168,6 +168,11 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import bench_continuum
 
         add(bench_continuum.compare(quick=options.quick))
+    if 'beam' in names:
+        from benchmarks import bench_beam
+
+        add(bench_beam.compare(quick=options.quick))
+        add(bench_beam.sequences(quick=options.quick, runs=options.runs or bench_beam.RUNS))
     if 'lockstep' in names:
         from benchmarks import bench_studies
 
