@@ -417,6 +417,20 @@ def test_a_device_that_keeps_time_gets_levels_ahead_and_says_when_they_took_effe
     assert (board.calls[-1], board.kept) == (('write', -0.1), [])
 
 
+@pytest.mark.parametrize('late', [0, 7])
+def test_the_level_in_force_takes_back_what_a_device_keeps_also_if_it_comes_late(late):
+    board, device = board_driver()
+    for stamp, level in ((10, 0.1), (500, 0.2), (510, 0.3)):
+        device.receive(0, START + stamp * MS, level)
+        step(board, device, START + 2 * MS)
+    step(board, device, START + 20 * MS)
+    device.receive(0, START + (20 - late) * MS, 0.1)
+    for k in range(20, 600):
+        step(board, device, START + k * MS)
+    assert board.kept == []
+    assert [x.level for x in device.changes()] == pytest.approx([0.1])
+
+
 def test_a_device_that_is_slow_to_answer_is_not_given_levels_again_that_are_past():
     def applied(self):
         self.run_until(self.host + 45 * MS)

@@ -262,6 +262,9 @@ class Coil(GuardedJoint):
     def _hand_over(self, now: int) -> None:
         """Schedule changed levels on the device."""
         if self._changed is None or self._changed <= now and not self._schedule.next_stamp:
+            if self._changed is not None and self._handed:
+                # A level that came late, as the one in force, replaces those stored.
+                self._write(self._schedule.current, now)
             self._changed = None
             return
         since = max(self._changed, now + 1)
