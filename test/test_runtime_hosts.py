@@ -393,6 +393,23 @@ def test_a_planner_starts_from_rest_that_samples_without_a_rate_show():
     assert rig.notes() == []
 
 
+def test_samples_that_have_waited_to_be_read_do_not_hide_rest():
+    rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS))
+    rig.runtime.request(StretchRequest('a', 1.2))
+    rig.run(START + 5000 * MS)
+    rig.rates = False
+    rig.plant.set_state(1.0, 0.0, 0.0)
+    asked = rig.now
+    rig.runtime.request(StretchRequest('a', 1.05))
+    for k in range(125):
+        old = asked - 4000 * MS + k * MS
+        rig.runtime.observed('a', old, 1.2, math.nan, rig.plant.flux_density, came=old)
+        rig.run(rig.now + 2 * MS)
+    rig.run(rig.now + 500 * MS)
+    assert not any('do not show rest' in x for x in rig.notes())
+    assert rig.residual(1.05) < 1e-6
+
+
 def test_a_start_that_samples_without_a_rate_do_not_show_is_named():
     rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS), blocks={'a': SLENDER})
     rig.rates = False

@@ -285,7 +285,8 @@ class Runtime:
         if self._takeover.waiting or not self._takeover.engaged:
             self._takeover.observe(joint, ObservedSample(
                 stamp, stretch, rate, flux_density,
-                None if self.environment.one_clock() else came - stamp))
+                None if self.environment.one_clock() else came - stamp,
+                self._steady() - max(self._clock() - came, 0)))
         if joint in self.devices.apart:
             return
         self._watch.add(joint, stamp, stretch)

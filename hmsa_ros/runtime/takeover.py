@@ -79,9 +79,12 @@ class Takeover:
         if joint not in self._planners or math.isinf(seen.rate) or not math.isfinite(
                 seen.stretch + seen.flux_density):
             return
+        last, steady = self._samples.get(joint), self._around.steady()
+        if last is not None and (seen.came or steady) < last.came:
+            # It has waited to be read, and a newer one has not.
+            return
         if math.isnan(seen.rate):
             self._still[joint].add(seen.stamp, seen.stretch)
-        last, steady = self._samples.get(joint), self._around.steady()
         # Samples are out of order by less than that; else, a clock was set.
         if last is None or seen.stamp >= last.stamp or last.stamp - seen.stamp > _DISORDER or (
                 steady - last.came > _RECENT):
