@@ -201,5 +201,12 @@ setup(
     long_description=read(README) if README else '',
     long_description_content_type='text/markdown',
     license='Apache-2.0',
+    classifiers=[
+        'Intended Audience :: Science/Research',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: C++',
+        *(f'Programming Language :: Python :: 3.{minor}' for minor in range(10, 15)),
+        'Topic :: Scientific/Engineering',
+    ],
     keywords=['ROS', 'soft robotics', 'command shaping', 'magnetic actuators'],
 )

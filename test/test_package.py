@@ -49,7 +49,7 @@ print(json.dumps({
     'package_data': given.package_data, 'data_files': given.data_files,
     'install_requires': given.install_requires,
     'extras_require': given.extras_require, 'scripts': given.entry_points['console_scripts'],
-    'python_requires': str(given.python_requires)}))
+    'classifiers': given.get_classifiers(), 'python_requires': str(given.python_requires)}))
 """
 
 
@@ -240,6 +240,7 @@ def test_constraints_pin_every_requirement_once_for_each_python(setup, python, d
 def test_supported_pythons_are_the_ones_that_the_constraints_were_made_for(setup):
     supported = SpecifierSet(setup['python_requires'])
     assert [f'3.{minor}' for minor in range(20) if f'3.{minor}' in supported] == list(PYTHONS)
+    assert re.findall(r'Python :: ([\d.]+)', ' '.join(setup['classifiers'])) == list(PYTHONS)
     for distro in DISTROS:
         header = constraints_of(distro).partition('\n')[0]
         assert f'for Python {PYTHONS[0]} to {PYTHONS[-1]}' in header
