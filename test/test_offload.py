@@ -34,7 +34,8 @@ def ends(parent):
 @pytest.fixture
 def offload():
     told = []
-    found = Offload(told.append, 'hmsa_lab.adapt.feedback')
+    # Imported while the process starts, which may take long on a busy machine.
+    found = Offload(told.append, 'test_offload')
     found.told = told
     yield found
     found.close()
@@ -80,21 +81,22 @@ def test_it_ends_with_the_planner_however_that_ends_and_not_by_ctrl_c(tmp_path):
     script = tmp_path / 'planner.py'
     script.write_text(
         'import time\n'
-        'from hmsa.offload import Offload\n'
-        'from hmsa.offload import finish\n'
+        'from hmsa.offload import finish, Offload\n'
         'from test_offload import whose\n'
-        'offload = Offload(print, "os")\n'
+        'offload = Offload(print, "test_offload")\n'
         'print(finish(offload(whose, 1))[1], flush=True)\n'
         'time.sleep(600)\n')
     with subprocess.Popen(
             [sys.executable, script], stdout=subprocess.PIPE, text=True,
             env={**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, sys.path))}) as planner:
-        process = os.pidfd_open(int(planner.stdout.readline()))
-        signal.pidfd_send_signal(process, signal.SIGINT)
-        end = select.poll()
-        end.register(process)
-        assert not end.poll(500)
-        planner.kill()
+        try:
+            process = os.pidfd_open(int(planner.stdout.readline()))
+            signal.pidfd_send_signal(process, signal.SIGINT)
+            end = select.poll()
+            end.register(process)
+            assert not end.poll(500)
+        finally:
+            planner.kill()
     assert end.poll(60_000)
 
 
