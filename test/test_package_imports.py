@@ -1,6 +1,7 @@
 """Permitted imports: walls between packages and rooms, no ROS in physics, and quick help."""
 
 import ast
+from functools import cache
 from pathlib import Path
 import re
 import subprocess
@@ -73,16 +74,21 @@ for name in {names!r}:
     assert (result.returncode, result.stderr) == (0, '')
 
 
-def imported(place: str) -> set[str]:
-    """Return the modules of this project that the modules of a package or room import."""
+@cache
+def imports(path: Path) -> set[str]:
+    """Return the modules, or names in modules, of this project that a file imports."""
     found = set()
-    for path in (ROOT / place.replace('.', '/')).rglob('*.py'):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.ImportFrom) and node.module:
-                found |= {f'{node.module}.{x.name}' for x in node.names}
-            elif isinstance(node, ast.Import):
-                found |= {x.name for x in node.names}
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {f'{node.module}.{x.name}' for x in node.names}
+        elif isinstance(node, ast.Import):
+            found |= {x.name for x in node.names}
     return {x for x in found if x.partition('.')[0] in PACKAGES}
+
+
+def imported(place: str) -> set[str]:
+    """Return what the modules of a package or room import of this project."""
+    return set().union(*map(imports, (ROOT / place.replace('.', '/')).rglob('*.py')))
 
 
 @pytest.mark.parametrize('package', PACKAGES)
