@@ -40,7 +40,7 @@ _turns = itertools.count(os.getpid())
 
 
 class SkipWithoutRos:
-    """Skips what imports ROS where there is none: a module of tests, or a test."""
+    """Skips what needs ROS where there is none: a module of tests, or a test."""
 
     @staticmethod
     def find_spec(name: str, *_: Any) -> None:
@@ -48,11 +48,23 @@ class SkipWithoutRos:
         if ROS_PACKAGE.fullmatch(name):
             pytest.skip("rclpy is not installed: pip install '.[ros]'", allow_module_level=True)
 
+    @classmethod
+    def install(cls) -> None:
+        """Skip by what is imported, and by messages whose definitions are looked for."""
+        from hmsa.bag import definitions
+        find = definitions._find
+
+        def find_or_skip(type_name: str, suffix: str) -> Path | None:
+            return find(type_name, suffix) or cls.find_spec(type_name.partition('/')[0])
+
+        definitions._find = find_or_skip
+        sys.meta_path.append(cls)
+
 
 def pytest_configure(config: pytest.Config) -> None:
     """Ignore warnings that cannot be fixed here, and start processes alike."""
     if not has('rclpy'):
-        sys.meta_path.append(SkipWithoutRos)
+        SkipWithoutRos.install()
     for number in (signal.SIGINT, signal.SIGHUP):
         # As nohup and the background of a shell leave them. Processes inherit what is ignored,
         # not what is handled.

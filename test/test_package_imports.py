@@ -184,6 +184,7 @@ assert main(['report', 'run.csv']) == 2
 
 
 def test_nodes_start_without_scipy_which_takes_longer_to_load_than_all_else():
+    needs('rclpy')
     result = run(BLOCKED.format(blocked=('scipy',)) + ''.join(
         f'import {x.module}\n' for x in NODES.values())
         # What `hmsa run` evaluates its bag with.
@@ -192,6 +193,7 @@ def test_nodes_start_without_scipy_which_takes_longer_to_load_than_all_else():
 
 
 def test_a_planner_without_feedback_imports_none_of_it():
+    needs('rclpy')
     result = run(BLOCKED.format(blocked=('hmsa_lab',)) + """
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
