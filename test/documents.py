@@ -618,7 +618,8 @@ def _fill(message: Any, values: Any) -> None:
 
 
 def _check_repository(words: list[str]) -> None:
-    program = words[0]
+    # The environment may have another name.
+    program = words[0].removeprefix('.venv/bin/')
     if program == 'make':
         targets = re.findall(r'^([a-z]+):', (ROOT / 'Makefile').read_text(), re.M)
         for word in words[1:]:

@@ -16,6 +16,7 @@ from extras import needs
 import numpy as np
 import pytest
 from scipy.io import loadmat
+from test_package_imports import BLOCKED, ROS
 
 import hmsa
 from hmsa.bag.definitions import message_definition
@@ -1406,16 +1407,7 @@ def test_bad_input_is_answered_in_one_line_with_status_2(tmp_path, monkeypatch, 
 
 
 def test_the_report_is_made_without_ros(bag, tmp_path):
-    blocked = """
-import sys
-class Blocker:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition('.')[0] in ('rclpy', 'sensor_msgs', 'std_msgs', 'rosgraph_msgs'):
-            raise ModuleNotFoundError('blocked: ' + name, name=name)
-sys.meta_path.insert(0, Blocker())
-from hmsa.cli import main
-sys.exit(main(sys.argv[1:]))
-"""
+    blocked = BLOCKED.format(blocked=ROS) + 'import hmsa.cli\nsys.exit(hmsa.cli.main())'
     done = subprocess.run(
         [sys.executable, '-W', 'error', '-c', blocked, 'report', str(bag), '--out',
          str(tmp_path / 'x.html')], capture_output=True, text=True, check=False)
