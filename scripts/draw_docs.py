@@ -204,6 +204,33 @@ def laws(path: Path) -> None:
         style.finish(axes, STRETCH, style.axis('load', r'\beta_1'))
 
 
+def entanglements(path: Path) -> None:
+    """Draw the command of a move by share of entanglements, and what is left without them."""
+    shares, time = np.linspace(0.0, 0.9, 19), np.linspace(0.0, 40.0, 8001)
+    chains = replace(MATERIAL, j_lim=math.inf)
+    with style.picture(path, 2.9, SCREEN) as figure:
+        left, middle, right = figure.subplots(1, 3)
+        for target, look in zip((1.2, 1.4, 1.8), looks.CASES, strict=False):
+            found = []
+            for share in shares:
+                bound = 3.0
+                moduli = {'law.gc': (1.0 - share) / (1.0 + 2.0 / 3.0 / (bound**2 - 1.0)),
+                          'law.ge': share, 'law.lambda_m': bound}
+                network = replace(MATERIAL, law=LAWS['nonaffine'].scaled(moduli)[1])
+                plan, without = (plan_two_step(1.0, target, x) for x in (network, chains))
+                stretch, _ = simulate(
+                    [0.0, without.tau_p], [without.beta_p, without.beta_1], time, network)
+                rings = stretch[time > without.tau_p][:800]
+                found.append((plan.beta_p, plan.tau_p, 100.0 * np.ptp(rings) / (target - 1.0)))
+            for axes, values in zip((left, middle, right), np.transpose(found), strict=True):
+                axes.plot(shares, values, **look.line(label=f'to {target:g}'))
+        right.legend(loc='upper left')
+        share = style.axis('share of entanglements', 'G_e/G')
+        style.finish(left, share, style.axis('load', r'\beta_p'), 'a')
+        style.finish(middle, share, style.axis('time', r'\tau_p'), 'b')
+        style.finish(right, share, style.axis('vibration', unit='% of step'), 'c')
+
+
 def creep(path: Path) -> None:
     """Draw a creeping block commanded by the paper's two-step and by a plan that knows it."""
     creeping = replace(MATERIAL, creep=Creep((0.1, 0.1), (2.0, 20.0)))
@@ -377,7 +404,7 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     'demo': demo, 'adapting': adapting, 'moves': moves, 'figure_05': figure(5),
     'figure_08': figure(8), 'theory_force': force, 'theory_two_steps': two_steps,
     'theory_paths': energy, 'theory_deliveries': deliveries, 'theory_smooth': smooth,
-    'laws': laws, 'creep': creep, 'beam': beam,
+    'laws': laws, 'entanglements': entanglements, 'creep': creep, 'beam': beam,
     **STUDIES}
 #: What draws each animation.
 ANIMATIONS: dict[str, Callable[[Path], None]] = {'moving': moving}

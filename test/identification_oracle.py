@@ -40,6 +40,23 @@ def _held(block: ActuatorParameters, law: tuple):
     if name == 'ogden':
         return lambda x: sum(mu * (x ** (alpha - 1.0) - x ** (-0.5 * alpha - 1.0))
                              for mu, alpha in zip(c[::2], c[1::2], strict=True))
+    if name in ('nonaffine', 'extended_tube'):
+        gc, ge, *others = c
+
+        def network(x):
+            invariant = x * x + 2.0 / x - 3.0
+            if name == 'nonaffine':
+                n, = (y * y for y in others)
+                slope, a = gc / 6.0 + gc * n / (3.0 * (n - 1.0) - invariant), -1.0
+                entangled = ge * (1.0 - x ** -1.5 - x ** -2.0 + x ** -0.5)
+            else:
+                d, a = others[0] ** 2, others[1]
+                left = 1.0 - d * invariant
+                slope = 0.5 * gc * ((1.0 - d) / left ** 2 - d / left)
+                entangled = 2.0 * ge / a * (x ** (0.5 * a - 1.0) - x ** (-a - 1.0))
+            return 2.0 * (x - x ** -2) * slope + entangled
+
+        return network
     if name == 'arruda_boyce':  # in I1; Yeoh's in I1 - 3
         shares = enumerate((1.0 / 2.0, 1.0 / 20.0, 11.0 / 1050.0, 19.0 / 7000.0, 519.0 / 673750.0))
         c = [c[0] * share / c[1] ** (2 * i) for i, share in shares]

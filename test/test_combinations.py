@@ -28,6 +28,8 @@ CONSTANTS = {
     'yeoh': {'law.c10': 5e3, 'law.c20': -200.0, 'law.c30': 40.0},
     'ogden': {'law.mu': [6e3, -1500.0, 10.0], 'law.alpha': [1.5, -3.0, 8.0]},
     'arruda_boyce': {'law.mu': [9e3], 'law.lambda_m': 2.0},
+    'nonaffine': {'law.gc': 6e3, 'law.ge': 3e3, 'law.lambda_m': 2.0},
+    'extended_tube': {'law.gc': 6e3, 'law.ge': 3e3, 'law.delta': 0.25, 'law.beta': 0.5},
     'table': {'law.stretch': STRETCHES.tolist(), 'law.flux_density': (
         0.12566 * elastic_force(STRETCHES, NondimensionalParameters())).tolist()}}
 # Times in units of that of a paper's block.

@@ -55,6 +55,14 @@ CASES = {
         {'law.mu': [9e3], 'law.lambda_m': 2.0},
         '9000 * (1/2 * (I1 - 3) + 1/20 / 4 * (I1**2 - 9) + 11/1050 / 16 * (I1**3 - 27)'
         '+ 19/7000 / 64 * (I1**4 - 81) + 519/673750 / 256 * (I1**5 - 243))'),
+    'nonaffine': (
+        {'law.gc': 6e3, 'law.ge': 3e3, 'law.lambda_m': 3.0},
+        '1000 * (I1 - 3) - 54000 * log((27 - I1) / 24) + 3000 * (l + 2/sqrt(l) - 3)'
+        '+ 3000 * (1/l + 2*sqrt(l) - 3)'),
+    'extended_tube': (
+        {'law.gc': 6e3, 'law.ge': 3e3, 'law.delta': 0.25, 'law.beta': 0.5},
+        '3000 * (15/16 * (I1 - 3) / (1 - (I1 - 3)/16) + log(1 - (I1 - 3)/16))'
+        '+ 24000 * (1/sqrt(l) + 2*l**(1/4) - 3)'),
 }
 STRETCHES = (0.3, 0.7, 0.999, 1.0, 1.0001, 1.4, 2.5)
 # The pieces of a move, and the extrapolations of each: the end is converged to 1e-17.
@@ -235,6 +243,9 @@ def test_a_move_that_collapses_where_the_force_falls_is_refused_and_others_are_f
     ('ogden', {'law.mu': [1e3], 'law.alpha': [0.0]}, 'expected no 0'),
     ('arruda_boyce', {'law.mu': [], 'law.lambda_m': 2.0}, 'law.mu has 0 values: expected one'),
     ('arruda_boyce', {'law.mu': [1e3]}, 'law.lambda_m is 0: expected more than 1'),
+    ('nonaffine', {'law.gc': 1e3, 'law.lambda_m': 1.0}, 'law.lambda_m is 1: expected more than 1'),
+    ('extended_tube', {'law.gc': 1e3}, 'law.beta is 0: expected more than 0'),
+    ('extended_tube', {'law.gc': 1e3, 'law.delta': 0.9, 'law.beta': 1.0}, 'got -620 Pa'),
 ])
 def test_constants_of_no_solid_are_refused_in_a_sentence(name, constants, message):
     with pytest.raises(BadInputError, match=message):

@@ -23,7 +23,9 @@ LAWS = {
     'mooney_rivlin': ((3500.0, 1500.0), {'law.c10': 5500.0, 'law.c01': 300.0}),
     'yeoh': ((5000.0, -300.0, 60.0), {'law.c10': 6500.0, 'law.c20': 0.0, 'law.c30': 0.0}),
     'ogden': ((7000.0, 2.6), {'law.mu': [9000.0], 'law.alpha': [1.7]}),
-    'arruda_boyce': ((9000.0, 1.8), {'law.mu': [7000.0], 'law.lambda_m': 3.0})}
+    'arruda_boyce': ((9000.0, 1.8), {'law.mu': [7000.0], 'law.lambda_m': 3.0}),
+    'nonaffine': (
+        (6000.0, 3000.0, 2.0), {'law.gc': 5000.0, 'law.ge': 5000.0, 'law.lambda_m': 3.0})}
 
 
 def block_of(law: str, constants: dict):
@@ -69,6 +71,27 @@ def test_constants_of_a_law_are_found_blind_within_their_intervals(law):
         assert abs(found.parameters[name].value - value) < 4.5 * found.parameters[name].std
         # A hundredth of the modulus, or of the value.
         assert found.parameters[name].std < 0.05 * max(abs(value), 500.0 if 'c' in name else 0.0)
+
+
+def test_a_tube_needs_larger_motion_for_all_its_constants_than_for_two():
+    constants = (6000.0, 3000.0, 0.25, 0.5)
+    start = dict(zip(('law.gc', 'law.ge', 'law.delta', 'law.beta'),
+                     (5000.0, 5000.0, 0.15, 0.7), strict=True))
+
+    def found(free, levels):
+        known = dict(zip(start, constants, strict=True)) | {x: start[x] for x in free}
+        return identify(
+            recorded(Extras(law=('extended_tube', *constants)), levels=levels),
+            free=[*free, *REST], actuator=block_of('extended_tube', known))
+
+    small, large = (0.05, -0.03, 0.07, 0.02, 0.0), (0.1, -0.1, 0.2, -0.05, 0.25, 0.0)
+    assert found(start, small).verdict == 'not_identifiable'
+    for free, levels in ((('law.gc', 'law.delta'), small), (tuple(start), large)):
+        identified = found(free, levels)
+        assert identified.verdict == 'identified', identified.reason
+        for name, true in zip(start, constants, strict=True):
+            value = identified.parameters[name]
+            assert name not in free or abs(value.value - true) < 4.5 * value.std
 
 
 def test_constants_that_small_motion_does_not_tell_apart_are_said_to_be_combined():

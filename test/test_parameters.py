@@ -37,7 +37,7 @@ DIMENSIONLESS = {
     'creep_tolerance', 'marker_scale', 'max_points', 'minimax_errors', 'path_tolerance',
     'actuator.chain_limit', 'initial_stretch', 'real_time_factor', 'robust_order', 'play.rate',
     'play.read_ahead_queue_size', 'record.queue_depth',
-    'reset_stretch', 'seed', 'law.alpha', 'law.lambda_m', 'law.stretch',
+    'reset_stretch', 'seed', 'law.alpha', 'law.beta', 'law.delta', 'law.lambda_m', 'law.stretch',
     'step_count',
     # In one unit of length, whichever.
     'sensor.gain', 'sensor.offset', 'sensor.rest_length',

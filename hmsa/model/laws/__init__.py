@@ -7,8 +7,10 @@ These modules are not compiled; forces and energies are in `hmsa/motion/hmsa/law
 from hmsa.model.laws import (
     arruda_boyce,
     beam,
+    extended_tube,
     gent,
     mooney_rivlin,
+    nonaffine,
     ogden,
     table,
     yeoh,
@@ -18,4 +20,4 @@ from hmsa.model.laws.record import Law
 #: Models by name; the first is the default.
 LAWS: dict[str, Law] = {x.name: x for x in (
     gent.GENT, gent.NEO_HOOKEAN, mooney_rivlin.LAW, yeoh.LAW, ogden.LAW, arruda_boyce.LAW,
-    table.LAW, beam.LAW)}
+    nonaffine.LAW, extended_tube.LAW, table.LAW, beam.LAW)}

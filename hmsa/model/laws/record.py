@@ -15,6 +15,8 @@ TABLE = 4.0  # number of pieces, then the result of `hmsa.model.laws.curve.Curve
 BEAM = 5.0  # result of `hmsa.model.laws.bending.packed`
 ARRUDA_BOYCE = 6.0  # mu, lambda_m
 ELASTICA = 7.0  # result of `hmsa.model.laws.elastica.packed`
+NONAFFINE = 8.0  # gc, ge, lambda_m
+EXTENDED_TUBE = 9.0  # gc, ge, delta, beta
 #: Families whose coordinate is the deflection of a tip.
 BEAMS = (BEAM, ELASTICA)
 
@@ -110,6 +112,24 @@ def polynomial(
     return Elastic(
         law.name, POLYNOMIAL, tuple(x / modulus for x in (second, *filled)),
         given(law, values, modulus))
+
+
+def network(
+        law: Law, family: float, values: Mapping[str, Any], modulus: float,
+        others: Sequence[float], chain_limit: float) -> Elastic:
+    """
+    Return a model of cross-links and entanglements, in units of the shear modulus.
+
+    ``others`` are its constants besides the moduli ``law.gc`` and ``law.ge`` (Pa), and
+    ``chain_limit`` is the greatest I1 - 3.
+    """
+    from hmsa.model.law import gent_limits  # imports NumPy, which not all users of laws need
+
+    lower, upper = gent_limits(1.0 / chain_limit)
+    return Elastic(
+        law.name, family, (*(values[x] / modulus for x in ('law.gc', 'law.ge')), *others),
+        given(law, values, modulus),
+        (max(float(lower), ENDLESS[0]), min(float(upper), ENDLESS[1])))
 
 
 def given(

@@ -118,6 +118,69 @@ template <class R> struct Ogden {
     }
 };
 
+template <class R> struct Network : Ogden<R> {
+    // f(I1) of cross-links, f' = p0 + p1/(1 - i x) + p2/(1 - i x)^2 with x = I1 - 3, and terms of
+    // Ogden of entanglements.
+    // Nonaffine: gc I1/6 - gc n ln(3 n - I1) + ge sum (l_i + 1/l_i), n = lambda_m^2,
+    // J. D. Davidson and N. C. Goulbourne, J. Mech. Phys. Solids 61, 1784 (2013).
+    // Extended tube: gc/2 ((1 - d) x/(1 - d x) + ln(1 - d x)) + 2 ge/b^2 sum (l_i^-b - 1),
+    // d = delta^2, M. Kaliske and G. Heinrich, Rubber Chem. Technol. 72, 602 (1999).
+    bool tube;
+    R gc, ge, bound, b;  // bound is lambda_m, or delta
+    R p[3], i_x;
+    void read(bool is_tube, const double *from)
+    {
+        tube = is_tube;
+        set(gc, 0, from[0]);
+        set(ge, 0, from[1]);
+        set(bound, 0, from[2]);
+        set(b, 0, tube ? from[3] : 1);
+        expand();
+    }
+    void seed(int constant, int j)
+    {
+        R *const constants[] = {&gc, &ge, &bound, &b};
+        incline(*constants[constant], j, 1);
+        expand();
+    }
+    void expand()
+    {
+        const R squared = bound * bound;
+        this->count = 2;
+        this->terms[1] = -b;
+        this->terms[3] = b;
+        if (tube) {
+            i_x = squared;
+            p[0] = 0.0 * gc;
+            p[1] = -0.5 * gc * squared;
+            p[2] = 0.5 * gc * (1.0 - squared);
+            this->terms[0] = -2.0 * ge * inverse(b);
+            this->terms[2] = 0.0 * ge;
+        } else {
+            i_x = inverse(3.0 * (squared - 1.0));
+            p[0] = gc * (1. / 6);
+            p[1] = gc * squared * i_x;
+            p[2] = 0.0 * gc;
+            this->terms[0] = -1.0 * ge;
+            this->terms[2] = ge;
+        }
+    }
+    template <class S> HMSA_INLINE S force(const S &l) const
+    {
+        const S i_l = inverse(positive(l)), e = l - 1.0;
+        const S half = e * (l * l + l + 1.0) * i_l * i_l, x = e * e * (l + 2.0) * i_l;
+        const S near = inverse(positive(1.0 - x * i_x));
+        return 2.0 * half * ((near * p[2] + p[1]) * near + p[0]) + Ogden<R>::force(l);
+    }
+    double energy(double l) const
+    {
+        const double x = (l - 1) * (l - 1) * (l + 2) / positive(l), i = get(i_x, 0);
+        const double chains = i > 0 ? -log1p(-i * x) / i : x, left = positive(1 - i * x);
+        return get(p[0], 0) * x + get(p[1], 0) * chains + get(p[2], 0) * x / left
+            + Ogden<R>::energy(l);
+    }
+};
+
 // sum c_k u^k, and its derivative by u.
 template <int N, class S> HMSA_INLINE S horner(const double *c, const S &u)
 {
