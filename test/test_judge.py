@@ -201,6 +201,13 @@ def test_samples_that_say_nothing_of_a_vibration_decide_nothing(frequency, gap):
     assert judge(time + gap, stretch, asked).verdict == 'undecided'
 
 
+def test_a_simulation_that_ends_exactly_at_its_target_is_at_rest_there_and_elsewhere_frozen():
+    time = np.arange(-100, 250) * MS
+    path = 1.1 + 0.2 * np.clip(-time / (100 * MS), 0.0, 1.0)**2.3
+    assert judge(time, path, setpoint(target=1.1)).arrived
+    assert 'frozen' in judge(time, path + 1e-6, setpoint(target=1.1)).message
+
+
 def test_a_sensor_that_rounds_at_rest_is_not_frozen():
     time, stretch = held(vibration=1.5)
     before = np.linspace(-20, -1, 20).astype(np.int64) * MS

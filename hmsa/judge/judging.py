@@ -232,7 +232,9 @@ def _frozen(values: Array, setpoint: RequestedSetpoint) -> str:
     # A motion that fades becomes ever slower, and a sensor that rounds moves by whole steps.
     step = float(np.min(changes[moved]))
     rounds = np.all(np.abs(changes[moved] / step - np.round(changes[moved] / step)) < 0.01)
-    if rounds or np.median(before) < _FADED * setpoint.step:
+    # And one that ends where it was to end, as in a simulation without noise, is at rest there.
+    ends = abs(float(values[-1]) - setpoint.target) < _FADED * setpoint.step
+    if rounds or ends or np.median(before) < _FADED * setpoint.step:
         return ''
     return f'{words}: it is frozen'
 
