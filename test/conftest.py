@@ -349,7 +349,7 @@ class Starter:
         words, env = [os.fspath(x) for x in command], {**self.env, **extra_env}
         with stdout_path.open('wb') as stdout, stderr_path.open('wb') as stderr:
             if (words[:3] == [sys.executable, '-m', 'hmsa_ros']
-                    and (server := self.fork_server(self.env)).suits(env)):
+                    and (server := self.fork_server(self.env)).suits(words[3:], env)):
                 popen = server.start(words[3:], env, stdout_path, stderr_path)
             else:
                 popen = subprocess.Popen(

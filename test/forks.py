@@ -17,7 +17,12 @@ import subprocess
 import sys
 from typing import Any
 
+from hmsa import plugins
+from hmsa.plugins import NODES, registered
+
 ROOT = Path(__file__).resolve().parent.parent
+# Those that start no processes: a demo in a fork, interrupted, ends with a segmentation fault.
+COMMANDS = (*registered(NODES), 'send', 'stop', 'param', 'watch')
 # Variables that a process reads while it starts and imports: with others it is no fork.
 EARLY = ('PYTHON', 'LC_', 'LANG', 'LD_', 'OMP_')
 
@@ -77,8 +82,10 @@ class ForkServer:
         self._line.send(json.dumps(request).encode())
         return int(self._line.recv(100))
 
-    def suits(self, env: Mapping[str, str]) -> bool:
-        """Return whether a process with an environment may be a fork."""
+    def suits(self, arguments: Sequence[str], env: Mapping[str, str]) -> bool:
+        """Return whether a process with arguments and an environment may be a fork."""
+        if not arguments or arguments[0] not in COMMANDS:
+            return False
         names = {x for x in {*env, *self._env} if x.startswith(EARLY)}
         return all(env.get(x) == self._env.get(x) for x in names)
 
@@ -128,15 +135,13 @@ def serve(line: socket.socket) -> None:
 
 
 if __name__ == '__main__':
-    sys.path[0] = str(ROOT)
     from rclpy.type_support import check_for_type_support
 
     from hmsa.entry import main
     from hmsa.interfaces import topics
-    from hmsa.plugins import COMMANDS, NODES, registered
     from hmsa_ros.nodes.ros_entities import interface_class
 
-    for group in (NODES, COMMANDS):
+    for group in (NODES, plugins.COMMANDS):
         for entry in registered(group).values():
             if not entry.value.startswith('hmsa_studies'):
                 entry.load()
