@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
                         help='faults: beginning of the key of a fault to inject')
     parser.add_argument('--runs', type=int, default=None,
                         help='harm: laboratories (default 400); laboratory, line: of each kind '
-                             '(default 20); beam: random sequences (default 6); identification, '
+                             '(default 20); beam: random sequences (default 4); identification, '
                              'judge, defects: simulated runs of each kind '
                              '(default 200, defects 30), in identification at most 40 of those')
     parser.add_argument('--hours', type=float, default=8.0,

@@ -21,6 +21,7 @@ from hmsa.model.delivery import Delivery
 from hmsa.model.laws import elastica
 from hmsa.model.moves import Level, State
 from hmsa.model.simulation import follow, observed, sampled
+from hmsa.model.status import Code
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
 
@@ -155,6 +156,18 @@ def test_modal_moves_a_rod_between_bent_states_without_vibration_or_offset(start
         for x in (2.0, 1.0))
     assert np.ptp(first) < 0.01 * step
     assert last.mean() == pytest.approx(target, abs=1e-3 * step)
+
+
+def test_modal_takes_at_most_1_3_times_as_long_as_two_steps_to_any_bent_state():
+    random = np.random.default_rng(4)
+    moves = [(0.0, 0.724), (0.07, 0.724), *random.uniform(-0.724, 0.724, (60, 2)).tolist()]
+    for ratio in (0.005, 0.02, 0.08):
+        for start, target in moves:
+            two, move = (
+                get_shaper(x)(MoveRequest(State(start), target, beam(ratio, x == 'modal')))
+                for x in ('two_step', 'modal'))
+            assert move.code is Code.MODAL
+            assert move.duration <= 1.3 * two.duration
 
 
 @pytest.mark.parametrize(('delivery', 'creep'), [

@@ -20,7 +20,7 @@ import numpy as np
 from hmsa.model import law
 from hmsa.model.equations import Array
 from hmsa.model.moves import Level, Move
-from hmsa.model.simulation import followed_by
+from hmsa.model.simulation import follow, followed_by
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.shapers.free import at_rest
 from hmsa.planning.shapers.request import AT_REST, MoveRequest
@@ -34,6 +34,8 @@ _LENGTHS = (1.0, 1.06, 0.94, 1.14, 1.25, 1.4, 1.6, 2.0)
 _BEYOND = 0.3
 # Durations of levels in units of those of their ramps, at least.
 _MORE = 1.25
+# Change of a load in the largest change of a move, for differences.
+_ASIDE = 1e-4
 # Durations and loads of the free levels.
 _Guess = tuple[list[float], list[float]]
 
@@ -97,9 +99,10 @@ def _solutions(request: MoveRequest, holding: float) -> Iterator[tuple[tuple[Lev
             continue
         before = durations
         begins = [math.fsum(durations[:i]) for i in range(len(durations) + 1)]
-        template = heights([Level(*x) for x in zip(begins, (*loads, holding), strict=True)])
+        levels = [Level(*x) for x in zip(begins, (*loads, holding), strict=True)]
+        template = heights(levels)
         if len(durations) > request.unknowns + 2 * len(request.material.modes.ratios):
-            free = _directions(np.array(begins), request)
+            free = _directions(levels, request)
             template = replace(template, d_times=np.zeros_like(free), d_loads=free)
         found = within_limits(solve(template, request, modes=True), request)
         if found is not None:
@@ -171,26 +174,31 @@ def _others(request: MoveRequest) -> list[tuple[float, float]]:
     return [(x * straight, y) for x, y in zip(modes.ratios, modes.dampings, strict=True)]
 
 
-def _directions(begins: Array, request: MoveRequest) -> Array:
+def _directions(levels: Sequence[Level], request: MoveRequest) -> Array:
     """
     Return one column of changes of the loads for each condition, the last of which stays.
 
-    They are the effects of the loads on modes and field at the end, in linear motion: the smallest
-    change of the guess that meets the conditions is a sum of them.
+    The smallest change of the levels that meets the conditions, in linear motion about that of
+    the guess, is a sum of them.
     """
-    packed, frequency = request.material.packed, request.frequency
-    decay = float(law.damping(request.target, packed)) / (
-        2.0 * float(law.mass(request.target, packed)))
-    roots = [complex(-decay, frequency)] + [
-        x * complex(-y, math.sqrt(1.0 - y ** 2)) for x, y in _others(request)]
-    left = begins[-1] - begins
-    effects = [part for root in roots for of in (np.exp(root * left),)
-               for part in (np.diff(of.real), np.diff(of.imag))]
-    if request.delivery.lag > 0.0:
-        effects.append(np.diff(np.exp(-left / request.delivery.lag)))
-    made: Array = np.zeros((len(begins), len(effects)))
-    for column, effect in enumerate(effects):
-        made[:-1, column] = effect / np.linalg.norm(effect)
+    material, delivery, stiffness = request.material, request.delivery, float(
+        law.elastic_stiffness(request.target, request.material.packed))
+    scales = [1.0, request.frequency]
+    for frequency, _ in _others(request):
+        scales += [1.0, frequency]
+
+    def end(of: Sequence[Level]) -> Array:
+        state = follow(of, request.start, of[-1].time, material, delivery)
+        reached = [state.stretch, state.rate, *state.followed[len(material.branches):]]
+        lags = [state.load / stiffness] if delivery.lag > 0.0 else []
+        return np.array([*(x / y for x, y in zip(reached, scales, strict=True)), *lags])
+
+    reached, aside = end(levels), _ASIDE * _largest_change(request, levels[-1].load)
+    effects: Array = np.array([
+        end([*levels[:i], replace(x, load=x.load + aside), *levels[i + 1:]]) - reached
+        for i, x in enumerate(levels[:-1])])
+    made: Array = np.zeros((len(levels), effects.shape[1]))
+    made[:-1] = np.linalg.qr(effects)[0]
     return made
 
 
