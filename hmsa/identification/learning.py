@@ -1,8 +1,9 @@
 """
 Learning from repeats: levels of a sequence, corrected by the measured residuals.
 
-Effects outside the model, such as hysteresis or a second mode, are the same in each repeat. The
-next levels follow from the last residual and the derivatives of the model, as in norm-optimal
+Effects outside the model, such as hysteresis or further modes, are the same in each repeat. Mass,
+damping and up to three secondary modes of the model are fitted to the repeats. The next levels
+follow from the residual of the best repeat and the derivatives of this model, as in norm-optimal
 iterative learning control (N. Amann, D. H. Owens, E. Rogers, IEE Proc. D 143, 217 (1996)).
 """
 
@@ -16,19 +17,30 @@ from scipy.optimize import least_squares
 
 from hmsa.errors import BadInputError
 from hmsa.model.equations import Array, natural_frequency
+from hmsa.model.modes import Modes, MOST
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.simulation import simulate
 
-# Parts per duration of a move between which the level may change, and their end in durations.
-_PARTS, _END = 4, 1.5
+# Parts per duration of a move between which the level may change, and their end in durations: at
+# least, and beyond what the half periods of all modes take that have at least this share.
+_PARTS, _END, _BEYOND, _COUNTS = 4, 1.5, 0.25, 0.03
 # Maximum change of a level, its expected standard deviation, and increment for derivatives, all
 # relative to the range of the levels.
 _LARGEST, _EXPECTED, _CHANGE = 0.2, 0.05, 1e-4
-# Frequencies and damping ratios to try for a second mode, and the minimum improvement of the
-# residual, in variances of the noise.
-_FREQUENCIES, _DAMPINGS, _CERTAIN = (np.geomspace(1.5, 12.0, 120), (0.003, 0.02, 0.06), 40.0)
+# Frequencies of the first mode to try relative to the model's, of a further mode relative to the
+# first and its share and damping ratio, and the minimum improvement of the squares in variances of
+# the noise and as a fraction.
+_FIRSTS = np.geomspace(0.45, 1.3, 16)
+_FREQUENCIES, _SHARE, _DAMPING = np.geomspace(1.1, 12.0, 80), 0.05, 0.02
+_CERTAIN, _IMPROVED = 40.0, 0.02
+# Maximum share of a mode, and maximum number of samples to fit.
+_MOST_SHARE, _FITTED = 0.45, 1500
+# Repeats after the best one, all of which left more, from which the best one is repeated.
+_FAILED = 2
 # Periods after a move that count: later ones mainly show errors of the model's frequency.
 _PERIODS = 4.0
+# Periods of rest that a longer move leaves to be seen.
+_SEEN = 2.0
 # Minimum number of samples per period of the second mode.
 _FEWEST = 4.0
 # Delays of the samples to try, in periods.
@@ -100,6 +112,8 @@ class Learnt:
     left: tuple[tuple[RemainingError, ...], ...]  #: by repeat and target
     best: int  #: index of the repeat with the smallest residual
     frequency: float  #: of the second mode in Hz; NaN if none is found
+    rests: tuple[float, ...]  #: times in s from which the actuator rests, by target
+    repeated: bool  #: whether the levels are those of the best repeat
 
 
 class _Sequence:
@@ -107,13 +121,13 @@ class _Sequence:
 
     def __init__(
             self, first: SequenceRepeat, targets: Sequence[TargetWindow],
-            actuator: ActuatorParameters) -> None:
+            actuator: ActuatorParameters, ends: float = _END) -> None:
         self.targets, self.actuator = targets, actuator
         unit = actuator.time_unit
         self.period = 2.0 * math.pi * unit / np.array([
             float(natural_frequency(x.stretch, actuator.nondimensional)) for x in targets])
         knots: list[float] = []
-        self.rests = []
+        self.rests: list[float] = []
         for target, period in zip(targets, self.period, strict=True):
             # Reported times have errors due to the clock of the device.
             off = _OFF * float(period)
@@ -124,11 +138,14 @@ class _Sequence:
                 raise BadInputError(
                     f'no level belongs to the setpoint {target.stretch:g}: expected one or more')
             length = float(own[-1] - own[0]) or 0.5 * float(period)
-            parts = own[0] + length / _PARTS * np.arange(round(_END * _PARTS) + 1)
+            # As late as the rest can still be seen.
+            room = max((target.end - own[0] - _SEEN * float(period)) / length, _END)
+            end = math.floor(min(ends, room) * _PARTS) / _PARTS
+            parts = own[0] + length / _PARTS * np.arange(round(end * _PARTS) + 1)
             # Prefer knots of the sequence to those nearby, unless it is smooth.
             own = own if len(own) <= _MANY else own[:1]
             knots += [*own, *(x for x in parts if np.min(np.abs(own - x)) > 0.05 * length)]
-            self.rests.append(float(own[0]) + _END * length)
+            self.rests.append(float(own[0]) + end * length)
             if target.end - self.rests[-1] < period:
                 raise BadInputError(
                     f'setpoint {target.stretch:g} is held for {target.end - self.rests[-1]:.3g} s '
@@ -171,26 +188,28 @@ class _Sequence:
             for x, target, step in zip(
                 self.windows(time), self.targets, self.steps, strict=True)])
 
-    def left(self, trial: SequenceRepeat, mode: '_Mode | None') -> tuple[RemainingError, ...]:
-        """Return the residual of a repeat, at the frequencies of the model and a second mode."""
+    def left(self, trial: SequenceRepeat, modes: Sequence[float]) -> tuple[RemainingError, ...]:
+        """Return the residual of a repeat, at some frequencies in rad/s."""
         found = []
         for x, target, step, period in zip(
                 self.windows(trial.time), self.targets, self.steps, self.period, strict=True):
             time, off = trial.time[x], (trial.stretch[x] - target.stretch) / step
             first = off[time < time[0] + period]
             # Use the amplitude of a fit, so that noise does not count as vibration.
-            fitted = _ringing(time[:len(first)], [
-                2.0 * math.pi / float(period), *([] if mode is None else [mode.frequency])])
+            fitted = _ringing(time[:len(first)], modes)
             curve = fitted @ np.linalg.lstsq(fitted, first, rcond=1e-6)[0]
             found.append(RemainingError(float(np.ptp(curve)), float(np.mean(off))))
         return tuple(found)
 
-    def simulated(self, levels: Array, time: Array) -> Array:
+    def simulated(
+            self, levels: Array, time: Array, actuator: ActuatorParameters | None = None
+    ) -> Array:
         """Return the stretch of the model."""
-        unit, loads = self.actuator.time_unit, self.actuator.units.of_level(levels)
+        model = self.actuator if actuator is None else actuator
+        unit, loads = model.time_unit, model.units.of_level(levels)
         found: Array = simulate(
             np.append(self.times[0] - 1.0, self.times) / unit, np.append(0.0, loads),
-            np.maximum(time, self.times[0] - 1.0) / unit, self.actuator.nondimensional)[0]
+            np.maximum(time, self.times[0] - 1.0) / unit, model.nondimensional)[0]
         return found
 
     def delay(self, trial: SequenceRepeat) -> float:
@@ -201,12 +220,12 @@ class _Sequence:
                for x in delays]
         return float(delays[np.argmin(off)])
 
-    def derivatives(self, levels: Array, time: Array) -> Array:
+    def derivatives(self, levels: Array, time: Array, actuator: ActuatorParameters) -> Array:
         """Return the derivatives of the residual by levels at the knots in T, shape (r, k)."""
         change = _CHANGE * float(np.max(np.abs(levels)))
-        base = self.residual(time, self.simulated(levels, time))
+        base = self.residual(time, self.simulated(levels, time, actuator))
         return np.column_stack([
-            (self.residual(time, self.simulated(levels + change * x, time)) - base) / change
+            (self.residual(time, self.simulated(levels + change * x, time, actuator)) - base) / change
             for x in self.held.T])
 
 
@@ -217,68 +236,120 @@ def _ringing(time: Array, frequencies: Sequence[float]) -> Array:
         f(x * since) for x in frequencies for f in (np.cos, np.sin))])
 
 
-@dataclass(frozen=True)
-class _Mode:
-    """A second mode: frequency in rad/s, damping ratio, and static stretch per T."""
+class _Fit:
+    """The model with mass, damping and secondary modes as the repeats show them."""
 
-    frequency: float
-    damping: float
-    gain: float = 1.0
+    def __init__(
+            self, sequence: _Sequence, trials: Sequence[SequenceRepeat], noise: float) -> None:
+        self._sequence, self._noise = sequence, noise
+        self._levels = [sequence.levels(x) for x in trials]
+        last = [min(x.end, y + _PERIODS * float(z)) for x, y, z in zip(
+            sequence.targets, sequence.rests, sequence.period, strict=True)]
+        self._times: list[Array] = []
+        self._seen: list[Array] = []
+        self._parts: list[list[Places]] = []
+        for x in trials:
+            # From the begin of each move to the end of its rest.
+            parts = [np.flatnonzero((x.time >= target.begin) & (x.time < end))
+                     for target, end in zip(sequence.targets, last, strict=True)]
+            every = max(sum(map(len, parts)) // _FITTED, 1)
+            parts = [y[::every] for y in parts]
+            places = np.concatenate(parts)
+            self._times.append(x.time[places])
+            self._seen.append(x.stretch[places])
+            self._parts.append(np.split(
+                np.arange(len(places)), np.cumsum([len(y) for y in parts])[:-1]))
+        spacing = float(np.median(np.diff(self._times[0])))
+        first = 2.0 * math.pi / float(np.min(sequence.period))
+        self._most = 2.0 * math.pi / (_FEWEST * spacing) / first
+        self.found = self._first_mode()
+        while len(self.found.modes.ratios) < MOST and self._add_mode():
+            pass
 
-    def driven(self, times: Array, levels: Array, time: Array) -> Array:
-        """Return its response at ``time``, from ``times[0]`` on, to levels set at ``times``."""
-        power = self.frequency * complex(-self.damping, math.sqrt(1.0 - self.damping**2))
-        states, state = [], 0j
-        for change, fade in zip(
-                np.diff(levels, prepend=0.0).tolist(),
-                np.exp(power * np.diff(times, append=times[-1])).tolist(), strict=True):
-            states.append(state + change)
-            state = states[-1] * fade
-        place = np.searchsorted(times, time, 'right') - 1
-        ring = np.array(states)[place] * np.exp(power * (time - times[place]))
-        found: Array = self.gain * (
-            levels[place] - ring.real + power.real / power.imag * ring.imag)
-        return found
+    @property
+    def frequencies(self) -> list[float]:
+        """Frequencies of all modes about rest in rad/s."""
+        found = self.found
+        first = float(natural_frequency(found.rest, found.nondimensional)) / found.time_unit
+        return [first, *(first * x for x in found.modes.ratios)]
 
-
-def _second_mode(sequence: _Sequence, trial: SequenceRepeat, noise: float) -> _Mode | None:
-    """Find a mode that the levels excite, other than the first one and its second harmonic."""
-    levels = sequence.levels(trial)
-    places = sequence.windows(trial.time)
-    # Use only samples at rest.
-    time, stretch = (x[np.concatenate(places)] for x in (trial.time, trial.stretch))
-    windows = np.split(np.arange(len(time)), np.cumsum([len(x) for x in places])[:-1])
-    first = 2.0 * math.pi / float(np.min(sequence.period))
-    spacing = float(np.median(np.diff(time)))
-    own = [_ringing(time[x], [2.0 * math.pi / p * y for y in (0.9, 1.0, 1.1, 2.0)])
-           for x, p in zip(windows, sequence.period, strict=True)]
-    bases = [np.linalg.qr(x)[0] for x in own]
-
-    def without(values: Array) -> Array:
+    def _without_offsets(self, values: Sequence[Array]) -> Array:
+        """Return values without their mean in each setpoint: hysteresis shifts what is held."""
         return np.concatenate([
-            values[x] - q @ (q.T @ values[x]) for x, q in zip(windows, bases, strict=True)])
+            x[y] - np.mean(x[y]) for x, parts in zip(values, self._parts, strict=True)
+            for y in parts])
 
-    seen = without(stretch)
+    def _shown(self, actuator: ActuatorParameters) -> Array:
+        return self._without_offsets([
+            self._sequence.simulated(x, y, actuator)
+            for x, y in zip(self._levels, self._times, strict=True)])
 
-    def explained(frequency: float, damping: float) -> tuple[float, float]:
-        """Return the reduction of the sum of squares, and the gain."""
-        shape = without(_Mode(frequency, damping).driven(sequence.times, levels, time))
-        power = float(shape @ shape)
-        gain = float(shape @ seen) / power if power > 0.0 else 0.0
-        return gain**2 * power, gain
+    def _left(self, actuator: ActuatorParameters) -> Array:
+        left: Array = self._shown(actuator) - self._without_offsets(self._seen)
+        return left
 
-    most = 2.0 * math.pi / (_FEWEST * spacing)
-    tried = [(explained(first * x, y)[0], first * x, y)
-             for x in _FREQUENCIES if first * x < most for y in _DAMPINGS]
-    if not tried or max(tried)[0] < _CERTAIN * noise**2:
-        return None
-    best = max(tried)
-    found = least_squares(
-        lambda x: math.sqrt(max(float(seen @ seen) - explained(
-            best[1] * math.exp(x[0]), min(best[2] * math.exp(x[1]), 0.5))[0], 0.0)),
-        [0.0, 0.0], bounds=([-0.1, -3.0], [0.1, 3.0]), x_scale=[1e-2, 1.0])
-    mode = best[1] * math.exp(found.x[0]), min(best[2] * math.exp(found.x[1]), 0.5)
-    return _Mode(*mode, explained(*mode)[1])
+    def _refined(self, actuator: ActuatorParameters) -> ActuatorParameters:
+        """Return an actuator with mass, damping and modes fitted."""
+        modes = actuator.modes
+        count = len(modes.ratios)
+
+        def changed(x: Array) -> ActuatorParameters:
+            return replace(
+                actuator, mass_factor=actuator.mass_factor * math.exp(x[0]),
+                damping_coefficient=actuator.damping_coefficient * math.exp(x[1]),
+                modes=replace(
+                    modes,
+                    ratios=tuple((np.array(modes.ratios) * np.exp(x[2:2 + count])).tolist()),
+                    shares=tuple(x[2 + count:2 + 2 * count].tolist()),
+                    dampings=tuple(x[2 + 2 * count:].tolist())) if count else modes)
+
+        nearest = [math.log(1.02 / x) for x in modes.ratios]
+        most = _MOST_SHARE / max(count, 1)
+        low = [-0.5, -2.0, *(max(-0.1, x) for x in nearest), *[-most] * count, *[0.0] * count]
+        high = [0.5, 2.0, *[0.1] * count, *[most] * count, *[0.5] * count]
+        start = np.clip([0.0, 0.0, *[0.0] * count, *modes.shares, *modes.dampings], low, high)
+        found = least_squares(
+            lambda x: self._left(changed(x)), start, bounds=(low, high), max_nfev=30,
+            x_scale=[0.05, 0.3, *[0.02] * count, *[0.05] * count, *[0.02] * count])
+        return changed(found.x)
+
+    def _first_mode(self) -> ActuatorParameters:
+        """Return the actuator with the mass and damping that fit best."""
+        actuator = self._sequence.actuator
+        tried = [replace(actuator, mass_factor=actuator.mass_factor / x**2)
+                 for x in (*_FIRSTS, 1.0)]
+        return self._refined(min(tried, key=lambda x: float(np.sum(self._left(x)**2))))
+
+    def _add_mode(self) -> bool:
+        """Add the mode that explains most of what remains; return whether there is one."""
+        base, left = self._shown(self.found), self._left(self.found)
+        modes, before = self.found.modes, float(left @ left)
+        tried = []
+        for ratio in _FREQUENCIES[_FREQUENCIES < self._most]:
+            if modes.ratios and np.min(np.abs(np.log(ratio / np.array(modes.ratios)))) < 0.05:
+                continue
+            more = Modes(
+                (*modes.ratios, float(ratio)), (*modes.shares, _SHARE),
+                (*modes.dampings, _DAMPING), (*modes.exponents, 0.0) if modes.exponents else ())
+            change = self._shown(replace(self.found, modes=more)) - base
+            size = -float(change @ left) / max(float(change @ change), 1e-300)
+            share = min(max(size * _SHARE, -0.5 * _MOST_SHARE), 0.5 * _MOST_SHARE)
+            tried.append((size**2 * float(change @ change), replace(
+                more, shares=(*modes.shares, share))))
+        if not tried:
+            return False
+        found = self._refined(replace(
+            self.found, modes=max(tried, key=lambda x: x[0])[1]))
+        after = float(np.sum(self._left(found)**2))
+        if before - after < max(_CERTAIN * self._noise**2, _IMPROVED * before):
+            return False
+        self.found = found
+        return True
+
+
+def _noise(trial: SequenceRepeat) -> float:
+    """Return the standard deviation of a sample."""
+    return float(np.median(np.abs(np.diff(trial.stretch, 2)))) / 0.6745 / math.sqrt(6.0)
 
 
 def learn(
@@ -316,18 +387,17 @@ def learn(
     sequence = _Sequence(trials[0], targets, actuator)
     delay = sequence.delay(trials[0])
     trials = [replace(x, time=x.time - delay) for x in trials]
+    modes = _Fit(sequence, trials[:1], _noise(trials[0])).found.modes
+    sequence = _Sequence(trials[0], targets, actuator, max(_END, 1.0 + _BEYOND + sum(
+        1.0 / x for x, share in zip(modes.ratios, modes.shares, strict=True)
+        if abs(share) >= _COUNTS)))
     residuals = [sequence.residual(x.time, x.stretch) for x in trials]
     best = int(np.argmin([float(x @ x) for x in residuals]))
     trial, residual = trials[best], residuals[best]
     levels = sequence.levels(trial)
-    noise = float(np.median(np.abs(np.diff(trial.stretch, 2)))) / 0.6745 / math.sqrt(6.0)
-    mode = _second_mode(sequence, trials[0], noise)
-    slopes = sequence.derivatives(levels, trial.time)
-    if mode is not None:
-        slopes = slopes + np.concatenate([
-            np.column_stack([mode.driven(sequence.knots, one, trial.time[x])
-                             for one in np.eye(len(sequence.knots))]) / step / math.sqrt(len(x))
-            for x, step in zip(sequence.windows(trial.time), sequence.steps, strict=True)])
+    noise = _noise(trial)
+    fit = _Fit(sequence, [trials[x] for x in sorted({0, best})], noise)
+    slopes = sequence.derivatives(levels, trial.time, fit.found)
     size = float(np.ptp(np.append(levels, 0.0)))
     # Regularisation by the ratio of the noise to the expected change.
     weight = max(noise, 1e-7) / min(map(abs, sequence.steps)) / math.sqrt(
@@ -337,7 +407,12 @@ def learn(
         np.append(-residual, np.zeros(slopes.shape[1])), rcond=None)[0]
     radius = _LARGEST * size * 0.5 ** (len(trials) - 1 - best)
     change *= min(1.0, radius / max(float(np.max(np.abs(change))), 1e-300))
+    failed = len(trials) - 1 - best
+    if failed >= _FAILED:
+        change *= 0.0
+    frequencies = fit.frequencies
     return Learnt(
         sequence.times, np.clip(levels + sequence.held @ change, *limits),
-        tuple(sequence.left(x, mode) for x in trials), best,
-        math.nan if mode is None else mode.frequency / (2.0 * math.pi))
+        tuple(sequence.left(x, frequencies) for x in trials), best,
+        frequencies[1] / (2.0 * math.pi) if len(frequencies) > 1 else math.nan,
+        tuple(sequence.rests), failed >= _FAILED)

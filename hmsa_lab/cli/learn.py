@@ -2,9 +2,10 @@
 Correct the levels of a sequence by the errors of its repeats.
 
 Read the runs of one sequence, in their order, and correct its levels by the measured errors, such
-as those by hysteresis or a second mode. The first run has the planned setpoints; each of the
+as those by hysteresis or further modes. The first run has the planned setpoints; each of the
 others executed the levels learnt from those before it. Print the error of each run, and write the
-levels for the next run, for hmsa run --levels.
+levels for the next run, for hmsa run --levels. After two runs that left more than an earlier one,
+these are the levels of that one.
 
 example: hmsa learn planned/run second/run --out next.yaml
 """
@@ -51,15 +52,21 @@ def run(arguments: argparse.Namespace) -> int:
               for x, y, vibration, offset in rows),
         'vibration: peak to peak in the first period after the move; offset: mean less the '
         'setpoint; in % of the step')]
+    lines.append('the moves end ' + ', '.join(
+        f'{x - y.begin:.3g}' for x, y in zip(found.rests, targets, strict=True))
+        + ' s after their begin')
     if math.isfinite(found.frequency):
         lines.append(f'second mode at {found.frequency:.4g} Hz')
-    if found.best != len(arguments.runs) - 1:
+    if found.repeated:
+        lines.append(f'note: {best} left less than all later runs: the next levels are its own')
+    elif found.best != len(arguments.runs) - 1:
         lines.append(f'note: {best} left less than later runs: the next levels start from it, '
                      'with smaller changes')
     return show(arguments, {
         'runs': [{'run': x, 'setpoints': [
             dict(zip(('stretch', 'vibration', 'offset'), y[1:], strict=True))
             for y in rows if y[0] is x]} for x in arguments.runs],
-        'best': best, 'second_mode': found.frequency,
+        'best': best, 'repeated': found.repeated, 'second_mode': found.frequency,
+        'rests': list(found.rests),
         'levels': list(zip(found.level_times, found.levels, strict=True)),
         'file': arguments.out}, *lines, written=[arguments.out])
