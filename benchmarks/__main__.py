@@ -19,6 +19,8 @@ of an hour; line makes cables, boards, amplifiers and sensors fail there, for tw
 kills the workers of a study. rates measures how many plans per second studies compute, for about
 seven minutes. lockstep compares the kernel of batches with C. continuum plays commands on finite
 elements, for five minutes; beam on an exact rod, for three.
+repeats plays what `hmsa learn` makes of repeats on finite elements and an exact rod, for half an
+hour.
 A page is a Markdown file; a table replaces the text between its marks ``<!-- begin NAME -->`` and
 ``<!-- end NAME -->``.
 """
@@ -43,7 +45,7 @@ NAMES = ('judge', 'planner', 'plant', 'preemption', 'joints', 'controller', 'rec
          'crash')
 #: Only run on request: they take long and need the machine for themselves.
 LONG = ('faults', 'soak', 'feedback', 'identification', 'defects', 'harm', 'laboratory',
-        'line', 'studies', 'rates', 'lockstep', 'continuum', 'beam')
+        'line', 'studies', 'rates', 'lockstep', 'continuum', 'repeats', 'beam')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -164,6 +166,10 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import bench_studies
 
         add(bench_studies.rates(quick=options.quick, minutes=options.minutes))
+    if 'repeats' in names:
+        from benchmarks import bench_repeats
+
+        add(bench_repeats.compare(quick=options.quick))
     if 'continuum' in names:
         from benchmarks import bench_continuum
 

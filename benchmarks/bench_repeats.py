@@ -1,0 +1,109 @@
+"""
+Repeats that `hmsa learn` corrects, on plants that share no equation with the package.
+
+    python -m benchmarks repeats [--quick]
+
+The paper's model plans a sequence for a block on finite elements, and for a beam that is an exact
+rod; each further repeat has the levels learnt from those before it. Vibration is that in the first
+period after the learnt moves, peak to peak, the larger of two setpoints, in % of the step.
+"""
+
+from collections.abc import Callable
+import math
+
+import numpy as np
+
+from benchmarks.beam_rod import FIRST, Rod
+from benchmarks.bench_continuum import SHAPES
+from benchmarks.block_elements import Block
+from benchmarks.sheet import Sheet
+from hmsa import Actuator
+from hmsa.api.doubts import unquestioned
+from hmsa.identification.learning import learn, SequenceRepeat, TargetWindow
+from hmsa.model.equations import Array, natural_frequency
+from hmsa.model.laws.elastica import FIRST_SHARE
+
+#: Repeats after the first one, and H/L of blocks.
+REPEATS, BLOCKS = 6, (0.1, 0.5, 1.0, 2.0)
+# Damping ratio and chain limit of blocks, and damping ratio of the beam.
+_RATIO, _J_LIM, _BEAM_RATIO = 0.08, 5.0, 0.03
+# Periods that a setpoint is held, samples in each, and their noise relative to the step.
+_HOLD, _SAMPLES, _NOISE = 10, 60, 1e-3
+# What may be left at the end, in %.
+_MOST = 1.0
+
+Plant = Callable[[Array, Array, Array], Array]
+
+
+def compare(*, quick: bool) -> Sheet:
+    """Return what each repeat leaves; passed if the last one leaves little."""
+    cases: dict[str, Callable[[], list[float]]] = {
+        f'block, H/L {x:g}': lambda x=x: _block(x)  # type: ignore[misc]
+        for x in ((1.0,) if quick else BLOCKS)}
+    if not quick:
+        cases['beam, 0.3 and back'] = _beam
+    found = {name: case() for name, case in cases.items()}
+    return Sheet(
+        'repeats', 'Vibration in % of the step in repeats that `hmsa learn` corrects',
+        ('plant', 'planned', *map(str, range(1, REPEATS + 1))),
+        [[name, *(f'{x:.2f}' for x in left)] for name, left in found.items()],
+        {'rows': found}, all(x[-1] <= _MOST for x in found.values()))
+
+
+def _block(shape: float) -> list[float]:
+    with unquestioned():  # of flat blocks
+        block = Actuator(half_thickness=0.01 * shape, damping_ratio=_RATIO, chain_limit=_J_LIM)
+    material, unit = block.model.material, block.block.time_unit
+
+    def play(times: Array, levels: Array, samples: Array) -> Array:
+        elements = Block(shape, _J_LIM, material.zeta * material.c1 / 6.0, SHAPES[shape])
+        ends = np.append(times[1:], samples[-1]) / unit
+        seen, stretch = elements.follow(list(zip(
+            (ends - times / unit).tolist(), block.model.units.of_level(levels).tolist(),
+            strict=True)))
+        return np.interp(samples / unit, seen, stretch, left=1.0)
+
+    return _left(block, (1.1, 1.0), play)
+
+
+def _beam() -> list[float]:
+    with unquestioned():  # of its weight
+        beam = Actuator.beam(
+            length=25e-3, thickness=1e-3, width=5e-3, youngs_modulus=1e6, density=2000.0,
+            damping_ratio=_BEAM_RATIO)
+    unit, load = beam.block.time_unit * FIRST / math.sqrt(3.0), 1.0 / FIRST_SHARE
+
+    def play(times: Array, levels: Array, samples: Array) -> Array:
+        ends = np.append(times[1:], samples[-1]) / unit
+        period = 2.0 * math.pi / FIRST
+        seen, bent = Rod(_BEAM_RATIO).follow(0.0, list(zip(
+            (ends - times / unit).tolist(), (load * beam.model.units.of_level(levels)).tolist(),
+            strict=True)), round(_SAMPLES * ends[-1] / period))
+        return np.interp(samples / unit, seen, bent, left=0.0)
+
+    return _left(beam, (0.3, 0.0), play)
+
+
+def _left(actuator: Actuator, setpoints: tuple[float, ...], play: Plant) -> list[float]:
+    """Return the vibration of each repeat in %."""
+    block, random = actuator.block, np.random.default_rng(7)
+    period = 2.0 * math.pi * block.time_unit / float(
+        natural_frequency(block.rest, actuator.model.material))
+    hold = _HOLD * period
+    steps = np.abs(np.diff((block.rest, *setpoints)))
+    plan = np.asarray(actuator.plan([(x, hold) for x in setpoints]).levels)
+    times, levels = plan[plan[:, 0] < hold * len(setpoints) * (1.0 - 1e-9)].T
+    targets = [TargetWindow(x, i * hold, (i + 1) * hold) for i, x in enumerate(setpoints)]
+    samples = np.arange(0.0, hold * len(setpoints), period / _SAMPLES)
+    played: list[Array] = []
+    repeats: list[SequenceRepeat] = []
+    for _ in range(REPEATS + 1):
+        played.append(play(times, levels, samples))
+        repeats.append(SequenceRepeat(
+            samples, played[-1] + _NOISE * float(np.min(steps)) * random.standard_normal(
+                len(samples)), times, levels))
+        found = learn(repeats, targets, block, (-0.5, 0.5))
+        times, levels = found.level_times, found.levels
+    return [max(
+        100.0 * float(np.ptp(x[(samples >= rest) & (samples < rest + period)])) / float(step)
+        for rest, step in zip(found.rests, steps, strict=True)) for x in played]
