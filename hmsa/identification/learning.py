@@ -33,8 +33,8 @@ _LARGEST, _EXPECTED, _CHANGE = 0.2, 0.05, 1e-4
 _FIRSTS = np.geomspace(0.45, 1.3, 16)
 _FREQUENCIES, _SHARE, _DAMPING = np.geomspace(1.1, 12.0, 80), 0.05, 0.02
 _CERTAIN, _IMPROVED = 40.0, 0.02
-# Maximum share of a mode, and maximum number of samples to fit.
-_MOST_SHARE, _FITTED = 0.45, 1500
+# Maximum share of a mode, exponent of the stretch in its ratio, and number of samples to fit.
+_MOST_SHARE, _EXPONENT, _FITTED = 0.45, 5.0, 800
 # Repeats after the best one, all of which left more, from which the best one is repeated.
 _FAILED = 2
 # Periods after a move that count: later ones mainly show errors of the model's frequency.
@@ -224,9 +224,8 @@ class _Sequence:
         """Return the derivatives of the residual by levels at the knots in T, shape (r, k)."""
         change = _CHANGE * float(np.max(np.abs(levels)))
         base = self.residual(time, self.simulated(levels, time, actuator))
-        return np.column_stack([
-            (self.residual(time, self.simulated(levels + change * x, time, actuator)) - base) / change
-            for x in self.held.T])
+        changed = (self.simulated(levels + change * x, time, actuator) for x in self.held.T)
+        return np.column_stack([(self.residual(time, x) - base) / change for x in changed])
 
 
 def _ringing(time: Array, frequencies: Sequence[float]) -> Array:
@@ -240,7 +239,8 @@ class _Fit:
     """The model with mass, damping and secondary modes as the repeats show them."""
 
     def __init__(
-            self, sequence: _Sequence, trials: Sequence[SequenceRepeat], noise: float) -> None:
+            self, sequence: _Sequence, trials: Sequence[SequenceRepeat], noise: float,
+            start: ActuatorParameters | None = None) -> None:
         self._sequence, self._noise = sequence, noise
         self._levels = [sequence.levels(x) for x in trials]
         last = [min(x.end, y + _PERIODS * float(z)) for x, y, z in zip(
@@ -249,9 +249,9 @@ class _Fit:
         self._seen: list[Array] = []
         self._parts: list[list[Places]] = []
         for x in trials:
-            # From the begin of each move to the end of its rest.
-            parts = [np.flatnonzero((x.time >= target.begin) & (x.time < end))
-                     for target, end in zip(sequence.targets, last, strict=True)]
+            # At rest: hysteresis spoils what a move shows of shares.
+            parts = [np.flatnonzero((x.time >= begin) & (x.time < end))
+                     for begin, end in zip(sequence.rests, last, strict=True)]
             every = max(sum(map(len, parts)) // _FITTED, 1)
             parts = [y[::every] for y in parts]
             places = np.concatenate(parts)
@@ -262,7 +262,7 @@ class _Fit:
         spacing = float(np.median(np.diff(self._times[0])))
         first = 2.0 * math.pi / float(np.min(sequence.period))
         self._most = 2.0 * math.pi / (_FEWEST * spacing) / first
-        self.found = self._first_mode()
+        self.found = self._first_mode() if start is None else self._refined(start)
         while len(self.found.modes.ratios) < MOST and self._add_mode():
             pass
 
@@ -292,6 +292,8 @@ class _Fit:
         """Return an actuator with mass, damping and modes fitted."""
         modes = actuator.modes
         count = len(modes.ratios)
+        # The deflection of a beam at rest is 0, which has no powers.
+        power = float(actuator.rest != 0.0)
 
         def changed(x: Array) -> ActuatorParameters:
             return replace(
@@ -301,21 +303,30 @@ class _Fit:
                     modes,
                     ratios=tuple((np.array(modes.ratios) * np.exp(x[2:2 + count])).tolist()),
                     shares=tuple(x[2 + count:2 + 2 * count].tolist()),
-                    dampings=tuple(x[2 + 2 * count:].tolist())) if count else modes)
+                    dampings=tuple(x[2 + 2 * count:2 + 3 * count].tolist()),
+                    exponents=tuple((power * x[2 + 3 * count:]).tolist())))
 
         nearest = [math.log(1.02 / x) for x in modes.ratios]
         most = _MOST_SHARE / max(count, 1)
-        low = [-0.5, -2.0, *(max(-0.1, x) for x in nearest), *[-most] * count, *[0.0] * count]
-        high = [0.5, 2.0, *[0.1] * count, *[most] * count, *[0.5] * count]
-        start = np.clip([0.0, 0.0, *[0.0] * count, *modes.shares, *modes.dampings], low, high)
+        low = [-0.5, -2.0, *(max(-0.1, x) for x in nearest), *[-most] * count, *[0.0] * count,
+               *[-_EXPONENT] * count]
+        high = [0.5, 2.0, *[0.1] * count, *[most] * count, *[0.5] * count,
+                *[_EXPONENT] * count]
+        start = np.clip([
+            0.0, 0.0, *[0.0] * count, *modes.shares, *modes.dampings, *modes.exponents], low, high)
         found = least_squares(
-            lambda x: self._left(changed(x)), start, bounds=(low, high), max_nfev=30,
-            x_scale=[0.05, 0.3, *[0.02] * count, *[0.05] * count, *[0.02] * count])
+            lambda x: self._left(changed(x)), start, bounds=(low, high), max_nfev=15,
+            x_scale=[0.05, 0.3, *[0.02] * count, *[0.05] * count, *[0.02] * count,
+                     *[1.0] * count])
         return changed(found.x)
 
     def _first_mode(self) -> ActuatorParameters:
         """Return the actuator with the mass and damping that fit best."""
         actuator = self._sequence.actuator
+        modes = actuator.modes
+        if not modes.exponents:
+            actuator = replace(
+                actuator, modes=replace(modes, exponents=(0.0,) * len(modes.ratios)))
         tried = [replace(actuator, mass_factor=actuator.mass_factor / x**2)
                  for x in (*_FIRSTS, 1.0)]
         return self._refined(min(tried, key=lambda x: float(np.sum(self._left(x)**2))))
@@ -325,12 +336,12 @@ class _Fit:
         base, left = self._shown(self.found), self._left(self.found)
         modes, before = self.found.modes, float(left @ left)
         tried = []
-        for ratio in _FREQUENCIES[_FREQUENCIES < self._most]:
+        for ratio in _FREQUENCIES[self._most > _FREQUENCIES]:
             if modes.ratios and np.min(np.abs(np.log(ratio / np.array(modes.ratios)))) < 0.05:
                 continue
             more = Modes(
                 (*modes.ratios, float(ratio)), (*modes.shares, _SHARE),
-                (*modes.dampings, _DAMPING), (*modes.exponents, 0.0) if modes.exponents else ())
+                (*modes.dampings, _DAMPING), (*modes.exponents, 0.0))
             change = self._shown(replace(self.found, modes=more)) - base
             size = -float(change @ left) / max(float(change @ change), 1e-300)
             share = min(max(size * _SHARE, -0.5 * _MOST_SHARE), 0.5 * _MOST_SHARE)
@@ -387,7 +398,10 @@ def learn(
     sequence = _Sequence(trials[0], targets, actuator)
     delay = sequence.delay(trials[0])
     trials = [replace(x, time=x.time - delay) for x in trials]
-    modes = _Fit(sequence, trials[:1], _noise(trials[0])).found.modes
+    for x in trials:
+        sequence.windows(x.time)
+    fit = _Fit(sequence, trials[:1], _noise(trials[0]))
+    modes = fit.found.modes
     sequence = _Sequence(trials[0], targets, actuator, max(_END, 1.0 + _BEYOND + sum(
         1.0 / x for x, share in zip(modes.ratios, modes.shares, strict=True)
         if abs(share) >= _COUNTS)))
@@ -396,7 +410,8 @@ def learn(
     trial, residual = trials[best], residuals[best]
     levels = sequence.levels(trial)
     noise = _noise(trial)
-    fit = _Fit(sequence, [trials[x] for x in sorted({0, best})], noise)
+    if best:
+        fit = _Fit(sequence, [trials[0], trial], noise, fit.found)
     slopes = sequence.derivatives(levels, trial.time, fit.found)
     size = float(np.ptp(np.append(levels, 0.0)))
     # Regularisation by the ratio of the noise to the expected change.
