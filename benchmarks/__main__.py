@@ -21,6 +21,7 @@ seven minutes. lockstep compares the kernel of batches with C. continuum plays c
 elements, for five minutes; beam on an exact rod, for three.
 repeats plays what `hmsa learn` makes of repeats on finite elements and an exact rod, for half an
 hour.
+modes identifies secondary modes from recordings of these elements, for half an hour.
 A page is a Markdown file; a table replaces the text between its marks ``<!-- begin NAME -->`` and
 ``<!-- end NAME -->``.
 """
@@ -45,7 +46,7 @@ NAMES = ('judge', 'planner', 'plant', 'preemption', 'joints', 'controller', 'rec
          'crash')
 #: Only run on request: they take long and need the machine for themselves.
 LONG = ('faults', 'soak', 'feedback', 'identification', 'defects', 'harm', 'laboratory',
-        'line', 'studies', 'rates', 'lockstep', 'continuum', 'repeats', 'beam')
+        'line', 'studies', 'rates', 'lockstep', 'continuum', 'repeats', 'beam', 'modes')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -179,6 +180,11 @@ def main(arguments: list[str] | None = None) -> int:
 
         add(bench_beam.compare(quick=options.quick))
         add(bench_beam.sequences(quick=options.quick, runs=options.runs or bench_beam.RUNS))
+    if 'modes' in names:
+        from benchmarks import bench_continuum
+
+        add(bench_continuum.covered(quick=options.quick))
+        add(bench_continuum.identified(quick=options.quick))
     if 'lockstep' in names:
         from benchmarks import bench_studies
 

@@ -42,7 +42,8 @@ def add_parser(subparsers: Any) -> None:
          'parameters to identify (default shear_modulus, damping_coefficient, chain_limit, '
          'remanence, stretch_bias); +NAME adds to these, and --free=-NAME removes one; '
          'others: density, time_unit, stretch_gain, sensor_latency, '
-         'coil_time_constant, constant_force, initial_stretch, initial_rate, '
+         'coil_time_constant, constant_force, initial_stretch, initial_rate; modes for as many '
+         'secondary modes as the recording shows, with mass_factor in place of shear_modulus; '
          'viscoelastic_ratio, viscoelastic_time and viscoelastic_exponent (further branches with '
          '_2 and _3); constants of a hyperelastic model, such as law.c10 and law.c01',
          {'default': ''}),

@@ -8,7 +8,7 @@ dwells is repeated; levels and dwells are drawn at random and improved one by on
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import TYPE_CHECKING
 
@@ -21,6 +21,7 @@ from hmsa.identification.response import respond, Response
 from hmsa.model import equations
 from hmsa.model.delivery import Delivery
 from hmsa.model.equations import Array
+from hmsa.model.modes import Modes
 from hmsa.model.moves import Limits, State
 from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa.model.status import RefusedError
@@ -37,6 +38,7 @@ _SCALINGS, _AIM, _ALMOST = 5, 0.99, 0.97
 # Number of random patterns, number of the best to improve, steps for each, and for the winner.
 _FIRST, _KEPT, _FEW, _STEPS = 150, 5, 60, 300
 _LEAST_DWELL, _MOST_DWELL = 0.2, 6.0  # range of the time on a level, in periods
+_MODAL_DWELL = 1.5  # its minimum with secondary modes
 _BEGIN = 0.2  # rest before the first level, in periods
 _LAST = 3.0  # duration of the last move and its rest, in periods
 _SHORTEST = 3.0  # minimum duration of a sequence, in periods
@@ -47,7 +49,20 @@ PAPER = (0.1, 0.2, 0.4)
 PLAIN = (0.1, 0.4, 0.0)
 _WEIGHT = 4.0  # weight of the worst parameter relative to the volume
 _WINDOW = 30.0  # periods over which patterns are compared
-_REST = 1e-3  # maximum deviation from rest at the end, stretch
+#: Modes that are expected where none are given.
+EXPECTED = Modes((1.4, 2.2), (0.15, 0.08), (0.1, 0.15))
+# Range of the motion that shows modes, about rest.
+_SMALL = -0.12, 0.15
+# Maximum deviation from rest at the end, stretch, without secondary modes and with them.
+_REST, _MODAL_REST = 1e-3, 5e-3
+
+
+def modal_free(actuator: ActuatorParameters, free: Sequence[str]) -> tuple[str, ...]:
+    """Return what ``modes`` frees of an actuator with modes, and the rest without J_lim."""
+    return (
+        *('mass_factor' if x == 'shear_modulus' else x for x in free
+          if x not in (quantities.MODES, 'chain_limit')),
+        *(x for names in quantities.SECONDARY[:len(actuator.modes.ratios)] for x in names[:3]))
 
 
 @dataclass(frozen=True)
@@ -151,8 +166,20 @@ class Designer:
             rate: float = 1000.0, noise: float = 1e-3,
             free: Sequence[str] = quantities.DEFAULT_FREE) -> None:
         least, most = bounds.of_motion(actuator)
-        self._actuator, self._bounds, self._noise = actuator, bounds, noise
         self._free = quantities.check_free(free, actuator.law)
+        if quantities.MODES in self._free:
+            actuator = actuator if actuator.modes else replace(actuator, modes=EXPECTED)
+            self._free = modal_free(actuator, self._free)
+            # Modes change with the stretch, so that large motion would blur them.
+            low, high = (x * abs(actuator.rest or 1.0) for x in _SMALL)
+            least, most = max(least, actuator.rest + low), min(most, actuator.rest + high)
+            bounds = replace(bounds, stretch_min=least, stretch_max=most)
+        # The last move brings the first mode to rest, and the others fade. Short dwells would
+        # feed the modes that nobody expects.
+        self._last, self._still, self._shortest = (
+            _LAST, _REST, _LEAST_DWELL) if not actuator.modes else (
+            2.0 * _LAST, _MODAL_REST, _MODAL_DWELL)
+        self._actuator, self._bounds, self._noise = actuator, bounds, noise
         self._values = quantities.values_of(actuator)
         self._group = actuator.nondimensional
         self.period = actuator.period
@@ -160,10 +187,11 @@ class Designer:
             raise BadInputError(
                 f'rate is {rate:g} Hz and noise {noise:g}: expected finite numbers above 0')
         duration = _PERIODS * self.period if duration is None else duration
-        if not (_SHORTEST + _LAST) * self.period <= duration < math.inf:
+        if not (_SHORTEST + self._last) * self.period <= duration < math.inf:
             raise BadInputError(
                 f'duration is {duration:g} s: expected at least '
-                f'{(_SHORTEST + _LAST) * self.period:.3g} s, {_SHORTEST + _LAST:g} periods')
+                f'{(_SHORTEST + self._last) * self.period:.3g} s, '
+                f'{_SHORTEST + self._last:g} periods')
         if not FEWEST <= duration * rate <= 1e6:
             raise BadInputError(
                 f'{duration:g} s at {rate:g} Hz are ' + (
@@ -205,7 +233,7 @@ class Designer:
             return None
         reach = float(np.min(coarse.stretch)), float(np.max(coarse.stretch))
         late = self._dense > self.duration - 0.5 * self.period
-        rest = float(np.ptp(coarse.stretch[late])) < _REST
+        rest = float(np.ptp(coarse.stretch[late])) < self._still
         response = self._respond(self._times, level_times, levels, 1e-6, self._free)
         if response is None:
             return None
@@ -224,7 +252,7 @@ class Designer:
 
     def _ended(self, level_times: Array, levels: Array) -> tuple[Array, Array]:
         """Return a sequence with a final move to rest without field."""
-        end = self.duration - _LAST * self.period
+        end = self.duration - self._last * self.period
         keep = level_times < end
         level_times, levels = level_times[keep], levels[keep]
         # Ramps have to end before the last move starts.
@@ -325,7 +353,7 @@ class Designer:
         points: list[Array] = [
             np.append([0.5 * high, high, low, 0.0, 0.3 * high], np.full(_PATTERN, 4.0)),
             *(np.append(random.uniform(low, high, _PATTERN), np.exp(
-                random.uniform(math.log(_LEAST_DWELL), math.log(_MOST_DWELL), _PATTERN)))
+                random.uniform(math.log(self._shortest), math.log(_MOST_DWELL), _PATTERN)))
               for _ in range(_FIRST))]
         tried = sorted(((*self._judged(x), x) for x in points), key=lambda x: -x[0])[:_KEPT]
         for steps in (_FEW, _STEPS):
@@ -351,7 +379,7 @@ class Designer:
             size = (high - low) if place < _PATTERN else 2.0
             trial[place] += width * size * random.standard_normal()
             trial[:_PATTERN] = np.clip(trial[:_PATTERN], low, high)
-            trial[_PATTERN:] = np.clip(trial[_PATTERN:], _LEAST_DWELL, _MOST_DWELL)
+            trial[_PATTERN:] = np.clip(trial[_PATTERN:], self._shortest, _MOST_DWELL)
             value, found = self._judged(trial)
             if value > score:
                 best, score, point = found, value, trial

@@ -188,7 +188,10 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
     for key, value in parameters_of(actuator).items():
         if key not in written:
             scale = key == f'law.{found.shown("shear_modulus")[0]}'
-            sought = ['shear_modulus'] if scale else [
+            name = key.removeprefix('actuator.')
+            own = [name] if name in quantities.FACTORS else [
+                x for names in quantities.SECONDARY for x in names if x.startswith(key)]
+            sought = ['shear_modulus'] if scale else [x for x in own if x in found.names] or [
                 x for x, (constant, _) in quantities.constants_of(actuator.law).items()
                 if constant.name == key and x in found.names]
             written[key] = _line(key, value, found, *sought)

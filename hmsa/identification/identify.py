@@ -3,19 +3,30 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 import math
+from typing import Any
 
 import numpy as np
 
 from hmsa.errors import BadInputError
 from hmsa.identification import diagnosis, quantities
-from hmsa.identification.defects import dead_band
-from hmsa.identification.fit import Fit, fit, robust_scale
+from hmsa.identification.defects import dead_band, GAIN
+from hmsa.identification.fit import Fit, fit, loss, robust_scale
 from hmsa.identification.initial_guess import begins_at_rest, segments
 from hmsa.identification.intervals import estimates_of, Precision, precision_of, stamp_error
+from hmsa.identification.lines import lines_of
 from hmsa.identification.measurement import Measurement
-from hmsa.identification.noise import errors_of_stamps, whiteness
+from hmsa.identification.modal import (
+    ENOUGH,
+    explained,
+    modes_in,
+    rescaled,
+    stiffens,
+    with_modes,
+    without_modes,
+)
+from hmsa.identification.noise import errors_of_stamps, whiteness, widening
 from hmsa.identification.repeats import repeated
-from hmsa.identification.result import Identification, IdentificationVerdict
+from hmsa.identification.result import Defect, Identification, IdentificationVerdict, Mode
 from hmsa.identification.search import rivals, search, unmoved
 from hmsa.interfaces.actuator import parameters_of
 from hmsa.model.equations import Array
@@ -25,6 +36,12 @@ from hmsa.model.parameters import ActuatorParameters, paper_actuator
 _MOST_SPREADS = 3
 # P-value of the test for whiteness below which residuals are certainly not white.
 _CERTAIN = 1e-4
+# Parameters that are freed because residuals advise it. Minimum of what a mode explains of their
+# effect, to be fitted in their place; excess of chi-squared that decides between the two; and
+# number of standard deviations that is no chance.
+_ADVISED = (GAIN, 'sensor_latency', 'coil_time_constant', 'constant_force', *(
+    x for names in quantities.BRANCHES for x in names))
+_RIVAL, _WORSE, _SURE = 0.5, 10.0, 3.0
 # Maximum overshoot of the moves of a shaped run, as a fraction of the step.
 _SHAPED = 0.15
 
@@ -97,11 +114,98 @@ def identify(
         raise BadInputError(
             f'{recording.label} has {len(recording.time)} samples for {len(free)} free '
             f'parameters: expected {2 * len(free)} or more')
-    best, tried, agreed = search(recording, values, free)
-    best, others = rivals(best)
+    given = {**dict.fromkeys(known), **uncertain}
+    if quantities.MODES in free:
+        kept = actuator.chain_limit
+        if 'chain_limit' in free and not stiffens(recording, kept):
+            recording, free, values = _keeping(recording, free, values, kept)
+        found = _with_modes(recording, free, values, actuator, known, given)
+        if math.isnan(found.parameters['chain_limit'].value):
+            found = _with_modes(
+                *_keeping(recording, free, values, kept), actuator, known, given)
+    else:
+        best, tried, agreed = search(recording, values, free)
+        best, others = rivals(best)
+        found = _conclude(
+            *_with_errors_of_stamps(best), others, tried, agreed, given, actuator.chain_limit)
+    return _challenged(found, set(free) - set(given), actuator.chain_limit)
+
+
+def _keeping(
+        recording: Measurement, free: Sequence[str], values: Mapping[str, Any], limit: float
+) -> tuple[Measurement, tuple[str, ...], dict[str, Any]]:
+    """Return a recording with a note, and names and values, to keep J_lim as given."""
+    note = f'chain_limit is kept at {limit:g}: the recording shows its modes, and hardly this'
+    return (
+        replace(recording, notes=(*recording.notes, note)),
+        tuple(x for x in free if x != 'chain_limit'), {**values, 'chain_limit': limit})
+
+
+def _with_modes(
+        recording: Measurement, free: Sequence[str], values: Mapping[str, Any],
+        actuator: ActuatorParameters, known: Collection[str],
+        given: Mapping[str, float | None]) -> Identification:
+    """Return the result with as many secondary modes as a recording shows."""
+    begin, first, together = without_modes(values, free, known)
+    one, tried, agreed = search(recording, begin, first)
+    start = one.values if 'shear_modulus' in together or together == first else rescaled(
+        one.values, values['shear_modulus'], together)
+    best = with_modes(
+        one, start, together, actuator.chain_limit, actuator.modes.numbers)
     return _conclude(
-        *_with_errors_of_stamps(best), others, tried, agreed,
-        {**dict.fromkeys(known), **uncertain})
+        *_with_errors_of_stamps(best), [], tried, agreed, given, actuator.chain_limit, one)
+
+
+def _challenged(
+        found: Identification, free: Collection[str], limit: float) -> Identification:
+    """
+    Return an identification that no secondary mode contests.
+
+    Parameters of coil, sensor and creep that were freed, as residuals advised, may imitate a mode:
+    where one explains as much of what they do, it is fitted in their place.
+    """
+    best = found.fit
+    added = [x for x in best.free if x in free and x in _ADVISED]
+    if not added or found.verdict != 'identified':
+        return found
+    found = replace(found, warnings=(*found.warnings, _on_trust(found, added)))
+    law = best.values['law']
+    if law is not None and law.section and GAIN in added:
+        # No constant of a beam's law is free: only its given shape separates gain and remanence.
+        gain = found.parameters[GAIN]
+        if abs(gain.value - 1.0) > _SURE * gain.std:
+            return replace(found, verdict='not_identifiable', reason=(
+                f'{GAIN} comes out as {gain.value:.4g}, and an error of the statics of the beam '
+                f'would look the same; calibrate the sensor, and give --known {GAIN}=VALUE+-STD'))
+    if quantities.modes_of(best.values):
+        return found
+    lines, by_others = lines_of(best, diagnosis.frequency_of(best), 1, added)
+    if not lines or lines[0].explained < _RIVAL * by_others:
+        return found
+    kept = tuple(x for x in best.free if x not in added)
+    values = {**best.values, **{
+        x: quantities.QUANTITIES[x].default for x in added if x in quantities.QUANTITIES}}
+    one = fit(best.recording, values, kept)
+    rival = None if one is None else with_modes(one, one.values, kept, limit)
+    if rival is None or not quantities.modes_of(rival.values):
+        return found
+    scale = min(best.scale, rival.scale)
+    excess = 2.0 * (loss(rival.residual, scale) - loss(best.residual, scale))
+    if excess > _WORSE:
+        return found
+    modes = modes_in(rival, _inverse(rival) * rival.scale ** 2)
+    return replace(found, verdict='not_identifiable', modes=modes, reason=(
+        f'{modes[0].words} explains the samples '
+        f'{"better than" if excess < -_WORSE else "as well as"} {", ".join(added)}: try --free '
+        f'+{quantities.MODES} instead, or calibrate, and give --known {added[0]}=VALUE+-STD'))
+
+
+def _on_trust(found: Identification, added: Sequence[str]) -> str:
+    """Return a sentence about parameters that only this recording supports."""
+    words = ', '.join(f'{x} {found.parameters[x].value:.4g}' for x in added)
+    return (
+        f'{words}: freed for this fit, and no other measurement supports '
+        f'{"it" if len(added) == 1 else "them"}')
 
 
 def _defaults(free: Collection[str], known: Collection[str]) -> str:
@@ -154,23 +258,30 @@ def _with_errors_of_stamps(best: Fit) -> tuple[Fit, Array]:
 
 def _conclude(
         best: Fit, variance: Array, others: Sequence[Fit], tried: int, agreed: int,
-        given: Mapping[str, float | None]) -> Identification:
+        given: Mapping[str, float | None], limit: float, one: Fit | None = None
+) -> Identification:
     """
     Return the result of a fit.
 
     ``variance`` is that of its coordinates due to timestamp errors, ``others`` are fits that are
-    nearly as good, and ``given`` are values known to the caller, with standard deviations.
+    nearly as good, and ``given`` are values known to the caller, with standard deviations;
+    ``limit`` is the prior J_lim. With secondary modes, ``one`` is the fit of the first alone.
     """
     known = precision_of(best, variance, given)
     found, marks = known.whiteness, known.missing.signatures
     alike = repeated(
         best, 1.0 / diagnosis.frequency_of(best), dead_band(best, known.deviation))
+    modes, named = modes_in(best, known.covariance), list[Defect]()
     if not found.white:
         marks = tuple(sorted(
             [*marks, *diagnosis.second_mode(best)], key=lambda x: (-x.found, -x.share)))
+        if one is None and not modes:
+            modes, named = _modes_left(best, marks, limit)
+            marks = (*named, *marks)
     distant = diagnosis.distant(best, found)
-    lost, weak = (set(best.free), '') if distant else diagnosis.weakness(
-        best, known.deviation, known.proved)
+    # Where modes are what is missing, the values are those of the first.
+    lost, weak = (set(best.free) if distant and not modes else set(), '') \
+        if distant or named else diagnosis.weakness(best, known.deviation, known.proved)
     still = set() if lost else unmoved(best)
     if not distant and not others and not still:
         diagnosis.check_plausible(best, lost)
@@ -183,7 +294,13 @@ def _conclude(
     elif not reason and (still or others):
         verdict, lost = 'not_identifiable', still or set(best.free) - quantities.STATIC
         reason = diagnosis.resting(best, still) if still else diagnosis.alike(best, others)
-    elif not reason and not best.converged:
+    elif not reason and one is not None and not found.white and (
+            explained(one, best) < ENOUGH):
+        reason = (
+            'secondary modes explain hardly more than the first alone, which leaves residuals '
+            f'of {best.scale:.3g}: the model does not describe the motion; see the figures of '
+            '--report page.html')
+    elif not reason and not best.converged and not (modes and not found.white):
         reason = (
             f'the search did not converge from {tried} starts: the best fit leaves residuals '
             f'of {best.scale:.3g}; give a file with closer values (--params-file actuator.yaml), '
@@ -203,17 +320,50 @@ def _conclude(
         verdict, reason, warnings, parameters, best.free, matrix, known.deviation,
         float(np.sqrt(np.mean(best.residual ** 2))), len(best.recording.time), outliers,
         best.recording, best, found, marks, float(np.max(known.correlated)), best.values, tried,
-        agreed, diagnosis.cost(best, marks, alike))
+        agreed, diagnosis.cost(best, marks, alike), modes)
+
+
+def _inverse(found: Fit) -> Array:
+    """Return the inverse of the information of a fit."""
+    inverse: Array = np.asarray(np.linalg.pinv(found.information), dtype=np.float64)
+    return inverse
+
+
+def _modes_left(
+        best: Fit, marks: Sequence[Defect], limit: float
+) -> tuple[tuple[Mode, ...], list[Defect]]:
+    """Return the modes that residuals show more than any other departure, also as departures."""
+    leading = max((x.share for x in marks if x.found and x.remedy), default=0.0)
+    lines, _ = lines_of(best, diagnosis.frequency_of(best), 1)
+    if not lines or lines[0].explained < leading:
+        return (), []
+    found = with_modes(best, best.values, best.free, limit, most=2)
+    part = explained(best, found)
+    if not quantities.modes_of(found.values) or part < max(ENOUGH, leading):
+        return (), []
+    weighted = found.root * found.residual
+    inverse = _inverse(found)
+    wider = widening(found.root[:, None] * found.jacobian, weighted, inverse, whiteness(weighted))
+    modes = modes_in(found, inverse * found.scale ** 2 * np.outer(wider, wider))
+    return modes, [Defect(
+        x.words, part, abs(x.share[0]) / max(0.5 * (x.share[2] - x.share[1]), 1e-9) * 1.96, True,
+        quantities.MODES) for x in modes]
 
 
 def _warnings(
         best: Fit, known: Precision, outliers: int, given: Collection[str]) -> list[str]:
     """Return further information for the reader, one sentence each."""
     found, recording = [], best.recording
-    if best.values['modes']:
-        found.append(
-            'secondary modes are kept from the parameters, and the fit is of one mode: their '
-            'vibration counts as noise')
+    if diagnosis.modal(best):
+        if 'mass_factor' in best.free:
+            found.append(
+                'mass_factor is free in place of shear_modulus, of which the motion shows only '
+                f'their ratio: it is for {best.values["shear_modulus"]:.6g} Pa')
+        if not known.whiteness.white:
+            found.append(
+                f'the modes leave {100.0 * diagnosis.unexplained(best):.2g} % of the motion, as '
+                'those of a continuum change with the stretch: intervals include it, and plans of '
+                f'modal leave up to {100.0 * diagnosis.cost(best, (), None):.2g} % of a step')
     if outliers:
         found.append(
             f'{outliers} of {len(recording.time)} samples are more than six standard deviations '

@@ -67,6 +67,16 @@ def segments(
     return found
 
 
+def changes_of(recording: Measurement) -> NDArray[np.int64]:
+    """Return a number for each sample: that of the last change of level, equal ones alike."""
+    levels = recording.levels
+    before = np.append(levels[0], levels[:-1])
+    place = recording.place(recording.time)
+    pairs = np.round(np.column_stack([before, levels])[place], 9)
+    found: NDArray[np.int64] = np.unique(pairs, axis=0, return_inverse=True)[1].ravel()
+    return found
+
+
 def deviations(values: Array, parts: NDArray[np.int64]) -> Array:
     """Return the standard deviations of parts of values, given by begin and end indices (n, 2)."""
     apart = values - np.mean(values)

@@ -10,7 +10,8 @@ from hmsa.errors import BadInputError
 from hmsa.identification import diagnosis, quantities
 from hmsa.identification.defects import Departures, departures
 from hmsa.identification.fit import Fit, fit, LEAST_SCALE, moved
-from hmsa.identification.noise import Whiteness, whiteness, widening
+from hmsa.identification.initial_guess import changes_of
+from hmsa.identification.noise import clustered, Whiteness, whiteness, widening
 from hmsa.identification.response import respond
 from hmsa.identification.result import Estimate, Identification
 from hmsa.model.equations import Array
@@ -46,8 +47,15 @@ def precision_of(best: Fit, variance: Array, given: Mapping[str, float | None]) 
     found, inverse = whiteness(weighted), _inverse(best.information)
     columns = best.root[:, None] * best.jacobian
     correlated = widening(columns, weighted, inverse, found)
-    variance = variance + _blurred(best, deviation, columns, inverse)
     missing = departures(best, found, inverse, deviation, given)
+    if diagnosis.modal(best) and not found.white:
+        # Errors of the model are what residuals contain, and stand for all departures.
+        correlated = np.maximum(correlated, clustered(
+            columns, weighted, inverse, changes_of(best.recording)))
+        return Precision(
+            deviation, freedom, found, inverse, correlated, correlated,
+            inverse * deviation ** 2 * np.outer(correlated, correlated), missing)
+    variance = variance + _blurred(best, deviation, columns, inverse)
     proved, factors = (
         correlated * np.sqrt(np.maximum(x / np.diag(inverse) / deviation ** 2, 1.0))
         for x in (variance, variance + missing.hint))

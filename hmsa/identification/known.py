@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from hmsa.errors import BadInputError
-from hmsa.identification.quantities import check_free
+from hmsa.identification.quantities import check_free, FACTORS
 from hmsa.model.equations import Array
 
 #: Prefix in parameter files.
@@ -48,8 +48,10 @@ class Known:
         """Return the values in parameters by dotted name; raise `BadInputError` if unusable."""
         names, values, flat = (
             settings.get(PREFIX + x) or [] for x in ('names', 'values', 'covariance'))
-        # Constants of a model are not estimated further: keep only the other parameters.
-        kept = [i for i, x in enumerate(names) if not x.startswith('law.')]
+        # Constants of a model, modes and factors of the mass are not estimated further: keep only
+        # the other parameters.
+        kept = [i for i, x in enumerate(names)
+                if not x.startswith(('law.', 'modes.')) and x not in FACTORS]
         if not kept:
             return cls()
         free = check_free(names[i] for i in kept)

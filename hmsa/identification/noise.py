@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hmsa.identification.fit import LEAST_SCALE, loss, robust_scale, weights_of
 from hmsa.model.equations import Array
@@ -22,6 +23,7 @@ _LAGS = 20
 # mechanics", 1997).
 _WINDOW = 6.0
 # Ratios of the standard deviation at the fastest motion to that at rest to try.
+_NORMAL_95 = 1.96
 _LARGEST_SPREADS = np.geomspace(0.5, 200.0, 13)
 
 
@@ -144,6 +146,31 @@ def widening(jacobian: Array, residual: Array, inverse: Array, found: Whiteness)
     largest = np.maximum(np.maximum(by_noise, by_score), plain)
     factors: Array = np.sqrt(largest / np.maximum(plain, 1e-300))
     return factors
+
+
+def clustered(
+        jacobian: Array, residual: Array, inverse: Array, clusters: NDArray[np.int64]) -> Array:
+    """
+    Return the factors, at least 1, by which errors of the model widen deviations, shape (p,).
+
+    Such errors are the same after equal changes of level. Each of these ``clusters``, an integer a
+    sample, is one draw of them: the covariance is that of their scores (K.-Y. Liang and S. L.
+    Zeger, Biometrika 73 (1986) 13), with Student's t for their number.
+    """
+    # Slow to import, and not needed by a planner that estimates.
+    from scipy.special import stdtrit
+
+    count = int(np.max(clusters, initial=0)) + 1
+    if count < 2:
+        return np.ones(jacobian.shape[1])
+    scores = np.zeros((count, jacobian.shape[1]))
+    np.add.at(scores, clusters, (jacobian @ inverse) * residual[:, None])
+    variance = float(residual @ residual) / max(len(residual) - jacobian.shape[1], 1)
+    wider = float(stdtrit(count - 1.0, 0.975)) / _NORMAL_95
+    factors: Array = wider * np.sqrt(
+        count / (count - 1.0) * np.sum(scores ** 2, axis=0) / np.maximum(
+            variance * np.diag(inverse), 1e-300))
+    return np.maximum(factors, 1.0)
 
 
 def _sum_of_lags(columns: Array, weights: Array) -> Array:

@@ -1,6 +1,6 @@
 """Parameters that can be estimated: names, units, ranges, and coordinates of the search."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 import math
@@ -37,6 +37,8 @@ _SCALE = ('only ratios of shear_modulus, density and remanence act on the motion
           'them (weigh the actuator for the density) and leave it out of --free')
 _CREEP = 'record rest far from that without field for several times the time of the creep'
 _NUMBERS = ('', '_2', '_3')
+_MODE = 'record unshaped steps, at a rate above twice the frequency of the mode'
+_MODE_NUMBERS = ('', '.2', '.3')
 #: Fields of `ActuatorParameters` that are measured with a ruler, and never estimated.
 GEOMETRY = ('half_length', 'half_thickness')
 #: Quantities by name; those of the actuator have the names of its parameters.
@@ -76,12 +78,30 @@ QUANTITIES: dict[str, Quantity] = {
         '', 1.0, 'linear', constant.minimum, constant.maximum,
         f'{_CREEP}, from steps of different heights')
        for name, constant in CONSTANTS.items() for x in _NUMBERS},
+    'mass_factor': Quantity('', advice=_STEP),
+    'transverse_mass_factor': Quantity(
+        '', least=0.1, most=10.0,
+        advice='record motion about stretches that differ widely, below and above 1'),
+    **{f'modes.{name}{x}': Quantity('', default, scale, least, most, _MODE)
+       for x in _MODE_NUMBERS for name, default, scale, least, most in (
+           ('frequency_ratio', 2.0, 'log', 1.05, 100.0),
+           ('share', 0.0, 'linear', -0.9, 0.9),
+           ('damping_ratio', 0.05, 'linear', 0.0, 0.95),
+           ('ratio_exponent', 0.0, 'linear', -5.0, 5.0))},
     **dict.fromkeys(GEOMETRY, Quantity('m')),
 }
 #: Ratio and time of each viscoelastic branch.
 BRANCHES = tuple((f'viscoelastic_ratio{x}', f'viscoelastic_time{x}') for x in _NUMBERS)
 #: Constants of the flow rule of each branch.
 FLOWING = tuple(tuple(f'viscoelastic_{y}{x}' for y in CONSTANTS) for x in _NUMBERS)
+#: Name that frees secondary modes, as many as the recording shows, and the mass factor.
+MODES = 'modes'
+#: Ratio, share, damping ratio and exponent of each secondary mode.
+SECONDARY = tuple(tuple(f'modes.{y}{x}' for y in (
+    'frequency_ratio', 'share', 'damping_ratio', 'ratio_exponent'))
+    for x in _MODE_NUMBERS)
+#: Factors on the mass.
+FACTORS = ('mass_factor', 'transverse_mass_factor')
 #: Constants of the hyperelastic models, by the name of their parameter.
 _OF_LAWS = {
     x.name: Quantity(
@@ -113,7 +133,7 @@ def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, .
         whole[first] = [x for x in constants if x.split('.')[1] == first]
     free = tuple(dict.fromkeys(z for x in names for y in [
         x.strip().removeprefix('actuator.').removeprefix('law.')] for z in whole.get(y, [y])))
-    possible = [*(x for x in QUANTITIES if x not in GEOMETRY), *constants]
+    possible = [*(x for x in QUANTITIES if x not in GEOMETRY), MODES, *constants]
     unknown = [x for x in free if x not in possible]
     if unknown or not free:
         raise BadInputError(
@@ -237,7 +257,20 @@ def values_of(
                 f'{name} is {value:g}: expected a finite number of at least {quantity.least:g}')
     return {name: x.default for name, x in QUANTITIES.items()} | actuator.numbers | {
         'time_unit': actuator.time_unit, 'law': actuator.law, 'initial_stretch': actuator.rest,
-        'factors': actuator.factors, 'modes': actuator.modes, **others}
+        **actuator.factors, **_modes_of(actuator.modes), **others}
+
+
+def _modes_of(modes: Modes) -> dict[str, float]:
+    """Return the values of secondary modes."""
+    return {name: value for names, row in zip(SECONDARY, modes.numbers, strict=False)
+            for name, value in zip(names, row, strict=True)}
+
+
+def modes_of(
+        values: Mapping[str, Any], free: Collection[str] = ()) -> tuple[tuple[str, ...], ...]:
+    """Return the names of the secondary modes that have a share, or are free."""
+    return tuple(
+        names for names in SECONDARY if values[names[1]] or set(names) & set(free))
 
 
 def actuator_of(values: Mapping[str, Any]) -> ActuatorParameters:
@@ -247,8 +280,9 @@ def actuator_of(values: Mapping[str, Any]) -> ActuatorParameters:
         half_length=values['half_length'], half_thickness=values['half_thickness'],
         remanence=values['remanence'], chain_limit=values['chain_limit'],
         damping_coefficient=values['damping_coefficient'], law=values.get('law'),
-        creep=values.get('creep', Creep()), modes=values.get('modes', Modes()),
-        **values.get('factors', {}))
+        creep=values.get('creep', Creep()),
+        modes=Modes.of_numbers([[values[x] for x in names] for names in modes_of(values)]),
+        **{x: values[x] for x in FACTORS})
 
 
 def flow_of(values: Mapping[str, Any], free: Iterable[str]) -> Flow:
@@ -279,7 +313,7 @@ def geometry_of(values: Mapping[str, Any]) -> Geometry:
     """Return the geometric factors of values of all quantities."""
     return Geometry(
         values['half_length'], values['half_thickness'], values.get('law'),
-        **values.get('factors', {}))
+        **{x: values[x] for x in FACTORS})
 
 
 def damping_unit(values: Mapping[str, Any]) -> float:

@@ -24,6 +24,8 @@ from hmsa.motion import theta as places
 #: Relative tolerance of the integration: far below the noise of any sensor.
 RTOL = 1e-8
 _NOTHING: Array = np.empty(0)
+# Parameters whose derivatives are central differences of the motion, and half their width.
+_ASIDE, _WIDTH = ('transverse_mass_factor',), 1e-3
 _SENSOR = ('stretch_bias', 'stretch_gain', 'sensor_latency')
 # Parameters to which values of theta are proportional, by index.
 _LINEAR = {
@@ -61,26 +63,29 @@ def _chain(
     a, k = modulus / inertia, remanence / (MU_0 * inertia)
     per_damping = 0.5 * geometry.c1 * geometry.half_length / geometry.damped / inertia
     per_force = 1.0 / (geometry.loaded * inertia)
-    theta = np.zeros(places.FIRST_BRANCH + places.BRANCH * branches)
+    modes = quantities.modes_of(values, free)
+    first = places.FIRST_BRANCH + places.BRANCH * branches
+    theta = np.zeros(first + places.MODE * len(modes))
     theta[:places.LAG] = (
         a, per_damping * values['damping_coefficient'], k, per_force * values['constant_force'])
     by_value = dict(zip(
         _LINEAR.values(), (a / modulus, per_damping, k / remanence, per_force), strict=True))
-    for name, i in _PLACES.items():
-        if i < len(theta):
-            theta[i] = values[name]
+    own = {x: i for x, i in _PLACES.items() if i < first} | {
+        x: i for i, x in enumerate((y for names in modes for y in names), first)}
+    for name, i in own.items():
+        theta[i] = values[name]
     if 'creep' in values:
         rows = np.array(values['creep'].rows())
         rows[:, SPEED] = values['creep'].times
-        theta[places.FIRST_BRANCH:] = rows[:, :places.BRANCH].ravel()
+        theta[places.FIRST_BRANCH:first] = rows[:, :places.BRANCH].ravel()
     else:
-        theta[places.FIRST_BRANCH + places.FLOW::places.BRANCH] = quantities.flow_of(
+        theta[places.FIRST_BRANCH + places.FLOW:first:places.BRANCH] = quantities.flow_of(
             values, free).kind
     per_density = {i: -float(theta[i]) / density for i in by_value}
     chain: dict[str, dict[int, float]] = {}
     for name in free:
-        if name in _PLACES:
-            chain[name] = {_PLACES[name]: 1.0}
+        if name in own:
+            chain[name] = {own[name]: 1.0}
         elif name in _LINEAR:
             chain[name] = {_LINEAR[name]: by_value[_LINEAR[name]]}
             if name == 'shear_modulus' and 'time_unit' in free:
@@ -89,11 +94,11 @@ def _chain(
                     chain[name][i] = chain[name].get(i, 0.0) + x * density / values[name]
         elif name == 'time_unit':
             chain[name] = {i: 2.0 * x * density / values[name] for i, x in per_density.items()}
-        elif name == 'density':
-            chain[name] = per_density
+        elif name in ('density', 'mass_factor'):
+            chain[name] = {i: x * density / values[name] for i, x in per_density.items()}
         elif name == 'chain_limit':
             chain[name] = {places.CONSTANT: -1.0 / values[name] ** 2}
-        elif name not in _SENSOR:
+        elif name not in (*_SENSOR, *_ASIDE):
             constant, i = quantities.constants_of(values['law'])[name]
             # The scale of the model stays: constants in Pa change its force in proportion.
             chain[name] = {places.CONSTANT + constant.place + 2 * i: (
@@ -199,6 +204,14 @@ def respond(
         return None
     raw *= values['stretch_gain']
     shown, jacobian = sensed(values, free, stretch, rate, raw[:, :inner_count] @ setup.mixing)
+    for j, name in enumerate(free):
+        if name in _ASIDE:
+            ends = [respond(
+                recording, {**values, name: values[name] * math.exp(x)}, (), rtol=rtol,
+                shifts=shifts) for x in (_WIDTH, -_WIDTH)]
+            if ends[0] is None or ends[1] is None:
+                return None
+            jacobian[:, j] = (ends[0].stretch - ends[1].stretch) / (2.0 * _WIDTH)
     return Response(values, shown, rate, jacobian, raw[:, inner_count:])
 
 

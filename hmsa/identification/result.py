@@ -75,6 +75,42 @@ class Defect:
     remedy: str = ''
 
 
+@dataclass(frozen=True)
+class Mode:
+    """
+    A secondary mode that a recording shows.
+
+    Attributes
+    ----------
+    frequency : float
+        In Hz, about rest without field.
+    ratio, share : tuple of float
+        Its frequency relative to that of the first mode, and its share of the static stretch, each
+        with the ends of the 95 % interval.
+    damping_ratio : float
+        Its damping ratio.
+    number : int
+        2 for the first of them, by frequency.
+
+    """
+
+    frequency: float
+    ratio: tuple[float, float, float]
+    share: tuple[float, float, float]
+    damping_ratio: float
+    number: int = 2
+
+    @property
+    def words(self) -> str:
+        """Description."""
+        value, low, high = self.ratio
+        share, least, most = (100.0 * x for x in self.share)
+        return (
+            f'{"a second mode" if self.number == 2 else f"mode {self.number}"} at '
+            f'{self.frequency:.4g} Hz ({value:.3g} times the first, {low:.3g} to {high:.3g}) with '
+            f'a share of {share:.3g} % ({least:.2g} to {most:.2g} %)')
+
+
 @dataclass(frozen=True, eq=False)
 class Identification:
     """
@@ -138,6 +174,7 @@ class Identification:
     starts: int
     agreed: int
     cost: float
+    modes: tuple[Mode, ...] = ()
 
     @property
     def actuator(self) -> ActuatorParameters:
@@ -209,4 +246,5 @@ class Identification:
                 'lag_one': float(self.whiteness.autocorrelation[1]),
                 'p_value': self.whiteness.p_value},
             'signatures': [asdict(x) for x in self.signatures],
+            'modes': [asdict(x) for x in self.modes],
             'starts': self.starts, 'agreed': self.agreed, 'cost': self.cost}

@@ -1,6 +1,6 @@
 """Secondary modes of an actuator that is a continuum: oscillators beside the first mode."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -81,6 +81,21 @@ class Modes:
             'modes.damping_ratio': list(self.dampings),
             'modes.ratio_exponent': list(self.exponents)} if self else {}
 
+    @property
+    def numbers(self) -> list[tuple[float, ...]]:
+        """Ratio, share, damping ratio and exponent of each mode."""
+        return [*zip(
+            self.ratios, self.shares, self.dampings,
+            self.exponents or (0.0,) * len(self.ratios), strict=True)]
+
+    @classmethod
+    def of_numbers(cls, rows: Sequence[Sequence[float]]) -> 'Modes':
+        """Return the modes with such numbers, the inverse of `numbers`."""
+        if not rows:
+            return cls()
+        ratios, shares, dampings, exponents = (tuple(x) for x in zip(*rows, strict=True))
+        return cls(ratios, shares, dampings, exponents if any(exponents) else ())
+
     def all_of(self, first: Any, others: Iterable[Any]) -> Any:
         """Return the sum over all modes of what each shows: numbers or arrays of one shape."""
         return self.first * first + sum(
@@ -90,10 +105,7 @@ class Modes:
         """Return two rows for each mode as arguments of `hmsa.motion`, with a state of 0."""
         return [
             [share, ratio, kind, damping, exponent, 0.0]
-            for ratio, share, damping, exponent in zip(
-                self.ratios, self.shares, self.dampings,
-                self.exponents or (0.0,) * len(self.ratios), strict=True)
-            for kind in (_POSITION, _RATE)]
+            for ratio, share, damping, exponent in self.numbers for kind in (_POSITION, _RATE)]
 
     def __bool__(self) -> bool:
         """Return whether there are secondary modes."""

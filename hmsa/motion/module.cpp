@@ -414,9 +414,9 @@ bool respond_gent(const Recorded &of, int from)
     if (!__builtin_cpu_supports("avx2"))
         return respond_as<Eight, Block<Eight, Gent>>(of, from);
     // The most common case of identification has its own code.
-    if (of.branches == 0 && of.wanted_count - from <= 4)
+    if (of.branches == 0 && of.modes == 0 && of.wanted_count - from <= 4)
         return respond_wide<Dual<four, 1>, 0>(of, from);
-    if (of.branches == 1 && of.theta[first_branch + 2] == maxwell)
+    if (of.branches == 1 && of.modes == 0 && of.theta[first_branch + 2] == maxwell)
         return respond_wide<Dual<four, 2>, 1>(of, from);
     return respond_wide<Dual<four, 2>, most_branches>(of, from);
 }
@@ -443,7 +443,9 @@ bool respond(Numbers theta, Numbers material, int branches, Places wanted, Numbe
     Results stretch, Results rate, Results jacobian, Results by_rate, Numbers behind, Results behind_last)
 {
     const int64_t cells = int64_t(times.count) * wanted.count;
-    if (!fit(branches >= 0 && branches <= most_branches && theta.count == first_branch + branch_places * branches
+    const int64_t modal = theta.count - first_branch - branch_places * branches;
+    if (!fit(branches >= 0 && branches <= most_branches && modal >= 0 && modal <= mode_places * most_modes
+            && modal % mode_places == 0
             && start.count == wanted.count && begins.count && levels.count == begins.count
             && ramps.count == begins.count && stretch.count == times.count && rate.count == times.count
             && jacobian.count == cells && (!by_rate.count || by_rate.count == cells)
@@ -452,6 +454,7 @@ bool respond(Numbers theta, Numbers material, int branches, Places wanted, Numbe
         return false;
     Recorded of{};
     of.theta = theta.data, of.material = material.data, of.branches = branches;
+    of.modes = int(modal / mode_places);
     of.wanted_count = wanted.count, of.wanted = wanted.data, of.start = start.data;
     of.pieces = begins.count, of.begins = begins.data, of.levels = levels.data, of.ramps = ramps.data;
     of.field = field, of.field_lag = field_lag, of.rtol = rtol;

@@ -18,6 +18,7 @@ from hmsa.identification.quantities import (
 )
 from hmsa.model.equations import Array
 from hmsa.model.laws.coordinate import Coordinate, coordinate_of
+from hmsa.model.modes import Modes
 from hmsa.model.parameters import ActuatorParameters
 from hmsa_ros.runtime.records import TRACKED
 
@@ -74,7 +75,7 @@ class Prior:
         in SI units. Raise `BadInputError` with the name that is unknown or cannot be tracked.
         """
         free = check_free(free, actuator.law)
-        wrong = [x for x in free if x in _NOT_TRACKED]
+        wrong = [x for x in free if x in _NOT_TRACKED or x not in DEVIATIONS]
         if wrong:
             raise BadInputError(
                 f'{", ".join(wrong)} cannot be tracked: expected some of '
@@ -85,7 +86,9 @@ class Prior:
                 x for x in SUSPECTS if x not in free
                 and not (x == 'chain_limit' and actuator.law is not None)
                 and not (x.startswith('viscoelastic') and any(actuator.creep.ratios))))
-        values: dict[str, Any] = complete(values_of(actuator, others), free)
+        # Of secondary modes feedback knows nothing.
+        values: dict[str, Any] = complete(values_of(
+            replace(actuator, modes=Modes()), others), free)
         values['viscoelastic_time'] = _RELAXATION * actuator.time_unit
         if actuator.creep:
             values['creep'] = actuator.creep.held

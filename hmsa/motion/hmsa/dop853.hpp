@@ -159,8 +159,8 @@ template <class S, int W, int stages = 12> struct Step {
         stage<12>(y, h, end);
     }
     // Coefficients of the dense output for the first values of a state; k[12] is the final slope.
-    template <class F, int... I> HMSA_INLINE void spread(const F &f, const S *y, const R &h, const S *end,
-        int numbers, R (*to)[2 * size_of<S>], std::integer_sequence<int, I...>)
+    template <class F, int room, int... I> HMSA_INLINE void spread(const F &f, const S *y, const R &h, const S *end,
+        int numbers, R (*to)[room], std::integer_sequence<int, I...>)
     {
         S x[W];
         for (int i = 13; i < 16; i++) {
@@ -177,7 +177,8 @@ template <class S, int W, int stages = 12> struct Step {
         }
     }
     // Evaluates at the fraction x of the step.
-    HMSA_INLINE static void between(double x, const S *y, int numbers, const R (*by)[2 * size_of<S>], S *at)
+    template <int room> HMSA_INLINE static void between(
+        double x, const S *y, int numbers, const R (*by)[room], S *at)
     {
         for (int m = 0; m < numbers; m++) {
             R sum = x * by[6][m];

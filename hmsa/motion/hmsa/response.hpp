@@ -1,17 +1,19 @@
 // The response to recorded levels with its derivatives by the parameters, in seconds:
 //     m(l) l'' + m'(l) l'^2/2 + d l' + a psi'(l) + sum_i gamma_i a (psi'(l) - w_i) = k B + f
 //     tau_i w_i' = psi'(l) - w_i        tau_c B' = u - B
-// divided by the density and L^2; u is the piecewise linear level of the amplifier.
+// divided by the density and L^2; u is the piecewise linear level of the amplifier. Secondary modes
+// follow the same load, and the sensor sees the sum of all modes.
 #pragma once
 #include "motion.hpp"
 
 namespace hmsa {
-// Indices in theta; from first_branch on gamma, tau, flow rule and its constants of each branch.
+// Indices in theta; from first_branch on gamma, tau, flow rule and its constants of each branch, then
+// frequency ratio, share, damping ratio and the exponent of the ratio of each secondary mode.
 // Beyond all indices, constant i of the hyperelastic model is the first plus i, and the start time
 // of piece m the second plus m. Two forces that are zero in every motion only serve
 // differentiation: one against the motion at any rate, and one with the square of the rate.
 enum Theta { stiffness_of, damping_of, drive_of, force_of, lag_of, stretch_of, rate_of, first_branch };
-constexpr int branch_places = 3 + flow_constants;
+constexpr int branch_places = 3 + flow_constants, mode_places = 4;
 constexpr int friction_of = 400, square_of = 401, constant_of = 500, switch_of = 1000;
 // Rate, relative to the fastest frequency, over which the friction changes sign.
 constexpr double soft_rate = 3e-3;
@@ -25,7 +27,7 @@ constexpr int most_response_steps = 20000, most_steps_a_sample = 20;
 
 struct Recorded {
     const double *theta, *material;
-    int branches;
+    int branches, modes;
     int wanted_count;
     const int64_t *wanted;  // indices of the parameters to differentiate by
     const double *start;  // derivatives of the initial stretch by them
@@ -50,19 +52,77 @@ struct Recorded {
     }
 };
 
+// Secondary modes with derivatives by parameters: oscillators about the rest under the present load.
+template <class S> struct Modal {
+    int count = 0;
+    S ratio[most_modes], share[most_modes], damping[most_modes], exponent[most_modes];
+    const double *material = nullptr;
+    // Rest, its natural frequency and the square of it under the load that was looked at last, and
+    // their derivatives by this load.
+    mutable double load = __builtin_nan(""), per_load, squared_per_load;
+    mutable S rest, squared;
+
+    template <class System, class Bare> HMSA_APART void find(
+        const System &system, const Bare &bare, const S &a, double left) const
+    {
+        constexpr double aside = 1e-4;  // of a central difference
+        const real<S> zero{};
+        const double stiff = get(value(a), 0), l = equilibrium(bare, material, left / stiff);
+        const double stiffness = bare.elastic(l).d[0];
+        per_load = stiffness > 0 ? 1 / (stiff * stiffness) : 0;
+        rest = (left - a * system.force(S{zero + l})) * per_load;
+        rest = rest + (zero + l - value(rest));
+        const auto slope = [&](const S &x) -> S {
+            const S mass = system.acceleration(x, S{zero}, S{zero}, [&](const S &) { return S{zero + 1.0}; });
+            return (system.force(x + aside) - system.force(x - aside)) * (0.5 / aside) * mass * a;
+        };
+        squared = slope(rest);
+        squared_per_load = (get(value(slope(S{zero + (l + aside)})), 0)
+            - get(value(slope(S{zero + (l - aside)})), 0)) / (2 * aside) * per_load;
+        squared = squared + (zero + abs(stiff * stiffness / bare.mass(l)) - value(squared));
+        load = left;
+    }
+    template <class System, class Bare> HMSA_INLINE void change(const System &system, const Bare &bare,
+        const S &a, const S &left, const S *at, S *by) const
+    {
+        if (!(get(value(left), 0) == load))
+            find(system, bare, a, get(value(left), 0));
+        const S off = left - load;  // 0, with derivatives
+        const S middle = off * per_load + rest, square = off * squared_per_load + squared;
+        const real<S> root = sqrt(value(square));
+        const S frequency = square * (0.5 / root) + 0.5 * root;
+        for (int k = 0; k < count; k++, at += 2, by += 2) {
+            // The rest of a beam may be 0, and its exponent is.
+            const S grown = get(value(middle), 0) > 0 ? power(middle, exponent[k]) * ratio[k] : ratio[k];
+            by[0] = at[1];
+            by[1] = square * grown * grown * (middle - at[0]) - frequency * grown * damping[k] * 2.0 * at[1];
+        }
+    }
+    // What a sensor sees of the first mode and the others: a stretch or a rate.
+    HMSA_INLINE S seen(const S &first, const S *others) const
+    {
+        S sum = first;
+        for (int k = 0; k < count; k++)
+            sum = sum + share[k] * (others[2 * k] - first);
+        return sum;
+    }
+};
+
 // N of the wanted parameters at a time, from a given one on; the motion is the same to the bit.
 template <class C, class System, int NB = most_branches> struct Response {
     using S = C;
     using R = real<S>;
-    static constexpr int most = room_of<S, NB>, N = count_of<S> * lanes<R>;
+    static constexpr bool modal = NB == most_branches;
+    static constexpr int most = room_of<S, NB>, N = count_of<S> * lanes<R>, dense_room = (modal ? most : 2) * size_of<S>;
     const Recorded &of;
-    const int from, creeping = NB == most_branches ? of.branches : NB, width = 2 + creeping;
+    const int from, creeping = modal ? of.branches : NB, width = 2 + creeping + (modal ? 2 * of.modes : 0);
     Response(const Recorded &recorded, int first) : of(recorded), from(first) { step.use(width); }
     System system;
     typename System::Bare bare;  // the system without derivatives
     S a, damping, drive, force, lag;
     Branches<NB, S> branches;
     Branches<NB> bare_branches;
+    std::conditional_t<modal, Modal<S>, char> modes{};
     double level, ramp;
     S excess;  // of the field over the line, at the start of the piece
     double piece_begin, fastest;
@@ -116,6 +176,14 @@ template <class C, class System, int NB = most_branches> struct Response {
                         branches.flow[b].seed(wanted - at - 3, j);
                 });
         }
+        if constexpr (modal) {
+            modes.count = of.modes, modes.material = of.material;
+            for (int k = 0; k < of.modes; k++) {
+                const int at = first_branch + branch_places * creeping + mode_places * k;
+                modes.ratio[k] = seeded_at(at), modes.share[k] = seeded_at(at + 1);
+                modes.damping[k] = seeded_at(at + 2), modes.exponent[k] = seeded_at(at + 3);
+            }
+        }
     }
     S field(double dt) const
     {
@@ -135,13 +203,31 @@ template <class C, class System, int NB = most_branches> struct Response {
                 incline(pull, squares, slope(pull, squares) - abs(v) * v);
         }
         by[0] = x[1];
+        [[maybe_unused]] S left{};  // for the elastic force
         by[1] = system.acceleration(x[0], x[1], damping, [&](const S &elastic)
             __attribute__((always_inline)) {
                 S held = elastic;
                 branches.hold(elastic, x + 2, by + 2, [&](const S &more)
                     __attribute__((always_inline)) { held = held + more; });
+                if constexpr (modal)
+                    if (modes.count)
+                        left = pull - a * (held - elastic);
                 return pull - a * held;
             });
+        if constexpr (modal)
+            if (modes.count)
+                modes.change(system, bare, a, left, x + 2 + creeping, by + 2 + creeping);
+    }
+    // A sample of a state, moved on at its rate for some time.
+    void put(int i, const S *y, double after = 0) const
+    {
+        if constexpr (modal)
+            if (modes.count) {
+                const S *others = y + 2 + creeping;
+                const S rate = modes.seen(y[1], others + 1);
+                return put(i, modes.seen(y[0], others) + rate * after, rate);
+            }
+        put(i, after ? y[0] + y[1] * after : y[0], y[1]);
     }
     void put(int i, const S &l, const S &v) const
     {
@@ -165,14 +251,17 @@ template <class C, class System, int NB = most_branches> struct Response {
     bool operator()()
     {
         set_up();
-        S y[most] = {}, end[most], at[2] = {};
-        R dense[7][2 * size_of<S>];
-        const int shown = of.by_rate ? 2 * size_of<S> : size_of<S> + 1;  // requested values
+        S y[most] = {}, end[most], at[most] = {};
+        R dense[7][dense_room];
+        const int shown = width > 2 + creeping ? width * size_of<S>
+            : of.by_rate ? 2 * size_of<S> : size_of<S> + 1;  // requested values
         y[0] = plain(of.theta[stretch_of]), y[1] = seeded_at(rate_of);
         if constexpr (N > 0)
             each([&](int j, int) { incline(y[0], j, of.start[from + j]); });
         for (int b = 0; b < creeping; b++)
             y[2 + b] = system.force(y[0]) + (of.behind ? of.behind[b] : 0);
+        for (int w = 2 + creeping; w < width; w++)  // at first, all modes move together
+            y[w] = y[(w - creeping) % 2];
         level = of.levels[0], ramp = of.ramps[0], piece_begin = of.begins[0];
         excess = plain(of.field - level) + lag * ramp;
         if constexpr (N > 0)
@@ -188,7 +277,7 @@ template <class C, class System, int NB = most_branches> struct Response {
         const int64_t attempts = most_response_steps + int64_t(most_steps_a_sample) * of.count;
         for (int64_t attempt = 0; attempt < attempts; attempt++) {
             for (; i < of.count && of.times[i] <= t; i++)  // constant rate before the start
-                put(i, y[0] + y[1] * (of.times[i] - t), y[1]);
+                put(i, y, of.times[i] - t);
             if (i == of.count) {
                 for (int b = 0; of.behind_last && b < creeping; b++)
                     of.behind_last[b] = first(y[2 + b]) - first(system.force(y[0]));
@@ -199,6 +288,9 @@ template <class C, class System, int NB = most_branches> struct Response {
             const double per_phase = sqrt(bare.mass(l) / (stiff * bare.elastic(l).d[0]));
             const double target = min(limit, of.times[of.count - 1]);
             h = min(h, longest_phase * per_phase);
+            if constexpr (modal)
+                for (int k = 0; k < modes.count; k++)
+                    h = min(h, longest_phase * per_phase / first(modes.ratio[k]));
             if (of.wanted_count > 0)
                 for (int b = 0; b < creeping; b++)
                     h = min(h, relaxed_share / bare_branches.tangent(b, bare.elastic(l).v - first(y[2 + b])));
@@ -219,7 +311,7 @@ template <class C, class System, int NB = most_branches> struct Response {
                 }, y, R{} + span, end, shown, dense, std::make_integer_sequence<int, 4>());
             for (; i < of.count && of.times[i] < after; i++) {
                 step.between((of.times[i] - t) / span, y, shown, dense, at);
-                put(i, at[0], at[1]);
+                put(i, at);
             }
             for (int w = 0; w < width; w++)
                 y[w] = end[w], step.k[0][w] = step.k[12][w];

@@ -1,0 +1,242 @@
+"""Identification of secondary modes: the motion with them, their search, advice and files."""
+
+from dataclasses import replace
+from datetime import datetime
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks.block_elements import Block
+from hmsa.cli import main
+from hmsa.identification.excitation import Bounds, excite
+from hmsa.identification.files import file_text, read_belief
+from hmsa.identification.identify import identify
+from hmsa.identification.known import Known
+from hmsa.identification.measurement import Measurement
+from hmsa.identification.quantities import (
+    DEFAULT_FREE,
+    from_coordinate,
+    MODES,
+    SECONDARY,
+    to_coordinate,
+    values_of,
+)
+from hmsa.identification.response import respond
+from hmsa.model.equations import elastic_force
+from hmsa.model.modes import Modes
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.simulation import ActuatorSimulation
+
+BLOCK = replace(paper_actuator(), damping_coefficient=0.5)
+TRUE = replace(
+    BLOCK, mass_factor=1.2, remanence=0.11, modes=Modes((1.4, 2.6), (0.2, 0.06), (0.1, 0.15)))
+TARGETS = (1.1, 1.0, 1.2, 1.1, 0.9, 1.0, 1.15, 1.0)
+DWELL = 8.0 * BLOCK.period
+WITH_MODES = (*DEFAULT_FREE, MODES)
+
+
+def levels_of(count=10, targets=TARGETS):
+    """Return times in s and levels in T of unshaped steps."""
+    times = np.append(0.0, 0.02 + DWELL * np.arange(count))
+    levels = BLOCK.flux_density_unit * np.append(0.0, elastic_force(
+        np.resize(targets, count), BLOCK.nondimensional))
+    return times, levels
+
+
+def recorded(actuator=TRUE, *, noise=1e-3, extras=None, seed=0, count=10) -> Measurement:
+    """Return a recording of unshaped steps."""
+    level_times, levels = levels_of(count)
+    times = np.arange(0.0, level_times[-1] + DWELL, 1e-3)
+    blank = Measurement(times, 1.0 + 0.1 * np.sin(70.0 * times), level_times, levels)
+    stretch = respond(blank, values_of(actuator, extras), (), rtol=1e-10).stretch
+    return replace(blank, stretch=stretch + noise * np.random.default_rng(
+        seed).standard_normal(len(times)))
+
+
+@pytest.mark.parametrize(('slew', 'extras'), [
+    (np.inf, {}), (20.0, {'coil_time_constant': 5e-4, 'viscoelastic_ratio': 0.1})])
+def test_derivatives_with_modes_are_those_of_finite_differences(slew, extras):
+    times = np.sort(np.random.default_rng(0).uniform(0.0, 0.25, 200))
+    recording = Measurement(
+        times, 1.0 + 0.1 * np.sin(70.0 * times), *levels_of(3), slew_limit=slew)
+    actuator = replace(
+        TRUE, transverse_mass_factor=1.3, modes=replace(TRUE.modes, exponents=(0.3, -0.2)))
+    values = values_of(actuator, extras)
+    free = (*DEFAULT_FREE, 'mass_factor', 'transverse_mass_factor', *SECONDARY[0], *SECONDARY[1],
+            *extras)
+    exact = respond(recording, values, free, rtol=1e-12).jacobian
+    for column, name in enumerate(free):
+        x = to_coordinate(name, values[name])
+        h = 1e-5 * max(abs(x), 1e-2)
+        ends = [respond(
+            recording, values | {name: from_coordinate(name, x + y)}, (), rtol=1e-12).stretch
+            for y in (h, -h)]
+        difference = (ends[0] - ends[1]) / (2.0 * h)
+        assert exact[:, column] == pytest.approx(
+            difference, abs=2e-5 * np.max(np.abs(difference))), name
+
+
+def test_response_with_modes_is_the_motion_of_the_simulation():
+    recording = recorded(noise=0.0, count=3)
+    simulation = ActuatorSimulation(TRUE)
+    for time, level in zip(recording.level_times, recording.levels, strict=True):
+        simulation.command(round(1e9 * time), float(level))
+    stretch = []
+    for time in recording.time:
+        simulation.advance(round(1e9 * time))
+        stretch.append(simulation.stretch)
+    assert recording.stretch == pytest.approx(stretch, abs=1e-6)
+
+
+@pytest.fixture(scope='module')
+def found():
+    return identify(recorded(), WITH_MODES, actuator=BLOCK, known={'stretch_gain': 1.0})
+
+
+def test_modes_are_found_in_one_recording_within_their_intervals(found):
+    assert found.verdict == 'identified', found.reason
+    assert len(found.modes) == 2
+    values = values_of(TRUE)
+    for name in found.names:
+        x = found.parameters[name]
+        assert abs(x.value - values[name]) < 4.0 * x.std, name
+    assert 'shear_modulus' not in found.names
+    assert found.parameters['shear_modulus'].value == BLOCK.shear_modulus
+    for mode, ratio, share in zip(found.modes, TRUE.modes.ratios, TRUE.modes.shares, strict=True):
+        assert mode.ratio[0] == pytest.approx(ratio, rel=0.02)
+        assert mode.share[0] == pytest.approx(share, rel=0.1)
+
+
+def test_file_of_modes_is_read_by_plans_and_as_prior(found, tmp_path):
+    path = tmp_path / 'actuator.yaml'
+    path.write_text(file_text(
+        found, read_belief(None), 'recording', datetime(2000, 1, 1)), encoding='utf-8')
+    belief = read_belief(path)
+    assert belief.actuator.modes == found.actuator.modes
+    assert belief.actuator.mass_factor == found.values['mass_factor'] != 1.0
+    assert 'standard deviation' in next(
+        x for x in path.read_text().splitlines() if 'modes.share:' in x)
+    # Feedback knows nothing of modes.
+    assert set(belief.known.names) == {
+        'damping_coefficient', 'chain_limit', 'remanence', 'stretch_bias'}
+
+
+def test_modes_of_the_parameter_file_are_part_of_the_fit():
+    known = replace(TRUE, remanence=BLOCK.remanence)
+    found = identify(recorded(), actuator=known)
+    assert found.verdict == 'identified', found.reason
+    x = found.parameters['shear_modulus']
+    assert abs(x.value - TRUE.shear_modulus) < 4.0 * x.std
+
+
+def test_a_mode_is_named_before_all_else_and_the_first_mode_is_shown():
+    found = identify(recorded(), actuator=BLOCK)
+    assert found.verdict == 'model_rejected'
+    assert found.reason.index('a second mode at') < found.reason.index('try --free +modes')
+    assert found.signatures[0].remedy == MODES
+    mode = found.modes[0]
+    assert mode.ratio[0] == pytest.approx(1.4, rel=0.1)
+    assert mode.share[1] > 0.0
+    assert all(np.isfinite(found.parameters[x].value) for x in found.names)
+    # Of one mode, the modulus has to explain the mass factor.
+    assert found.parameters['shear_modulus'].value == pytest.approx(
+        BLOCK.shear_modulus / 1.2, rel=0.05)
+    assert found.record()['modes'][0]['ratio'] == mode.ratio
+
+
+def test_without_modes_none_is_found():
+    found = identify(recorded(replace(BLOCK, mass_factor=1.3)), WITH_MODES, actuator=BLOCK)
+    assert found.verdict == 'identified', found.reason
+    assert not found.modes
+    assert found.parameters['mass_factor'].value == pytest.approx(1.3, rel=1e-3)
+
+
+@pytest.mark.parametrize(('extras', 'words'), [
+    ({'viscoelastic_ratio': 0.1}, 'creep'), ({'stretch_gain': 0.97}, 'stretch_gain')])
+def test_defects_are_not_taken_for_modes(extras, words):
+    found = identify(recorded(BLOCK, extras=extras), actuator=BLOCK)
+    assert found.verdict == 'model_rejected'
+    assert not found.modes
+    assert words in found.reason
+
+
+def test_what_is_freed_on_advice_is_said():
+    found = identify(
+        recorded(BLOCK, extras={'stretch_gain': 0.97}), (*DEFAULT_FREE, 'stretch_gain'),
+        actuator=BLOCK)
+    assert found.verdict == 'identified', found.reason
+    assert any(x.startswith('stretch_gain 0.97') and 'no other measurement' in x
+               for x in found.warnings)
+
+
+def _elements(known, cells) -> Measurement:
+    """Return a recording of coarse finite elements."""
+    material, unit, dwell = known.nondimensional, known.time_unit, 8.0 * known.period
+    times = np.append(0.0, 0.02 + dwell * np.arange(6))
+    levels = known.flux_density_unit * np.append(0.0, elastic_force(
+        np.resize(TARGETS, 6), material))
+    block = Block(
+        known.half_thickness / known.half_length, material.j_lim,
+        material.zeta * material.c1 / 6.0, cells)
+    end = float(times[-1] + dwell)
+    moved, stretch = block.follow([*zip(
+        np.diff(np.append(times, end)) / unit, (levels / known.flux_density_unit).tolist(),
+        strict=True)])
+    samples = np.arange(0.0, end, 1e-3)
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(len(samples))
+    return Measurement(samples, noise + np.interp(
+        samples, np.append(0.0, moved) * unit, np.append(1.0, stretch)), times, levels)
+
+
+def test_finite_elements_are_rejected_for_a_second_mode_and_identified_with_it():
+    known = replace(BLOCK, half_thickness=0.5 * BLOCK.half_length)
+    recording = _elements(known, (3, 3, 2))
+    plain = identify(recording, actuator=known)
+    assert plain.verdict == 'model_rejected'
+    assert 'a second mode' in plain.reason
+    assert '--free +modes' in plain.reason
+    found = identify(recording, WITH_MODES, actuator=known)
+    assert found.verdict == 'identified', found.reason
+    assert found.residual_rms < 0.8 * plain.residual_rms
+    assert found.parameters['remanence'].value == pytest.approx(BLOCK.remanence, rel=0.03)
+    assert any('modes leave' in x for x in found.warnings)
+
+
+@pytest.mark.slow
+def test_excitation_for_modes_is_small_and_resolves_them():
+    actuator = replace(BLOCK, modes=Modes((1.4,), (0.2,), (0.1,)))
+    found = excite(actuator, Bounds(), duration=0.4, free=WITH_MODES)
+    low, high = found.best.reach
+    assert 0.85 < low < 0.95
+    assert 1.05 < high <= 1.15
+    assert found.best.std['modes.frequency_ratio'] < 0.01
+    assert found.best.std['modes.share'] < 0.1
+    assert 'mass_factor' in found.best.std
+    assert 'chain_limit' not in found.best.std
+
+
+def test_command_frees_modes_and_writes_them(tmp_path, capsys):
+    recording = recorded()
+    np.savetxt(
+        tmp_path / 'camera.csv', np.column_stack([recording.time, recording.stretch]),
+        delimiter=',', header='time,stretch', comments='')
+    np.savetxt(
+        tmp_path / 'levels.csv', np.column_stack([recording.level_times, recording.levels]),
+        delimiter=',', header='time,flux_density', comments='')
+    out = tmp_path / 'actuator.yaml'
+    assert main([
+        'identify', str(tmp_path / 'camera.csv'), '--commands', str(tmp_path / 'levels.csv'),
+        '--known', f'damping_coefficient={BLOCK.damping_coefficient}', '--free', '+modes',
+        '--out', str(out), '--json']) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record['verdict'] == 'identified'
+    assert len(record['modes']) == len(read_belief(out).actuator.modes.ratios) == 2
+
+
+def test_known_values_leave_out_modes():
+    assert Known.read({
+        'identification.names': ['remanence', 'modes.share', 'mass_factor'],
+        'identification.values': [0.1, 0.2, 1.2],
+        'identification.covariance': np.diag([1e-6, 1e-4, 1e-4]).ravel().tolist(),
+    }).names == ('remanence',)
