@@ -18,6 +18,7 @@ from hmsa.identification.measurement import Measurement
 from hmsa.identification.modal import (
     ENOUGH,
     explained,
+    HALF_95,
     modes_in,
     rescaled,
     stiffens,
@@ -42,6 +43,8 @@ _CERTAIN = 1e-4
 _ADVISED = (GAIN, 'sensor_latency', 'coil_time_constant', 'constant_force', *(
     x for names in quantities.BRANCHES for x in names))
 _RIVAL, _WORSE, _SURE = 0.5, 10.0, 3.0
+# Size of a mode in standard deviations that rejects a fit alone.
+_CLEAR = 8.0
 # Maximum overshoot of the moves of a shaped run, as a fraction of the step.
 _SHAPED = 0.15
 
@@ -276,7 +279,8 @@ def _conclude(
         marks = tuple(sorted(
             [*marks, *diagnosis.second_mode(best)], key=lambda x: (-x.found, -x.share)))
         if one is None and not modes:
-            modes, named = _modes_left(best, marks, limit)
+            modes, named = _modes_left(
+                best, marks, limit, bool(diagnosis.misfit(best, found, marks, alike)))
             marks = (*named, *marks)
     distant = diagnosis.distant(best, found)
     # Where modes are what is missing, the values are those of the first.
@@ -330,9 +334,13 @@ def _inverse(found: Fit) -> Array:
 
 
 def _modes_left(
-        best: Fit, marks: Sequence[Defect], limit: float
+        best: Fit, marks: Sequence[Defect], limit: float, rejected: bool
 ) -> tuple[tuple[Mode, ...], list[Defect]]:
-    """Return the modes that residuals show more than any other departure, also as departures."""
+    """
+    Return the modes that residuals show more than any other departure, also as departures.
+
+    A fit that is not rejected for other reasons needs stronger evidence of them.
+    """
     leading = max((x.share for x in marks if x.found and x.remedy), default=0.0)
     lines, _ = lines_of(best, diagnosis.frequency_of(best), 1)
     if not lines or lines[0].explained < leading:
@@ -345,9 +353,11 @@ def _modes_left(
     inverse = _inverse(found)
     wider = widening(found.root[:, None] * found.jacobian, weighted, inverse, whiteness(weighted))
     modes = modes_in(found, inverse * found.scale ** 2 * np.outer(wider, wider))
-    return modes, [Defect(
-        x.words, part, abs(x.share[0]) / max(0.5 * (x.share[2] - x.share[1]), 1e-9) * 1.96, True,
-        quantities.MODES) for x in modes]
+    sizes = [2.0 * HALF_95 * abs(x.share[0]) / max(x.share[2] - x.share[1], 1e-9) for x in modes]
+    if not rejected and max(sizes) < _CLEAR:
+        return (), []
+    return modes, [Defect(x.words, part, size, True, quantities.MODES)
+                   for x, size in zip(modes, sizes, strict=True)]
 
 
 def _warnings(

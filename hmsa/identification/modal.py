@@ -33,8 +33,8 @@ _WHOLE = 0.9
 _CHI_SQUARED, _PART = 30.0, 0.15
 # Ratio of two frequencies below which they are those of one mode that changes with the stretch.
 _NEAR = 1.02 * LEAST_RATIO
-# Half a 95 % interval in standard deviations.
-_HALF_95 = 1.96
+#: Half a 95 % interval in standard deviations.
+HALF_95 = 1.96
 # Relative change of the force by J_lim that is noticeable.
 _STIFFENS = 0.04
 #: Fraction of the residuals' sum of squares that all modes together explain at least.
@@ -203,7 +203,7 @@ def modes_in(found: Fit, covariance: Array) -> tuple[Mode, ...]:
             half = 0.0
             if name in found.free:
                 place = found.free.index(name)
-                half = _HALF_95 * math.sqrt(float(covariance[place, place])) * (
+                half = HALF_95 * math.sqrt(float(covariance[place, place])) * (
                     quantities.derivative(name, value))
             ends.append((value, value - half, value + half))
         modes.append(Mode(own * ends[0][0], ends[0], ends[1], float(values[names[2]])))
