@@ -109,6 +109,50 @@ def test_a_stop_is_sent_to_a_device_whose_receipts_are_silent():
     assert outcomes(rig) == ['accepted', 'unheard', 'stopped']
 
 
+def test_a_stop_that_a_silent_device_may_have_carried_out_is_sent_once(monkeypatch):
+    rig, reports = Bench(), []
+    rig.runtime.request(trajectory(*((1.2 + 0.1 * (i % 2), 400 * MS * i) for i in range(1, 9))))
+    rig.run(START + 500 * MS)
+    # Commands arrive, but nothing comes back.
+    rig.mute, hear = True, rig.runtime.applied
+    monkeypatch.setattr(rig.runtime, 'applied', lambda *report: reports.append(report))
+    rig.run(START + 1600 * MS)
+    rig.runtime.request(Stop('the stop'))
+    rig.run(rig.now + SECOND)
+    assert reports
+    count = len(rig.sent)
+    rig.run(rig.now + 25 * SECOND, step=20 * MS)
+    assert len(rig.sent) == count
+    assert outcomes(rig) == ['accepted', 'unheard']
+    rig.mute = False
+    monkeypatch.setattr(rig.runtime, 'applied', hear)
+    for report in reports:
+        rig.runtime.applied(*report)
+    rig.run(rig.now + SECOND)
+    assert outcomes(rig) == ['accepted', 'unheard', 'stopped']
+    assert 'replanned' not in rig.codes()
+
+
+def test_the_lost_levels_of_a_stop_are_planned_anew_only_once_the_device_is_heard():
+    rig = Bench()
+    rig.runtime.request(trajectory(*LONG))
+    rig.run(START + 47 * MS)
+    rig.hears = False
+    rig.runtime.request(Stop('the stop'))
+    rig.run(rig.now + 2 * SECOND)
+    rig.mute = True
+    rig.run(rig.now + SECOND)
+    assert rig.runtime.devices.receipts.silent
+    assert rig.runtime.following.astray
+    count = len(rig.sent)
+    rig.run(rig.now + 25 * SECOND, step=20 * MS)
+    assert len(rig.sent) == count
+    assert outcomes(rig)[-1] == 'unheard'
+    rig.hears, rig.mute = True, False
+    rig.run(rig.now + 2 * SECOND)
+    assert outcomes(rig)[-1] == 'stopped'
+
+
 def test_a_stop_is_not_carried_out_before_its_time_by_the_clock_of_the_device():
     rig = Bench()
     rig.runtime.request(trajectory(*LONG))

@@ -223,8 +223,8 @@ class Deviations:
         """Find commands that took no effect; reports may be as late as commands."""
         before, self._suspected = self._suspected, {}
         for name, planner in self._group.planners.items():
-            if name not in self.newest:
-                # There are no reports of applied levels.
+            if name not in self.newest or name in self._receipts.silent:
+                # There are no reports of applied levels, or they do not arrive either.
                 continue
             reported = self._reported(name, now) - planner.options.lead_time
             stamp = planner.unheard(
@@ -286,12 +286,12 @@ class Deviations:
     # -- replanning ----------------------------------------------------------------------------
 
     def to_resume(self) -> list[str]:
-        """Return the joints whose plan may have to be replanned."""
+        """Return the joints whose plan may have to be replanned, once their devices report."""
         vain = [x for x in self.astray if not self._group.may_resume(x)]
         if vain:
             self.dropped(vain)
             self._report_kept()
-        return sorted(self.astray)
+        return sorted(self.astray - self._receipts.silent)
 
     def resumption(self, name: str) -> PlanningTask:
         """Return the work of replanning the rest for a joint if that reduces the error."""
