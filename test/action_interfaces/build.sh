@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Build the interfaces of control_msgs that the planner uses, with the generators of the ROS wheels:
-#     test/control_msgs/build.sh DISTRO PYTHON FOLDER
+#     test/action_interfaces/build.sh DISTRO PYTHON FOLDER
 # for an environment's interpreter; then `. FOLDER/setup.sh` makes them available to it.
 set -euo pipefail
 distro=$1 python=$2
