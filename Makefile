@@ -77,6 +77,10 @@ docs: tools ## build the documentation into docs/_build/html, warnings as errors
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html $(ARGS)
 	@echo "docs/_build/html/index.html"
 
+.PHONY: weight
+weight: env ## print how large the packages are, and how far a setpoint travels through them
+	$(BIN)/python scripts/weigh.py
+
 .PHONY: graph
 graph: tools ## redraw docs/images/graph.svg, when a topic has changed
 	$(BIN)/python scripts/draw_graph.py
@@ -142,8 +146,8 @@ $(VENV)/.bench: $(VENV)/.installed
 	@touch $@
 
 # Apart from the environment, which is one without control_msgs.
-$(VENV)/.control_msgs: $(wildcard test/control_msgs/* test/control_msgs/*/*) | $(VENV)/.installed
-	test/control_msgs/build.sh $(ROS) $(BIN)/python $(VENV)/control_msgs
+$(VENV)/.control_msgs: $(wildcard test/action_interfaces/* test/action_interfaces/*/*) | $(VENV)/.installed
+	test/action_interfaces/build.sh $(ROS) $(BIN)/python $(VENV)/control_msgs
 	@touch $@
 
 # The installation compiles the motion, too; this is for when its sources change.

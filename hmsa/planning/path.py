@@ -163,14 +163,14 @@ def along(
     leaves the range of the model, or has no rest at its end.
     """
     request.holding_load()
-    follower = _Follower(request, path, tolerance)
+    follower = _PathFit(request, path, tolerance)
     while follower.done < len(follower.edges) - 1:
         follower.advance()
         check()
     return follower.move()
 
 
-class _Follower:
+class _PathFit:
     """Computation of the levels of a path, block by block."""
 
     def __init__(self, request: MoveRequest, path: Path, tolerance: float) -> None:

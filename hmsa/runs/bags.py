@@ -167,7 +167,7 @@ class _Point:
 
 
 @dataclass(frozen=True)
-class _Plan:
+class _SentPlan:
     """A plan as received, with its timestamp in ns."""
 
     sent: int
@@ -176,7 +176,7 @@ class _Plan:
     points: tuple[_Point, ...]
 
     @classmethod
-    def of(cls, sent: int, message: Any) -> '_Plan':
+    def of(cls, sent: int, message: Any) -> '_SentPlan':
         """Return the plan in a message."""
         return cls(sent, tuple(message.joint_names), nanoseconds_of(message.header.stamp), tuple(
             _Point(nanoseconds_of(x.time_from_start), *(
@@ -195,7 +195,7 @@ class _Collected:
         self.refused = Counter[str]()
         # Of all joints, with the time of publishing by the planner's clock: all are latched, and
         # a new subscriber receives old ones, perhaps after newer ones.
-        self.plans: list[tuple[int, _Plan]] = []
+        self.plans: list[tuple[int, _SentPlan]] = []
         self.verdicts: list[tuple[int, RecordedVerdict]] = []
         self.outcomes: list[tuple[int, Outcome]] = []
         # With the joint of each.
@@ -236,7 +236,7 @@ class _Collected:
                 sent, nanoseconds_of(content.header.stamp) or sent,
                 float(content.wrench.force.z)))
         elif role == roles.PLAN:
-            self.plans.append((message.publish_time, _Plan.of(sent, content)))
+            self.plans.append((message.publish_time, _SentPlan.of(sent, content)))
         elif role == roles.OUTCOMES:
             self.outcomes.append((message.publish_time, Outcome.read(content)))
         elif role == roles.ESTIMATE:

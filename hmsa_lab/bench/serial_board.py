@@ -33,7 +33,7 @@ class BoardError(HmsaError):
     """A board that does not answer, or answers incorrectly."""
 
 
-class _Answer(NamedTuple):
+class _BoardAnswer(NamedTuple):
     session: int
     verb: str
     values: list[int]
@@ -125,7 +125,7 @@ class Board(OnLine):
         """Return at least ``count`` values of the board's answer; repeat the request if needed."""
         patience = _PATIENCE if patience is None else patience
         until = monotonic() + patience
-        answer: _Answer | None = None
+        answer: _BoardAnswer | None = None
         while True:
             if self._lost and verb != 'H':
                 self._lost = False
@@ -146,7 +146,7 @@ class Board(OnLine):
                     f'the board on {self._port} {why}, {patience:g} s after it was asked {verb}: '
                     'expected the firmware of this package, at the same baud, without echo')
 
-    def _attempt(self, verb: str, values: Sequence[int]) -> _Answer | None:
+    def _attempt(self, verb: str, values: Sequence[int]) -> _BoardAnswer | None:
         self._number = (self._number + 1) % 65536
         request = ' '.join(map(str, (self._number, self._session, verb, *values)))
         answers = (_read(x, self._number) for x in self._lines(b'\n' + framed(request)))
@@ -195,14 +195,14 @@ class Board(OnLine):
         return found
 
 
-def _read(line: bytes, number: int) -> _Answer | None:
+def _read(line: bytes, number: int) -> _BoardAnswer | None:
     """Return the answer to a request in a line; None if it is damaged or for another request."""
     try:
         text = line.decode('ascii').rpartition('*')[0]
         if framed(text) != line + b'\n':
             return None
         theirs, session, verb, *values = text.split(' ')
-        answer = _Answer(int(session), verb, [int(x) for x in values])
+        answer = _BoardAnswer(int(session), verb, [int(x) for x in values])
         return answer if int(theirs) == number else None
     except ValueError:
         return None

@@ -36,7 +36,7 @@ class TopicError(HmsaError):
     """A topic without subscriber."""
 
 
-class _Topic:
+class _SharedTopic:
     """A topic whose subscriber is awaited, and the fields of its joints in one message."""
 
     def __init__(self, name: str, type_name: str) -> None:
@@ -105,7 +105,7 @@ class _Topic:
 
 
 # Topics in use, by name and type as given.
-_SHARED: dict[tuple[str, str], _Topic] = {}
+_SHARED: dict[tuple[str, str], _SharedTopic] = {}
 
 
 class Field:
@@ -148,7 +148,7 @@ class Field:
         self._joint, self._key = joint, (topic, type_name)
         self._level, self._size = 0.0, int(size)
         shared = _SHARED.get(self._key)
-        self._topic = _Topic(topic, type_name) if shared is None else shared
+        self._topic = _SharedTopic(topic, type_name) if shared is None else shared
         try:
             self._find(path, direction)
         except BaseException:

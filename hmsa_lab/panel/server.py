@@ -109,7 +109,8 @@ class Server:
         ours = {'server': self}
         server = HTTPServer(
             Application(
-                [('/([^/]+)/socket', _Socket, ours), ('/([^/]+)/report/(.+)', _Report, ours),
+                [('/([^/]+)/socket', _Socket, ours),
+                 ('/([^/]+)/report/(.+)', _ReportHandler, ours),
                  ('/([^/]+)/([^/]*)', _Page, ours)],
                 default_handler_class=_Guarded, default_handler_args=ours,
                 log_function=lambda _: None, websocket_max_message_size=_LONGEST,
@@ -175,7 +176,7 @@ class _Page(_Guarded):
         self.finish((_HERE / file).read_bytes())
 
 
-class _Report(_Guarded):
+class _ReportHandler(_Guarded):
     def get(self, _: str, name: str) -> None:
         """Send a report; raise `HTTPError` if it does not exist."""
         path = self.server.reports.get(name)

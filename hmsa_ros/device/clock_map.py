@@ -25,7 +25,7 @@ _SLOW, _LEAST = 3.0, 20_000
 _STRANGE = 3
 
 
-class _Answer(NamedTuple):
+class _Comparison(NamedTuple):
     """Host and device times, and half the duration of a query, in ns since the first answer."""
 
     host: int
@@ -41,7 +41,7 @@ class ClockMap:
     """
 
     def __init__(self) -> None:
-        self._answers: deque[_Answer] = deque(maxlen=_KEPT)
+        self._answers: deque[_Comparison] = deque(maxlen=_KEPT)
         self._origin = 0, 0
         self._strange = 0
         # Device time minus host time is offset + drift (host - centre), with times in ns.
@@ -68,7 +68,7 @@ class ClockMap:
         if not self._answers:
             self._origin = before, device
         host, clock = self._origin
-        answer = _Answer(
+        answer = _Comparison(
             (before + after) // 2 - host, device - clock, max((after - before) // 2, _LEAST))
         off = answer.device - answer.host - self._offset - self.drift * (
             answer.host - self._centre)

@@ -24,7 +24,7 @@ _REMEMBERED = 16
 
 
 @dataclass
-class _Joint:
+class _Receiver:
     """State of the device of a joint; times in ns by the steady clock, unless noted."""
 
     arrived: int  # arrival of the newest receipt
@@ -61,7 +61,7 @@ class Receipts:
 
     def __init__(self, steady: Callable[[], int]) -> None:
         self._steady = steady
-        self._joints: dict[str, _Joint] = {}
+        self._joints: dict[str, _Receiver] = {}
         self._looked = steady()
         self._disturbances: deque[Disturbance] = deque(maxlen=_REMEMBERED)
         self.silent: set[str] = set()
@@ -93,7 +93,7 @@ class Receipts:
         steady = self._steady()
         known = self._joints.get(joint)
         if known is None:
-            known = self._joints[joint] = _Joint(steady)
+            known = self._joints[joint] = _Receiver(steady)
         if known.silent and comparable and known.is_delayed(time, steady):
             return False
         if steady - known.arrived > _STALE:

@@ -10,7 +10,7 @@ _PATIENCE, _INTERVALS = 2 * NANOSECONDS, 3
 
 
 @dataclass
-class _Joint:
+class _LastSample:
     """The newest sample of a joint; times in ns."""
 
     stamp: int
@@ -29,7 +29,7 @@ class SampleTimeout:
 
     def __init__(self, environment: Environment) -> None:
         self._around = environment
-        self._joints: dict[str, _Joint] = {}
+        self._joints: dict[str, _LastSample] = {}
 
     def restart(self) -> None:
         """Discard all samples."""
@@ -38,7 +38,7 @@ class SampleTimeout:
     def record(self, joint: str, stamp: int) -> None:
         """Record the timestamp of the newest sample of a joint."""
         before = self._joints.get(joint)
-        self._joints[joint] = _Joint(
+        self._joints[joint] = _LastSample(
             stamp, self._around.steady(), self._around.clock(),
             0 if before is None else stamp - before.stamp)
 

@@ -92,12 +92,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Plan the sweep and write its table."""
     sweep = _sweep(arguments)
     in_chunks = _in_chunks(sweep, arguments)
-    picture = _Picture(sweep, arguments)
+    picture = _SweepPicture(sweep, arguments)
     return _plan_in_chunks(sweep, arguments, picture) if in_chunks \
         else _plan_at_once(sweep, arguments.out, picture)
 
 
-class _Picture:
+class _SweepPicture:
     """The figures of a sweep: columns to draw, and files."""
 
     def __init__(self, sweep: 'Sweep', arguments: argparse.Namespace) -> None:
@@ -237,7 +237,7 @@ def _is_folder(out: Path) -> bool:
     return not out.suffix or (out.is_dir() and out.suffix.lower() not in {'.csv', '.parquet'})
 
 
-def _plan_at_once(sweep: 'Sweep', out: Path | None, picture: _Picture) -> int:
+def _plan_at_once(sweep: 'Sweep', out: Path | None, picture: _SweepPicture) -> int:
     from hmsa_studies.study_folder import StudyFolder
     from hmsa_studies.tables import open_writer
 
@@ -257,7 +257,7 @@ def _plan_at_once(sweep: 'Sweep', out: Path | None, picture: _Picture) -> int:
 
 
 def _plan_in_chunks(
-        sweep: 'Sweep', arguments: argparse.Namespace, picture: _Picture) -> int:
+        sweep: 'Sweep', arguments: argparse.Namespace, picture: _SweepPicture) -> int:
     from hmsa.files import require_arrow
     from hmsa_studies.schedulers import cores
     from hmsa_studies.study_folder import StudyFolder

@@ -99,7 +99,7 @@ def _kept(request: MoveRequest) -> Move:
 
 
 @dataclass(frozen=True)
-class _Case:
+class _ErrorCase:
     """An actuator in the uncertainty set, and its initial state, in its own units."""
 
     packed: Array
@@ -115,7 +115,7 @@ class _Case:
     tail: Array  #: (2, n), vibration due to the tail of levels for the branches of the model
 
 
-def _cases(request: MoveRequest, holding: float) -> list[_Case]:
+def _cases(request: MoveRequest, holding: float) -> list[_ErrorCase]:
     """Return the nominal actuator, and others in and on the box or ellipsoid of errors."""
     errors = request.errors
     offs: list[tuple[float, ...]] = [(0.0, 0.0, 0.0, 0.0)]
@@ -131,7 +131,7 @@ def _cases(request: MoveRequest, holding: float) -> list[_Case]:
     return [x for x in found if x is not None]
 
 
-def _case(request: MoveRequest, holding: float, errors: Errors) -> _Case | None:
+def _case(request: MoveRequest, holding: float, errors: Errors) -> _ErrorCase | None:
     """Return an actuator with errors, None if it does not oscillate about its equilibrium."""
     state, nominal = request.state, request.material.packed
     stiffer, faster = errors.stiffer, errors.faster
@@ -150,7 +150,7 @@ def _case(request: MoveRequest, holding: float, errors: Errors) -> _Case | None:
     root, mode, tail = found
     move = max(abs(request.target - state.stretch), AT_REST)
     peaks = (1.0 + math.exp(math.pi * root.real / root.imag)) / move
-    return _Case(
+    return _ErrorCase(
         packed, stiffer, faster, stretch, state.rate / faster, with_followed(
             material, np.array(branches_of(state, request.material)) / stiffer),
         rest, law.elastic_force(rest, packed), law.elastic_stiffness(rest, packed), peaks * mode,
@@ -158,7 +158,7 @@ def _case(request: MoveRequest, holding: float, errors: Errors) -> _Case | None:
 
 
 def left(
-        request: MoveRequest, cases: Sequence[_Case], levels: Sequence[Level],
+        request: MoveRequest, cases: Sequence[_ErrorCase], levels: Sequence[Level],
         arrival: float) -> Array:
     """Return the vibration after a command, (n, 2); infinite if the integration fails."""
     delivery = request.delivery
@@ -267,7 +267,7 @@ def _frame(request: MoveRequest, chain: Move, length: float) -> _Frame | None:
 
 
 def _search(
-        request: MoveRequest, cases: Sequence[_Case], chain: Move,
+        request: MoveRequest, cases: Sequence[_ErrorCase], chain: Move,
         frame: _Frame) -> tuple[tuple[Level, ...], float]:
     """Return levels, and the largest vibration over all cases."""
     low, high = frame.low, frame.high

@@ -73,7 +73,7 @@ def smooth(request: MoveRequest) -> Move:
         f'{units.load_text(limits.maximum)}{ramps} and the largest rate'))
 
 
-class _Path(NamedTuple):
+class _SmoothMove(NamedTuple):
     """Amplifier levels along a path, evenly spaced over its duration."""
 
     duration: float
@@ -81,7 +81,7 @@ class _Path(NamedTuple):
     slopes: Array
 
 
-def _shortest(request: MoveRequest, holding: float, period: float) -> _Path | None:
+def _shortest(request: MoveRequest, holding: float, period: float) -> _SmoothMove | None:
     """Return the shortest path within the limits, else None."""
     shortest = short = duration = request.pace.periods * period
     longest = max(MOST_PERIODS * period, 2.0 * shortest)
@@ -99,7 +99,7 @@ def _shortest(request: MoveRequest, holding: float, period: float) -> _Path | No
     return path
 
 
-def _path(request: MoveRequest, holding: float, duration: float) -> _Path | None:
+def _path(request: MoveRequest, holding: float, duration: float) -> _SmoothMove | None:
     """Return the levels of a path of a given duration, None if it does not keep the limits."""
     material, delivery, limits = request.material, request.delivery, request.limits
     packed = material.packed
@@ -128,7 +128,7 @@ def _path(request: MoveRequest, holding: float, duration: float) -> _Path | None
     if not (limits.minimum - slack <= loads.min() and loads.max() <= limits.maximum + slack
             and np.max(np.abs(slopes)) <= _SLEW_SHARE * delivery.slew):
         return None
-    return _Path(duration, loads, slopes)
+    return _SmoothMove(duration, loads, slopes)
 
 
 def _free(
@@ -157,7 +157,7 @@ def _free(
     return stretch, rate, acceleration(stretch, rate, pull, material), loads, followed
 
 
-def _delivered(request: MoveRequest, path: _Path, holding: float, period: float) -> Attempt:
+def _delivered(request: MoveRequest, path: _SmoothMove, holding: float, period: float) -> Attempt:
     """Return the levels of a path as commands, corrected to end at rest."""
     delivery, limits = request.delivery, request.limits
     duration, along, slopes = path
