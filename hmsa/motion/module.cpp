@@ -372,6 +372,8 @@ std::tuple<bool, double, int> solve(Results times, Results loads, Numbers d_time
                 return with(fixed<3>);
         if (unknowns <= 4)
             return with(fixed<4>);
+        if (unknowns <= 6)
+            return with(fixed<6>);
         return with(fixed<most_unknowns>);
     });
     return {solved, lasts, work};

@@ -43,8 +43,8 @@ template <int NB, class System> Late late(const System &system, const Branches<N
     const Shot shot{3, 3, times, loads, d_times, d_loads, move.start, move.rate, before.field,
         before.load, move.target, infinity(), before.lag, before.branches, before.branch_count,
         search.followed, most_attempts};
-    // Number of unknowns for models without their own code: the maximum.
-    Shooting<System, has_own_code<System> ? 3 : most_unknowns> shooting{system, shot};
+    // Models without their own code share that of four unknowns.
+    Shooting<System, has_own_code<System> ? 3 : 4> shooting{system, shot};
     double lasts;
     if (!shooting.solve(m, lasts))
         plan.status = not_converged;

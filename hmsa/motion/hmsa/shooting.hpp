@@ -5,8 +5,9 @@
 
 namespace hmsa {
 constexpr int most_levels = 304;
-// Stretch, rate, field, and load; position and rate of each mode.
-constexpr int most_unknowns = 4 + 2 * most_modes;
+// Stretch, rate, field, and load, and position and rate of each mode, are conditions; there are
+// more unknowns than conditions if each mode has one more level.
+constexpr int most_unknowns = 4 + 3 * most_modes;
 
 struct Shot {
     int levels, unknowns;
@@ -51,6 +52,7 @@ template <class System, int P> struct Shooting {
     double miss[most_unknowns], trial[most_unknowns][P];  // one row per unknown
     double frequency_at_target, stiffness, force;
     double first_times[most_levels], first_loads[most_levels];
+    int conditions;
     int work = 0;  // steps, times the number of values and derivatives
 
     // Computes the pieces of the load and their derivatives; false if a ramp does not fit.
@@ -167,8 +169,8 @@ template <class System, int P> struct Shooting {
     }
     // Distance of the end from rest at the target, in units of stretch, and its derivatives. The
     // conditions are stretch, rate, field (if it lags), with branches and a ramping amplifier its
-    // last load, from which the next levels start, and position and rate of each mode. As many
-    // count as there are unknowns.
+    // last load, from which the next levels start, and position and rate of each mode. At most as
+    // many count as there are unknowns.
     double missed(bool derivatives)
     {
         const int n = derivatives ? shot.unknowns : 0;
@@ -210,15 +212,32 @@ template <class System, int P> struct Shooting {
                 trial[row + 1][c] = d_end[at + 1][c] / frequency;
             }
         }
+        conditions = min(row, shot.unknowns);
         double squares = 0;
-        for (int i = 0; i < shot.unknowns; i++)
+        for (int i = 0; i < conditions; i++)
             squares += miss[i] * miss[i];
         return sqrt(squares);
     }
-    // The Newton step, by elimination.
+    // The Newton step, by elimination: the smallest one if there are more unknowns than conditions.
     void newton(const double (*jacobian)[P], double *step) const
     {
-        const int n = shot.unknowns;
+        if (conditions == shot.unknowns)
+            return eliminate(jacobian, step);
+        double square[P][P] = {}, along[P];
+        for (int i = 0; i < conditions; i++)
+            for (int j = 0; j < conditions; j++)
+                for (int c = 0; c < shot.unknowns; c++)
+                    square[i][j] += jacobian[i][c] * jacobian[j][c];
+        eliminate(square, along);
+        for (int c = 0; c < shot.unknowns; c++) {
+            step[c] = 0;
+            for (int i = 0; i < conditions; i++)
+                step[c] += jacobian[i][c] * along[i];
+        }
+    }
+    void eliminate(const double (*jacobian)[P], double *step) const
+    {
+        const int n = conditions;
         double work[P][P + 1];
         for (int i = 0; i < n; i++) {
             for (int j = 0; j < n; j++)
