@@ -15,12 +15,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 import math
 
-import numpy as np
-
 from hmsa.model import law
-from hmsa.model.equations import Array
-from hmsa.model.moves import Level, Move
-from hmsa.model.simulation import follow, followed_by
+from hmsa.model.moves import Level, Move, State
+from hmsa.model.simulation import followed_by
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.shapers.free import at_rest
 from hmsa.planning.shapers.request import AT_REST, MoveRequest
@@ -34,8 +31,8 @@ _LENGTHS = (1.0, 1.06, 0.94, 1.14, 1.25, 1.4, 1.6, 2.0)
 _BEYOND = 0.3
 # Durations of levels in units of those of their ramps, at least.
 _MORE = 1.25
-# Change of a load in the largest change of a move, for differences.
-_ASIDE = 1e-4
+# Motion below this fraction of the move is none for the guess.
+_STILL = 1e-3
 # Durations and loads of the free levels.
 _Guess = tuple[list[float], list[float]]
 
@@ -99,11 +96,7 @@ def _solutions(request: MoveRequest, holding: float) -> Iterator[tuple[tuple[Lev
             continue
         before = durations
         begins = [math.fsum(durations[:i]) for i in range(len(durations) + 1)]
-        levels = [Level(*x) for x in zip(begins, (*loads, holding), strict=True)]
-        template = heights(levels)
-        if len(durations) > request.unknowns + 2 * len(request.material.modes.ratios):
-            free = _directions(levels, request)
-            template = replace(template, d_times=np.zeros_like(free), d_loads=free)
+        template = heights([Level(*x) for x in zip(begins, (*loads, holding), strict=True)])
         found = within_limits(solve(template, request, modes=True), request)
         if found is not None:
             yield found
@@ -125,7 +118,8 @@ def _around_two_steps(request: MoveRequest, holding: float) -> Iterator[_Guess]:
     """Yield the durations and loads of a two-step command that is shaped for all other modes."""
     half, delivery = math.pi / request.frequency, request.delivery
     try:
-        move = two_step(replace(request, work=request.work.more(request.work.left)))
+        move = two_step(replace(
+            request, state=_seen(request), work=request.work.more(request.work.left)))
     except RefusedError:
         move = Move(Code.HOLD, (Level(0.0, 0.5 * (request.load + holding)),), math.inf)
     delays, impulses = [], [(0.0, 1.0)]
@@ -158,6 +152,13 @@ def _around_two_steps(request: MoveRequest, holding: float) -> Iterator[_Guess]:
         yield durations, loads
 
 
+def _seen(request: MoveRequest) -> State:
+    """Return the state, at rest if it hardly moves: from motion, two_step searches twice."""
+    state = request.state
+    moves = abs(state.rate) > _STILL * request.frequency * abs(request.target - state.stretch)
+    return state if moves else replace(state, rate=0.0)
+
+
 def _load(
         levels: Sequence[Level], time: float, before: float, after: float, end: float) -> float:
     """Return the load at a time of a command that ends at another one."""
@@ -172,34 +173,6 @@ def _others(request: MoveRequest) -> list[tuple[float, float]]:
     straight = float(law.natural_frequency(0.0, request.material.packed))
     modes = request.material.modes
     return [(x * straight, y) for x, y in zip(modes.ratios, modes.dampings, strict=True)]
-
-
-def _directions(levels: Sequence[Level], request: MoveRequest) -> Array:
-    """
-    Return one column of changes of the loads for each condition, the last of which stays.
-
-    The smallest change of the levels that meets the conditions, in linear motion about that of
-    the guess, is a sum of them.
-    """
-    material, delivery, stiffness = request.material, request.delivery, float(
-        law.elastic_stiffness(request.target, request.material.packed))
-    scales = [1.0, request.frequency]
-    for frequency, _ in _others(request):
-        scales += [1.0, frequency]
-
-    def end(of: Sequence[Level]) -> Array:
-        state = follow(of, request.start, of[-1].time, material, delivery)
-        reached = [state.stretch, state.rate, *state.followed[len(material.branches):]]
-        lags = [state.load / stiffness] if delivery.lag > 0.0 else []
-        return np.array([*(x / y for x, y in zip(reached, scales, strict=True)), *lags])
-
-    reached, aside = end(levels), _ASIDE * _largest_change(request, levels[-1].load)
-    effects: Array = np.array([
-        end([*levels[:i], replace(x, load=x.load + aside), *levels[i + 1:]]) - reached
-        for i, x in enumerate(levels[:-1])])
-    made: Array = np.zeros((len(levels), effects.shape[1]))
-    made[:-1] = np.linalg.qr(effects)[0]
-    return made
 
 
 def _on_grid(duration: float, request: MoveRequest) -> float:
