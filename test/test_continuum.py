@@ -23,6 +23,8 @@ from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.simulation import follow, observed, sampled
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
+from hmsa.planning.sequence import plan_sequence
+from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
 
@@ -200,6 +202,22 @@ def test_modal_brings_all_modes_to_rest_from_rest_and_from_motion(delivery):
                 [x for x in move.levels if x.time < half], request.start, half, GROUP, delivery)
         else:
             state = State(target)
+
+
+@pytest.mark.parametrize('delivery', [
+    Delivery(), Delivery(period=0.05, slew=3.0, lag=0.1)], ids=['ideal', 'all'])
+def test_sequence_of_modal_moves_starts_each_from_where_the_motion_is(delivery):
+    frame, dwell = MoveRequest(State(1.0), 1.0, GROUP, delivery=delivery), 12.0
+    state = frame.state
+    for segment in plan_sequence(
+            [Setpoint(x, dwell) for x in (1.2, 0.9, 1.3)], frame, 'modal'):
+        state = follow(
+            segment.move.levels, replace(frame, state=state).start, dwell, GROUP, delivery)
+        assert segment.end.followed[::2] == pytest.approx(state.followed[::2], abs=1e-9)
+        assert segment.end.followed[1::2] == pytest.approx(state.followed[1::2], abs=1e-8)
+        assert (segment.end.stretch, segment.end.rate, segment.end.load) == pytest.approx(
+            (state.stretch, state.rate, state.load), abs=1e-8)
+        assert (segment.end.amplifier is None) == (state.amplifier is None)
 
 
 def test_modal_without_modes_is_the_two_step_command():

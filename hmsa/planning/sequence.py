@@ -187,6 +187,11 @@ def _follow(request: MoveRequest, move: Move, span: float) -> State:
     # A move held without an end also vibrates after the last level.
     _check_known(request, move.levels, (ramped, max(end, span)))
     if not material.creep:
+        if move.code is Code.MODAL:
+            # This is what has been solved for; to follow all modes again takes time.
+            return State(
+                request.target, 0.0, last, last if delivery.lag > 0.0 else None,
+                (request.target, 0.0) * len(material.modes.ratios))
         end = min(end, ramped + longest_motion(last, material) + delivery.settling(0.0))
     return follow(move.levels, request.start, end, material, delivery)
 
