@@ -81,6 +81,13 @@ EXTRAS_REQUIRE = {
     'panel': [
         'tornado>=6.2',
     ],
+    # DataFrames of plans, motions and tables; quantities with units.
+    'pandas': [
+        'pandas>=1.5',
+    ],
+    'units': [
+        'pint>=0.20',
+    ],
     # Boards on a serial port.
     'serial': [
         'pyserial>=3.5',

@@ -6,6 +6,7 @@ obvious, the remedy.
 """
 
 from collections.abc import Iterable
+from difflib import get_close_matches
 import reprlib
 import sys
 import warnings
@@ -61,6 +62,12 @@ class MissingWarning(UserWarning):
 
     ``warnings.simplefilter('ignore', hmsa.MissingWarning)`` accepts all of them.
     """
+
+
+def meant(word: object, known: Iterable[str]) -> str:
+    """Return ``; did you mean NAME?`` with the known name closest to a word, or nothing."""
+    near = get_close_matches(str(word), list(known), 1)
+    return f'; did you mean {near[0]}?' if near else ''
 
 
 def assume(text: str, kind: type[Warning] = AssumedWarning) -> None:

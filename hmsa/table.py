@@ -1,15 +1,15 @@
 """Tables of results: text in a terminal, HTML in a notebook, columns for further use."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 import math
 import shutil
 import sys
 import textwrap
-from typing import Any
+from typing import Any, overload, SupportsIndex
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, meant
 
 #: Heading of the standard deviation of the column before.
 DEVIATION = '±'
@@ -51,8 +51,21 @@ class Table:
     """
     Rows of results.
 
-    Printing aligns the columns, and a notebook shows HTML. ``table['arrival']`` returns a column
-    by its name without the unit, and `to_pandas` returns a DataFrame.
+    Printing aligns the columns, and a notebook shows HTML. ``table['verdict']`` returns a column
+    by its name without the unit, ``table[0]`` a row by these names, and ``table[:2]`` a table of
+    rows. Iteration yields the rows, and `to_pandas` returns a DataFrame.
+
+    Examples
+    --------
+    >>> from hmsa import Actuator
+    >>> table = Actuator().plan([(1.1, 0.5), (1.0, 0.5)]).report()
+    >>> table['status']
+    ['two_step', 'two_step']
+    >>> [row['stretch'] for row in table]
+    [1.1, 1.0]
+    >>> table[-1]['last level'], len(table[:1])
+    (0.0, 1)
+
     """
 
     columns: tuple[Column, ...]
@@ -63,20 +76,36 @@ class Table:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def __getitem__(self, name: str) -> list[Any]:
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return iter(self.records())
+
+    @overload
+    def __getitem__(self, key: str) -> list[Any]: ...
+
+    @overload
+    def __getitem__(self, key: SupportsIndex) -> dict[str, Any]: ...
+
+    @overload
+    def __getitem__(self, key: slice) -> 'Table': ...
+
+    def __getitem__(self, key: Any) -> Any:
+        if isinstance(key, slice):
+            return replace(self, rows=self.rows[key])
+        if isinstance(key, SupportsIndex):
+            return self.records()[key]
         names = [x.name for x in self.columns]
-        if name not in names:
+        if key not in names:
             raise BadInputError(
-                f'the table has no column {name!r}: expected one of {", ".join(names)}')
-        return [row[names.index(name)] for row in self.rows]
+                f'the table has no column {key!r}: expected one of {", ".join(names)}'
+                + meant(key, names))
+        return [row[names.index(key)] for row in self.rows]
 
     def __repr__(self) -> str:
         return str(self)  # shown at a prompt
 
     def __str__(self) -> str:
         texts = list(self._texts())
-        right = [all(not isinstance(row[i], str) for row in self.rows)
-                 for i in range(len(self.columns))]
+        right = self._right()
         room = _room()
         heads = [[x.title] for x in self.columns]
         if _width(_widths(heads, texts)) > room:
@@ -100,21 +129,41 @@ class Table:
         return max(1, named.index(False) if False in named else 1)
 
     def _repr_html_(self) -> str:
+        # Words to the left, numbers to the right, as notebooks show a DataFrame.
+        styles = ['' if x else ' style="text-align: left"' for x in self._right()]
+
         def row(cells: Sequence[str], tag: str) -> str:
-            return f'<tr>{"".join(f"<{tag}>{escape(x)}</{tag}>" for x in cells)}</tr>'
+            return '<tr>' + ''.join(
+                f'<{tag}{y}>{escape(x)}</{tag}>'
+                for x, y in zip(cells, styles, strict=True)) + '</tr>'
 
         caption = f'<caption>{escape(self.caption)}</caption>' if self.caption else ''
         return (
-            f'<table>{caption}<thead>{row([x.title for x in self.columns], "th")}</thead><tbody>'
+            f'<table class="dataframe">{caption}'
+            f'<thead>{row([x.title for x in self.columns], "th")}</thead><tbody>'
             + ''.join(row(x, 'td') for x in self._texts()) + '</tbody></table>'
             + ''.join(f'<p>{escape(x)}</p>' for x in self.notes))
+
+    def _right(self) -> list[bool]:
+        """Return whether a column contains numbers."""
+        return [all(not isinstance(row[i], str) for row in self.rows)
+                for i in range(len(self.columns))]
 
     def _texts(self) -> Iterator[list[str]]:
         for row in self.rows:
             yield [x.shown(value) for x, value in zip(self.columns, row, strict=True)]
 
     def records(self) -> list[dict[str, Any]]:
-        """Return each row as a mapping from column names."""
+        """
+        Return each row as a mapping from column names.
+
+        Examples
+        --------
+        >>> from hmsa import Actuator
+        >>> Actuator().plan([(1.1, 0.5)]).report().records()[0]['status']
+        'two_step'
+
+        """
         return [dict(zip((x.name for x in self.columns), row, strict=True)) for row in self.rows]
 
     def to_pandas(self) -> Any:
@@ -125,6 +174,13 @@ class Table:
         ------
         BadInputError
             If pandas is not installed.
+
+        Examples
+        --------
+        >>> from hmsa import Actuator
+        >>> Actuator().plan([(1.1, 0.5)]).report().to_pandas()[['stretch', 'duration (s)']]
+           stretch  duration (s)
+        0      1.1           0.5
 
         """
         return frame({
@@ -197,6 +253,6 @@ def frame(columns: dict[str, Any]) -> Any:
         import pandas
     except ImportError as error:
         raise BadInputError(
-            'pandas is not installed: install it (pip install pandas), or take the columns as '
-            'arrays') from error
+            "pandas is not installed: install it (pip install pandas, or the extra 'pandas' of "
+            'this package), or take the columns as arrays') from error
     return pandas.DataFrame(columns)

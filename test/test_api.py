@@ -2,7 +2,6 @@
 
 import contextlib
 import doctest
-from importlib import import_module
 import inspect
 import json
 import math
@@ -13,9 +12,12 @@ import sys
 from types import SimpleNamespace
 
 from core_oracle import follow
+from extras import needs
 from matplotlib.figure import Figure
 import numpy as np
 import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_typestore, Stores
 from scipy.io import loadmat
 
 import hmsa
@@ -79,12 +81,61 @@ def test_names_that_were_in_the_package_of_ros_still_work_and_say_where_they_are
         hmsa_ros.plans  # noqa: B018
 
 
-@pytest.mark.parametrize('name', [
-    '', '.api.actuator', '.api.identified', '.api.motion', '.api.plan'])
-def test_examples_in_docstrings_print_what_they_show(name):
-    found = doctest.testmod(import_module(f'hmsa{name}'))
-    assert found.attempted
-    assert found.failed == 0
+def public(name):
+    """Yield the name and object of a part of the face, and of its public functions."""
+    whole = getattr(hmsa, name)
+    yield name, whole
+    for member in vars(whole) if inspect.isclass(whole) else ():
+        found = getattr(whole, member)
+        if not member.startswith('_') and (inspect.isfunction(found) or inspect.ismethod(found)):
+            yield f'{name}.{member}', found
+
+
+def write_bag(folder):
+    """Write a bag of samples and a command, as another program does."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    folder.parent.mkdir()
+
+    def header(time):
+        return store.types['std_msgs/msg/Header'](
+            stamp=store.types['builtin_interfaces/msg/Time'](sec=0, nanosec=time), frame_id='coil')
+
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, kind, values in (
+                ('/flux_density_command', 'sensor_msgs/msg/MagneticField', [{
+                    'magnetic_field': store.types['geometry_msgs/msg/Vector3'](
+                        x=0.0, y=0.0, z=0.02), 'magnetic_field_covariance': np.zeros(9)}]),
+                ('/joint_states', 'sensor_msgs/msg/JointState', [{
+                    'name': ['actuator'], 'position': np.array([1.0 + 1e-4 * i]),
+                    'velocity': np.array([0.1]), 'effort': np.array([0.02])}
+                    for i in range(100)])):
+            made = writer.add_connection(topic, kind, typestore=store)
+            for i, value in enumerate(values, 1):
+                time = 1_000_000 * i
+                writer.write(made, time, store.serialize_cdr(
+                    store.types[kind](header=header(time), **value), kind))
+
+
+CALLABLE = [x for name in sorted(FACE) if not name.endswith(('Error', 'Warning'))
+            for x in public(name)]
+
+
+@pytest.mark.parametrize('thing', [
+    pytest.param(x, id=name) for name, x in [('hmsa', hmsa), *CALLABLE]])
+def test_everything_public_has_an_example_that_prints_what_it_shows(
+        thing, tmp_path, monkeypatch):
+    thing = inspect.unwrap(thing)
+    text = inspect.getdoc(thing)
+    if 'to_pandas()' in text:
+        needs('pandas')
+    found = doctest.DocTestParser().get_doctest(text, {}, getattr(
+        thing, '__qualname__', 'hmsa'), inspect.getsourcefile(thing), 0)
+    assert found.examples
+    assert not any(doctest.SKIP in x.options for x in found.examples)
+    if 'my_run/run' in text:
+        write_bag(tmp_path / 'my_run' / 'run')
+    monkeypatch.chdir(tmp_path)
+    assert doctest.DocTestRunner().run(found).failed == 0
 
 
 def test_a_plan_rests_at_its_targets_as_another_integrator_finds(block):
@@ -346,7 +397,7 @@ def test_a_notebook_shows_tables_and_pictures(block, tmp_path):
     plan = block.plan([(1.1, 0.02)])
     motion = plan.simulate()
     for thing in (block, plan, motion, plan.report()):
-        assert thing._repr_html_().startswith('<table>')
+        assert thing._repr_html_().startswith('<table class="dataframe">')
     figure = motion.plot(tmp_path / 'motion.svg', width=85, data=True)
     assert figure._repr_png_().startswith(b'\x89PNG')
     assert (tmp_path / 'motion.csv').read_text().startswith('panel,curve,')
@@ -355,12 +406,118 @@ def test_a_notebook_shows_tables_and_pictures(block, tmp_path):
     assert '<h1>simulated</h1>' in page.read_text()
     table = Table(
         (Column('a<b', 'T', '.2f'), Column('what')), ((1.0, 'x'), (None, 'y')), 'c', ('n',))
-    assert '<th>a&lt;b (T)</th>' in table._repr_html_()
+    assert '<th>a&lt;b (T)</th><th style="text-align: left">what</th>' in table._repr_html_()
     assert str(table).splitlines() == [
         'a<b (T)  what', '───────  ────', '   1.00  x', '      –  y', 'c', 'note: n']
     # As a prompt without HTML shows them.
     assert repr(table) == str(table)
     assert repr(plan) == '<Plan two_step: 1 setpoints, 2 levels in 0.00165067 s>'
+    assert repr(block) == (
+        '<Actuator gent: 10 x 10 mm, shear modulus 30 kPa, 309.8 Hz, damping ratio 0.0408>')
+
+
+def test_a_plan_is_a_sequence_of_its_levels_and_a_table_one_of_its_rows(block):
+    plan = block.plan([(1.1, 0.5), (1.0, 0.5)])
+    assert np.array(list(plan)).tolist() == plan.levels.tolist()
+    assert len(plan) == len(plan.levels) == 4
+    assert (plan[-1].time, plan[-1].flux_density) == tuple(plan.levels[-1])
+    # Its slices are levels that can be simulated.
+    assert block.simulate(plan[:2], until=0.4).stretches[-1] == pytest.approx(1.1, abs=1e-6)
+    table = plan.report()
+    assert [x['status'] for x in table] == table['status']
+    assert (table[1], table[1:]['stretch']) == (table.records()[1], [1.0])
+
+
+class Quantity:
+    """The part of a quantity of pint that is needed: numbers, and what a unit of theirs is."""
+
+    UNITS = {'kPa': ('Pa', 1e3), 'mm': ('m', 1e-3), 'mT': ('T', 1e-3), 'ms': ('s', 1e-3),
+             'kHz': ('Hz', 1e3), '%': ('', 1e-2)}
+
+    def __init__(self, value, unit):
+        self.value, self.unit = value, unit
+
+    def m_as(self, unit):
+        base, factor = self.UNITS[self.unit]
+        if base != unit:
+            raise TypeError(f'cannot convert {self.unit} to {unit}')
+        return factor * self.value
+
+
+def quantity(kind):
+    """Return what makes quantities, of pint itself if that is wanted."""
+    return needs('pint').UnitRegistry().Quantity if kind == 'pint' else Quantity
+
+
+@pytest.mark.parametrize('kind', ['alike', 'pint'])
+def test_quantities_with_units_are_converted_wherever_numbers_are_taken(block, kind):
+    q = quantity(kind)
+    same = hmsa.Actuator(
+        shear_modulus=q(30.0, 'kPa'), half_length=q(5.0, 'mm'), remanence=q(80.0, 'mT'), zeta=0.1)
+    assert same.block == block.block
+    plan = block.plan([(1.1, 0.5), (1.0, 0.5)], limits=0.2, period=1e-4)
+    limits, period = (q(-200.0, 'mT'), q(200.0, 'mT')), q(0.1, 'ms')
+    for setpoints in (
+            [(1.1, q(500.0, 'ms')), (1.0, 0.5)], [(q(110.0, '%'), 0.5), (1.0, 0.5)],
+            {'stretch': [1.1, 1.0], 'duration': q(np.array([500.0, 500.0]), 'ms')}):
+        assert block.plan(setpoints, limits=limits, period=period).levels == pytest.approx(
+            plan.levels)
+    motion = plan.simulate(until=q(100.0, 'ms'), rate=q(2.0, 'kHz'))
+    assert len(motion.times) == 201
+    assert block.stretch(q(100.0, 'mT')) == block.stretch(0.1)
+    assert block.stretch([q(100.0, 'mT'), 0.1]) == pytest.approx([block.stretch(0.1)] * 2)
+    for shape in ('sine', 'square'):
+        wave = block.wave(shape, q(0.01, 'kHz'), 0.01)
+        assert wave.levels == pytest.approx(block.wave(shape, 10.0, 0.01).levels)
+    times = np.linspace(0.0, 0.5, 11)
+    path = 1.0 + 0.1 * np.sin(np.pi * times / 0.5) ** 2
+    assert block.follow(q(1e3 * times, 'ms'), path).levels == pytest.approx(
+        block.follow(times, path).levels)
+
+
+@pytest.mark.parametrize(('wrong', 'said'), [
+    (lambda x, q: hmsa.Actuator(shear_modulus=q(3.0, 'mm')), 'a quantity that converts to Pa'),
+    (lambda x, q: x.plan([(1.1, q(3.0, 'mm'))]), 'for duration: .* that converts to s'),
+    (lambda x, q: x.plan([(q(3.0, 'mm'), 1.0)]), 'for stretch: expected a number without'),
+    (lambda x, q: x.stretch(q(3.0, 'mm')), 'for flux densities: .* converts to T'),
+    (lambda x, q: x.flux_density(q(np.array([1.0]), 'mm')), 'for stretches: .* without a unit')])
+def test_a_quantity_of_another_dimension_is_refused(block, wrong, said):
+    with pytest.raises(hmsa.BadInputError, match=said):
+        wrong(block, Quantity)
+
+
+@pytest.mark.parametrize(('misspelt', 'meant'), [
+    (lambda x: hmsa.Actuator(shear_modulos=1.0), 'shear_modulus'),
+    (lambda x: hmsa.Actuator.beam(
+        length=0.01, thickness=1e-3, width=5e-3, youngs_modulus=2e6, densty=1e3), 'density'),
+    (lambda x: hmsa.Actuator(law='yeo'), 'yeoh'),
+    (lambda x: hmsa.Actuator(law='yeoh', constants={'c1': 1.0}), 'c10'),
+    (lambda x: hmsa.Actuator(mount='fre'), 'free'),
+    (lambda x: x.replace(remanance=1.0), 'remanence'),
+    (lambda x: x.scaled(remanance=1.0), 'remanence'),
+    (lambda x: x.plan([(1.1, 1.0)], shapper='step'), 'shaper'),
+    (lambda x: x.plan([(1.1, 1.0)], 'two_steps'), 'two_step'),
+    (lambda x: x.wave('sin', 1.0, 0.1), 'sine'),
+    (lambda x: x.amplifiers([(1.1, 1.0)], inductence=1.0), 'inductance'),
+    (lambda x: x.plan([(1.1, 1.0)]).simulate(noize=1.0), 'noise'),
+    (lambda x: x.plan([(1.1, 1.0)]).plot(widht=85), 'width'),
+    (lambda x: x.plan([(1.1, 1.0)]).plot(ax=Figure().subplots(), panel='comand'), 'command'),
+    (lambda x: x.report()['values'], 'value'),
+    (lambda x: hmsa.identify(x.simulate(LEVELS), free=['remanance']), 'remanence'),
+    (lambda x: hmsa.read('run', joit='a'), 'joint')])
+def test_a_misspelt_argument_is_named_with_the_one_that_is_meant(block, misspelt, meant):
+    with pytest.raises((TypeError, hmsa.BadInputError), match=f'did you mean {meant}[?]'):
+        misspelt(block)
+
+
+def test_runs_are_compared_in_axes_of_your_own(block, tmp_path):
+    runs = [block.plan([(1.1, 0.05)], x).simulate(label=x) for x in ('two_step', 'step')]
+    ax = Figure().subplots()
+    hmsa.compare(*runs, ax=ax, panel='phase')
+    assert [x.get_label() for x in ax.get_lines()] == ['two_step', 'step']
+    assert ax.get_lines()[1].get_ydata() == pytest.approx(runs[1].rates)
+    with pytest.raises(hmsa.BadInputError, match='width given without a picture'):
+        hmsa.compare(*runs, width=85)
 
 
 def test_samples_and_levels_are_read_only_and_the_given_arrays_are_not(block):

@@ -21,12 +21,13 @@ from hmsa.api.arguments import (
     numbers,
     parameters_in,
     setpoints_of,
+    suggesting,
     whole,
 )
 from hmsa.api.doubts import unquestioned, warn
 from hmsa.api.facts import facts
 from hmsa.api.mounting import mount_facts, with_mount
-from hmsa.errors import BadInputError, excerpt
+from hmsa.errors import BadInputError, excerpt, meant
 from hmsa.files import write_text, yaml_text
 from hmsa.interfaces.actuator import actuator_from, model_from, parameters_of
 from hmsa.interfaces.parameters import (
@@ -66,6 +67,8 @@ _SPECS = (*PLANNED, *VISCOELASTIC, replace(CREEP_TOLERANCE, default=IDEAL.ripple
 class Actuator:
     """
     A block of 2L x 2L x 2H of hard-magnetic elastomer, or a beam, with its coil; all in SI units.
+
+    Here and in all methods, quantities of pint are accepted as well as numbers, and converted.
 
     Parameters
     ----------
@@ -126,6 +129,7 @@ class Actuator:
 
     """
 
+    @suggesting
     def __init__(
             self, *, shear_modulus: float | None = None, density: float = 1900.0,
             half_length: float = 0.01, half_thickness: float | None = None,
@@ -161,6 +165,13 @@ class Actuator:
         Missing parameters take their defaults. ``belief`` is their uncertainty, if known, or the
         file that contains it. Raise `BadInputError` if a value has the wrong type or is out of
         range.
+
+        Examples
+        --------
+        >>> from hmsa import Actuator
+        >>> Actuator.from_parameters({'actuator.shear_modulus': 30e3}).shear_modulus
+        30000.0
+
         """
         return cls._of(
             _model(mapping_of(values, 'parameters', "'actuator.remanence': 0.1")), belief)
@@ -180,6 +191,17 @@ class Actuator:
         ------
         BadInputError
             If the file cannot be read, or a value in it is out of range.
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> from hmsa import Actuator
+        >>> block = Actuator(shear_modulus=30e3)
+        >>> with TemporaryDirectory() as folder:
+        ...     block.to_yaml(Path(folder, 'actuator.yaml'))
+        ...     Actuator.from_yaml(Path(folder, 'actuator.yaml')) == block
+        True
 
         """
         path = file_of(path, 'the path of a YAML file')
@@ -290,25 +312,61 @@ class Actuator:
         return scales(self.block, *self.flux_density_limits)
 
     def flux_density(self, stretch: ArrayLike) -> Any:
-        """Return the flux densities in T that hold stretches; a number or an array."""
+        """
+        Return the flux densities in T that hold stretches; a number or an array.
+
+        Raise `BadInputError` if the stretches are no numbers.
+
+        Examples
+        --------
+        >>> from hmsa import Actuator
+        >>> Actuator().flux_density([1.0, 1.1]).round(4).tolist()
+        [0.0, 0.0346]
+
+        """
         found = self.model.units.level(
             elastic_force(numbers(stretch, 'stretches'), self.model.material))
         return found if np.ndim(found) else float(found)
 
     def stretch(self, flux_density: ArrayLike) -> Any:
-        """Return the equilibrium stretches at flux densities in T; a number or an array."""
-        load = self.model.units.of_level(numbers(flux_density, 'flux densities'))
+        """
+        Return the equilibrium stretches at flux densities in T; a number or an array.
+
+        Raise `BadInputError` if the flux densities are no numbers.
+
+        Examples
+        --------
+        >>> from hmsa import Actuator
+        >>> Actuator().stretch([0.0, 0.02]).round(4).tolist()
+        [1.0, 1.0559]
+
+        """
+        load = self.model.units.of_level(
+            numbers(flux_density, 'flux densities', unit='T'))
         found = equilibrium_stretch(load, self.model.material)
         return found if np.ndim(found) else float(found)
 
     def report(self) -> Table:
-        """Return a table of the derived quantities."""
+        """
+        Return a table of the derived quantities.
+
+        Examples
+        --------
+        >>> from hmsa import Actuator
+        >>> Actuator().report()[1]
+        {'quantity': 'natural frequency at rest', 'value': '89.437 Hz'}
+
+        """
         return Table(
             (Column('quantity'), Column('value')),
             (*facts(self.scales, self.block), *mount_facts(self.block)))
 
     def __repr__(self) -> str:
-        return f'Actuator.from_parameters({self.parameters!r})'
+        size = ' x '.join(f'{2e3 * x:.4g}' for x in (
+            self.block.half_length, self.block.half_thickness))
+        return (
+            f'<Actuator {self.law}: {size} mm, shear modulus {1e-3 * self.shear_modulus:.4g} kPa, '
+            f'{self.scales.frequency:.4g} Hz, damping ratio {self.damping_ratio:.3g}>')
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Actuator) and self.model == other.model
@@ -351,7 +409,8 @@ class Actuator:
         unknown = [x for x in parameters if x not in _KEYS]
         if unknown:
             raise BadInputError(
-                f'{unknown[0]} is no parameter of an actuator: expected {", ".join(_KEYS)}')
+                f'{unknown[0]} is no parameter of an actuator: expected {", ".join(_KEYS)}'
+                + meant(unknown[0], _KEYS))
         mount = parameters.pop('mount', 'paper')
         changed = parameters_in(parameters, self.law)
         # A new model or new branches replace all previous ones.
@@ -398,13 +457,15 @@ class Actuator:
         unknown = [x for x in factors if x not in ACTUATOR_FIELDS]
         if unknown:
             raise BadInputError(
-                f'{unknown[0]} has no factor: expected {", ".join(ACTUATOR_FIELDS)}')
+                f'{unknown[0]} has no factor: expected {", ".join(ACTUATOR_FIELDS)}'
+                + meant(unknown[0], ACTUATOR_FIELDS))
         block = actuator_from(_checked(self.parameters) | {
             f'mismatch.{name}': number(x, f'the factor on {name}') for name, x in factors.items()})
         return self._of(JointModel(replace(block, creep=self.block.creep), self.model.options))
 
     # -- plans and motions ---------------------------------------------------------------------
 
+    @suggesting
     def plan(
             self, setpoints: Any, shaper: str = 'two_step', *,
             limits: float | tuple[float, float] | None = None, start: float | None = None,
@@ -487,6 +548,7 @@ class Actuator:
             shaper, short_spell)
         return Plan(self, segments, shaper)
 
+    @suggesting
     def follow(
             self, times: ArrayLike, stretches: ArrayLike, rates: ArrayLike | None = None,
             accelerations: ArrayLike | None = None, *, tolerance: float = 1e-6,
@@ -534,9 +596,10 @@ class Actuator:
         from hmsa.api.paths import followed, path_of
 
         path = path_of(self, (times, stretches, rates, accelerations))
-        ends = float(np.asarray(stretches)[0]), float(np.asarray(stretches)[-1])
-        return followed(self, path, ends, tolerance, period)
+        ends = numbers(stretches, 'stretches')[[0, -1]].tolist()
+        return followed(self, path, (ends[0], ends[1]), tolerance, period)
 
+    @suggesting
     def wave(
             self, shape: Any, frequency: float, amplitude: float, *, offset: float | None = None,
             cycles: float = 10.0, last: float | None = None, tolerance: float = 1e-4) -> 'Plan':
@@ -587,13 +650,14 @@ class Actuator:
         from hmsa.api.paths import followed, wave_of, wave_path
 
         wave = wave_of(self, shape, amplitude, offset)
+        first, end = (number(x, 'frequency', 'Hz', above=0.0) for x in (
+            frequency, frequency if last is None else last))
         if isinstance(shape, str) and shape == 'square':
-            half = 0.5 / number(frequency, 'frequency', 'Hz', above=0.0)
+            half = 0.5 / first
             count = round(number(cycles, 'cycles', least=1.0, most=1e5))
-            return self.plan([(wave.mean + amplitude, half), (
-                wave.mean - amplitude, half)] * count + [(self.block.rest, half)])
-        path = wave_path(
-            self, wave, (frequency, frequency if last is None else last), cycles)
+            return self.plan([(wave.mean + wave.amplitude, half), (
+                wave.mean - wave.amplitude, half)] * count + [(self.block.rest, half)])
+        path = wave_path(self, wave, (first, end), cycles)
         return followed(self, path, (self.block.rest,) * 2, tolerance)
 
     def wave_bands(self, shape: Any, amplitude: float, offset: float | None = None) -> Array:
@@ -602,6 +666,13 @@ class Actuator:
 
         The arguments are those of `wave`. A band that starts at 0 has no lower limit. Raise
         `BadInputError` if the arguments describe no wave.
+
+        Examples
+        --------
+        >>> from hmsa import Actuator
+        >>> Actuator(flux_density_limits=0.05).wave_bands('sine', 0.05).round(1).tolist()
+        [[0.0, 167.3]]
+
         """
         from hmsa.api.paths import bands
 
@@ -617,6 +688,7 @@ class Actuator:
             self._belief = read_belief(self._belief)
         return errors_of(self._belief, ERRORS)
 
+    @suggesting
     def simulate(
             self, levels: Any, *, until: float | None = None, rate: float | None = None,
             noise: float = 0.0, seed: int = 0, start: float | None = None,
@@ -717,6 +789,16 @@ class Actuator:
         ------
         BadInputError
             If the file cannot be written.
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> from hmsa import Actuator
+        >>> with TemporaryDirectory() as folder:
+        ...     Actuator().to_yaml(Path(folder, 'actuator.yaml'))
+        ...     print(Path(folder, 'actuator.yaml').read_text().splitlines()[2])
+            actuator.shear_modulus: 10000.0
 
         """
         write_text(file_of(path), '\n'.join([

@@ -1,12 +1,13 @@
 """Amplifiers compared for a plan: slew rate, bandwidth, current, voltage and time lost."""
 
 from collections.abc import Sequence
+from inspect import signature
 import math
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from hmsa.api.arguments import number, numbers, several
+from hmsa.api.arguments import check_names, number, numbers, several
 from hmsa.errors import BadInputError
 from hmsa.model.equations import Array
 from hmsa.model.simulation import response
@@ -48,6 +49,9 @@ def amplifiers(
         If an argument has the wrong type or is out of range.
 
     """
+    check_names('Actuator.amplifiers', more, [
+        'slew_limits', 'bandwidths', *_COIL,
+        *(x for x in signature(actuator.plan).parameters if x != 'setpoints')])
     given = {x: more.pop(x, None) for x in _COIL}
     coil = {
         x: number(y, x, _COIL[x], above=0.0) for x, y in given.items() if y is not None}
@@ -75,8 +79,8 @@ def amplifiers(
             notes.append(
                 f'{own:.4g} Hz is the bandwidth of the coil itself, R/(2 pi L), on an amplifier '
                 'that sets voltages and not currents')
-    slew_limits, bandwidths = (numbers(several(x), y).ravel().tolist() for x, y in (
-        (slew_limits, 'slew limits'), (bandwidths, 'bandwidths')))
+    slew_limits, bandwidths = (numbers(several(x), y, unit=z).ravel().tolist() for x, y, z in (
+        (slew_limits, 'slew limits', 'T/s'), (bandwidths, 'bandwidths', 'Hz')))
     for slew, band in [*((x, math.inf) for x in slew_limits), *(
             (math.inf, x) for x in bandwidths)]:
         try:

@@ -1,15 +1,17 @@
 """Checks of the arguments of public functions: numbers, columns and actuator parameters."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import wraps
+import inspect
 import math
 from numbers import Real
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from hmsa.errors import BadInputError, excerpt
+from hmsa.errors import BadInputError, excerpt, meant
 from hmsa.interfaces.parameters import ACTUATOR, COIL_TIME_CONSTANT, LAW_NAME
 from hmsa.model.equations import Array
 from hmsa.model.laws import LAWS
@@ -24,6 +26,60 @@ _OPTIONAL = ('shear_modulus', 'half_thickness', *DAMPED, 'constants')
 _FINEST = 1e-9
 #: Alternative names of columns.
 _ALIASES = {'duration': ('span', 'seconds'), 'stretch': ('deflection', 'position')}
+
+
+# Units of columns; others have none.
+_UNITS = {'time': 's', 'duration': 's', 'flux_density': 'T'}
+
+_P = ParamSpec('_P')
+_R = TypeVar('_R')
+
+
+def suggesting(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Have a function name the argument that a misspelt one may mean."""
+    known = inspect.signature(function).parameters.values()
+    if any(x.kind is x.VAR_KEYWORD for x in known):
+        return function  # which checks them
+    names = [x.name for x in known if x.name != 'self']
+
+    @wraps(function)
+    def checked(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        check_names(function.__qualname__.removesuffix('.__init__'), kwargs, names)
+        return function(*args, **kwargs)
+
+    return checked
+
+
+def check_names(function: str, given: Iterable[str], names: Sequence[str]) -> None:
+    """Raise `TypeError`, as Python does, if a function has no argument of a given name."""
+    for name in given:
+        if name not in names:
+            raise TypeError(
+                f'{function}() got an unexpected keyword argument {name!r}: expected some of '
+                f'{", ".join(names)}' + meant(name, names))
+
+
+def plain(value: Any, unit: str, what: str) -> Any:
+    """
+    Return a quantity of pint as numbers in a unit, and anything else unchanged.
+
+    An empty unit is that of a dimensionless value.
+
+    Raises
+    ------
+    BadInputError
+        If the quantity has another dimension.
+
+    """
+    if not hasattr(value, 'm_as'):
+        return value
+    try:
+        return value.m_as(unit)
+    except (AttributeError, TypeError, ValueError) as error:
+        raise BadInputError(
+            f'{excerpt(value)} is given for {what}: expected '
+            + (f'a quantity that converts to {unit}' if unit else 'a number without a unit')
+        ) from error
 
 
 def columns_of(value: Any, names: tuple[str, str], what: str) -> tuple[Array, Array]:
@@ -55,16 +111,17 @@ def columns_of(value: Any, names: tuple[str, str], what: str) -> tuple[Array, Ar
     if isinstance(value, Mapping) or hasattr(value, 'columns') and hasattr(value, '__getitem__'):
         pair = [_column(value, x, what) for x in names]
     elif isinstance(value, tuple) and len(value) == 2 and all(
-            isinstance(x, np.ndarray) for x in value):
+            isinstance(x, np.ndarray) or np.ndim(x) and hasattr(x, 'm_as') for x in value):
         pair = list(value)
     else:
-        rows = numbers(value, what, expected)
+        rows = numbers(_plain_rows(value, names), what, expected)
         if rows.ndim != 2 or rows.shape[1] != 2:
             raise BadInputError(
                 f'{what} have the shape {rows.shape}: {expected}, as in '
                 f'[({", ".join(names)}), ({", ".join(names)})]')
         pair = [rows[:, 0], rows[:, 1]]
-    one, other = (np.ascontiguousarray(numbers(x, what, expected)) for x in pair)
+    one, other = (np.ascontiguousarray(numbers(x, what, expected, _UNITS.get(name, '')))
+                  for x, name in zip(pair, names, strict=True))
     if one.ndim != 1 or one.shape != other.shape or not len(one):
         raise BadInputError(
             f'{what} have {names[0]} of shape {one.shape} and {names[1]} of shape {other.shape}: '
@@ -103,10 +160,11 @@ def file_of(value: Any, what: str = 'the path of a file') -> Path:
 
 def grid_of(period: Any) -> float:
     """Return the period of a command grid in s, 0 for none, or raise `BadInputError`."""
-    if 0.0 < number(period, 'period', 's', least=0.0) < _FINEST:
+    found = number(period, 'period', 's', least=0.0)
+    if 0.0 < found < _FINEST:
         raise BadInputError(
-            f'period is {period:g} s: expected 0 for any time, or at least {_FINEST:g} s')
-    return float(period)
+            f'period is {found:g} s: expected 0 for any time, or at least {_FINEST:g} s')
+    return found
 
 
 def mapping_of(value: Any, what: str, example: str) -> Mapping[str, Any]:
@@ -145,8 +203,21 @@ def _column(value: Any, name: str, what: str) -> Any:
     return value[found[0]]
 
 
-def numbers(value: Any, what: str, expected: str = 'expected numbers') -> Array:
-    """Return numbers of any shape, or raise `BadInputError`."""
+def _plain_rows(value: Any, names: tuple[str, str]) -> Any:
+    """Return pairs with each quantity as a number in the unit of its column."""
+    if not isinstance(value, (tuple, list)):
+        return value
+    return [
+        [plain(x, _UNITS.get(name, ''), name) for x, name in zip(row, names, strict=True)]
+        if isinstance(row, (tuple, list)) and len(row) == len(names) else row for row in value]
+
+
+def numbers(
+        value: Any, what: str, expected: str = 'expected numbers', unit: str = '') -> Array:
+    """Return numbers of any shape, those of quantities in a unit, or raise `BadInputError`."""
+    value = plain(value, unit, what)
+    if isinstance(value, (tuple, list)):
+        value = [plain(x, unit, what) for x in value]
     try:
         if np.iscomplexobj(value):
             raise TypeError  # NumPy would drop the imaginary parts
@@ -169,6 +240,7 @@ def number(
 
     """
     units = f' {unit}' if unit else ''
+    value = plain(value, unit, what)
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
         raise BadInputError(
             f'{what} is {excerpt(value)}: expected a number' + (f' in {unit}' if unit else ''))
@@ -227,7 +299,8 @@ def parameters_in(given: Mapping[str, Any], law: str = 'gent') -> dict[str, Any]
 def _law_values(name: Any, constants: Any, modulus_given: bool) -> dict[str, Any]:
     """Return the parameters of a model; a number is accepted for a constant that is a list."""
     if not isinstance(name, str) or name not in LAWS:
-        raise BadInputError(f'law is {excerpt(name)}: expected one of {", ".join(LAWS)}')
+        raise BadInputError(f'law is {excerpt(name)}: expected one of {", ".join(LAWS)}'
+                            + meant(name, LAWS))
     law = LAWS[name]
     constants = mapping_of(constants, 'constants', "'mu': 5e3")
     names = {x.name.partition('.')[2]: x for x in law.constants}
@@ -235,7 +308,7 @@ def _law_values(name: Any, constants: Any, modulus_given: bool) -> dict[str, Any
     if unknown:
         raise BadInputError(
             f'law {name} has no constant {unknown[0]!r}: expected '
-            + (', '.join(names) or 'none'))
+            + (', '.join(names) or 'none') + meant(unknown[0], names))
     if modulus_given and law.scaled is not None:
         raise BadInputError(
             f'shear_modulus is given with law {name}, whose constants it follows from: expected '
@@ -245,7 +318,8 @@ def _law_values(name: Any, constants: Any, modulus_given: bool) -> dict[str, Any
         kind = names[key].kind
         values[names[key].name] = (
             number(value, key, names[key].unit) if kind is float
-            else [number(x, key) for x in several(value)] if kind is list else str(value))
+            else [number(x, key, names[key].unit) for x in several(value)] if kind is list
+            else str(value))
     return values
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hmsa.api.actuator import Actuator
-from hmsa.api.arguments import columns_of, file_of, mapping_of, names_of, number
+from hmsa.api.arguments import columns_of, file_of, mapping_of, names_of, number, suggesting
 from hmsa.api.motion import Motion
 from hmsa.errors import BadInputError, excerpt
 from hmsa.files import may_be_bag, write_text
@@ -38,6 +38,16 @@ class Identified:
     actuator : Actuator
         The actuator with these values and the given coil; use it only if the verdict is
         ``identified``.
+
+    Examples
+    --------
+    >>> import hmsa
+    >>> levels = [(0.0, 0.0), (0.05, 0.03), (0.2, -0.02), (0.35, 0.02), (0.5, 0.0)]
+    >>> motion = hmsa.Actuator().simulate(levels, until=0.7, noise=1e-4)
+    >>> found = hmsa.identify(motion, free=['remanence', 'stretch_bias'])
+    >>> low, high = found.intervals['remanence']
+    >>> low < 0.1 < high
+    True
 
     """
 
@@ -71,6 +81,16 @@ class Identified:
         Return the table of ``hmsa identify``.
 
         With a path, also write the HTML page there; raise `BadInputError` if it cannot be written.
+
+        Examples
+        --------
+        >>> import hmsa
+        >>> levels = [(0.0, 0.0), (0.05, 0.03), (0.2, -0.02), (0.35, 0.02), (0.5, 0.0)]
+        >>> motion = hmsa.Actuator().simulate(levels, until=0.7, noise=1e-4)
+        >>> found = hmsa.identify(motion, free=['remanence', 'stretch_bias'])
+        >>> found.report()['parameter']
+        ['remanence', 'stretch_bias']
+
         """
         if path is not None:
             from hmsa.report.identified import page
@@ -87,6 +107,19 @@ class Identified:
         BadInputError
             If the verdict is not ``identified``, or the file cannot be written.
 
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> import hmsa
+        >>> levels = [(0.0, 0.0), (0.05, 0.03), (0.2, -0.02), (0.35, 0.02), (0.5, 0.0)]
+        >>> motion = hmsa.Actuator().simulate(levels, until=0.7, noise=1e-4)
+        >>> found = hmsa.identify(motion, free=['remanence', 'stretch_bias'])
+        >>> with TemporaryDirectory() as folder:
+        ...     found.to_yaml(Path(folder, 'actuator.yaml'))
+        ...     hmsa.Actuator.from_yaml(Path(folder, 'actuator.yaml')) == found.actuator
+        True
+
         """
         if self.verdict != 'identified':
             raise BadInputError(
@@ -100,6 +133,7 @@ class Identified:
         return self.report()._repr_html_()
 
 
+@suggesting
 def identify(
         samples: Any, commands: Any = None, *, actuator: Actuator | None = None,
         free: Sequence[str] | None = None, known: Mapping[str, float] | None = None,

@@ -1,15 +1,15 @@
 """A simulated or recorded motion: samples, levels and report."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from hmsa.api.arguments import file_of, number, several, whole
-from hmsa.errors import BadInputError, excerpt
+from hmsa.api.arguments import file_of, number, several, suggesting, whole
+from hmsa.errors import BadInputError, excerpt, meant
 from hmsa.interfaces.outcome import Outcome
 from hmsa.model.equations import Array
 from hmsa.model.simulation import check_stretch, longest_motion, response
@@ -91,6 +91,14 @@ class Motion:
 
         With a path, also write the page of ``hmsa report`` there; raise `BadInputError` if it
         cannot be written.
+
+        Examples
+        --------
+        >>> from hmsa import Actuator
+        >>> motion = Actuator().plan([(1.1, 0.2), (1.0, 0.2)]).simulate()
+        >>> motion.report()['verdict']
+        ['arrived', 'arrived']
+
         """
         from hmsa.report.arrivals import Part
         from hmsa.report.comparison import setpoints
@@ -164,11 +172,35 @@ class Motion:
         Write the samples, and the levels to a second file, as ``hmsa export`` does.
 
         The name ends in .csv, .parquet or .mat. Raise `BadInputError` if a file cannot be written.
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> from hmsa import Actuator
+        >>> motion = Actuator().plan([(1.1, 0.2)]).simulate()
+        >>> with TemporaryDirectory() as folder:
+        ...     [x.name for x in motion.save(Path(folder, 'motion.csv'))]
+        ['motion.csv', 'motion_levels.csv']
+
         """
         return write_run(file_of(path), self.run)
 
     def to_pandas(self) -> Any:
-        """Return the samples as a DataFrame: time, stretch, stretch_rate and flux_density."""
+        """
+        Return the samples as a DataFrame: time, stretch, stretch_rate and flux_density.
+
+        Raise `BadInputError` if pandas is not installed.
+
+        Examples
+        --------
+        >>> from hmsa import Actuator
+        >>> motion = Actuator().plan([(1.1, 0.2)]).simulate()
+        >>> samples = motion.to_pandas().set_index('time')
+        >>> samples.shape, round(float(samples['stretch'].iloc[-1]), 3)
+        ((721, 3), 1.1)
+
+        """
         return frame(dict(samples_of(self.run)))
 
     def __repr__(self) -> str:
@@ -180,6 +212,7 @@ class Motion:
         return self.report()._repr_html_()
 
 
+@suggesting
 def read(path: str | Path, *, joint: str = '') -> Motion:
     """
     Read a bag without ROS.
@@ -201,6 +234,14 @@ def read(path: str | Path, *, joint: str = '') -> Motion:
     BadInputError
         If there is no bag, it has no samples, or it has several actuators and ``joint`` is empty.
 
+    Examples
+    --------
+    Read and draw the bag of ``hmsa run --out my_run``:
+
+    >>> import hmsa
+    >>> motion = hmsa.read('my_run/run')
+    >>> figure = motion.plot('motion.pdf', width=85)
+
     """
     from hmsa.runs.bags import read_run
 
@@ -209,9 +250,10 @@ def read(path: str | Path, *, joint: str = '') -> Motion:
     return Motion(read_run(file_of(path, 'the folder of a bag'), joint=joint))
 
 
+@suggesting
 def compare(
         *motions: Motion, picture: str | Path | Sequence[str | Path] | None = None,
-        **paper: Any) -> Table:
+        ax: Any = None, panel: str = 'response', **paper: Any) -> Table:
     """
     Compare motions: move time, steady-state error and vibration of each setpoint, and curves.
 
@@ -221,6 +263,10 @@ def compare(
         Two or more; the others are compared with the first.
     picture : str, Path or sequence of these, optional
         Files to which to write a figure of all motions.
+    ax : matplotlib.axes.Axes, optional
+        Axes of your own to draw a line of each motion into.
+    panel : {'response', 'command', 'phase'}
+        With ``ax``, the curve to draw.
     **paper
         As for `Motion.plot`.
 
@@ -241,6 +287,11 @@ def compare(
     >>> runs = [block.plan([(1.1, 0.05)], shaper=x).simulate() for x in ('two_step', 'step')]
     >>> hmsa.compare(*runs)['apart'][1] > 50.0   # % of the step
     True
+    >>> from matplotlib.figure import Figure
+    >>> ax = Figure().subplots()
+    >>> _ = hmsa.compare(*runs, ax=ax)
+    >>> len(ax.get_lines())
+    2
 
     """
     if len(motions) < 2 or not all(isinstance(x, Motion) for x in motions):
@@ -252,7 +303,14 @@ def compare(
 
     found = comparison([Part.of(x.run) for x in motions])
     if picture is not None:
-        _draw([x.run for x in motions], picture, paper)
+        _draw([x.run for x in motions], picture, {} if ax is not None else paper)
+    elif paper and ax is None:
+        raise BadInputError(
+            f'{", ".join(paper)} given without a picture: expected picture, the file to draw, or '
+            'ax')
+    if ax is not None:
+        for each in motions:
+            _draw_into(ax, each, panel, paper)
     return found
 
 
@@ -267,12 +325,14 @@ def _draw(runs: list[Run], path: Any, paper: Mapping[str, Any]) -> Any:
         x: y if x in ('data', 'panels') or y is None else number(y, x) for x, y in paper.items()}
     if isinstance(panels := checked.get('panels'), str):
         checked['panels'] = panels.split(',')
+    known = [x.name for x in fields(Paper)]
     try:
         size = Paper(**checked)
     except TypeError as error:
         raise BadInputError(
             f'pictures have {", ".join(paper)}: expected numbers for width and height (mm), '
-            'letters (pt) and dpi, names of panels, and data') from error
+            'letters (pt) and dpi, names of panels, and data'
+            + ''.join(meant(x, known) for x in paper if x not in known)) from error
     return draw(paths, parts_of(runs), size)
 
 
@@ -292,7 +352,8 @@ def _draw_into(ax: Any, motion: Motion, panel: Any, line: Mapping[str, Any]) -> 
     if not isinstance(ax, Axes):
         raise BadInputError(f'ax is {excerpt(ax)}: expected axes of Matplotlib')
     if not isinstance(panel, str) or panel not in panels:
-        raise BadInputError(f'panel is {excerpt(panel)}: expected one of {", ".join(panels)}')
+        raise BadInputError(f'panel is {excerpt(panel)}: expected one of {", ".join(panels)}'
+                            + meant(panel, panels))
     line = {'label': motion.run.label, **line}
     try:
         if panel == 'command':

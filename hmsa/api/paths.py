@@ -9,7 +9,7 @@ import numpy as np
 
 from hmsa.api.arguments import columns_of, grid_of, number, numbers
 from hmsa.columns import read_table
-from hmsa.errors import BadInputError, excerpt
+from hmsa.errors import BadInputError, excerpt, meant
 from hmsa.model.equations import Array
 from hmsa.model.moves import State
 from hmsa.model.simulation import check_stretch
@@ -53,7 +53,8 @@ def path_of(actuator: 'Actuator', columns: tuple[Any, ...]) -> Path:
 
     Raise `BadInputError` if the columns describe no path.
     """
-    given = [_column(x) for i, x in enumerate(columns) if i < 2 or x is not None]
+    given = [_column(x, ('s', '', '1/s', '1/s^2')[i])
+             for i, x in enumerate(columns) if i < 2 or x is not None]
     if columns[2] is None and columns[3] is not None:
         raise BadInputError('accelerations are given without rates: expected both')
     if len({len(x) for x in given}) > 1 or len(given[0]) < 2:
@@ -73,8 +74,8 @@ def path_of(actuator: 'Actuator', columns: tuple[Any, ...]) -> Path:
         x * unit ** i for i, x in enumerate(more, 1))) if more else Path.smooth(since, stretches)
 
 
-def _column(values: Any) -> Array:
-    found = numbers(values, 'columns of the path')
+def _column(values: Any, unit: str = '') -> Array:
+    found = numbers(values, 'columns of the path', unit=unit)
     if found.ndim != 1 or not np.all(np.isfinite(found)):
         raise BadInputError(
             f'a column of the path is {excerpt(values)}: expected one dimension of finite numbers')
@@ -95,7 +96,7 @@ def wave_of(
         if shape not in SHAPES:
             raise BadInputError(
                 f'shape is {excerpt(shape)}: expected one of {", ".join(SHAPES)}, or one '
-                'period of times and stretches')
+                'period of times and stretches' + meant(shape, SHAPES))
         form = SHAPES[shape]
     else:
         times, stretches = columns_of(shape, ('time', 'stretch'), 'samples of a wave')

@@ -1,16 +1,16 @@
 """A plan: levels for the coil and their times, and the predicted motion."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, overload, SupportsIndex
 
 import numpy as np
 
 from hmsa.api.actuator import Actuator
-from hmsa.api.arguments import file_of, number
+from hmsa.api.arguments import file_of, number, suggesting
 from hmsa.api.motion import Motion, simulated
 from hmsa.errors import BadInputError, excerpt
 from hmsa.model.equations import Array
@@ -49,13 +49,21 @@ def _between(segment: Segment, time: float, shown: Callable[[float], float]) -> 
     ) if len(inside) <= _MOST_BETWEEN else f'{len(inside)} levels'
 
 
+class PlannedLevel(NamedTuple):
+    """A field level of a plan."""
+
+    time: float  #: from which it is valid, in s
+    flux_density: float  #: in T
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
     """
     A planned command: field levels, each valid from its time on.
 
-    `Actuator.plan` makes plans. Equal plans have the same actuator, setpoints, levels and shaper.
-    Their arrays are read-only.
+    `Actuator.plan` makes plans. A plan is a sequence of its levels: it has a length, and
+    iteration, indices and slices return times and flux densities. Equal plans have the same
+    actuator, setpoints, levels and shaper. Their arrays are read-only.
 
     Examples
     --------
@@ -67,6 +75,10 @@ class Plan:
     ['two_step', 'two_step']
     >>> plan.simulate().report()['verdict']
     ['arrived', 'arrived']
+    >>> len(plan), round(plan[-1].time, 6), plan[-1].flux_density
+    (4, 0.505733, 0.0)
+    >>> [f'{1e3 * flux_density:.1f} mT' for time, flux_density in plan[:2]]
+    ['20.1 mT', '34.6 mT']
 
     """
 
@@ -115,6 +127,21 @@ class Plan:
         return read_only(np.array(
             [x.move.duration for x in self.segments]) * self.actuator.model.units.time)
 
+    def __len__(self) -> int:
+        return len(self.levels)
+
+    def __iter__(self) -> Iterator[PlannedLevel]:
+        return (PlannedLevel(*x) for x in self.levels.tolist())
+
+    @overload
+    def __getitem__(self, key: SupportsIndex) -> PlannedLevel: ...
+
+    @overload
+    def __getitem__(self, key: slice) -> tuple[PlannedLevel, ...]: ...
+
+    def __getitem__(self, key: Any) -> Any:
+        return tuple(self)[key]
+
     def currents(self, tesla_per_ampere: float) -> Array:
         """
         Return the levels in A, for a coil constant in T/A, shape (m,).
@@ -123,6 +150,12 @@ class Plan:
         ------
         BadInputError
             If the coil constant is not a number above 0.
+
+        Examples
+        --------
+        >>> from hmsa import Actuator
+        >>> Actuator().plan([(1.1, 0.5)]).currents(0.02).round(3).tolist()
+        [1.006, 1.729]
 
         """
         return self.flux_densities / number(
@@ -134,6 +167,15 @@ class Plan:
 
         The table of a path contains its duration, its largest flux density and how fast this
         changes.
+
+        Examples
+        --------
+        >>> from hmsa import Actuator
+        >>> print(Actuator().plan([(1.1, 0.5)]).report())
+        stretch  duration (s)  first level (T)  move time (s)  last level (T)  status
+        ───────  ────────────  ───────────────  ─────────────  ──────────────  ────────
+            1.1           0.5         0.020118     0.00573522       0.0345706  two_step
+
         """
         units, name = self.actuator.model.units, self.actuator.block.coordinate.name
         unit, level = units.load_name.strip(), units.level
@@ -154,6 +196,7 @@ class Plan:
               else None, level(x.held)) for x in self.segments],
             Column('between', f'{unit} at s'), units.time, level)
 
+    @suggesting
     def simulate(
             self, *, truth: Actuator | None = None, noise: float = 0.0,
             rate: float | None = None, until: float | None = None, seed: int = 0,
@@ -207,7 +250,18 @@ class Plan:
     def plot(
             self, path: str | Path | Sequence[str | Path] | None = None, *, ax: Any = None,
             panel: str = 'response', **more: Any) -> Any:
-        """Draw the motion that the plan predicts, as `Motion.plot` does."""
+        """
+        Draw the motion that the plan predicts, as `Motion.plot` does.
+
+        Examples
+        --------
+        >>> from matplotlib.figure import Figure
+        >>> from hmsa import Actuator
+        >>> ax = Actuator().plan([(1.1, 0.2)]).plot(ax=Figure().subplots(), panel='command')
+        >>> ax.get_ylabel()
+        'flux density $B$ (T)'
+
+        """
         return self.simulate(label=self.shaper).plot(path, ax=ax, panel=panel, **more)
 
     def save(self, path: str | Path) -> None:
@@ -216,11 +270,35 @@ class Plan:
 
         ``hmsa simulate`` and ``hmsa run --levels`` read the CSV file. Raise `BadInputError` if the
         file cannot be written.
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> from hmsa import Actuator
+        >>> with TemporaryDirectory() as folder:
+        ...     Actuator().plan([(1.1, 0.5)]).save(Path(folder, 'levels.csv'))
+        ...     print(Path(folder, 'levels.csv').read_text().splitlines()[0])
+        time,flux_density
+
         """
         write_table(file_of(path), {'time': self.times, 'flux_density': self.flux_densities})
 
     def to_pandas(self) -> Any:
-        """Return the levels as a DataFrame."""
+        """
+        Return the levels as a DataFrame.
+
+        Raise `BadInputError` if pandas is not installed.
+
+        Examples
+        --------
+        >>> from hmsa import Actuator
+        >>> Actuator().plan([(1.1, 0.5)]).to_pandas().round(4)
+             time  flux_density
+        0  0.0000        0.0201
+        1  0.0057        0.0346
+
+        """
         return frame({'time': self.times, 'flux_density': self.flux_densities})
 
     def _values(self) -> tuple[object, ...]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, meant
 from hmsa.model.creep import Creep
 from hmsa.model.equations import Array
 from hmsa.model.flows import CONSTANTS, FLOWS
@@ -138,7 +138,7 @@ def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, .
     if unknown or not free:
         raise BadInputError(
             f'free parameter {", ".join(map(repr, unknown)) or "missing"}: expected some of '
-            f'{", ".join(possible)}')
+            f'{", ".join(possible)}' + ''.join(meant(x, possible) for x in unknown[:1]))
     sought = [x for x in free if x in constants]
     scales = [x for x in free if x in ('shear_modulus', 'time_unit')]
     if sought and scales:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from hmsa.errors import BadInputError, excerpt
+from hmsa.errors import BadInputError, excerpt, meant
 from hmsa.model import law
 from hmsa.model.equations import Array
 from hmsa.model.laws import elastica
@@ -210,7 +210,8 @@ def _together(frequencies: Array, shares: Array) -> tuple[Array, Array]:
 def check_mount(mount: Any) -> None:
     """Raise `BadInputError` if a value is not in `MOUNTS`."""
     if not isinstance(mount, str) or mount not in MOUNTS:
-        raise BadInputError(f'mount is {excerpt(mount)}: expected one of {", ".join(MOUNTS)}')
+        raise BadInputError(f'mount is {excerpt(mount)}: expected one of {", ".join(MOUNTS)}'
+            + meant(mount, MOUNTS))
 
 
 @lru_cache(maxsize=64)

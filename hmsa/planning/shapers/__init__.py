@@ -7,7 +7,7 @@ quantities are dimensionless; `Units` only format the messages.
 
 import math
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, meant
 from hmsa.planning.shapers.advice import advised
 from hmsa.planning.shapers.linear import ei, step, zv, zvd
 from hmsa.planning.shapers.minimax import minimax
@@ -38,4 +38,5 @@ def get_shaper(name: str) -> Shaper:
         return SHAPERS[name]
     except KeyError:
         raise BadInputError(
-            f'shaper {name!r} is unknown: expected one of {", ".join(SHAPERS)}') from None
+            f'shaper {name!r} is unknown: expected one of {", ".join(SHAPERS)}'
+            + meant(name, SHAPERS)) from None
