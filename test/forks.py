@@ -19,10 +19,13 @@ from typing import Any
 
 from hmsa import plugins
 from hmsa.plugins import NODES, registered
+from hmsa_ros.middleware import ros_distro
 
 ROOT = Path(__file__).resolve().parent.parent
 # Those that start no processes: a demo in a fork, interrupted, ends with a segmentation fault.
 COMMANDS = (*registered(NODES), 'send', 'stop', 'param', 'watch')
+# With Fast DDS 3 a fork that has two contexts ends with a segmentation fault.
+SAFE = ros_distro() == 'jazzy'
 # Variables that a process reads while it starts and imports: with others it is no fork.
 EARLY = ('PYTHON', 'LC_', 'LANG', 'LD_', 'OMP_')
 
@@ -84,7 +87,7 @@ class ForkServer:
 
     def suits(self, arguments: Sequence[str], env: Mapping[str, str]) -> bool:
         """Return whether a process with arguments and an environment may be a fork."""
-        if not arguments or arguments[0] not in COMMANDS:
+        if not arguments or arguments[0] not in COMMANDS or not SAFE:
             return False
         names = {x for x in {*env, *self._env} if x.startswith(EARLY)}
         return all(env.get(x) == self._env.get(x) for x in names)
