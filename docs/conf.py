@@ -12,7 +12,7 @@ author = 'hmsa_ros maintainers'
 copyright = author
 release = version = __version__
 
-extensions = ['myst_parser', 'sphinx.ext.autodoc', 'numpydoc', 'mathml', 'reference']
+extensions = ['myst_parser', 'sphinx.ext.autodoc', 'numpydoc', 'mathml', 'reference', 'words']
 exclude_patterns = ['_build']
 nitpicky = False
 

@@ -1,6 +1,8 @@
 """The pages: built with warnings as errors, with every block run or checked."""
 
+import json
 from pathlib import Path
+import re
 import subprocess
 import sys
 
@@ -84,6 +86,40 @@ def test_pages_are_built_without_a_warning(tmp_path):
     theory = (tmp_path / 'html' / 'explanation' / 'theory.html').read_text(encoding='utf-8')
     assert '<math' in theory
     assert '<script src="http' not in theory
+    index = (tmp_path / 'html' / 'searchindex.js').read_text(encoding='utf-8')
+    check_searched(json.loads(index[index.index('(') + 1:index.rindex(')')]))
+
+
+def check_searched(index):
+    """Check that the search leads from a student's words to their page."""
+    for word, page in (
+            ('emergency stop', 'explanation/faults'), ('gait', 'guides/without-ros'),
+            ('camera', 'guides/sensors'), ('field to current', 'guides/calibration'),
+            ('matlab', 'guides/recording'), ('several actuators', 'guides/several-actuators'),
+            ('two actuators', 'guides/several-actuators')):
+        found = [index['docnames'][x] for x, *_ in index['indexentries'][word]]
+        assert found == [page]
+        # The page is about it, too: each word is in its text or title.
+        for part in word.split():
+            assert re.search(
+                rf'\b{part}', (ROOT / 'docs' / f'{page}.md').read_text(encoding='utf-8'), re.I)
+
+
+def test_sidebar_has_groups_of_at_most_seven_pages_and_each_page_once():
+    text = (ROOT / 'docs' / 'index.md').read_text(encoding='utf-8')
+    groups = re.findall(r'```{toctree}\n:caption: (.*)\n:maxdepth: 1\n\n((?:.+\n)+?)```', text)
+    assert len(groups) == text.count('{toctree}')
+    entries = [entries.split() for _, entries in groups]
+    assert max(map(len, entries)) <= 7
+    found = {str(x.relative_to(ROOT / 'docs').with_suffix(''))
+             for x in (ROOT / 'docs').rglob('*.md') if '_build' not in x.parts} - {'index'}
+    assert sorted(sum(entries, [])) == sorted(found)
+
+
+def test_landing_page_begins_with_the_moving_picture():
+    title, _, first = (ROOT / 'docs' / 'index.md').read_text(encoding='utf-8').splitlines()[:3]
+    assert title == '# hmsa_ros'
+    assert re.fullmatch(r'!\[.+\]\(images/moving\.gif\)', first)
 
 
 def test_graph_shows_the_topics_as_they_are():

@@ -1,0 +1,41 @@
+"""
+Words that readers search for and the page that answers each, entered into its index.
+
+Sphinx's search lists a page whose index entry is searched for before those that contain the words.
+"""
+
+from typing import Any
+
+from docutils import nodes
+from sphinx import addnodes
+from sphinx.application import Sphinx
+
+WORDS = {
+    'explanation/faults': ('emergency stop', 'interlock', 'watchdog'),
+    'explanation/modes': ('mode shapes',),
+    'guides/calibration': ('field to current', 'current', 'ampere', 'coil constant'),
+    'guides/hyperelastic-models': ('Gent', 'Ogden', 'Yeoh', 'stress-strain curve'),
+    'guides/recording': ('Matlab', 'CSV', 'rosbag', 'export'),
+    'guides/report': ('figure', 'plot', 'paper figure'),
+    'guides/sensors': ('camera', 'laser'),
+    'guides/serial-board': ('Arduino', 'microcontroller'),
+    'guides/several-actuators': ('several actuators', 'two actuators', 'joints'),
+    'guides/setpoints': ('stop', 'joystick', 'MoveIt', 'trajectory'),
+    'guides/without-ros': ('gait', 'sine wave', 'periodic motion'),
+    'reference/driver': ('bench supply',),
+    'tutorials/notebook': ('Python', 'notebook', 'pandas'),
+}
+
+
+def enter(app: Sphinx, document: nodes.document) -> None:
+    """Enter the words of a page, with its beginning as their target."""
+    words = WORDS.get(app.env.docname, ())
+    if words:
+        entry = addnodes.index(entries=[('single', x, 'searched', '', None) for x in words])
+        document.insert(0, [entry, nodes.target(ids=['searched'])])
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Register the entries."""
+    app.connect('doctree-read', enter)
+    return {'parallel_read_safe': True, 'parallel_write_safe': True}
