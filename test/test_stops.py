@@ -153,6 +153,23 @@ def test_the_lost_levels_of_a_stop_are_planned_anew_only_once_the_device_is_hear
     assert outcomes(rig)[-1] == 'stopped'
 
 
+def test_no_level_is_sent_in_vain_while_commands_do_not_arrive():
+    rig = Bench()
+    rig.runtime.request(trajectory(*LONG))
+    rig.run(START + 47 * MS)
+    rig.hears = False
+    rig.runtime.request(Stop('the stop'))
+    rig.run(rig.now + 2 * SECOND)
+    count = rig.runtime.devices.sent
+    rig.run(rig.now + 25 * SECOND, step=20 * MS)
+    assert rig.runtime.devices.sent == count
+    # Heartbeats go on, with the level that is in force.
+    assert rig.sent[-1][1].flux_density == rig.plant.flux_density
+    rig.hears = True
+    rig.run(rig.now + 2 * SECOND)
+    assert outcomes(rig)[-1] == 'stopped'
+
+
 def test_a_stop_is_not_carried_out_before_its_time_by_the_clock_of_the_device():
     rig = Bench()
     rig.runtime.request(trajectory(*LONG))

@@ -549,6 +549,11 @@ class Runtime:
         try:
             if self.devices.must_wait(self.settings):
                 return False
+        except RefusedError as error:
+            # What is to be planned anew waits: sent now, its levels could arrive in part.
+            self.planning.refuse_all(error)
+            return False
+        try:
             self._look_at_samples()
             return self._takeover.look(self.settings, keep=not requests)
         except RefusedError as error:
