@@ -14,7 +14,6 @@ import struct
 import subprocess
 import sys
 import termios
-import threading
 import time
 
 import pytest
@@ -242,16 +241,25 @@ def test_send_without_a_planner_says_how_to_start_one(start):
 
 # Help ----------------------------------------------------------------------------------------
 
-def test_a_long_operation_says_what_is_under_way_where_no_bar_is_shown(capsys, wait_until):
-    for lines, said in ((0.0, 'starting ...\nworking (1 of 2) ...\nclosing ...\n'), (1e3, '')):
-        with progress(lines=lines) as update:
-            if said:
-                wait_until(lambda: not any(
-                    isinstance(x, threading.Timer) for x in threading.enumerate()))
-            for what in ('starting', 'working (1 of 2)', 'working (2 of 2)', 'closing'):
-                update(what, 0.5)
-        found = capsys.readouterr()
-        assert (found.out, found.err) == ('', said)
+def test_a_long_operation_says_what_is_under_way_and_how_long_where_no_bar_is_shown(
+        capsys, wait_until):
+    said = []
+
+    def heard(line):
+        said.extend(capsys.readouterr().err.splitlines())
+        return any(re.fullmatch(line, x) for x in said)
+
+    with progress(lines=0.05) as update:
+        for what in ('starting', 'working (1 of 2)', 'working (2 of 2)', 'closing'):
+            update(what, 0.5)
+            lasting = rf'{re.escape(what)}, \d+ s \.\.\.'
+            wait_until(lambda line=lasting: heard(line))
+    said += capsys.readouterr().err.splitlines()
+    assert [x for x in said if ' s ...' not in x] == [
+        'starting ...', 'working (1 of 2) ...', 'closing ...']
+    with progress(lines=1e3) as update:
+        update('starting', 0.5)
+    assert capsys.readouterr() == ('', '')
 
 
 def parsers(parser, path='hmsa'):

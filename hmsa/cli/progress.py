@@ -2,7 +2,7 @@
 Progress of long operations, on standard error.
 
 On a terminal a bar, removed at the end; elsewhere, for operations of many seconds, a line for each
-activity.
+activity, and for one that lasts a line about every two seconds.
 """
 
 from collections.abc import Callable, Iterator
@@ -10,6 +10,7 @@ from contextlib import contextmanager
 import math
 import sys
 import threading
+import time
 
 #: Seconds of silence after which `progress` says what is under way.
 PATIENCE = 1.5
@@ -22,8 +23,9 @@ def progress(
     """
     Yield a function of the current activity and the completed fraction or None.
 
-    Where no bar can be shown, a line says the activity that is under way after ``lines`` s, and
-    each later one: what fails at once leaves its error alone.
+    Where no bar can be shown, a line says the activity that is under way after ``lines`` s, each
+    later one, and how long one has lasted after every ``lines`` s more: what fails at once leaves
+    its error alone.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -32,24 +34,33 @@ def progress(
     # Tested with the file, since FORCE_COLOR in notebooks makes Rich assume a terminal.
     bar = sys.stderr.isatty() and not console.is_dumb_terminal
     present, begun = what, False
+    since = spoken = time.monotonic()
+    done = threading.Event()
 
-    def say() -> None:
-        nonlocal begun
-        begun = True
-        print(f'{present} ...', file=sys.stderr, flush=True)
+    def say(after: str = '') -> None:
+        nonlocal begun, spoken
+        begun, spoken = True, time.monotonic()
+        print(f'{present}{after} ...', file=sys.stderr, flush=True)
+
+    def wait() -> None:
+        while not done.wait(max(spoken + lines - time.monotonic(), 0.0)):
+            now = time.monotonic()
+            if now >= spoken + lines:
+                say(f', {now - since:.0f} s' if begun else '')
 
     def change(what: str) -> None:
-        nonlocal present
+        nonlocal present, since
         # Figures in parentheses change all the time.
         new = what.partition(' (')[0] != present.partition(' (')[0]
         present = what
-        if new and begun:
-            say()
+        if new:
+            since = time.monotonic()
+            if begun:
+                say()
 
-    timer = None if bar or math.isinf(lines) else threading.Timer(lines, say)
-    if timer is not None:
-        timer.daemon = True
-        timer.start()
+    waiter = None if bar or math.isinf(lines) else threading.Thread(target=wait, daemon=True)
+    if waiter is not None:
+        waiter.start()
     with Progress(
             TextColumn('{task.description:<28}'), BarColumn(), TextColumn('{task.fields[share]}'),
             TimeElapsedColumn(), console=console, transient=True, disable=not bar) as shown:
@@ -68,5 +79,6 @@ def progress(
         try:
             yield update
         finally:
-            if timer is not None:
-                timer.cancel()
+            done.set()
+            if waiter is not None:
+                waiter.join()  # no line after the result

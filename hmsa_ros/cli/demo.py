@@ -34,7 +34,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     folder = arguments.out or dated('hmsa_demo')
     stay_local()
-    from hmsa_ros.clients.demo import run_demo
     from hmsa_ros.clients.experiment import prepare
 
     prepare(folder)
@@ -42,6 +41,8 @@ def run(arguments: argparse.Namespace) -> int:
     print(f'ROS_DOMAIN_ID {os.environ["ROS_DOMAIN_ID"]}, output in {folder}', file=sys.stderr)
     try:
         with progress(lines=PATIENCE) as update:
+            from hmsa_ros.clients.demo import run_demo
+
             result = run_demo(folder, update)
             ENDING.check()
     except KeyboardInterrupt:
