@@ -61,6 +61,19 @@ def test_a_stop_at_rest_is_acknowledged_too():
     assert outcomes(rig) == ['accepted', 'stopped']
 
 
+def test_a_stop_at_rest_is_acknowledged_by_hardware_that_rounds_times_and_levels(monkeypatch):
+    rig = Bench()
+    hear = rig.runtime.applied
+    # As a serial board: levels in steps of 1 uT, and times in steps of 1 us.
+    monkeypatch.setattr(rig.runtime, 'applied', lambda joint, stamp, level: hear(
+        joint, stamp - 438, round(level, 6)))
+    rig.runtime.request(trajectory(*LONG))
+    rig.run(START + SECOND)
+    rig.runtime.request(Stop('the stop'))
+    rig.run(rig.now + SECOND)
+    assert outcomes(rig) == ['accepted', 'stopped']
+
+
 def test_a_plan_that_goes_on_without_the_lost_levels_of_a_stop_is_no_stop():
     rig = stopped_in_the_middle(Bench())
     rig.hears = False

@@ -18,6 +18,9 @@ _PATIENCE = 2 * NANOSECONDS
 # Largest difference of an applied level from the commanded one, as a fraction of the largest
 # recent level. Hardware rounds by less.
 _SAME = 5e-4
+# Time in ns by which hardware may apply a level early: it rounds times to its own clock (a serial
+# board by up to 1 us). Shorter than the time between any two levels.
+_EARLY = 500_000
 # Findings that show rest, also beside the predicted stretch or after its time.
 _RESTING = (Code.ARRIVED, Code.OFF_TARGET, Code.LATE)
 # Findings that contradict rest.
@@ -115,7 +118,7 @@ class Stops:
             return True
         plan = self._group.planners[joint].plan
         level = plan.level(now)
-        if not plan.segments or level.due < plan.segments[-1].since:
+        if not plan.segments or level.due < plan.segments[-1].since - _EARLY:
             # Levels of the stop that took no effect were removed from the plan.
             return False
         received = self._devices.receipts.carried_out(joint, level.due)
