@@ -188,10 +188,11 @@ def test_plant_shows_the_motion_of_all_modes():
 @pytest.mark.parametrize('delivery', [
     Delivery(), Delivery(period=0.1), Delivery(slew=2.0), Delivery(lag=0.2),
     Delivery(period=0.05, slew=3.0, lag=0.1)], ids=['ideal', 'grid', 'ramps', 'lag', 'all'])
-def test_modal_brings_all_modes_to_rest_from_rest_and_from_motion(delivery):
+@pytest.mark.parametrize('order', [2, 3])
+def test_modal_brings_all_modes_to_rest_from_rest_and_from_motion(delivery, order):
     shape, state, random = get_shaper('modal'), State(1.0), np.random.default_rng(1)
     for i, target in enumerate(random.uniform(0.85, 1.35, 12).tolist()):
-        request = MoveRequest(state, target, GROUP, delivery=delivery)
+        request = MoveRequest(state, target, GROUP, delivery=delivery, order=order)
         move = shape(request)
         end = follow(move.levels, request.start, move.duration, GROUP, delivery)
         assert [end.stretch, *end.followed[::2]] == pytest.approx([target] * 3, abs=1e-9)
@@ -218,6 +219,21 @@ def test_sequence_of_modal_moves_starts_each_from_where_the_motion_is(delivery):
         assert (segment.end.stretch, segment.end.rate, segment.end.load) == pytest.approx(
             (state.stretch, state.rate, state.load), abs=1e-8)
         assert (segment.end.amplifier is None) == (state.amplifier is None)
+
+
+@pytest.mark.parametrize('factor', [0.985, 1.015])
+@pytest.mark.parametrize('target', [0.9, 1.1, 1.3])
+def test_third_order_of_modal_leaves_less_where_frequencies_are_wrong(target, factor):
+    left = {}
+    for order in (2, 3):
+        request = MoveRequest(State(1.0), target, GROUP, order=order)
+        move = get_shaper('modal')(request)
+        # A longer command is one for a slower block.
+        end = follow([Level(factor * x.time, x.load) for x in move.levels], request.start,
+                     factor * move.duration, GROUP, Delivery())
+        left[order] = math.hypot(end.stretch - target, end.rate / request.frequency)
+    assert left[3] < 0.004 * abs(target - 1.0)
+    assert left[3] < 0.75 * left[2]
 
 
 def test_modal_without_modes_is_the_two_step_command():
