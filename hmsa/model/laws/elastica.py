@@ -37,7 +37,10 @@ _TERMS, _POINTS = 16, 48
 # Number and degree of the pieces of the tables, their end, and the deflection of a stop.
 _PIECES, _DEGREE = 32, 7
 _END, _STOP = 0.86, 1.0
-_NEWTON, _EXACT = 40, 1e-13
+_NEWTON, _EXACT, _NEAR = 40, 1e-13, 1e-6
+# Steps to a deflection: at once, Newton's method diverges above 0.85 with the rounding of some
+# libraries (NumPy 2.2; test_elastica).
+_STAGES = 8
 #: Share of the first mode in the static deflection of a straight beam, 12/1.8751^4: loads here are
 #: those of `hmsa.model.laws.bending` over it.
 FIRST_SHARE = 12.0 / ROOT ** 4
@@ -93,12 +96,23 @@ class _Rod:
         return made
 
     def rest(self, deflections: Array) -> tuple[Array, Array]:
-        """Return shapes (n, m) and loads at rest, by Newton's method."""
-        count = len(deflections)
-        shapes = angle_of(deflections)[:, None] * self.first
+        """Return shapes (n, m) and loads at rest, by Newton's method from smaller deflections."""
+        part = deflections / _STAGES
+        shapes = angle_of(part)[:, None] * self.first
         loads = np.einsum('ni,ni->n', shapes @ self.bending, shapes) / (
             np.einsum('ni,ni->n', self.lever(shapes), shapes))
-        matrices = np.zeros((count, _TERMS + 1, _TERMS + 1))
+        for stage in range(1, _STAGES + 1):
+            growth = stage / max(stage - 1, 1)
+            shapes, loads = self._rest(
+                part * stage, shapes * growth, loads * growth,
+                _EXACT if stage == _STAGES else _NEAR)
+        return shapes, loads
+
+    def _rest(
+            self, deflections: Array, shapes: Array, loads: Array,
+            tolerance: float) -> tuple[Array, Array]:
+        """Return shapes and loads at rest, from those near them."""
+        matrices = np.zeros((len(deflections), _TERMS + 1, _TERMS + 1))
         for _ in range(_NEWTON):
             lever = self.lever(shapes)
             matrices[:, :-1, :-1] = self.stiffness(shapes, loads)
@@ -108,7 +122,7 @@ class _Rod:
                 np.sin(shapes @ self.rotations) @ self.weights - deflections])
             step = np.linalg.solve(matrices, off[..., None])[..., 0]
             shapes, loads = shapes - step[:, :-1], loads - step[:, -1]
-            if np.max(np.abs(step)) < _EXACT:
+            if np.max(np.abs(step)) < tolerance:
                 break
         return shapes, loads
 
