@@ -33,7 +33,8 @@ ACTUATOR = {
     'actuator.damping_coefficient': 0.6}
 LAW_CONSTANTS = {
     'law.c10': 5e3, 'law.c01': 1e3, 'law.c20': 300.0, 'law.c30': 20.0, 'law.mu': [9e3],
-    'law.alpha': [2.5], 'law.lambda_m': 3.0,
+    'law.alpha': [2.5], 'law.lambda_m': 3.0, 'law.gc': 6e3, 'law.ge': 3e3, 'law.delta': 0.2,
+    'law.beta': 0.5,
     'law.stretch': [0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6, 1.7],
     'law.flux_density': []}
 STRETCH = np.array(LAW_CONSTANTS['law.stretch'])
