@@ -289,7 +289,9 @@ class HardwareWorker:
             self._away = why
             return True
         closed = '' if left else self.device.close()
-        if self._saver is not None or not (why or left or closed or reported):
+        # An error that the worker would have survived does not spoil an end that was asked for.
+        survived = again and not (left or closed or reported)
+        if self._saver is not None or survived or not (why or left or closed or reported):
             return False
         after = f' at last, after {monotonic() - begun:.1f} s' if reported else ''
         self.failure = HmsaError(
