@@ -1,6 +1,7 @@
 """Nodes and bags of one ROS 2 distribution beside those of another."""
 
 import os
+from pathlib import Path
 import signal
 
 import pytest
@@ -24,7 +25,8 @@ def of(start):
     def run(other, *arguments):
         if not other:
             return start.hmsa(*arguments)
-        return start(OTHER, '-m', 'hmsa_ros', *arguments, **NEUTRAL)
+        # Not as a module, which Python would look for in the working directory first.
+        return start(Path(OTHER).with_name('hmsa'), *arguments, **NEUTRAL)
     return run
 
 
