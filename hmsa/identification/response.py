@@ -86,6 +86,8 @@ def _chain(
     for name in free:
         if name in own:
             chain[name] = {own[name]: 1.0}
+        elif name in _PLACES:
+            chain[name] = {}  # of a branch that is not there
         elif name in _LINEAR:
             chain[name] = {_LINEAR[name]: by_value[_LINEAR[name]]}
             if name == 'shear_modulus' and 'time_unit' in free:
