@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     with progress('reading'):
         found = compare(
             *(read(x, joint=arguments.joint) for x in arguments.runs),
-            picture=arguments.picture or None, **asdict(paper))
+            picture=arguments.picture or None, **(asdict(paper) if arguments.picture else {}))
     return show(arguments, {
         'runs': arguments.runs, 'setpoints': found.records(), 'files': arguments.picture,
     }, found, *arguments.picture)
