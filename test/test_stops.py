@@ -15,10 +15,16 @@ SECOND = 1000 * MS
 LONG = ((1.1, HOLD), (1.2, 2 * HOLD), (1.3, 20 * SECOND))
 
 
+def moving(rig, span=47 * MS):
+    """Return a rig in the first move of a sequence, or later."""
+    rig.runtime.request(trajectory(*LONG))
+    rig.run(START + span)
+    return rig
+
+
 def stopped_in_the_middle(rig):
     """Return a rig that was stopped during the first move."""
-    rig.runtime.request(trajectory(*LONG))
-    rig.run(START + 47 * MS)
+    moving(rig)
     assert rig.runtime.request(Stop('the stop')).code == 'accepted'
     rig.tick()
     assert rig.status.verdict.message.startswith('stopping: ')
@@ -53,9 +59,7 @@ def test_a_stop_has_stopped_once_its_last_level_was_acknowledged_at_its_time():
 
 
 def test_a_stop_at_rest_is_acknowledged_too():
-    rig = Bench()
-    rig.runtime.request(trajectory(*LONG))
-    rig.run(START + SECOND)
+    rig = moving(Bench(), SECOND)
     rig.runtime.request(Stop('the stop'))
     rig.run(rig.now + SECOND)
     assert outcomes(rig) == ['accepted', 'stopped']
@@ -147,9 +151,7 @@ def test_a_stop_that_a_silent_device_may_have_carried_out_is_sent_once(monkeypat
 
 
 def test_the_lost_levels_of_a_stop_are_planned_anew_only_once_the_device_is_heard():
-    rig = Bench()
-    rig.runtime.request(trajectory(*LONG))
-    rig.run(START + 47 * MS)
+    rig = moving(Bench())
     rig.hears = False
     rig.runtime.request(Stop('the stop'))
     rig.run(rig.now + 2 * SECOND)
@@ -167,9 +169,7 @@ def test_the_lost_levels_of_a_stop_are_planned_anew_only_once_the_device_is_hear
 
 
 def test_no_level_is_sent_in_vain_while_commands_do_not_arrive():
-    rig = Bench()
-    rig.runtime.request(trajectory(*LONG))
-    rig.run(START + 47 * MS)
+    rig = moving(Bench())
     rig.hears = False
     rig.runtime.request(Stop('the stop'))
     rig.run(rig.now + 2 * SECOND)
@@ -184,9 +184,7 @@ def test_no_level_is_sent_in_vain_while_commands_do_not_arrive():
 
 
 def test_a_stop_is_not_carried_out_before_its_time_by_the_clock_of_the_device():
-    rig = Bench()
-    rig.runtime.request(trajectory(*LONG))
-    rig.run(START + 47 * MS)
+    rig = moving(Bench())
     rig.ahead = -5 * SECOND
     rig.runtime.request(Stop('the stop'))
     rig.run(rig.now + 8 * SECOND)

@@ -86,7 +86,7 @@ class Prior:
                 x for x in SUSPECTS if x not in free
                 and not (x == 'chain_limit' and actuator.law is not None)
                 and not (x.startswith('viscoelastic') and any(actuator.creep.ratios))))
-        # Of secondary modes feedback knows nothing.
+        # Feedback does not model secondary modes.
         values: dict[str, Any] = complete(values_of(
             replace(actuator, modes=Modes()), others), free)
         values['viscoelastic_time'] = _RELAXATION * actuator.time_unit
