@@ -12,7 +12,6 @@ _DECIDED = (RANGE, 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER', 'ROS_LOCALHOST_ON
 #: Environment variables of profiles: of Fast DDS 2, in ROS 2 Jazzy, and of Fast DDS 3. The
 #: middleware of later distributions reads the first one too, and warns.
 PROFILES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
-_FAST_DDS_2 = 'jazzy'
 _WHEEL = re.compile(r'ros_([a-z]+)_rclpy-.*\.dist-info')
 _HERE = Path(__file__).parent
 
@@ -42,8 +41,12 @@ def prepare_middleware() -> None:
         os.environ[RANGE] = 'LOCALHOST'
     if not any(os.environ.get(name) for name in PROFILES):
         local = os.environ.get(RANGE) == 'LOCALHOST' or os.environ.get('ROS_LOCALHOST_ONLY') == '1'
-        version = 2 if ros_distro() == _FAST_DDS_2 else 3
-        os.environ[PROFILES[version - 2]] = str(profiles(version, local=local))
+        os.environ[PROFILES[fast_dds() - 2]] = str(profiles(fast_dds(), local=local))
+
+
+def fast_dds() -> int:
+    """Return the major version of Fast DDS in the distribution that is there."""
+    return 2 if ros_distro() == 'jazzy' else 3
 
 
 def profiles(version: int, *, local: bool) -> Path:

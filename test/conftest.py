@@ -26,7 +26,7 @@ from forks import Forked, ForkServer
 from hypothesis import HealthCheck, Phase, settings
 import pytest
 
-from hmsa_ros.middleware import PROFILES, profiles, ros_distro
+from hmsa_ros.middleware import fast_dds, PROFILES, profiles
 
 ROOT = Path(__file__).resolve().parent.parent
 # Limit of every wait: generous, since only failing tests reach it.
@@ -243,9 +243,8 @@ def ros_domain_id() -> Iterator[int]:
 
 def own_profiles() -> dict[str, str]:
     """Return the environment that selects this package's profiles for nodes of this host."""
-    version = 2 if ros_distro() == 'jazzy' else 3
-    return {**dict.fromkeys(PROFILES, ''), PROFILES[version - 2]: str(
-        profiles(version, local=True))}
+    return {**dict.fromkeys(PROFILES, ''), PROFILES[fast_dds() - 2]: str(
+        profiles(fast_dds(), local=True))}
 
 
 @pytest.fixture
