@@ -18,14 +18,13 @@ from hmsa.identification.measurement import Measurement
 from hmsa.identification.modal import (
     ENOUGH,
     explained,
-    HALF_95,
     modes_in,
     rescaled,
     stiffens,
     with_modes,
     without_modes,
 )
-from hmsa.identification.noise import errors_of_stamps, whiteness, widening
+from hmsa.identification.noise import errors_of_stamps, HALF_95, whiteness, widening
 from hmsa.identification.repeats import repeated
 from hmsa.identification.result import Defect, Identification, IdentificationVerdict, Mode
 from hmsa.identification.search import rivals, search, unmoved

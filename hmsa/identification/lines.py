@@ -18,21 +18,22 @@ import numpy as np
 from hmsa import motion
 from hmsa.identification import quantities
 from hmsa.identification.fit import Fit
-from hmsa.identification.measurement import pieces
+from hmsa.identification.measurement import Measurement, pieces
 from hmsa.identification.response import ResponseArguments
 from hmsa.model.equations import Array
 from hmsa.motion import theta as places
 
-#: Minimum ratio to the frequency of the first mode, and the maximum.
-LEAST_RATIO, MOST_RATIO = 1.1, 12.0
+#: Minimum ratio to the frequency of the first mode.
+LEAST_RATIO = 1.1
+_MOST_RATIO = 12.0
 # Ratio of neighbouring frequencies of the search, and its damping ratios.
 _SPACING = 1.03
 _DAMPINGS = (0.03, 0.1, 0.3)
 # Grids of the refinement: steps in the logarithms of both, and how often they shrink.
 _STEPS, _REFINED, _SHRINK = np.linspace(-1.0, 1.0, 5), 4, 0.45
 _LEAST_DAMPING, _MOST_DAMPING = 0.002, 0.6
-#: Samples a period that resolve a line.
-RESOLVED = 2.5
+# Samples a period that resolve a line.
+_RESOLVED = 2.5
 # Minimum size of a line in standard deviations, and of the part of the residuals that it explains.
 _DEVIATIONS, _PART = 6.0, 0.04
 # Steps a period in which a field that does not step is replaced by one that does.
@@ -48,6 +49,11 @@ class Line:
     damping: float  #: damping ratio
     share: float  #: of the static stretch
     explained: float  #: fraction of the residuals' sum of squares, 0 to 1
+
+
+def highest_ratio(recording: Measurement, own: float) -> float:
+    """Return the highest ratio, to a frequency in Hz, that samples resolve."""
+    return min(1.0 / (_RESOLVED * recording.gap * own), _MOST_RATIO)
 
 
 def lines_of(
@@ -75,7 +81,7 @@ def lines_of(
         Fraction of these residuals' sum of squares that the parameters ``without`` explain.
 
     """
-    highest = min(1.0 / (RESOLVED * fit.recording.gap * own), MOST_RATIO)
+    highest = highest_ratio(fit.recording, own)
     if highest <= LEAST_RATIO * _SPACING:
         return [], 0.0
     residual, base = _residual(fit, without)

@@ -11,9 +11,9 @@ import numpy as np
 from hmsa.identification import quantities
 from hmsa.identification.diagnosis import frequency_of
 from hmsa.identification.fit import Fit, fit, loss
-from hmsa.identification.lines import LEAST_RATIO, lines_of, MOST_RATIO, RESOLVED
+from hmsa.identification.lines import highest_ratio, LEAST_RATIO, lines_of
 from hmsa.identification.measurement import Measurement
-from hmsa.identification.noise import whiteness
+from hmsa.identification.noise import HALF_95, whiteness
 from hmsa.identification.quantities import MODES, SECONDARY
 from hmsa.identification.result import Mode
 from hmsa.model import equations
@@ -33,8 +33,6 @@ _WHOLE = 0.9
 _CHI_SQUARED, _PART = 30.0, 0.15
 # Ratio of two frequencies below which they are those of one mode that changes with the stretch.
 _NEAR = 1.02 * LEAST_RATIO
-#: Half a 95 % interval in standard deviations.
-HALF_95 = 1.96
 # Relative change of the force by J_lim that is noticeable.
 _STIFFENS = 0.04
 #: Fraction of the residuals' sum of squares that all modes together explain at least.
@@ -113,7 +111,7 @@ def with_modes(
     recording = one.recording
     best = fit(recording, start, free, most=_FIRST) or one
     own = frequency_of(best)
-    highest = min(1.0 / (RESOLVED * recording.gap * own), MOST_RATIO)
+    highest = highest_ratio(recording, own)
     wide, values = tuple(free), dict(best.values)
     if values['law'] is None or not values['law'].section:
         wide = (*(x for x in free if x != 'chain_limit'), 'transverse_mass_factor')

@@ -22,8 +22,9 @@ _LAGS = 20
 # Window length in correlation times (A. Sokal, "Monte Carlo methods in statistical
 # mechanics", 1997).
 _WINDOW = 6.0
+#: Half a 95 % interval of normal noise, in standard deviations.
+HALF_95 = 1.96
 # Ratios of the standard deviation at the fastest motion to that at rest to try.
-_NORMAL_95 = 1.96
 _LARGEST_SPREADS = np.geomspace(0.5, 200.0, 13)
 
 
@@ -166,7 +167,7 @@ def clustered(
     scores = np.zeros((count, jacobian.shape[1]))
     np.add.at(scores, clusters, (jacobian @ inverse) * residual[:, None])
     variance = float(residual @ residual) / max(len(residual) - jacobian.shape[1], 1)
-    wider = float(stdtrit(count - 1.0, 0.975)) / _NORMAL_95
+    wider = float(stdtrit(count - 1.0, 0.975)) / HALF_95
     factors: Array = wider * np.sqrt(
         count / (count - 1.0) * np.sum(scores ** 2, axis=0) / np.maximum(
             variance * np.diag(inverse), 1e-300))
