@@ -5,6 +5,7 @@ from typing import Any
 
 from hmsa.errors import BadInputError
 from hmsa.model.laws.record import (
+    above,
     ARRUDA_BOYCE,
     Constant,
     Elastic,
@@ -22,9 +23,7 @@ def _scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
     if len(mu) != 1:
         raise BadInputError(
             f'parameter law.mu has {len(mu)} values: expected one for law {LAW.name}')
-    if not lambda_m > 1.0:
-        raise BadInputError(
-            f'parameter law.lambda_m is {lambda_m:g}: expected more than 1 for law {LAW.name}')
+    above(LAW.name, 'law.lambda_m', lambda_m, 1.0)
     modulus = positive_modulus(
         LAW.name, 2.0 * mu[0] * sum(
             i * term * (3.0 / lambda_m ** 2) ** (i - 1) for i, term in enumerate(TERMS, 1)),

@@ -3,15 +3,20 @@
 from collections.abc import Mapping
 from typing import Any
 
-from hmsa.errors import BadInputError
-from hmsa.model.laws.record import Constant, Elastic, EXTENDED_TUBE, Law, network, positive_modulus
+from hmsa.model.laws.record import (
+    above,
+    Constant,
+    Elastic,
+    EXTENDED_TUBE,
+    Law,
+    network,
+    positive_modulus,
+)
 
 
 def _scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
     gc, ge, delta, beta = (float(values[x.name]) for x in LAW.constants)
-    if not beta > 0.0:
-        raise BadInputError(
-            f'parameter law.beta is {beta:g}: expected more than 0 for law {LAW.name}')
+    above(LAW.name, 'law.beta', beta, 0.0)
     modulus = positive_modulus(
         LAW.name, gc * (1.0 - 2.0 * delta**2) + ge, 'gc (1 - 2 delta^2) + ge',
         (gc, ge, delta, beta))

@@ -3,16 +3,20 @@
 from collections.abc import Mapping
 from typing import Any
 
-from hmsa.errors import BadInputError
-from hmsa.model.laws.record import Constant, Elastic, Law, network, NONAFFINE, positive_modulus
+from hmsa.model.laws.record import (
+    above,
+    Constant,
+    Elastic,
+    Law,
+    network,
+    NONAFFINE,
+    positive_modulus,
+)
 
 
 def _scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
     gc, ge, lambda_m = (float(values[x.name]) for x in LAW.constants)
-    if not lambda_m > 1.0:
-        raise BadInputError(
-            f'parameter law.lambda_m is {lambda_m:g}: expected more than 1 for law {LAW.name}')
-    beyond = lambda_m**2 - 1.0
+    beyond = above(LAW.name, 'law.lambda_m', lambda_m, 1.0)**2 - 1.0
     modulus = positive_modulus(
         LAW.name, gc * (1.0 + 2.0 / (3.0 * beyond)) + ge,
         'gc (1 + 2/(3 (lambda_m^2 - 1))) + ge', (gc, ge, lambda_m))

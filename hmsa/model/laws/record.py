@@ -99,6 +99,14 @@ def positive_modulus(law: str, modulus: float, words: str, values: Sequence[Any]
     return modulus
 
 
+def above(law: str, name: str, value: float, least: float) -> float:
+    """Return the value of a constant, or raise `BadInputError` if it is not above a bound."""
+    if not value > least:
+        raise BadInputError(
+            f'parameter {name} is {value:g}: expected more than {least:g} for law {law}')
+    return value
+
+
 def polynomial(
         law: Law, values: Mapping[str, Any], modulus: float, powers: Sequence[float],
         second: float = 0.0) -> Elastic:
@@ -123,7 +131,7 @@ def network(
     ``others`` are its constants besides the moduli ``law.gc`` and ``law.ge`` (Pa), and
     ``chain_limit`` is the greatest I1 - 3.
     """
-    from hmsa.model.law import gent_limits  # imports NumPy, which not all users of laws need
+    from hmsa.model.laws.chains import gent_limits  # NumPy, which not all users of laws need
 
     lower, upper = gent_limits(1.0 / chain_limit)
     return Elastic(

@@ -139,9 +139,7 @@ def _smooth(each: float, request: MoveRequest) -> Array:
     frequency = request.frequency
     damping = float(law.damping(target, packed) / law.mass(target, packed)) / (2.0 * frequency)
     ratios = [(1.0, damping), *(
-        (ratio * target ** exponent, damping) for ratio, damping, exponent in zip(
-            modes.ratios, modes.dampings, modes.exponents or (0.0,) * len(modes.ratios),
-            strict=True))]
+        (ratio * target ** exponent, damping) for ratio, _, damping, exponent in modes.numbers)]
     left = each * np.arange(-_SMOOTH, 1)
     effects = [np.exp(frequency * ratio * complex(y, math.sqrt(max(1.0 - y * y, 0.0))) * left)
                for ratio, y in ratios]
