@@ -267,6 +267,18 @@ def test_a_saturated_amplifier_is_neither_learnt_from_nor_asked_for_more(shown):
     assert it.planner.model.actuator.shear_modulus == 1e4
 
 
+@pytest.mark.parametrize('later', [4, -4])
+def test_a_field_measured_before_or_after_the_stretch_is_no_fault_of_the_coil(later):
+    # By a tenth of the time scale; samples arrive 2 ms after their timestamps.
+    it = bench(factors={'shear_modulus': 0.8}, report=False)
+    it.effort = lambda: field_of(it, it.now + (later - 2) * MS)
+    left = np.abs(moves(it))
+    values = it.estimates[-1].values
+    assert values['new_beginnings'] == 0
+    assert np.max(left[2:]) < 0.1
+    assert float(values['field_mismatch_ms']) == pytest.approx(4 if later > 0 else 0, abs=3)
+
+
 def test_nothing_is_learnt_while_the_field_is_not_reported_any_more():
     it = bench(False, report=False)
     off = []

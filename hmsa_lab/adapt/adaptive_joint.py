@@ -44,7 +44,8 @@ _CHOICE = 3.0
 # Time scales after an arrival that show whether it succeeded.
 _LOOK = 3.0
 # Tolerance of the measured field: this fraction of its value or of the unit of load, and this many
-# time scales and coil time constants after a change.
+# time scales and coil time constants, after a change or in all. A field that is measured some ms
+# before or after the stretch differs for that long at each change of level.
 _OFF, _LEAST, _FOLLOWED = 0.05, 0.01, 3.0
 # Fraction by which the report of an applied level may be rounded.
 _ROUNDED = 0.01
@@ -94,6 +95,8 @@ class AdaptiveJoint:
     _setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place under way
     _sensor: tuple[StateEstimate, SensorModel] | None = None  # estimate, and its sensor
     _measured: bool = False  # whether the field is measured
+    _differs: int | None = None  # timestamp since which the field differs; None if it does not
+    mismatch: int = 0  # longest time in ns for which it differed, and then not any more
 
     def __post_init__(self, begun: int) -> None:
         given, settings = self.given, self.settings
@@ -195,22 +198,29 @@ class AdaptiveJoint:
             self.largest = abs(flux_density)
 
     def _off(self, stamp: int, field: float) -> str:
-        """Return why the field may differ from the commanded one; empty if it does not."""
-        if math.isnan(field):
-            return (
-                'the field is no longer reported, and may differ from the command'
-                if self._measured else '')
-        self._measured = True
+        """Return why the field differs from the commanded one for too long; empty if not."""
         plan = self.planner.plan
         level = plan.level(stamp)
         wanted, options, units = level.flux_density, level.model.options, level.model.units
-        follows = _FOLLOWED * (units.time + options.coil_time_constant) + (
-            abs(wanted - level.in_force) / options.slew_limit)
-        if not plan.segments or stamp < level.stamp + follows * NANOSECONDS or (
+        ramp = abs(wanted - level.in_force) / options.slew_limit
+        follows = round(NANOSECONDS * (
+            _FOLLOWED * (units.time + options.coil_time_constant) + ramp))
+        known = not math.isnan(field)
+        self._measured |= known
+        if not plan.segments or not self._measured or stamp < level.stamp + follows and known or (
                 abs(field - wanted) <= max(
                     _OFF * max(abs(field), abs(wanted)), _LEAST * units.load)):
+            if self._differs is not None and not self.lost:
+                self.mismatch = max(self.mismatch, stamp - self._differs)
+            self._differs = None
             return ''
-        return f'the coil has {flux_text(field)} where {flux_text(wanted)} were commanded'
+        if self._differs is None:
+            self._differs = stamp
+        if stamp < self._differs + follows:
+            return self.lost
+        return (
+            f'the coil has {flux_text(field)} where {flux_text(wanted)} were commanded'
+            if known else 'the field is no longer reported, and may differ from the command')
 
     # -- looks at them -------------------------------------------------------------------------
 
@@ -414,6 +424,7 @@ class AdaptiveJoint:
             'rejected': screening.rejected, 'frozen': screening.frozen,
             'unreadable': screening.unreadable, 'repeated': screening.repeated,
             'too_late': screening.late, 'ahead_of_clock': screening.ahead,
+            'field_mismatch_ms': f'{self.mismatch / 1e6:.3g}',
             'new_beginnings': self.trust.beginnings, 'ended': self.trust.ended,
             **self.sensor.to_dict()}
 
