@@ -7,8 +7,9 @@ from bench_oracle import Bench, MS, paper, Plant
 import numpy as np
 import pytest
 
-from hmsa_lab.adapt import adaptive_joint, estimator, window
+from hmsa_lab.adapt import adaptive_joint, corrections, estimator, window
 from hmsa_lab.adapt.motion import follow
+from hmsa_ros.runtime.records import Trajectory
 
 MOVES = (1.4, 1.1, 1.4, 1.1, 1.4)
 
@@ -166,6 +167,24 @@ def test_modulus_and_damping_are_learnt_from_the_first_move(factors):
     assert abs(left[0, 1]) < 0.2
     assert np.max(np.abs(left[1])) < 0.2
     assert 'plans use it' in it.message
+
+
+def test_setpoints_that_have_not_begun_are_planned_with_what_was_learnt(monkeypatch):
+    # Twice the damping leaves nothing to correct in the setpoint under way.
+    monkeypatch.setattr(corrections, '_may_gain', lambda *_: False)
+    it = bench(False, factors={'damping_coefficient': 2.0})
+    targets, hold = (1.4, 1.15, 1.35, 1.2), 400 * MS
+    it.runtime.request(Trajectory(
+        ('a',), [((x,), (i + 1) * hold) for i, x in enumerate(targets)], len(targets)))
+    begin, truth = it.now, it.pass_time(len(targets) * hold)
+    left = []
+    for i, (target, before) in enumerate(zip(targets, (1.0, *targets), strict=False)):
+        since = begin + i * hold + 50 * MS
+        seen = truth[(truth[:, 0] > since + 10 * MS) & (truth[:, 0] < since + 25 * MS), 1]
+        left.append(np.ptp(seen) / abs(target - before))
+    assert left[0] > 0.05
+    assert max(left[1:]) < 0.003
+    assert 'corrected' in it.codes
 
 
 def test_a_fault_after_a_healthy_move_leaves_what_that_move_confirmed():

@@ -313,6 +313,15 @@ def draft_resumption(outset: PlanStart, arrival: int | None = None) -> Draft | N
     return None
 
 
+def draft_later(outset: PlanStart, index: int) -> Draft:
+    """
+    Draft the setpoints of the running plan from an index on again, from the start of the first.
+
+    Raise `RefusedError` if they cannot be carried out.
+    """
+    return replace(draft_moves(outset, _left(outset, index), index=index), resumed=index)
+
+
 def _left(outset: PlanStart, index: int) -> Iterator[Setpoint]:
     """Yield the setpoints of the running plan from an index on, with their remaining durations."""
     planned = outset.plan.segments

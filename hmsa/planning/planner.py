@@ -179,6 +179,10 @@ class Planner(RunningPlan):
                 self.check()
         return drafting.draft_resumption(outset)
 
+    def draft_later(self, place: int) -> Draft:
+        """Draft the setpoints of the plan from an index on again; those before it stay."""
+        return drafting.draft_later(self._outset(self.plan.segments[place].since), place)
+
     def draft_path_anew(
             self, begin: int, model: JointModel, believed: Believed | None) -> Draft:
         """Draft the rest of the running path again with a model, from an estimated state."""

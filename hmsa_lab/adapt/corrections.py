@@ -127,8 +127,12 @@ class Corrections:
             level = _trimmed(joint, estimate)
             if level is not None:
                 yield self._work(joint, partial(_trim, level=level))
-            elif joint.adapted() and _may_gain(joint, estimate, now):
+                continue
+            if joint.adapted() and _may_gain(joint, estimate, now):
                 yield self._work(joint, _correct)
+            if _outdated(joint, now):
+                # Nothing is left to do if a correction has been adopted before.
+                yield self._work(joint, _later)
 
     def _work(
             self, joint: AdaptiveJoint,
@@ -172,8 +176,15 @@ class Corrections:
         if joint is None or draft is None:
             return None
         words = joint.words(self._clock())
-        joint.planner.take(draft, now)
+        place, segments = draft.resumed, joint.planner.plan.segments
         self._feedback.corrections += 1
+        if place and draft.begin == segments[place].since:
+            joint.planner.take(draft, now)
+            joint.moves.planned_anew = draft.begin
+            return Verdict(Severity.OK, Code.CORRECTED, (
+                f'setpoints from {place + 1} of {len(segments)} on planned anew with the '
+                f'estimate: {words}'))
+        joint.planner.take(draft, now)
         joint.next_sample = 0
         joint.moves.corrected.append(draft.begin)
         joint.moves.expected, joint.after = joint.after, 0.0
@@ -241,6 +252,25 @@ def _correct(joint: AdaptiveJoint, now: int) -> Replanning:
                 raise
             return None
     return Replanning(draft, partial(_gains, joint, arrival))
+
+
+def _outdated(joint: AdaptiveJoint, now: int) -> int:
+    """Return the index of the next setpoint if it is planned with another model; else 0."""
+    planner = joint.planner
+    plan, soonest = planner.plan, planner.soonest(now)
+    place = plan.under_way(soonest) + 1
+    return place if 0 < place < len(plan.segments) and joint.shown(now) and (
+        plan.segments[place].since > soonest) and not same_parameters(
+            plan.levels[-1].model, planner.model) else 0
+
+
+def _later(joint: AdaptiveJoint, now: int) -> Replanning | None:
+    """Replan the setpoints after the one under way with the model in force."""
+    place = _outdated(joint, now)
+    if not place:
+        return None
+    since = joint.planner.plan.segments[place].since
+    return Replanning(lambda plan: plan.draft_later(place), starts=(since,))
 
 
 def _gains(joint: AdaptiveJoint, arrival: int, draft: Draft | None) -> Draft | None:

@@ -26,6 +26,11 @@ class Moves:
     learnt: bool = False  # planned with learnt parameters
     expected: float = 0.0  # predicted amplitude of the newest move
     corrected: list[int] = field(default_factory=list)  # times from which plans were corrected
+    planned_anew: float = math.inf  # time from which they are planned with learnt parameters
+
+    def learnt_from(self, begin: int) -> bool:
+        """Return whether a move that begins at a time was planned with learnt parameters."""
+        return self.learnt or begin >= self.planned_anew
 
 
 class MoveErrors:
@@ -55,7 +60,7 @@ class MoveErrors:
             return ''
         corrected = [x for x in moves.corrected if x >= setpoint.begins]
         later = [x for x in corrected if x >= asked]
-        learnt = moves.learnt or len(later) < len(corrected)
+        learnt = moves.learnt_from(setpoint.begins) or len(later) < len(corrected)
         early = yield from hold.shown(
             replace(setpoint, moved=None, end=later[0], held=False) if later
             else replace(setpoint, moved=None), sensor=sensor)

@@ -199,6 +199,8 @@ class Replanning(NamedTuple):
     draft: Callable[[Planner], Draft | None]
     #: Returns the draft to adopt; None to keep the plan.
     adopt: Callable[[Draft | None], Draft | None] = lambda draft: draft
+    #: Further times in ns from which it may be drafted.
+    starts: tuple[int, ...] = ()
 
 
 def replanning(
@@ -209,7 +211,7 @@ def replanning(
         anew = make(now)
         if anew is None:
             return None
-        plan = planner.snapshot(planner.resumptions(now))
+        plan = planner.snapshot((*planner.resumptions(now), *anew.starts))
 
         def draft(check: Check) -> dict[str, Any]:
             return {name: anew.draft(plan.checked(check))}
