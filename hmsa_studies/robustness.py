@@ -21,7 +21,6 @@ from hmsa.model.delivery import Delivery, IDEAL
 from hmsa.model.equations import Array
 from hmsa.model.moves import Level, Limits, Move, State
 from hmsa.model.parameters import NondimensionalParameters
-from hmsa.model.simulation import check_stretch
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.shapers import get_shaper, SHAPERS
 from hmsa.planning.shapers.creeping import held
@@ -95,8 +94,8 @@ class Case:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        check_stretch(self.start, self.material, 'start stretch')
-        check_stretch(self.target, self.material, 'target stretch')
+        self.material.check(self.start, 'start stretch')
+        self.material.check(self.target, 'target stretch')
         if abs(self.target - self.start) < 1e-6:
             raise BadInputError(
                 f'the move from {self.material.coordinate.name} {self.start:g} to '

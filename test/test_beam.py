@@ -28,7 +28,6 @@ from hmsa.errors import BadInputError
 from hmsa.interfaces.actuator import actuator_from, parameters_of
 from hmsa.interfaces.parameters import BLOCK
 from hmsa.model import equations
-from hmsa.model.actuators import check_stretch
 from hmsa.model.creep import Creep
 from hmsa.model.laws import bending
 from hmsa.model.parameters import paper_actuator
@@ -135,7 +134,7 @@ def test_refusals_speak_of_the_deflection(points, message):
     with pytest.raises(RefusedError, match=message):
         planner.request(points, 0, 0)
     with pytest.raises(BadInputError, match='^reset_stretch is 0.9: expected a deflection'):
-        check_stretch(0.9, silicone().nondimensional, 'reset_stretch')
+        silicone().nondimensional.check(0.9, 'reset_stretch')
 
 
 def test_the_law_of_a_running_planner_does_not_turn_stretches_into_deflections():

@@ -17,7 +17,7 @@ from hmsa.identification.identify import identify
 from hmsa.identification.measurement import Measurement
 from hmsa.interfaces.actuator import actuator_from, parameters_of
 from hmsa.interfaces.parameters import ACTUATOR, BLOCK
-from hmsa.model.actuators import check_stretch, unheld
+from hmsa.model.actuators import unheld
 from hmsa.model.delivery import Delivery
 from hmsa.model.equations import (
     elastic_energy,
@@ -214,7 +214,7 @@ def test_what_cannot_be_held_is_refused_where_the_force_falls(name):
     inside = edge - 0.2 * (edge - 1.0)
     assert plan_two_step(1.0, inside, group).code is Code.TWO_STEP
     with pytest.raises(BadInputError, match=f'between the limits .* of law {name}'):
-        check_stretch(beyond, group)
+        group.check(beyond)
     assert f'{edge:.4f}, where law {name} has a falling force' in unheld(group)
     # A motion may pass there, and a load that no stretch balances gives the limit.
     stretch, _ = simulate(

@@ -12,7 +12,7 @@ from hmsa.api.arguments import file_of, number, several, suggesting, whole
 from hmsa.errors import BadInputError, excerpt, meant
 from hmsa.interfaces.outcome import Outcome
 from hmsa.model.equations import Array
-from hmsa.model.simulation import check_stretch, longest_motion, response
+from hmsa.model.simulation import longest_motion, response
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs.levels import RecordedLevel
 from hmsa.runs.record import read_only, Run
@@ -401,7 +401,7 @@ def simulated(
             f'of the coil, {low:g} to {high:g} T: expected flux densities in T, or '
             'flux_density_limits (in a parameter file flux_density_max) that allow it')
     begin = number(model.material.rest if start is None else start, 'start')
-    check_stretch(begin, model.material, 'start stretch')
+    model.material.check(begin, 'start stretch')
     if until is not None:
         end = number(until, 'until', 's', above=0.0)
     elif plan is None or math.isinf(end := float(np.sum(plan.setpoints[:, 1]))):

@@ -12,7 +12,6 @@ from hmsa.columns import read_table
 from hmsa.errors import BadInputError, excerpt, meant
 from hmsa.model.equations import Array
 from hmsa.model.moves import State
-from hmsa.model.simulation import check_stretch
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.drafting import check_path
@@ -102,7 +101,7 @@ def wave_of(
         times, stretches = columns_of(shape, ('time', 'stretch'), 'samples of a wave')
         form = sampled_shape(times, stretches)
     for stretch in (mean - size, mean + size):
-        check_stretch(stretch, actuator.model.material, 'an extreme of the wave')
+        actuator.model.material.check(stretch, 'an extreme of the wave')
     if mean + size == mean:
         raise BadInputError(f'amplitude is {size:g}: expected more beside the offset {mean:g}')
     return Wave(form, mean, size)

@@ -9,7 +9,6 @@ another, and an actuator alone moves bit for bit as it does among others.
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
-import re
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,21 +26,6 @@ RTOL = 1e-13
 _NEVER = np.iinfo(np.int64).max
 # Larger loads are indistinguishable from the limit.
 _LARGEST_LOAD = 1e9
-
-
-def check_stretch(
-        stretch: float, material: NondimensionalParameters, name: str = 'stretch') -> None:
-    """Raise `BadInputError` for a stretch beyond the limits of a material."""
-    lower, upper = stretch_limits(material)
-    if not lower < stretch < upper:
-        coordinate = material.coordinate.name
-        whose = f'J_lim {material.j_lim:g}' if material.law is None \
-            else f'law {material.law.law}'
-        # Parameter names stay unchanged.
-        called = re.sub(r'\bstretch\b', coordinate, name)
-        raise BadInputError(
-            f'{called} is {stretch:g}: expected a {coordinate} '
-            f'between the limits {lower:.4f} and {upper:.4f} of {whose}')
 
 
 def unheld(material: NondimensionalParameters) -> str:
@@ -73,7 +57,7 @@ class Setup:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        check_stretch(self.stretch, self.actuator.nondimensional, 'initial stretch')
+        self.actuator.nondimensional.check(self.stretch, 'initial stretch')
         if not self.slew_limit > 0.0:
             raise BadInputError(
                 f'slew limit is {self.slew_limit:g} T/s: expected a number above 0')
@@ -204,7 +188,7 @@ class Actuators:
         The rate is in 1/s; ``level`` (T) is the level to which the amplifier still ramps, by
         default the present flux density. Raise `BadInputError` if the state is out of range.
         """
-        check_stretch(stretch, self.setups[i].actuator.nondimensional)
+        self.setups[i].actuator.nondimensional.check(stretch)
         if not math.isfinite(rate):
             raise BadInputError(f'stretch rate is {rate:g} 1/s: expected a finite number')
         level = flux_density if level is None else level

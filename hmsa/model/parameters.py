@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 import math
+import re
 import sys
 from typing import Any
 
@@ -85,7 +86,7 @@ class NondimensionalParameters:
         """Check the values."""
         _check(self)
 
-    @property
+    @cached_property
     def coordinate(self) -> Coordinate:
         """Kind of position, such as a stretch or the deflection of a beam."""
         return coordinate_of(self.law)
@@ -94,6 +95,18 @@ class NondimensionalParameters:
     def rest(self) -> float:
         """Stretch (or deflection of a beam) at rest without a field."""
         return self.coordinate.rest
+
+    @cached_property
+    def creeps(self) -> bool:
+        """Whether there are viscoelastic branches with a stiffness above 0."""
+        return bool(self.creep)
+
+    @cached_property
+    def limits(self) -> tuple[float, float]:
+        """Limiting stretches between which the force increases, both excluded."""
+        from hmsa.model.law import LOWER, UPPER  # as below
+
+        return float(self.packed[LOWER]), float(self.packed[UPPER])
 
     @cached_property
     def packed(self) -> NDArray[np.float64]:
@@ -137,7 +150,24 @@ class NondimensionalParameters:
     @cached_property
     def elastic(self) -> 'NondimensionalParameters':
         """The group without branches."""
-        return replace(self, creep=Creep()) if self.creep else self
+        return replace(self, creep=Creep()) if self.creeps else self
+
+    def beyond(self, stretch: float, name: str = 'stretch') -> str:
+        """Return why a stretch, by a name, is beyond the limits; empty if it is not."""
+        lower, upper = self.limits
+        if lower < stretch < upper:
+            return ''
+        kind = self.coordinate.name
+        whose = f'J_lim {self.j_lim:g}' if self.law is None else f'law {self.law.law}'
+        # Parameter names stay unchanged.
+        called = re.sub(r'\bstretch\b', kind, name)
+        return (f'{called} is {stretch:g}: expected a {kind} between the limits {lower:.4f} and '
+                f'{upper:.4f} of {whose}')
+
+    def check(self, stretch: float, name: str = 'stretch') -> None:
+        """Raise `BadInputError` for a stretch, by a name, beyond the limits."""
+        if reason := self.beyond(stretch, name):
+            raise BadInputError(reason)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from hmsa import motion
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.model import law
-from hmsa.model.actuators import Actuators, check_stretch, RTOL, Setup
+from hmsa.model.actuators import Actuators, RTOL, Setup
 from hmsa.model.creep import Creep
 from hmsa.model.delivery import Delivery, IDEAL, Piece, ramps
 from hmsa.model.equations import Array
@@ -25,7 +25,7 @@ from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa.model.schedule import CommandSchedule
 
 __all__ = [
-    'ActuatorSimulation', 'check_stretch', 'follow', 'longest_motion', 'response', 'RTOL',
+    'ActuatorSimulation', 'follow', 'longest_motion', 'response', 'RTOL',
     'sampled', 'simulate', 'too_large']
 
 # Time constants after which a motion has settled, and periods after which its phase is uncertain.
@@ -86,7 +86,7 @@ def simulate(
         raise BadInputError(
             'switches and times must not decrease, and no time may lie before the first switch')
     stretch = material.rest if stretch is None else stretch
-    check_stretch(stretch, material)
+    material.check(stretch)
     seen, speed = observed(_sampled(
         np.column_stack([switches, loads, slope]), State(stretch, rate), times, material),
         material)
@@ -98,7 +98,7 @@ def follow(
         delivery: Delivery) -> State:
     """Return the state at a time after the last level; arguments are not checked."""
     pieces, last = ramps(levels, state.ramps_from, end, delivery.slew)
-    if material.creep or delivery.lag > 0.0:
+    if material.creeps or delivery.lag > 0.0:
         return _follow_slowly(pieces, last, state, end, material, delivery)
     stretch, rate, _, *followed = _sampled(
         pieces, state, np.array([float(end)]), material)[:, 0].tolist()
@@ -135,7 +135,7 @@ def with_followed(
 def observed(rows: Array, material: NondimensionalParameters) -> Array:
     """Return stretch and rate of all modes together from rows of `sampled`, shape (2, m)."""
     seen = rows[:motion.FIELD]
-    if not material.modes:
+    if not material.modes.ratios:
         return seen
     after = motion.FOLLOWED + len(material.branches)
     return np.array(material.observed(seen[0], seen[1], rows[after:]))
@@ -210,7 +210,7 @@ def _follow_slowly(
         material: NondimensionalParameters, delivery: Delivery) -> State:
     """Integrate until vibration has ended; from then on only the branches relax."""
     rings, amplifier = end, last if delivery.lag > 0.0 else None
-    if material.creep:
+    if material.creeps:
         rings = min(end, max(pieces[-1][0], 0.0) + longest_motion(last, material)
                     + delivery.settling(0.0))
     stretch, rate, field, *followed = _sampled(
@@ -259,7 +259,7 @@ def longest_motion(load: float, material: NondimensionalParameters) -> float:
     frequency = law.natural_frequency(stretch, material.packed)
     longest = _MOST_PERIODS * 2.0 * math.pi / frequency
     decay = law.damping(stretch, material.packed) / (2.0 * law.mass(stretch, material.packed))
-    if material.modes:
+    if material.modes.ratios:
         decay = min(decay, frequency * material.modes.slowest_decay())
     if decay == 0.0:
         return longest

@@ -20,7 +20,7 @@ from hmsa.planning.history import agree
 from hmsa.planning.path import along, ON_PATH, Path
 from hmsa.planning.sequence import Segment, segments
 from hmsa.planning.setpoint import impossible, Setpoint
-from hmsa.planning.shapers import get_shaper
+from hmsa.planning.shapers import SHAPERS
 from hmsa.planning.shapers.free import through
 from hmsa.planning.shapers.request import MoveRequest, Shaper
 from hmsa.planning.stopping import brake, holdable
@@ -133,7 +133,9 @@ def draft_sequence(
             left = end
         if number % _CHECKED == _CHECKED - 1:
             outset.check()
-    return draft_setpoints(outset, setpoints)
+    if len(setpoints) == 1 and outset.plan.ends_at(setpoints[0].stretch, begin):
+        return None
+    return draft_moves(outset, setpoints)
 
 
 def check_path(points: Sequence[tuple[PathPoint, int]], rest: float) -> None:
@@ -223,15 +225,6 @@ def _along(
     return replace(draft, segments=(replace(draft.segments[0], **known),))
 
 
-def draft_setpoints(outset: PlanStart, setpoints: Sequence[Setpoint]) -> Draft | None:
-    """Draft setpoints; None if the only one is the last of the plan and has begun."""
-    planned = outset.plan.segments
-    if len(setpoints) == 1 and planned and planned[-1].stretch == setpoints[0].stretch \
-            and planned[-1].since <= outset.begin:
-        return None
-    return draft_moves(outset, setpoints)
-
-
 def draft_stop(outset: PlanStart) -> Draft:
     """Draft a stop: rest as near as the flux density limits allow."""
     # A two-step command with the hardest braking load as beta_p: that load up to the first turning
@@ -244,7 +237,7 @@ def draft_stop(outset: PlanStart) -> Draft:
     own = model.options.shaper if model.options.shaper == 'smooth' or (
         model.options.shaper == 'modal' and model.material.modes) else ''
     if (not own and holdable(model, found.stretch) == found.stretch
-            and not model.material.creep
+            and not model.material.creeps
             and (model.delivery.ideal or found.duration == 0.0 and _settled(model, state))):
         move = Move(Code.HOLD, tuple(
             [Level(0.0, found.load)] * (found.duration > 0.0)
@@ -357,7 +350,7 @@ def draft_moves(
     levels: list[PlannedLevel] = []
     placed: list[PlannedSegment] = []
     for segment in segments(
-            _frame(model, outset.state), setpoints, get_shaper(shaper or model.options.shaper),
+            _frame(model, outset.state), setpoints, SHAPERS[shaper or model.options.shaper],
             model.options.short_spell, first=first):
         more, one = _placed(model, outset.begin, outset.check, segment)
         levels += more

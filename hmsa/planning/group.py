@@ -95,8 +95,13 @@ class PlannerGroup:
 
     def draft_setpoint(self, name: str, stretch: float, now: int) -> dict[str, Draft]:
         """Draft a move of one joint; see `draft_request`."""
-        return self._each(
-            [name], lambda name: self.planners[name].draft_setpoint(stretch, now))
+        try:
+            draft = self.planners[name].draft_setpoint(stretch, now)
+        except RefusedError as error:
+            if len(self.planners) == 1:
+                raise
+            raise _of_joint(name, error) from error
+        return {} if draft is None else {name: draft}
 
     def draft_stop(self, now: int) -> dict[str, Draft]:
         """Draft a stop of all joints; see `draft_request`."""
@@ -139,7 +144,7 @@ class PlannerGroup:
             except RefusedError as error:
                 if len(self.planners) == 1:
                     raise
-                raise RefusedError(error.code, f'joint {name}: {error}') from error
+                raise _of_joint(name, error) from error
             if made is not None:
                 drafts[name] = made
         return drafts
@@ -208,6 +213,10 @@ class PlannerGroup:
             name: _samples(planner.plan, stamps) for name, planner in self.planners.items()}
 
 
+def _of_joint(name: str, error: RefusedError) -> RefusedError:
+    return RefusedError(error.code, f'joint {name}: {error}')
+
+
 def resumed(planner: Planner, now: int) -> Resumption:
     """Draft the rest of a joint's plan, or else a stop."""
     try:
@@ -221,7 +230,7 @@ def _rests(draft: Draft, segment: PlannedSegment) -> bool:
     level = draft.levels[bisect_left(draft.levels, segment.begin, key=lambda x: x.stamp)]
     model = level.model
     # A creeping joint would have relaxed further by then.
-    return not model.material.creep and (
+    return not model.material.creeps and (
         abs(level.state.rate) <= _AT_REST
         and math.isclose(
             level.state.load, model.holding(level.stretch), rel_tol=_AT_REST, abs_tol=_AT_REST))

@@ -225,7 +225,7 @@ class _PathFit:
         times: Array = (edges[:-1, np.newaxis] + spans[:, np.newaxis] * _POINTS).ravel()
         stretch, rate, wanted = self._course(times)
         loads = loads_for(stretch, rate, wanted, material)
-        if material.creep:
+        if material.creeps:
             # Include the edges, since the next block starts with the branch states at one of them.
             every = np.append(np.column_stack([edges[:-1], times.reshape(-1, 6)]), edges[-1])
             held, behind = held_along(

@@ -14,7 +14,6 @@ import math
 from hmsa.errors import BadInputError
 from hmsa.model.equations import equilibrium_stretch
 from hmsa.model.parameters import ActuatorParameters
-from hmsa.model.simulation import check_stretch
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning import drafting
@@ -83,9 +82,9 @@ class Planner(RunningPlan):
                 'or a planner that is started with the other')
         model = JointModel(actuator, options)
         segments = self.plan.segments
-        check_stretch(
+        model.material.check(
             segments[-1].stretch if segments else self.plan.levels[-1].stretch,
-            model.material, 'the stretch that is held')
+            'the stretch that is held')
         return model
 
     def take_model(self, model: JointModel) -> None:
@@ -156,8 +155,10 @@ class Planner(RunningPlan):
     def draft_setpoint(self, stretch: float, now: int) -> Draft | None:
         """Draft a move to one stretch; None if it changes nothing."""
         drafting.check_target(stretch, self.model.material.rest)
-        outset = self._outset(self.soonest(now))
-        return drafting.draft_setpoints(outset, [Setpoint(stretch, math.inf)])
+        begin = self.soonest(now)
+        if self.plan.ends_at(stretch, begin):
+            return None
+        return drafting.draft_moves(self._outset(begin), [Setpoint(stretch, math.inf)])
 
     def draft_stop(self, now: int) -> Draft:
         """Draft a stop."""
@@ -230,6 +231,31 @@ class Planner(RunningPlan):
                 state, stretch=believed[0], rate=believed[1] * model.units.time,
                 followed=believed[2] or state.followed)
         return PlanStart(self.plan, model, begin, state, self._history.stale, self.check)
+
+    def as_held(self, time: int) -> Believed | None:
+        """
+        Return the predicted state at a time in ns, in the stretches of the present model.
+
+        The last level may be planned with other parameters. With those of the model it holds
+        another stretch, and a move from the planned one would leave vibration. None if both have
+        the same parameters, or if the model cannot be at that stretch.
+        """
+        last, model = self.plan.levels[-1], self.model
+        if last.model is model or (
+                last.model.actuator == model.actuator and last.model.others == model.others):
+            return None
+        state = self.state(time)
+        stretch = state.stretch + float(
+            equilibrium_stretch(model.load(last.flux_density), model.material)
+            - equilibrium_stretch(last.load, last.model.material))
+        if model.material.beyond(stretch):
+            return None
+        count = len(model.material.branches)
+        more = model.holding(stretch) - model.holding(state.stretch)
+        return stretch, state.rate / model.units.time, (
+            *(x + more for x in state.followed[:count]),
+            *(x if i % 2 else x + stretch - state.stretch
+              for i, x in enumerate(state.followed[count:])))
 
     def as_sent(self, time: int) -> bool:
         """Return whether the level at a time in ns belongs to commanded levels or a path."""

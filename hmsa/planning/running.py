@@ -11,7 +11,7 @@ import math
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.model.equations import elastic_stiffness, equilibrium_stretch
 from hmsa.model.moves import State
-from hmsa.model.simulation import check_stretch, longest_motion
+from hmsa.model.simulation import longest_motion
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.history import Deviation, History
 from hmsa.planning.timeline import (
@@ -20,6 +20,8 @@ from hmsa.planning.timeline import (
     JointModel,
     PlannedLevel,
     PlannedSegment,
+    SINCE,
+    STAMP,
     Timeline,
 )
 
@@ -47,7 +49,7 @@ class RunningPlan:
 
     def __init__(self, model: JointModel, stretch: float) -> None:
         """Start at rest."""
-        check_stretch(stretch, model.material, 'initial stretch')
+        model.material.check(stretch, 'initial stretch')
         self.model = model
         #: Expected lateness, in ns, of all future levels.
         self.delay = 0
@@ -97,7 +99,7 @@ class RunningPlan:
         block cannot be in this state.
         """
         model, units = self.model, self.model.units
-        check_stretch(stretch, model.material, 'stretch in force')
+        model.material.check(stretch, 'stretch in force')
         level = in_force if flux_density is None else flux_density
         if not math.isfinite(rate + in_force + level):
             raise BadInputError(
@@ -139,15 +141,15 @@ class RunningPlan:
         if draft is None:
             return self.plan
         history, old, begin = self._history, self.plan, draft.begin
-        kept = bisect_left(old.levels, begin, key=lambda x: x.stamp)
-        begun = bisect_right(old.levels, now, key=lambda x: x.stamp)
+        kept = bisect_left(old.levels, begin, key=STAMP)
+        begun = bisect_right(old.levels, now, key=STAMP)
         # Forget levels that were sent and are over, except the present one and those for which
         # reports may still arrive.
         over = max(min(history.sent, kept, begun) - 1, 0)
         first = max(min(over, history.known), over - _REMEMBERED)
         new = draft.resumed is None
         self._past += old.levels[:first]
-        over = bisect_right(self._past, now - _PAST, key=lambda x: x.stamp) - 1
+        over = bisect_right(self._past, now - _PAST, key=STAMP) - 1
         del self._past[:max(over, len(self._past) - _PAST_LEVELS, 0)]
         before = _running(old, begin, now) if new else old.segments[:draft.resumed]
         stale = history.stale
@@ -163,11 +165,18 @@ class RunningPlan:
     def due(self, now: int) -> tuple[PlannedLevel, ...]:
         """Return the commands to send now, each once: those up to lead_time ahead."""
         first, latest = self._history.sent, now + self.model.options.lead_time
-        if not self.pending or self.plan.levels[first].stamp > latest:
+        levels = self._history.plan.levels
+        if first == len(levels) or levels[first].stamp > latest:
             return ()
-        end = bisect_right(self.plan.levels, latest, first, key=lambda x: x.stamp)
-        self._history = replace(self._history.predicted(end), sent=end)
+        end = bisect_right(levels, latest, first, key=STAMP)
+        self._catch_up(end)
+        self._history = replace(self._history, sent=end)
         return self.plan.levels[first:end]
+
+    def _catch_up(self, end: int) -> None:
+        """Predict levels up to an index again, as far as their prediction is no longer valid."""
+        if self._history.stale is not None:
+            self._history = self._history.predicted(end)
 
     def moves(self, now: int) -> bool:
         """Return whether setpoints are still to be reached at a time in ns."""
@@ -204,7 +213,7 @@ class RunningPlan:
         if not self.pending or self.plan.levels[first].stamp >= now - tolerance:
             return 0
         soonest = now + self.model.options.lead_time
-        end = bisect_left(self.plan.levels, soonest, first, key=lambda x: x.stamp)
+        end = bisect_left(self.plan.levels, soonest, first, key=STAMP)
         self._leave_out(first, end, soonest)
         return end - first
 
@@ -277,10 +286,11 @@ class RunningPlan:
 
     def state(self, time: int) -> State:
         """Predict the nondimensional state at a time in ns, in the units of the next request."""
-        self._history = self._history.predicted(self.plan.place(time) + 1)
-        level = self.plan.level(time)
+        place = self.plan.place(time)
+        self._catch_up(place + 1)
+        level = self.plan.levels[place]
         if time < level.stamp and self._past:
-            before = bisect_right(self._past, time, key=lambda x: x.stamp) - 1
+            before = bisect_right(self._past, time, key=STAMP) - 1
             level = self._past[max(before, 0)]
         return self.model.taken_from(level.at(time), level.model)
 
@@ -293,9 +303,11 @@ class RunningPlan:
 
     def _delayed(self, time: int) -> State:
         """Predict the state `delay` after a time in ns, with future levels late by `delay`."""
+        if not self.delay:
+            return self.state(time)
         state, rest = self.unknown(ALWAYS)
         late = [x for x in rest[:_REMEMBERED + 1] if x.stamp <= time]
-        if not self.delay or len(late) > _REMEMBERED:
+        if len(late) > _REMEMBERED:
             return self.state(time)
         for level in late:
             state = replace(
@@ -310,7 +322,7 @@ class RunningPlan:
 
 def _running(plan: Timeline, begin: int, now: int) -> tuple[PlannedSegment, ...]:
     """Return the setpoints of a plan from the current one to those that a draft replaces."""
-    end = bisect_left(plan.segments, begin, key=lambda x: x.since)
+    end = bisect_left(plan.segments, begin, key=SINCE)
     running = plan.segments[max(min(plan.under_way(now), end - 1), 0):end]
     if running and running[-1].arrival is not None and running[-1].arrival > begin:
         running = (*running[:-1], replace(running[-1], arrival=None))

@@ -8,12 +8,13 @@ import math
 import numpy as np
 
 from hmsa.errors import BadInputError, excerpt, HmsaError
+from hmsa.model import law
 from hmsa.model.delivery import Delivery, ramps
-from hmsa.model.equations import elastic_force, natural_frequency, stretch_limits
+from hmsa.model.equations import elastic_force, natural_frequency
 from hmsa.model.laws.record import ENDLESS
 from hmsa.model.moves import Level, Move, State
 from hmsa.model.parameters import NondimensionalParameters
-from hmsa.model.simulation import check_stretch, follow, longest_motion, sampled
+from hmsa.model.simulation import follow, longest_motion, sampled
 from hmsa.model.status import Code, RefusedError
 from hmsa.motion import STRETCH
 from hmsa.planning.setpoint import Setpoint
@@ -118,16 +119,17 @@ def segments(
     """
     shape = first or shaper
     units, state = frame.units, frame.state
-    check_stretch(state.stretch, frame.material, 'start stretch')
+    frame.material.check(state.stretch, 'start stretch')
     begin = 0.0
     upcoming = iter(setpoints)
     setpoint = next(upcoming, None)
     while setpoint is not None:
         following = next(upcoming, None)
         request = replace(frame, state=state, target=setpoint.stretch, work=StepBudget())
-        move = creeping.held(
-            request, _rounded(shape(request), frame.delivery),
-            math.inf if following is None else setpoint.span)
+        move = _rounded(shape(request), frame.delivery)
+        if frame.material.creeps:
+            move = creeping.held(
+                request, move, math.inf if following is None else setpoint.span)
         # Both are rounded: a duration that the move fills exactly is long enough.
         if setpoint.span * (1.0 + 1e-12) < move.duration < math.inf:
             if short_spell == 'refuse':
@@ -143,7 +145,7 @@ def segments(
             move = move.until(setpoint.span)
         yield Segment(
             setpoint, begin, state, end, move,
-            float(elastic_force(setpoint.stretch, frame.material)))
+            float(law.elastic_force(setpoint.stretch, frame.material.packed)))
         begin += setpoint.span
         state = end
         setpoint = following
@@ -169,31 +171,32 @@ def _rounded(move: Move, delivery: Delivery) -> Move:
 
 def _follow(request: MoveRequest, move: Move, span: float) -> State:
     """Return the state at the end of a duration, or at the end of the last ramp."""
-    material, delivery = request.material, request.delivery
+    material, delivery, start = request.material, request.delivery, request.start
     end = move.levels[-1].time if math.isinf(move.duration) else move.duration
     if math.isfinite(span):
         end = max(end, span)
     if move.tail:
         # The motion of the branches after the arrival is known.
-        if move.duration > 0.0:
+        if move.duration > 0.0 and material.law is not None:
             _check_known(request, move.until(move.duration).levels, (move.duration,) * 2)
         place = bisect_right(move.levels, end, key=lambda x: x.time) - 1
         level = move.levels[place]
         return follow(
             (replace(level, time=0.0),), move.tail[place - len(move.levels)], end - level.time,
             material, delivery)
-    parts, last = ramps(move.levels, request.load, end, delivery.slew)
+    parts, last = ramps(move.levels, start.ramps_from, end, delivery.slew)
     ramped = max(parts[-1][0], 0.0)
-    # A move held without an end also vibrates after the last level.
-    _check_known(request, move.levels, (ramped, max(end, span)))
-    if not material.creep:
+    if material.law is not None:
+        # A move held without an end also vibrates after the last level.
+        _check_known(request, move.levels, (ramped, max(end, span)))
+    if not material.creeps:
         if move.code is Code.MODAL:
             # This is what has been solved for; to follow all modes again takes time.
             return State(
                 request.target, 0.0, last, last if delivery.lag > 0.0 else None,
                 (request.target, 0.0) * len(material.modes.ratios))
         end = min(end, ramped + longest_motion(last, material) + delivery.settling(0.0))
-    return follow(move.levels, request.start, end, material, delivery)
+    return follow(move.levels, start, end, material, delivery)
 
 
 def _check_known(request: MoveRequest, levels: Sequence[Level], ends: tuple[float, float]) -> None:
@@ -203,7 +206,7 @@ def _check_known(request: MoveRequest, levels: Sequence[Level], ends: tuple[floa
     ``ends`` are the times of the last ramp and of the end of the check.
     """
     material, target = request.material, request.target
-    elastic, limits = material.law, stretch_limits(material)
+    elastic, limits = material.law, material.limits
     if elastic is None or limits == ENDLESS:
         return
     # Stretches from which the elastic force decreases, unless the range of the model ends there.

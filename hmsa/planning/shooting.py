@@ -81,7 +81,7 @@ def solve(
     times, loads = template.times.copy(), template.loads.copy()
     d_times, d_loads = template.d_times, template.d_loads
     state, material = request.state, request.material
-    if material.creep and delivery.slew < math.inf:
+    if material.creeps and delivery.slew < math.inf:
         # The tail begins with the load at the end of the last ramp.
         d_times, d_loads = (np.pad(x, ((0, 0), (0, 1))) for x in (d_times, d_loads))
         d_loads[-1, -1] = 1.0

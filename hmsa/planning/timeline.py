@@ -10,6 +10,7 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import math
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,8 @@ ESTIMATED = ('coil_time_constant', 'constant_force')
 _WARNINGS = (Code.TOO_DAMPED, Code.INDISTINGUISHABLE, Code.SPELL_TOO_SHORT)
 #: Timestamp of a level that has always been in effect, at rest.
 ALWAYS = -2**62
+#: Order of levels by start, and of setpoints by start.
+STAMP, SINCE = attrgetter('stamp'), attrgetter('since')
 
 
 @dataclass(frozen=True)
@@ -115,11 +118,11 @@ class JointModel:
 
     def load(self, flux_density: float) -> float:
         """Return the load of a flux density in T plus the constant force."""
-        return float(self.units.of_level(flux_density)) + self.pull
+        return float(flux_density / self.units.load) + self.pull
 
     def flux_density(self, load: float) -> float:
         """Return the flux density in T of a load."""
-        return float(self.units.level(load - self.pull))
+        return float((load - self.pull) * self.units.load)
 
     def holding(self, stretch: float) -> float:
         """Return the load that holds a stretch."""
@@ -135,7 +138,7 @@ class JointModel:
 
     def observed(self, state: State) -> tuple[float, float]:
         """Return stretch and dimensionless rate of all modes together."""
-        if not self.material.modes or len(state.followed) != len(self.material.rows):
+        if not self.material.modes.ratios or len(state.followed) != len(self.material.rows):
             return state.stretch, state.rate
         seen, speed = self.material.observed(
             state.stretch, state.rate, state.followed[len(self.material.branches):])
@@ -215,7 +218,7 @@ class PlannedLevel:
         return self.model.follow(
             self.state, self.load,
             min(max(self.model.time(time - self.stamp), 0.0),
-                math.inf if self.model.material.creep else self._settled()))
+                math.inf if self.model.material.creeps else self._settled()))
 
     @property
     def ramped(self) -> float:
@@ -233,7 +236,7 @@ class PlannedLevel:
         model, settled = self.model, self._settled()
         after = np.array([model.time(x - self.stamp) for x in times])
         # After settling, creep may continue.
-        count = int(np.searchsorted(after, settled)) if model.material.creep else len(after)
+        count = int(np.searchsorted(after, settled)) if model.material.creeps else len(after)
         stretch, rate = observed(sampled(
             (Level(0.0, self.load),), self.state, np.minimum(after[:count], settled),
             model.material, model.delivery), model.material) if count else np.empty((2, 0))
@@ -298,11 +301,16 @@ class Timeline:
 
     def place(self, time: int) -> int:
         """Return the index of the level at a time; before all levels, that of the first one."""
-        return max(bisect_right(self.levels, time, key=lambda x: x.stamp) - 1, 0)
+        return max(bisect_right(self.levels, time, key=STAMP) - 1, 0)
 
     def under_way(self, time: int) -> int:
         """Return the index of the setpoint at a time, -1 before the first."""
-        return bisect_right(self.segments, time, key=lambda x: x.since) - 1
+        return bisect_right(self.segments, time, key=SINCE) - 1
+
+    def ends_at(self, stretch: float, time: int) -> bool:
+        """Return whether the last setpoint has a stretch and has begun by a time in ns."""
+        last = self.segments[-1] if self.segments else None
+        return last is not None and last.stretch == stretch and last.since <= time
 
     def step(self, place: int) -> float:
         """Return the distance in stretch of a setpoint from the previous one, by index."""

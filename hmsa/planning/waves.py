@@ -149,7 +149,7 @@ class Wave:
         found = loads_for(
             stretch, self.amplitude * frequency * slope,
             self.amplitude * frequency ** 2 * curve, material)
-        if material.creep:
+        if material.creeps:
             # Upper bound: branches that do not relax during a cycle.
             forces = elastic_force(stretch, material)
             found = found + material.branches[:, 0].sum() * (forces - forces.mean())

@@ -22,7 +22,6 @@ from hmsa_lab.adapt.motion import held, rest
 from hmsa_lab.adapt.move_errors import MoveErrors, Moves
 from hmsa_lab.adapt.prior import Prior
 from hmsa_lab.adapt.trust import Trust
-from hmsa_ros.runtime.follower import as_held
 from hmsa_ros.runtime.records import Settings
 
 # Earlier levels that still affect the samples: the field of a coil with lag depends on them.
@@ -317,7 +316,7 @@ class AdaptiveJoint:
         except HmsaError:
             return None
         if found is None:
-            return as_held(self.planner, time)
+            return self.planner.as_held(time)
         # Effects missing in the model shift its equilibrium: a plan uses the stretches of its
         # model.
         level, model = self.planner.plan.levels[-1].flux_density, self.planner.model

@@ -15,7 +15,7 @@ from hmsa_lab.adapt.corrections import Corrections
 from hmsa_lab.adapt.learnt import same_parameters, save
 from hmsa_lab.adapt.messages import differences
 from hmsa_ros.runtime.environment import Clock
-from hmsa_ros.runtime.follower import as_held, Follower
+from hmsa_ros.runtime.follower import Follower
 from hmsa_ros.runtime.planning_task import Drafts, PlanningTask
 from hmsa_ros.runtime.records import EstimateChanged, Output, Settings, Severity, Verdict
 
@@ -64,7 +64,7 @@ class Feedback(Follower):
 
     def _believed(self, name: str, time: int) -> Believed | None:
         joint = self.joints.get(name)
-        return as_held(self._group.planners[name], time) if joint is None else (
+        return self._group.planners[name].as_held(time) if joint is None else (
             joint.initial_state(time))
 
     def restart(self) -> None:

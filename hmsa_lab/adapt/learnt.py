@@ -16,7 +16,6 @@ from hmsa.identification.quantities import BRANCHES, derivative, QUANTITIES, val
 from hmsa.interfaces.actuator import parameters_of
 from hmsa.judge.records import SensorModel
 from hmsa.model.laws.coordinate import coordinate_of
-from hmsa.model.simulation import check_stretch
 from hmsa.planning.planner import Believed
 from hmsa.planning.timeline import JointModel
 from hmsa_lab.adapt.estimator import CREEPS, StateEstimate
@@ -48,7 +47,7 @@ def learnt_model(
     """
     try:
         found = estimate.model(model.options, sure)
-        check_stretch(held, found.material, 'stretch')
+        found.material.check(held, 'stretch')
     except BadInputError:
         return model
     return found

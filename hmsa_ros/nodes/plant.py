@@ -14,7 +14,7 @@ from hmsa.interfaces import parameters as shared
 from hmsa.interfaces import topics
 from hmsa.interfaces.actuator import planned_from
 from hmsa.interfaces.parameters import ParameterSpec
-from hmsa.model.actuators import check_stretch, Setup, unheld
+from hmsa.model.actuators import Setup, unheld
 from hmsa.model.real_time_factor import RealTimeFactor
 from hmsa.model.sampling import too_few_samples
 from hmsa.model.units import NANOSECONDS
@@ -89,7 +89,7 @@ def _joints_from(values: JointParameters) -> dict[str, SimulatedJoint]:
     def joint(_: str, own: Mapping[str, Any]) -> SimulatedJoint:
         actuator = planned_from(own)
         if own['reset_stretch']:
-            check_stretch(own['reset_stretch'], actuator.nondimensional, 'reset_stretch')
+            actuator.nondimensional.check(own['reset_stretch'], 'reset_stretch')
         return SimulatedJoint(
             Setup(
                 actuator, own['initial_stretch'], own['slew_limit'] or math.inf,

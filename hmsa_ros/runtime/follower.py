@@ -1,16 +1,13 @@
 """What follows the joints by their samples: feedback, or nothing in open loop."""
 
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 from typing import Any
 
 from hmsa.errors import BadInputError
 from hmsa.judge.records import SensorModel
 from hmsa.judge.setpoint_samples import SetpointSamples
-from hmsa.model.equations import equilibrium_stretch, stretch_limits
 from hmsa.offload import Awaited, Doing, here
 from hmsa.planning.group import PlannerGroup
-from hmsa.planning.planner import Believed, Planner
 from hmsa.planning.timeline import JointModel
 from hmsa.plugins import FOLLOWER, registered
 from hmsa_ros.runtime.environment import Clock
@@ -32,7 +29,7 @@ class Follower:
         #: Executes long-running work.
         self.doing = doing
         for planner in group.planners.values():
-            planner.believed = partial(as_held, planner)
+            planner.believed = planner.as_held
 
     @property
     def on(self) -> bool:
@@ -119,29 +116,3 @@ def feedback(
     """Return feedback from samples; ``report_ended`` is told why that of a joint has ended."""
     make: Callable[..., Follower] = registered(FOLLOWER)['adapt'].load()
     return make(group, settings, outputs, clock, report_ended, doing)
-
-
-def as_held(planner: Planner, time: int) -> Believed | None:
-    """
-    Return the predicted state at a time in ns, in the stretches of the planner's model.
-
-    The last level may be planned with other parameters. With those of the model it holds another
-    stretch, and a move from the planned one would leave vibration. None if both have the same
-    parameters, or if the model cannot be at that stretch.
-    """
-    last, model = planner.plan.levels[-1], planner.model
-    if last.model.actuator == model.actuator and last.model.others == model.others:
-        return None
-    state = planner.state(time)
-    stretch = state.stretch + float(
-        equilibrium_stretch(model.load(last.flux_density), model.material)
-        - equilibrium_stretch(last.load, last.model.material))
-    low, high = stretch_limits(model.material)
-    if not low < stretch < high:
-        return None
-    count = len(model.material.branches)
-    more = model.holding(stretch) - model.holding(state.stretch)
-    return stretch, state.rate / model.units.time, (
-        *(x + more for x in state.followed[:count]),
-        *(x if i % 2 else x + stretch - state.stretch
-          for i, x in enumerate(state.followed[count:])))

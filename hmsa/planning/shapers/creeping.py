@@ -78,7 +78,7 @@ def held(request: MoveRequest, found: Move, span: float) -> Move:
     start. Without creep, or if the target is only approached, the move does not change.
     """
     material, delivery = request.material, request.delivery
-    if not material.creep or not found.duration < np.inf:
+    if not material.creeps or not found.duration < np.inf:
         return found
     end = arrival(request, found)
     holding = float(law.elastic_force(request.target, material.packed))

@@ -132,7 +132,7 @@ def _refusal(request: MoveRequest) -> tuple[Code, str]:
             + (f'{ramps} and ' if slow else '')
             + f'flux densities of {units.load_text(limits.minimum)} to '
             f'{units.load_text(limits.maximum)}')
-    if request.material.creep:
+    if request.material.creeps:
         return Code.NO_TWO_STEP, (
             f'no two flux densities within the limits bring {request.named_target} of this '
             'creeping elastomer to rest: expected wider limits, a smaller move or several '

@@ -90,7 +90,7 @@ def shaped(request: MoveRequest, impulses: Impulses) -> Move:
 
     levels = levels_to(holding)
     end = levels[-1].time
-    for _ in range(_PASSES if material.creep else 0):
+    for _ in range(_PASSES if material.creeps else 0):
         # Account for the overstress at arrival, after the last ramp, and for the tail.
         rows, _ = ramps(levels, request.load, math.inf, request.delivery.slew)
         end = max(end, rows[-1][0])

@@ -350,7 +350,7 @@ def _command(
     """
     levels = [Level(*x) for x in zip(frame.times, loads.tolist(), strict=False)]
     holding = chain.levels[-1].load
-    if not request.material.creep or (
+    if not request.material.creeps or (
             request.delivery.lag == 0.0 and frame.last == chain.duration):
         return _settled(request, chain, frame, levels, holding, holding)
     # Match field and amplifier to the overstress, which hardly depends on how they reach it.

@@ -92,7 +92,7 @@ def _attempt(request: MoveRequest, low: float, high: float) -> Attempt:
         Template.of((Level(0.0, push), Level(turn, brake), Level(
             turn + max(braking, down), holding)), [('time', 1), ('time', 2)]), elastic,
         replace(delivery, lag=0.0))
-    if found is not None and (request.material.creep or delivery.lag > 0.0):
+    if found is not None and (request.material.creeps or delivery.lag > 0.0):
         found = _carried(request, found[0])
     return within_limits(on_time(found, request), request)
 

@@ -14,7 +14,7 @@ from hmsa.model.equations import Array
 from hmsa.model.mismatch import Ellipsoid, Uncertainty
 from hmsa.model.moves import Level, Limits, Move, State
 from hmsa.model.parameters import NondimensionalParameters
-from hmsa.model.simulation import branches_of, check_stretch
+from hmsa.model.simulation import branches_of
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import Units
 from hmsa.planning.shapers.smooth_limits import PACE, SmoothLimits
@@ -118,7 +118,8 @@ class MoveRequest:
     @property
     def start(self) -> State:
         """The state, with the holding load if the load is not given."""
-        return replace(self.state, load=self.field)
+        known = math.isfinite(self.state.load)
+        return self.state if known else replace(self.state, load=self.field)
 
     @property
     def frequency(self) -> float:
@@ -141,10 +142,8 @@ class MoveRequest:
 
     def holding_load(self) -> float:
         """Return the load that holds the target, beta_1; `RefusedError` outside the limits."""
-        try:
-            check_stretch(self.target, self.material, 'target stretch')
-        except BadInputError as error:
-            raise RefusedError(Code.OUT_OF_RANGE, str(error)) from error
+        if reason := self.material.beyond(self.target, 'target stretch'):
+            raise RefusedError(Code.OUT_OF_RANGE, reason)
         load = float(law.elastic_force(self.target, self.material.packed))
         self.limits.check(load, self.target, self.units)
         return load

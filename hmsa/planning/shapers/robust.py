@@ -47,7 +47,7 @@ def robust(request: MoveRequest) -> Move:
         chain = _chain(ideal, [*waypoints, request.target])
         if chain.code is not Code.ROBUST:
             break
-    if chain.code is Code.ROBUST and (request.material.creep or not request.delivery.ideal):
+    if chain.code is Code.ROBUST and (request.material.creeps or not request.delivery.ideal):
         chain = _chain(request, [*waypoints, request.target])
     return chain if chain.code is Code.ROBUST else replace(move, reason=(
         f'no chain of order {request.order} leads to {request.named_target} ({chain.code}): '
@@ -72,7 +72,7 @@ def _chain(request: MoveRequest, waypoints: list[float]) -> Move:
         if levels[-1].time >= (1.0 - _ROUNDING) * begin:
             # There is no ramp to complete: the next command starts at once.
             levels.pop()
-        if request.material.creep:
+        if request.material.creeps:
             state = arrival(replace(request, state=state, target=waypoint), move)
         else:
             state = State(waypoint, 0.0, last.load)

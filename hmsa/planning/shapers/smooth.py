@@ -117,7 +117,7 @@ def _path(request: MoveRequest, holding: float, duration: float) -> _SmoothMove 
             and np.max(np.abs(speed)) <= max(request.pace.rate, float(np.max(np.abs(rate))))):
         return None
     loads = loads_for(stretch, speed, wanted, material)
-    if material.creep:
+    if material.creeps:
         loads = loads + held_along(times, stretch, followed, material)[0]
     if delivery.lag > 0.0:
         # The field that the present level would give needs no change of the level.
@@ -142,7 +142,7 @@ def _free(
     material, state = request.material, request.state
     load, field = request.load, request.field
     followed = branches_of(state, material)
-    if not material.creep and state.rate == 0.0 and field == load == law.elastic_force(
+    if not material.creeps and state.rate == 0.0 and field == load == law.elastic_force(
             state.stretch, material.packed):
         nothing = np.zeros(_POINTS)
         return np.full(_POINTS, state.stretch), nothing, nothing, nothing + load, followed
@@ -150,7 +150,7 @@ def _free(
         (Level(0.0, load),), request.start, times, material, replace(
             request.delivery, slew=math.inf))
     pull = loads
-    if material.creep:
+    if material.creeps:
         force = elastic_force(stretch, material)
         pull = loads - material.branches[:, motion.RATIO] @ (
             force - np.array(rows[:len(followed)]))
@@ -186,7 +186,7 @@ def _delivered(request: MoveRequest, path: _SmoothMove, holding: float, period: 
     d_loads = np.zeros((count + 1, len(changes)))
     d_loads[:-1] = np.array(changes).T
     rounded = np.array([delivery.rounded(x) for x in times.tolist()])
-    loads = np.append(loads, along[-1] if request.material.creep else holding)
+    loads = np.append(loads, along[-1] if request.material.creeps else holding)
     return solve(
         Template(rounded, loads, np.zeros_like(d_loads), d_loads), request,
         wait=delivery.rounded(0.5 * each))

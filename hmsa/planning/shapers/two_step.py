@@ -25,7 +25,7 @@ from hmsa.planning.shooting import (
     Template,
     within_limits,
 )
-from hmsa.planning.two_step import CODES, HOLD_TOLERANCE, plan_two_step, RTOL
+from hmsa.planning.two_step import CODES, HOLD_TOLERANCE, RTOL
 
 # Duration of the push that settles a lagging field, in time constants: the push exceeds the
 # holding level by as much as the previous level falls short of it; others on a grid are longer.
@@ -58,7 +58,7 @@ def two_step(request: MoveRequest) -> Move:
     replaces it. The move's reason reports each of these cases.
     """
     holding = request.holding_load()
-    delivery, creeps = request.delivery, bool(len(request.material.branches))
+    delivery, creeps = request.delivery, request.material.creeps
     lags, at_once = delivery.lag > 0.0, delivery.period == 0.0 and delivery.slew == math.inf
     if lags and at_rest(request):
         return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
@@ -68,9 +68,8 @@ def two_step(request: MoveRequest) -> Move:
     if code in _WITHOUT and not (lags and code is Code.HOLD):
         return _without(request, code, holding)
     if code is Code.TWO_STEP:
-        found = within_limits((levels, levels[-1].time) if at_once else _delivered(
-            request, levels), request)
-        if found is not None:
+        found = (levels, levels[-1].time) if at_once else _delivered(request, levels)
+        if found is not None and request.keeps(found[0]):
             sooner = _sooner(request, found[1]) if lags or creeps else None
             return sooner or Move(Code.TWO_STEP, *found)
     if request.still and not lags and (code is Code.TWO_STEP or not creeps):
@@ -99,10 +98,10 @@ def _sooner(request: MoveRequest, duration: float) -> Move | None:
 def _plain(request: MoveRequest) -> tuple[Code, tuple[Level, ...]]:
     """Return code and levels for ideal hardware without branches."""
     state, limits = request.state, request.limits
-    plan = plan_two_step(
-        state.stretch, request.target, request.material, rate=state.rate,
-        load_limits=(limits.minimum, limits.maximum))
-    return plan.code, (Level(0.0, plan.beta_p), Level(plan.tau_p, plan.beta_1))
+    status, beta_p, tau_p, beta_1, _ = motion.two_step(
+        state.stretch, state.rate, request.target, request.material.packed, limits.minimum,
+        limits.maximum, RTOL, HOLD_TOLERANCE)
+    return CODES[status], (Level(0.0, beta_p), Level(tau_p, beta_1))
 
 
 def _late(request: MoveRequest, lag: float) -> tuple[Code, tuple[Level, ...]]:
