@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from hmsa.judge import judging, setpoint_samples
-from hmsa.judge.records import RequestedSetpoint
+from hmsa.judge.records import RequestedSetpoint, SensorModel, Tolerances
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
+from hmsa.model.status import Code
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa_ros.device.sensor import SensorErrors
@@ -369,3 +370,19 @@ def test_a_setpoint_that_a_plan_comes_back_to_is_not_missed():
     hold.move(setpoint.arrival, corrected=True)
     assert hold.found is None
     assert not hold.over
+
+
+@pytest.mark.parametrize('lost', [(0, 300), (15, 300), (5, 240)])
+@pytest.mark.parametrize(('swing', 'verdict'), [(0.0, Code.ARRIVED), (0.02, Code.VIBRATING)])
+def test_what_is_held_is_judged_by_later_samples_where_those_after_the_arrival_are_lost(
+        lost, swing, verdict):
+    asked = RequestedSetpoint(1.2, 1.0, 0, 100 * MS, 100 * MS, 600.0, 1.0, held=True)
+    hold, sensor = setpoint_samples.SetpointSamples(asked), SensorModel()
+    for after in range(-99, 1000):
+        now = asked.arrival + after * MS
+        if not lost[0] <= after < lost[1] and hold.needs(now, now):
+            ringing = 0.5 * swing * math.cos(0.6 * after)
+            hold.add(now, 1.2 + (ringing if after > 0 else 0.002 * after), now)
+        hold.judge(now, now, Tolerances(), sensor, observable=True)
+    assert hold.over
+    assert hold.found.verdict is verdict

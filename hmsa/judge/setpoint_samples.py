@@ -23,6 +23,9 @@ from hmsa.offload import ANSWER, Awaited, Doing, here
 _RARE = NANOSECONDS // 4
 # Number of samples kept from the move: they show whether the sensor moves at all.
 _MOVING = 32
+# Time in ns after an arrival until which a setpoint that is held waits for samples again, if those
+# after the arrival are lost, as where reader or network pause.
+_LOST = 2 * NANOSECONDS
 # Time without samples, by the steady clock, after which the setpoint is judged without them.
 _PATIENCE = NANOSECONDS // 2
 _TOLERANCES = Tolerances()
@@ -77,6 +80,7 @@ class SetpointSamples:
         self.due = min(begin + self._length, self._closes)
         self._few: bool | None = None
         self._waits = False  # whether it waits for a last sample
+        self._again = False  # whether it waited for samples after lost ones
 
     def move(self, arrival: int, *, corrected: bool) -> None:
         """Adopt the arrival in ns of a new plan, ``corrected`` if it was made from samples."""
@@ -191,6 +195,8 @@ class SetpointSamples:
             setpoint = replace(setpoint, end=None, moved=(
                 self._begin + after // 2 if self.due < self._closes
                 else self._closes - 2 * self._length))
+        elif self._again and (begin := self._resumed(self._newest)) is not None:
+            setpoint = replace(setpoint, end=None, moved=begin)
         found = yield from self.judged(
             setpoint, self._goal or tolerances, sensor=sensor, until=self.due)
         self.news = bool(self._samples)
@@ -239,6 +245,8 @@ class SetpointSamples:
         closes = self._closes if self._cut is None else min(self._closes, self._cut)
         if self._newest >= self.due and self._first() < ENOUGH:
             self.due = max(self.due, min(self._begin + _RARE, self._closes))
+        if self._newest >= closes and self._waits_again():
+            return False
         if self._newest >= self.due:
             return True
         if self._newest >= closes:
@@ -254,6 +262,27 @@ class SetpointSamples:
             return False
         self.due = self._closes
         return True
+
+    def _waits_again(self) -> bool:
+        """Return whether samples after the arrival are lost and later ones can show the rest."""
+        if self._again or not self.setpoint.held or self._cut is not None:
+            return False
+        begin = self._resumed(self._newest)
+        if begin is None or begin > self._begin + _LOST:
+            return False
+        self._again = True
+        self.due = begin + self._length
+        self._closes = max(self._closes, begin + 2 * self._length)
+        return self._newest < self.due
+
+    def _resumed(self, newest: int) -> int | None:
+        """Return when samples came again after a gap in the first look; None without one."""
+        stamps = np.array(sorted(x for x in (*self._samples, newest) if x >= self._begin))
+        gaps = np.diff(stamps, prepend=self._begin)
+        # Few samples have a longer look.
+        look = max(self._length, ENOUGH * int(np.median(gaps[1:])) if len(gaps) > 2 else 0)
+        lost = np.flatnonzero((2 * gaps > look) & (stamps - gaps < self._begin + look))
+        return int(stamps[lost[-1]]) if len(lost) else None
 
     def shown(self, setpoint: RequestedSetpoint, *, sensor: SensorModel) -> Awaited[Finding]:
         """Return the last finding of a setpoint, or judge it."""
