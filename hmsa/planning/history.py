@@ -106,9 +106,10 @@ class History:
         # The level as the hardware rounds it.
         news = replace(taken, stamp=stamp, flux_density=flux_density)
         deviation = replace(deviation, change=flux_density - levels[known].flux_density)
-        after = tuple(
-            replace(x, stamp=stamp, sent_for=x.due) if x.stamp < stamp else x
-            for x in levels[rest:self.sent])
+        after = levels[rest:self.sent]
+        if after and after[0].stamp < stamp:
+            after = tuple(
+                replace(x, stamp=stamp, sent_for=x.due) if x.stamp < stamp else x for x in after)
         changed = (*levels[:known + 1], news, *after, *levels[self.sent:])
         count = known + 2 + len(after)
         stale: int | None = known + 1

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+import math
 from time import monotonic_ns, time_ns
 from typing import Any, TYPE_CHECKING
 
@@ -47,7 +48,8 @@ PARAMETERS = SPECS
 _POLL_NS = 2_000_000
 _LONGEST_POLL_NS = 100_000_000
 # Matches publishers of samples with any reliability.
-_SAMPLES = replace(topics.JOINT_STATES, qos=topics.Quality(1000, reliable=False))
+_SAMPLES = replace(
+    topics.JOINT_STATES, qos=replace(topics.JOINT_STATES.qos, reliable=False))
 # Queue for the newest samples of several joints, each with its own publisher.
 _NEWEST = replace(topics.JOINT_STATES, qos=topics.Quality(20, reliable=False))
 # Time in ns that a subscription to samples is kept after use, since it takes time to match.
@@ -84,6 +86,7 @@ class PlannerNode(ManagedNode):
         self._samples: RawSubscription | None = None
         self._newest: RawSubscription | None = None
         self._listen_until = self._read = 0
+        self._due: float = math.inf  # when to serve next, by the monotonic clock in ns
         self._crowded = ''
         self._action: FollowJointTrajectory | None = None
         self.on_change(self._take_parameters)
@@ -295,7 +298,9 @@ class PlannerNode(ManagedNode):
 
     def _serve_soon(self) -> None:
         """Serve within a period, since frequent messages are not served one by one."""
-        if self.simulated:
+        # The executor calls the timer only after all messages that came before it is due, of
+        # which a path has a thousand a second.
+        if self.simulated or self._channels and monotonic_ns() > self._due + _READ_NS:
             self._serve()
         elif self._channels:
             self._pace()
@@ -307,6 +312,7 @@ class PlannerNode(ManagedNode):
             longest = _POLL_NS if soon else _READ_NS
         elif wake is None and not self.simulated:
             self._poll.cancel()
+            self._due = math.inf
             self._runtime.serve_by(None)
             return
         period = _POLL_NS
@@ -316,6 +322,7 @@ class PlannerNode(ManagedNode):
         if period != self._poll.timer_period_ns or self._poll.is_canceled():
             self._poll.timer_period_ns = period
             self._poll.reset()
+        self._due = monotonic_ns() + period
         self._runtime.serve_by(steady_ns() + period)
 
     def _listen(self) -> None:
