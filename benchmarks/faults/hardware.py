@@ -26,6 +26,8 @@ _BEAT = 0.05
 _LEAD = 200_000_000
 # Timeouts in s: the driver's watchdog, a call, and the firmware's watchdog.
 _TIMEOUT, _CALL, _FIRMWARE = 0.5, 0.5, 0.4
+# Timeout in s of a call where the fault is not a call that hangs: a busy host is none either.
+_PATIENT_CALL = 5.0
 _STALL = 1.2  # time in s for which a process is stopped
 # Allowed time in s for a driver to end on request, and for one whose call hangs.
 _PROMPT, _SOON = 3.0, 5.0
@@ -311,7 +313,7 @@ def _planner_killed(rig: Rig) -> Seen:
 
 def _stalled(rig: Rig, who: str, latest: float) -> Seen:
     """Stop a process for longer than the watchdog waits; ``latest`` is when the coil is off."""
-    with _bench(rig) as bench:
+    with _bench(rig, **{'hardware.timeout': _PATIENT_CALL}) as bench:
         processes = {'driver': bench.driver, 'planner': rig.start('planner', {
             'lead_time': PATIENT_LEAD})}
         bench.ready()
