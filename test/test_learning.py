@@ -153,6 +153,7 @@ def test_repeats_find_the_modes_of_a_block_whose_model_has_none(damping):
     assert found.rests[0] <= 2.75 * plan[1, 0]
 
 
+@pytest.mark.slow
 def test_samples_that_are_late_teach_as_much():
     levels = first = planned()
     bench, late, trials, left = Bench(1, max(abs(b) for _, b in levels)), 40, [], []
