@@ -183,9 +183,11 @@ def test_a_level_that_comes_too_late_is_refused_and_does_not_feed_the_watchdog(m
     device.receive(0, START + 2 * MS - 20 * MS, 0.04)
     device.advance(START + 3 * MS)
     assert [x.level for x in device.changes()] == [0.04]
+    assert device.guards[0].too_late is None
     device.notices()
     for step in range(100):
         device.receive(0, device.time - 21 * MS, 0.03)
+        assert device.cut_offs or device.guards[0].too_late == device.time - 21 * MS
         device.advance(START + (5 + 2 * step) * MS)
     assert [x.level for x in device.changes()] == [0.0]
     notices = device.notices()
@@ -282,6 +284,8 @@ def test_a_driver_drops_levels_that_it_could_not_write_in_time():
     device.advance(START + 500 * MS)
     assert [x.level for x in device.changes()][-1] == 0.05
     assert '2 levels are dropped, the first of which is 0.250 s late' in device.notices()[-1].text
+    # It was accepted, and would be acknowledged.
+    assert device.guards[0].too_late == START + 400 * MS
     device.receive(0, 0, 0.01)
     device.advance(START + 900 * MS)
     assert [x.level for x in device.changes()] == [0.01]

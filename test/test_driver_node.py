@@ -79,6 +79,26 @@ def test_driver_of_the_tutorial_keeps_the_contract_of_a_driver(start, ros):
 
 
 @pytest.mark.ros
+@pytest.mark.parametrize('node', [('plant',), ('driver', *BENCH)])
+def test_receipts_tell_commands_that_came_too_late_from_those_that_apply(start, ros, node):
+    receipts = ros.collect(
+        topics.FLUX_DENSITY_RECEIVED.type, topics.FLUX_DENSITY_RECEIVED.name,
+        topics.FLUX_DENSITY_RECEIVED.qos)
+    device = start.hmsa(*node, PYTHONPATH=str(TUTORIALS))
+    command = ros.publisher(
+        topics.FLUX_DENSITY_COMMAND.type, topics.FLUX_DENSITY_COMMAND.name,
+        topics.FLUX_DENSITY_COMMAND.qos)
+    ros.spin_until(lambda: receipts and command.get_subscription_count(), 'the first receipt')
+    for ahead, said in ((0.0, ''), (-1.0, 'late'), (0.5, '')):
+        stamp = ros.node.get_clock().now().nanoseconds + round(ahead * SECOND)
+        command.publish(to_command(stamp, 0.01, 'coil'))
+        ros.spin_until(
+            lambda stamp=stamp: from_time(receipts[-1].time_ref) == stamp, 'its receipt')
+        assert receipts[-1].header.frame_id == said
+    assert device.stop() == 0
+
+
+@pytest.mark.ros
 def test_hardware_that_breaks_ends_the_driver_with_all_coils_switched_off(start, ros, tmp_path):
     (tmp_path / 'lab.py').write_text(BROKEN)
     applied = field(ros)

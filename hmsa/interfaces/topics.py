@@ -146,9 +146,10 @@ FLUX_DENSITY_RECEIVED = Topic(
     'newest command arrived, or the current time, in the clock of the sender; `time_ref` is the '
     'timestamp of that command (0 before the first), `source` the joint. `frame_id` is '
     '`interlock` while the interlock is open, and `cut_off` after a cut-off of the coil, until '
-    'that is acknowledged: `time_ref` is then the time of the cut-off. The planner uses it to '
-    'check that commands arrive, and to measure the offset of the clocks. Optional for a driver '
-    'of your own.',
+    'that is acknowledged: `time_ref` is then the time of the cut-off. It is `late` if the '
+    'newest command came too late and was rejected. The planner uses it to check that commands '
+    'arrive and apply, and to measure the offset of the clocks. Optional for a driver of your '
+    'own.',
     publishers=(PLANT, DRIVER), subscribers=(PLANNER,))
 INTERLOCK = Topic(
     '~/interlock', 'std_msgs/msg/Bool', RELIABLE,

@@ -226,6 +226,7 @@ class Coil(GuardedJoint):
             return
         count = len(self._schedule)
         self._schedule = CommandSchedule(self._schedule.current)
+        self.too_late = self._newest
         if self.instrument.keeps_levels:
             self._changed = now + 1
         self.note(

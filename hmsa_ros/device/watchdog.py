@@ -92,6 +92,9 @@ class GuardedJoint:
         #: Time in ns that names the cut-off in force; 0 for none.
         self.cut_off_time = 0
         self._acknowledged = 0  # the last one that was acknowledged
+        self._newest: int | None = None  # timestamp of the newest command
+        #: Timestamp in ns of the newest command if it was too late and takes no effect; else None.
+        self.too_late: int | None = None
 
     def note(self, kind: Kind, text: str, late: int = 0) -> None:
         """Add a notice to log; ``late`` is a lateness in ns."""
@@ -249,6 +252,7 @@ class GuardedJoint:
     def refuses(self, stamp: int, level: float, now: int, current: float) -> bool:
         """Return whether a level in T is rejected: after a cut-off, or since it is too late."""
         late = now - stamp if stamp else 0
+        self._newest, self.too_late = stamp, None
         if self._since is not None:
             if level or current or stamp not in (0, self.cut_off_time):
                 ago = (now - self._since) / NANOSECONDS
@@ -262,6 +266,7 @@ class GuardedJoint:
         elif late > self.lateness_limit and not (
                 stamp == self._acknowledged and level == current == 0.0):
             self._stray = f'the newest one came {late / NANOSECONDS:.3f} s late'
+            self.too_late = stamp
             self.note(
                 Kind.REFUSED, f'{level:g} T came {late / NANOSECONDS:.3f} s after the time it '
                 f'applies: expected at most {self._fallback.lateness_limit:g} s (lateness_limit); '
@@ -287,6 +292,8 @@ class Device(ABC):
         self._notices: deque[Notice] = deque()
         #: Why commands are rejected; empty if they are accepted.
         self.locked = ''
+        #: Whether a command that was received is still to be processed.
+        self.busy = False
 
     @property
     @abstractmethod

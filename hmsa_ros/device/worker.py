@@ -112,6 +112,11 @@ class HardwareWorker:
         self.device.check(joint, stamp, level)
         self._put(partial(self._obey, joint, stamp, level, self._steady()))
 
+    @property
+    def busy(self) -> bool:
+        """Whether a command that was received is still to be processed."""
+        return bool(self._commands)
+
     def switch_off(self) -> None:
         """Switch off all coils, and drop pending levels."""
         self._put(self._switch_off)
@@ -188,7 +193,10 @@ class HardwareWorker:
                     self.trouble = ''
                 self._let_main_thread_read()
                 while self._commands:
-                    self._commands.popleft()()
+                    try:
+                        self._commands[0]()
+                    finally:
+                        self._commands.popleft()
                 self.device.advance(self._now())
                 self._wait()
         except BaseException as error:

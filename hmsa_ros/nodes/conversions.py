@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from hmsa.interfaces.outcome import Outcome
     from hmsa_ros.runtime.records import StatusChanged
 
-#: Contents of a receipt while commands from before a cut-off, or all commands, are rejected.
-CUT_OFF, INTERLOCK = 'cut_off', 'interlock'
+#: Contents of a receipt while commands from before a cut-off, or all commands, are rejected, and
+#: if the newest command was too late and takes no effect.
+CUT_OFF, INTERLOCK, LATE = 'cut_off', 'interlock', 'late'
 
 
 def to_time(nanoseconds: int) -> Time:
@@ -76,8 +77,8 @@ def to_receipt(joint: str, time: int, command: int, refuses: str) -> TimeReferen
     """
     Return a receipt: timestamp of the newest command of a joint, and present time; both in ns.
 
-    ``refuses`` is `CUT_OFF` or `INTERLOCK` if commands are rejected, else empty. For `CUT_OFF`,
-    the time of the cut-off takes the place of the timestamp.
+    ``refuses`` is `CUT_OFF`, `INTERLOCK` or `LATE` if commands are rejected, else empty. For
+    `CUT_OFF`, the time of the cut-off takes the place of the timestamp.
     """
     return TimeReference(
         header=Header(stamp=to_time(time), frame_id=refuses),

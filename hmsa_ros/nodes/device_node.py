@@ -97,9 +97,11 @@ class DeviceJoint:
         self._applied, self._received = (
             Outlet(ros_entities.publisher(node, topics.of_joint(x, self.name, names)))
             for x in (topics.FLUX_DENSITY_APPLIED, topics.FLUX_DENSITY_RECEIVED))
-        # Timestamp of the newest command; its time of arrival in ns, 0 if a receipt was published;
-        # and the time of the last receipt by the steady clock.
-        self._newest, self._came, self._reported_at = 0, 0, 0
+        # Timestamps of the newest command, and of that of the last receipt; time of arrival of
+        # the newest in ns, 0 if it is in a receipt; and steady time of the last receipt, and what
+        # it said on rejections.
+        self._newest, self._processed, self._came, self._reported_at = 0, 0, 0, 0
+        self._reported = ''
         self._topic = topics.of_joint(topics.FLUX_DENSITY_COMMAND, self.name, names)
         # Publishers at the last look, and the identifier of the one obeyed, or ignored as
         # companion.
@@ -117,22 +119,29 @@ class DeviceJoint:
         self._applied.publish(conversions.to_command(change.stamp, change.level, ''))
 
     def publish_receipt(self) -> None:
-        """Publish the newest command, after a new command or a long interval."""
-        steady = monotonic_ns()
-        if steady - self._reported_at < (_RECEIPTS if self._came else _SIGNS_OF_LIFE):
+        """Publish the newest command once it is processed, a new refusal, or a sign of life."""
+        steady, came = monotonic_ns(), 0 if self._commanded.busy else self._came
+        new = came or self.refuses != self._reported
+        if steady - self._reported_at < (_RECEIPTS if new else _SIGNS_OF_LIFE):
             return
-        refuses = self.refuses
+        if came:
+            self._processed, self._came = self._newest, 0
+        refuses = self._reported = self.refuses
         cut = self.cut_off_time if refuses == conversions.CUT_OFF else 0
         self._received.publish(conversions.to_receipt(
-            self.name, self._came or self._node.now(), cut or self._newest, refuses))
-        self._came, self._reported_at = 0, steady
+            self.name, came or self._node.now(), cut or self._processed, refuses))
+        self._reported_at = steady
 
     @property
     def refuses(self) -> str:
         """Reason why commands are rejected, as in a receipt."""
         if self._commanded.locked or self._node.away:
             return conversions.INTERLOCK
-        return conversions.CUT_OFF if self._number in self._device.cut_offs else ''
+        guard = self._device.guards[self._number]
+        if guard.is_cut_off:
+            return conversions.CUT_OFF
+        late = guard.too_late
+        return conversions.LATE if late is not None and late == self._processed else ''
 
     @property
     def cut_off_time(self) -> int:
