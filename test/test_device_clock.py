@@ -181,6 +181,24 @@ def test_receipts_that_were_held_up_by_an_outage_do_not_end_the_silence():
     assert pass_time(100) == set()
 
 
+def test_a_planner_that_stood_still_knows_that_commands_did_not_arrive_before():
+    time = 0
+    receipts = Receipts(lambda: time)
+    receipts.received('a', time, 0, time, comparable=True)
+    receipts.sent('a', 50 * MS, time)
+    for stall in (0, 700, 0, 0, 500, 0, 0, 0, 0):
+        time += 100 * MS + stall * MS
+        receipts.look()
+        # That it has received nothing.
+        receipts.received('a', time, 0, time, comparable=True)
+        assert not receipts.lost('a')
+    for _ in range(3):
+        time += 100 * MS
+        receipts.look()
+        receipts.received('a', time, 0, time, comparable=True)
+    assert receipts.lost('a')
+
+
 @pytest.mark.parametrize('seed', range(5))
 def test_delays_are_never_taken_for_a_clock_that_was_set(seed):
     chance, clock = random.Random(seed), DeviceClock()

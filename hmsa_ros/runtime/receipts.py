@@ -196,7 +196,8 @@ class Receipts:
         for name, known in self._joints.items():
             if absent > _PAUSE:
                 known.arrived = min(known.arrived + absent, steady)
-                known.unanswered = None
+                if known.unanswered is not None:
+                    known.unanswered = min(known.unanswered + absent, steady)
             silent = steady - known.arrived > _PATIENCE
             if silent is not known.silent:
                 changed.append(name)
