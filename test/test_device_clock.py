@@ -199,6 +199,23 @@ def test_a_planner_that_stood_still_knows_that_commands_did_not_arrive_before():
     assert receipts.lost('a')
 
 
+def test_a_level_that_was_dropped_after_its_acknowledgement_is_not_carried_out():
+    time = 0
+    receipts = Receipts(lambda: time)
+    receipts.received('a', time, 0, time, comparable=True)
+    receipts.sent('a', 50 * MS, time)
+    receipts.expect('a', 50 * MS)
+    assert receipts.owed('a')
+    time = 60 * MS
+    receipts.received('a', time, 50 * MS, time, comparable=True)
+    assert (receipts.owed('a'), receipts.carried_out('a', 50 * MS)) == (False, True)
+    receipts.received('a', time, 50 * MS, time, comparable=True, late=True)
+    assert (receipts.owed('a'), receipts.carried_out('a', 50 * MS)) == (True, False)
+    receipts.sent('a', 100 * MS, time)
+    receipts.received('a', time, 100 * MS, time, comparable=True)
+    assert not receipts.owed('a')
+
+
 @pytest.mark.parametrize('seed', range(5))
 def test_delays_are_never_taken_for_a_clock_that_was_set(seed):
     chance, clock = random.Random(seed), DeviceClock()

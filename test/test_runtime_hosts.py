@@ -40,7 +40,9 @@ class Bench(Rig):
         self.hears = True  # whether commands arrive while the link works
         self.mute = False  # whether receipts are lost
         self.cut_at = START + 1  # time that names the cut-off
+        self.limit = math.inf  # lateness above which a command is rejected
         self._newest = 0
+        self._late = False
         self._came = 0  # time of the device at which a command arrived
         self._next = START
 
@@ -59,6 +61,8 @@ class Bench(Rig):
             self.wire = []
         for _, x in self.wire:
             self._newest, self._came = x.stamp, self.now + self.ahead
+            self._late = self._came - x.stamp > self.limit
+        self.wire = [x for x in self.wire if self.now + self.ahead - x[1].stamp <= self.limit]
         if self.cut:
             while self.wire and self.cut:
                 _, x = self.wire.pop(0)
@@ -76,7 +80,7 @@ class Bench(Rig):
             self._next = self.now + 100 * MS
             self.runtime.received(
                 'a', self._came or self.now + self.ahead,
-                self.cut_at if self.cut else self._newest, cut_off=self.cut)
+                self.cut_at if self.cut else self._newest, cut_off=self.cut, late=self._late)
             self._came = 0
 
     def cut_off(self):
@@ -219,6 +223,32 @@ def test_a_level_whose_report_is_late_is_not_taken_back_by_a_heartbeat(sampled):
     rig.run(rig.now + 1000 * MS)
     assert {x.flux_density for _, x in rig.sent[first:]} <= planned
     assert rig.residual(1.4) < 1e-9
+
+
+@pytest.mark.parametrize('how', ['lost', 'late', 'deaf'])
+def test_a_level_that_was_lost_is_not_repeated_by_a_heartbeat(how):
+    highest = 0.0
+    for begin in (0, 70, 140):
+        for outage in (20, 60, 140, 460, 580, 1200):
+            rig = Bench()
+            rig.limit = 100 * MS
+            rig.runtime.request(StretchRequest('a', 1.2))
+            rig.run(START + (1000 + begin) * MS)
+            rig.linked, rig.hears = how == 'deaf', how != 'deaf'
+            rig.runtime.request(StretchRequest('a', 1.4))
+            rig.run(rig.now + outage * MS)
+            rig.linked = rig.hears = True
+            if how == 'late':
+                # With the first in time, the move would be as planned.
+                rig.wire = [x for x in rig.wire if rig.now - x[1].stamp > rig.limit]
+            else:
+                rig.wire = []
+            for _ in range(150):
+                rig.run(rig.now + 8 * MS, 4 * MS)
+                highest = max(highest, rig.plant.stretch)
+            assert rig.residual(1.4) < 1e-6
+    # In one step it would swing to 1.54.
+    assert highest < 1.401
 
 
 def test_a_device_without_receipts_is_sent_everything():

@@ -70,6 +70,11 @@ class History:
                 return i + 1 - first
         return 0
 
+    @property
+    def awaiting(self) -> bool:
+        """Whether a change of level that was sent has not been reported yet."""
+        return self._changes(range(self.known + 1, self.sent)) > 0
+
     def without(self, start: int, end: int) -> 'History':
         """Return the history without levels ``start`` to ``end``, which never took effect."""
         sent = self.sent - max(min(self.sent, end) - start, 0)

@@ -275,6 +275,11 @@ class RunningPlan:
         """Whether the effect of a sent level has not been reported yet."""
         return self._history.sent > self._history.known + 1
 
+    @property
+    def awaiting_change(self) -> bool:
+        """Whether one of these levels is another than the one in force."""
+        return self._history.awaiting
+
     def unknown(self, now: int) -> tuple[PlannedLevel, tuple[PlannedLevel, ...]]:
         """Return the last level known to apply by a time in ns, and the levels after it."""
         levels, place = self.plan.levels, self._history.known

@@ -93,7 +93,8 @@ class JointChannel:
             self._joint, conversions.from_time(message.header.stamp),
             conversions.from_time(message.time_ref),
             cut_off=message.header.frame_id == conversions.CUT_OFF,
-            locked=message.header.frame_id == conversions.INTERLOCK)
+            locked=message.header.frame_id == conversions.INTERLOCK,
+            late=message.header.frame_id == conversions.LATE)
         if message.header.frame_id:
             self._serve()
 

@@ -81,13 +81,14 @@ class CommandLink:
             if name in silent | self.apart | self.cut:
                 # The command would arrive too late, apply at another time, or be rejected.
                 continue
-            if name in self._void and name in self._following.astray:
+            if name in self._void and name in self._following.astray or self._following.lost(name):
                 # The plan is for another state, and is being replaced.
                 continue
             self._void.discard(name)
             for level in planner.due(_FAR if everything else now):
                 self.fresh.discard(name)
                 self._hand_out(name, level.stamp, level.flux_density, now)
+                self.receipts.expect(name, level.stamp)
                 self.sent += 1
                 self._following.sent(name, level.stamp, now)
 
@@ -95,13 +96,15 @@ class CommandLink:
         self.deliver(Send(name, stamp, flux_density))
         self.receipts.sent(name, stamp, now)
 
-    def beat(self, now: int) -> None:
+    def beat(self, now: int, *, finds_lost: bool) -> None:
         """
         Send the levels in force again, as a heartbeat of the planner.
 
         A level that was sent and took no effect in time is not among them: by now it would leave
-        vibration, and the rest is planned anew instead. While it may be lost, nothing is sent: if
-        only the report is late, the level before it would leave vibration, too.
+        vibration, and the rest is planned anew instead. Until its device has acknowledged it, or
+        reported its effect, it may be lost, and nothing is sent: if only the report is late, the
+        level before it would leave vibration, too. ``finds_lost`` tells whether lost levels are
+        looked for; otherwise they are repeated.
         """
         for name, planner in self._planners.items():
             if name in self.receipts.silent | self.cut | self.fresh | self.apart:
@@ -111,12 +114,16 @@ class CommandLink:
                 continue
             stamp, following = planner.beat_stamp(now), planner.next_stamp
             level = planner.last_sent.flux_density
-            if self._following.lost(name):
+            lost = self._following.lost(name)
+            if (finds_lost and not lost and name in self._following.newest
+                    and self.receipts.owed(name) and planner.awaiting_change):
+                continue
+            if lost:
                 if stamp <= planner.last_sent.stamp:
                     # It would replace the last level, which is on its way.
                     continue
                 level = self._following.newest.get(name, (0, level))[1]
-            if following is None or stamp < following:
+            if lost or following is None or stamp < following:
                 self._hand_out(name, stamp, level, now)
                 self.heartbeats += 1
 
@@ -158,10 +165,13 @@ class CommandLink:
             verdict = verdict or found
         return verdict
 
-    def received(self, joint: str, time: int, command: int | None) -> Verdict | None:
+    def received(
+            self, joint: str, time: int, command: int | None, *,
+            late: bool = False) -> Verdict | None:
         """Process a receipt as `Receipts.received` does; return the verdict on a plan."""
         restarted = self.receipts.received(
-            joint, time, command, self._around.clock(), comparable=not self._around.one_clock())
+            joint, time, command, self._around.clock(), late=late,
+            comparable=not self._around.one_clock())
         if not restarted:
             return None
         self._following.newest.pop(joint, None)
@@ -338,8 +348,9 @@ class CommandLink:
         names = self._following.astray
         for joint in self.cut:
             self.acknowledge(joint)
-        lost = [x for x in self._planners
-                if self.receipts.lost(x, *((0,) if x in self.cut else ()))]
+        # After a loss, a heartbeat shows whether commands arrive again.
+        lost = [x for x in self._planners if self.receipts.lost(
+            x, *((0,) if x in self.cut or self._following.lost(x) else ()))]
         owed = any(
             self._around.reports(x) and not self.receipts.knows(x) for x in self._planners)
         if not (lost or self.cut or owed) and all(

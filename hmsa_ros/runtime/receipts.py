@@ -32,6 +32,7 @@ class _Receiver:
     command: int = 0  # timestamp that it acknowledged; 0 for none
     unanswered: int | None = None  # time since which no command is acknowledged
     acknowledged: int = 0  # newest timestamp sent that was acknowledged; 0 for none
+    level: int | None = None  # timestamp of the newest level sent; None once acknowledged
     silent: bool = False
     missing: int = 0  # consecutive looks without a publisher of receipts
     clock: DeviceClock = field(default_factory=DeviceClock)
@@ -78,17 +79,28 @@ class Receipts:
             known.unanswered = self._steady()
         known.clock.sent(stamp, now)
 
+    def expect(self, joint: str, stamp: int) -> None:
+        """Expect the acknowledgement of a level that was sent, rather than of a heartbeat."""
+        known = self._joints.get(joint)
+        if known is not None:
+            known.level = stamp
+
+    def owed(self, joint: str) -> bool:
+        """Return whether a joint's device has not acknowledged the newest level."""
+        known = self._joints.get(joint)
+        return known is not None and known.level is not None
+
     def received(
             self, joint: str, time: int, command: int | None, now: int, *,
-            comparable: bool) -> bool:
+            comparable: bool, late: bool = False) -> bool:
         """
         Process a receipt with the device's time; return whether the device restarted.
 
         ``command`` is the timestamp of the newest command that the device has received, 0 for
-        none; None if the receipt contains none, as during a cut-off. ``now`` is the time of the
-        planner's clock. The two times are ``comparable`` if each side has its own clock: a shared
-        clock may be slowed down or paused. A device has restarted if it reports no command after
-        it reported one.
+        none; None if the receipt contains none, as during a cut-off. If it was too ``late``, it
+        has arrived, but takes no effect. ``now`` is the time of the planner's clock. The two times
+        are ``comparable`` if each side has its own clock: a shared clock may be slowed down or
+        paused. A device has restarted if it reports no command after it reported one.
         """
         steady = self._steady()
         known = self._joints.get(joint)
@@ -104,11 +116,18 @@ class Receipts:
         if restarted:
             # Commands that were sent to the previous device are lost.
             known.clock.lost()
-            known.unanswered = None
+            known.unanswered = known.level = None
             known.acknowledged = 0
         known.arrived, known.time, known.missing, known.delayed = steady, time, 0, None
         if command is not None and known.clock.awaits(command):
-            known.unanswered, known.acknowledged = None, command
+            known.unanswered = None
+            if not late:
+                known.acknowledged = command
+                if known.level is not None and command >= known.level:
+                    known.level = None
+        if late and command is not None:
+            # Also after its acknowledgement: a driver that stood still drops what it has accepted.
+            known.acknowledged, known.level = min(known.acknowledged, command - 1), command
         if comparable:
             known.step += known.clock.received(time, command, now, steady)
         return restarted
@@ -134,7 +153,7 @@ class Receipts:
         known = self._joints.get(joint)
         if known is not None:
             known.clock.lost()
-            known.unanswered = None
+            known.unanswered = known.level = None
 
     @property
     def joints(self) -> set[str]:
@@ -175,7 +194,7 @@ class Receipts:
         self._disturbed(self._steady() - _STALE, 'the clock of the planner was set')
         for known in self._joints.values():
             known.clock.set(self._steady())
-            known.acknowledged = 0
+            known.acknowledged, known.level = 0, None
 
     def take_step(self, joint: str) -> int:
         """Return by how many ns a device's clock was set ahead since the last call."""

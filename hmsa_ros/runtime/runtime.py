@@ -194,16 +194,18 @@ class Runtime:
 
     def received(
             self, joint: str, time: int, command: int, *, cut_off: bool,
-            locked: bool = False) -> None:
+            locked: bool = False, late: bool = False) -> None:
         """
         Process a receipt: by its time in ns, a device has received the command of a timestamp.
 
         A device that was cut off rejects commands until that is acknowledged, and ``command`` is
-        the time of the cut-off; one that is locked by an interlock rejects all.
+        the time of the cut-off; one that is locked by an interlock rejects all. It has rejected
+        this command if it was too ``late``.
         """
         self.following.seen(time)
         self._unheard.discard(joint)
-        self._drop(self.devices.received(joint, time, None if cut_off else command))
+        self._drop(self.devices.received(
+            joint, time, None if cut_off else command, late=late))
         self._check_clock(joint)
         self.cut_off(joint, in_force=cut_off or locked, locked=locked,
                      time=command if cut_off else 0)
@@ -500,7 +502,7 @@ class Runtime:
             if self.settings.replan_late:
                 self.following.look_for_unheard(now)
             self._drop(self.devices.look_for_newcomers())
-            self.devices.beat(now)
+            self.devices.beat(now, finds_lost=self.settings.replan_late)
         return True
 
     def _taken(self) -> list[Output]:
