@@ -91,6 +91,21 @@ def test_who_has_profiles_of_his_own_keeps_them(monkeypatch, name):
     assert ''.join(os.environ[x] for x in PROFILES) == os.environ[name] == '/somewhere/else.xml'
 
 
+@pytest.mark.ros
+def test_a_node_starts_without_the_parsers_that_generate_messages(start):
+    node = start.python('-c', """
+from hmsa_ros.middleware import prepare_middleware
+prepare_middleware()
+import sys
+import rclpy
+from std_msgs.msg import Empty
+rclpy.init()
+rclpy.create_node('node').create_subscription(Empty, 'topic', print, 1)
+print('lark' in sys.modules)
+""")
+    assert (node.wait(), node.output.strip()) == (0, 'False')
+
+
 @pytest.mark.parametrize(('distro', 'place'), [('jazzy', 0), ('kilted', 1), ('rolling', 1)])
 def test_profiles_are_those_of_the_middleware_of_the_distribution(monkeypatch, distro, place):
     monkeypatch.setenv('ROS_DISTRO', distro)

@@ -21,10 +21,12 @@ from hmsa.model.status import Code
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.temporary_node import SLICE_SECONDS, Visitor
 
-# Time limit in s for a stop, perhaps in slow motion; and time until it is sent again to a planner
-# that has not answered, as one that was just discovered may not have received it.
+# Time limit in s for a stop, perhaps in slow motion; time until it is sent again to a planner that
+# has not answered, as one that was just discovered may not have received it; and interval of looks
+# for the planner, as discovery wakes no executor.
 _STOP_SECONDS = 15.0
-_AGAIN_SECONDS = 0.5
+_AGAIN_SECONDS = 0.1
+_LOOK_SECONDS = 0.005
 # Time in s of a stop after which it is said what is awaited.
 _QUIET_SECONDS = 1.0
 
@@ -116,7 +118,8 @@ class Link(Visitor):
                 ENDING.check()
             if monotonic() - begin > _QUIET_SECONDS:
                 self.say(stopping.words)
-            self._executor.spin_once(timeout_sec=SLICE_SECONDS)
+            self._executor.spin_once(
+                timeout_sec=SLICE_SECONDS if stopping.answered else _LOOK_SECONDS)
             stopping.go_on()
         if stopping.done is None:
             raise HmsaError(stopping.failure or '')
