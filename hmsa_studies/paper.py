@@ -289,8 +289,8 @@ def _draw_chain_limit_cases(figure: Figure, runs: tuple[PaperResponse, ...]) -> 
         right.set_xlim(begin - 0.2, begin + 2.0)
         last = pair is pairs[-1]
         style.finish(left, TAU if last else '', STRETCH, letter)
-        style.finish(
-            right, TAU + ', close-up' if last else '', STRETCH if _stacked(figure) else '')
+        style.finish(right, TAU if last else '', STRETCH)
+        right.set_title(f'close-up of ({letter})', loc='right')
         left.set_title(
             rf'$J_{{\mathrm{{lim}}}}={pair[0].material.j_lim:g}$, $\lambda_m={limit:.3f}$, '
             rf'$\tilde{{\lambda}}_m={paper_data.NEAR_LIMIT:g}\,\lambda_m'
