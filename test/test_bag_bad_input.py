@@ -291,7 +291,8 @@ def test_what_is_not_there_is_said(tmp_path, capsys):
     ('a.db3', b'SQLite format 3\0 ...', 'a.db3 cannot be read ('),
     ('a.mcap.zstd', zstandard.compress(MAGIC), 'decompress it with "zstd -d FILE"'),
     ('a.bag', b'#ROSBAG V2.0\n', 'a.bag'),
-    ('a.mcap', b'version https://git-lfs.github.com/spec/v1\n', 'the file with "git lfs pull"'),
+    *((f'a{x}', b'version https://git-lfs.github.com/spec/v1\n', 'the file with "git lfs pull"')
+      for x in ('.mcap', '.db3', '.bag')),
 ])
 def test_a_file_that_is_no_bag_is_refused_with_a_way_on(
         tmp_path, capsys, name, content, advice, in_folder):

@@ -16,6 +16,7 @@ from mcap.records import Channel, Schema
 
 from hmsa.bag import limits
 from hmsa.bag.definitions import ROS1
+from hmsa.bag.folder import advice_on
 from hmsa.bag.merge import Message
 from hmsa.bag.metadata import BagMetadata, FILE_NAME
 from hmsa.bag.records import MessageBlock
@@ -61,6 +62,10 @@ class ForeignFile:
             with self._opened() as reader:
                 self._take(reader)
         except Exception as error:  # rosbags, apsw and the parsers of each format raise their own
+            for x in self.paths:
+                # In a compressed bag, compressed files are no mistake.
+                if (advice := advice_on(x)) and (x == path or x.suffix != '.zstd'):
+                    raise BadInputError(f'{x} {advice}') from error
             what = ' '.join(str(error).split()) or type(error).__name__
             raise BadInputError(
                 f'{path} cannot be read ({what}): expected a bag of MCAP, SQLite or ROS 1'
