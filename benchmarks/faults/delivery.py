@@ -1,5 +1,7 @@
 """Faults of delivery: load, delay, loss, duplication and reordering of commands."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from benchmarks.faults.common import (
@@ -22,6 +24,8 @@ _FINE = 1e4
 # Allowed residual of a move that is late as a whole, caused by the relay's own jitter: 0.008 on an
 # idle machine, 0.08 on a busy one.
 _ALIKE = 0.1
+# Largest stretch beyond the target of a shaped move, for samples and their rounding.
+_BEYOND = 1e-3
 # Time by which a replanned move has been executed.
 _AFTER_NS = round((LEAD + 0.03) * 1e9)
 
@@ -111,6 +115,21 @@ def _drop(rig: Rig) -> Seen:
     remap = rig.relay('--drop', '2')
     pair(rig, remap=remap, planner={'lead_time': LEAD})
     return _learnt(rig)
+
+
+@FAULTS.fault(
+    'drop_move', 'all commands of a move lost',
+    'relay drops both, but no heartbeat; heartbeat_period 0.01 s',
+    'no heartbeat carries the last level in one step; the planner re-plans a shaped move')
+def _drop_move(rig: Rig) -> Seen:
+    remap = rig.relay('--drop', '1,2')
+    pair(rig, remap=remap, planner={'lead_time': LEAD, 'heartbeat_period': 0.01})
+    mark = rig.count()
+    seen = _learnt(rig)
+    # One step from 1 to 1.2 swings beyond it by most of its size.
+    beyond = float(rig.samples(mark)[1][:, 0].max()) - 1.2
+    return replace(seen, text=f'{seen.text}, {beyond:.0e} beyond the target',
+                   met=seen.met and beyond < _BEYOND)
 
 
 @FAULTS.fault(

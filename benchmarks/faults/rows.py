@@ -17,5 +17,5 @@ FAULTS = (
 
 #: Faults injected by the tests: one of each kind.
 QUICK = (
-    'none', 'twice', 'planner_restarted', 'planner_stopped', 'planner_stalled',
-    'plant_stalled', 'stranger_first', 'parameter_refused')
+    'none', 'twice', 'drop_move', 'planner_restarted', 'planner_stopped',
+    'planner_stalled', 'plant_stalled', 'stranger_first', 'parameter_refused')
